@@ -108,7 +108,9 @@ _TIP = ("J_lin", "J_ang", "p_base", "axis_base")
 
 @cache
 def chain_dtype(joints: int) -> np.dtype[np.void]:
-    """Returns the layout of a joint's row, which contains its constants and work space.
+    """Returns the NumPy data type of the row that stores a joint of a chain.
+
+    A row contains the constants of the joint and the work space of the algorithms.
 
     Args:
         joints: Number of joints of the chain.
@@ -367,12 +369,14 @@ def _along_axis(row: Row, linear: Three, angular: Three) -> float:
 
 @leaf
 def friction_torque(row: Row, speed: float) -> float:
-    """Returns the friction torque of a joint, N m or N; it increases with the speed.
+    """Returns the torque with which friction opposes the motion of a joint, N m or N.
 
         f(v) = viscous v + coulomb x / sqrt(1 + x^2),    x = v / COULOMB_SPEED
 
+    It increases with the velocity v. The second term is a smooth form of dry friction.
+
     Args:
-        row: Row of the joint.
+        row: Row of the joint, with the coefficients `viscous` and `coulomb`.
         speed: Velocity v of the joint, rad/s or m/s.
     """
     x = speed / COULOMB_SPEED

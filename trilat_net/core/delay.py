@@ -172,11 +172,13 @@ def _longest_us(model: LinkModel, trace: Points | None) -> float:
 
 
 def max_delay_us(models: Sequence[LinkModel], traces: Sequence[Points | None]) -> int:
-    """Returns an upper bound of the delays of a link, us, the play-out buffer included.
+    """Returns an upper bound of the delays on a link, us, the play-out buffer included.
+
+    It determines for how many waiting samples a link needs room.
 
     Args:
-        models: Models of the link.
-        traces: Per model the points of its trace, or None.
+        models: Models that apply to the link, one after another.
+        traces: Per model the points of its trace, a table of delays by time, or None.
     """
     bounds_us = []
     for model, trace in zip(models, traces, strict=True):
@@ -203,13 +205,13 @@ _LOOP = int(TraceEnd.LOOP)
 
 @leaf
 def draw_delay_us(key: DrawKey, sample: int, purpose: int, model: Row) -> float:
-    """Returns a draw of a delay model without memory, us, not rounded.
+    """Draws a random delay from a distribution that has no memory, us, not rounded.
 
     Args:
         key: Key of the link, from which all its random numbers follow.
         sample: Index of the sample.
         purpose: DELAY for the sample, COPY for its duplicate.
-        model: The model, a row of LINK_MODEL_DTYPE.
+        model: Model of the delay, a row of LINK_MODEL_DTYPE.
     """
     location: float = model.location
     scale: float = model.scale
@@ -238,16 +240,18 @@ def draw_delay_us(key: DrawKey, sample: int, purpose: int, model: Row) -> float:
 def next_ar1_value(
     key: DrawKey, sample: int, correlation: float, before: float, fresh: bool
 ) -> float:
-    """Returns the next number of an AR(1) sequence of standard normal numbers.
+    """Returns the next number of a random sequence whose neighbours are correlated.
 
         x_m = c x_{m-1} + sqrt(1 - c^2) n_m,  n_m standard normal
 
+    This is an AR(1) sequence. Each of its numbers has the mean 0 and the deviation 1.
+
     Args:
-        key: the key of the link.
-        sample: the sample m.
-        correlation: c.
-        before: x_{m-1}.
-        fresh: true: the sequence starts here, with x_m = n_m.
+        key: Key of the link, from which all its random numbers follow.
+        sample: Index m of the sample.
+        correlation: Correlation c of neighbours.
+        before: Number x_{m-1} of the previous sample.
+        fresh: True: the sequence starts here, with x_m = n_m.
     """
     draw = standard_normal(key, sample, DELAY, 0)
     if fresh:
@@ -257,11 +261,11 @@ def next_ar1_value(
 
 @leaf
 def sine_delay_us(stamp_ns: int, model: Row) -> float:
-    """Returns the sinusoidal delay of a sample with this stamp, us, not rounded.
+    """Returns the delay of a sample on a link whose delay is a sine of time, us, not rounded.
 
     Args:
-        stamp_ns: Stamp of the sample, ns since the epoch.
-        model: The model, a row of LINK_MODEL_DTYPE.
+        stamp_ns: Stamp of the sample, the time at which it was sent, ns since the epoch.
+        model: Model of the delay, a row of LINK_MODEL_DTYPE.
     """
     location: float = model.location
     scale: float = model.scale
@@ -271,15 +275,18 @@ def sine_delay_us(stamp_ns: int, model: Row) -> float:
 
 @leaf
 def trace_delay_us(stamp_ns: int, model: Row, points: Points) -> int:
-    """Returns the delay of a trace at a stamp, us; -1 if the sample is lost.
+    """Returns the delay of a sample on a link with a trace, a table of delays by time.
 
     The delay is that of the last point at or before the stamp. A trace that loops starts again
     after its last point, which lasts as long as the point before it.
 
     Args:
-        stamp_ns: Stamp of the sample, ns since the epoch.
-        model: The model, a row of LINK_MODEL_DTYPE.
+        stamp_ns: Stamp of the sample, the time at which it was sent, ns since the epoch.
+        model: Model of the delay, a row of LINK_MODEL_DTYPE.
         points: Points of all traces, rows of time and delay, us.
+
+    Returns:
+        The delay, us. It is -1 if the sample is lost.
     """
     first = model.trace_first
     count = model.trace_count
@@ -310,15 +317,15 @@ def draw_pair(now: Row, index: int, attempt: int) -> tuple[float, float]:
 def custom_delay_us(
     key: DrawKey, sample: int, stamp_ns: int, model: Row, points: Points
 ) -> float:
-    """Returns the delay of a CUSTOM model, us, not rounded and at most `location`.
+    """Returns the delay that a user's compiled function gives a sample, us, not rounded.
 
-    The function of the model receives its own numbers, which are stored in the site's table of
-    points, two in each row.
+    The delay is at most `location`. The function of the model receives its own numbers, which
+    are stored in the site's table of points, two in each row.
 
     Args:
-        key: Key of the link.
+        key: Key of the link, from which all its random numbers follow.
         sample: Index of the sample.
-        stamp_ns: Stamp of the sample, ns since the epoch.
+        stamp_ns: Stamp of the sample, the time at which it was sent, ns since the epoch.
         model: The model, in which the function finds its input and writes the delay.
         points: The site's table of points.
     """

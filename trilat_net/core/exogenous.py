@@ -117,13 +117,13 @@ _NUMBERS = ("a", "b", "K", "B")
 
 @cache
 def torque_source_dtype(width: int) -> np.dtype[np.void]:
-    """Returns the layout of the row of an actor, an operator or environment.
+    """Returns the NumPy data type of the row that stores an operator or an environment.
 
     A user's function, at the address `call`, reads the fields t_s, coordinates, at and speed,
     and writes effort.
 
     Args:
-        width: Largest length of the actors' vectors.
+        width: Largest length of the vectors of all operators and environments.
     """
     integers = ("kind", "sampled", "table_first", "table_count", "call", "coordinates")
     scalars = (*_SCALARS, "t_s")
@@ -155,12 +155,15 @@ _LIVE_TIP, _LIVE_FORCE, _LIVE_JOINT = map(int, LIVE_KINDS)
 def torque_source_rows(
     actors: tuple[TorqueSource, ...], joints: int = 2, axes: int = 2
 ) -> tuple[TorqueSourceRows, TorqueTable]:
-    """Returns a row per actor, and one table that joins the tables of all actors.
+    """Converts operators and environments to arrays, which compiled code can read.
 
     Args:
         actors: Operators and environments.
         joints: Number of joints of the arm.
         axes: Number of axes of its space.
+
+    Returns:
+        A row per operator or environment, and one table that joins the tables of all of them.
     """
     width = 1 + joints
     rows = np.zeros(len(actors), torque_source_dtype(max(joints, axes)))
@@ -197,16 +200,19 @@ def torque_source_rows(
 
 @leaf
 def minimum_jerk(t_s: float, start_s: float, end_s: float) -> Pair:
-    """Returns the progress of a minimum-jerk motion, 0 to 1, and its rate, 1/s.
+    """Returns the progress of a minimum-jerk motion, a smooth motion as of a human arm.
 
         10 x^3 - 15 x^4 + 6 x^5,    x = (t - start) / (end - start)
 
     After Flash and Hogan, "The coordination of arm movements", J. Neuroscience 5 (1985).
 
     Args:
-        t_s: Time, s.
+        t_s: Time t, s.
         start_s: Start of the motion, s.
         end_s: End of the motion, s.
+
+    Returns:
+        The progress, 0 to 1, and its rate, 1/s.
     """
     if t_s <= start_s:
         return 0.0, 0.0

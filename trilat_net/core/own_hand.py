@@ -125,7 +125,9 @@ class HandProgram(Protocol):
 
 
 class OwnHand:
-    """Hand program at one site: the ticks of its decisions, and the times at which they act.
+    """Program that moves the arm of one site, and the times at which its decisions act.
+
+    It is created from the scenario, and asked in each tick for the action of the program.
 
     Args:
         rules: Limits of the program's actions.

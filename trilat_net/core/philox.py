@@ -80,11 +80,15 @@ def philox(
 
 @leaf
 def unit_interval(high: np.uint64, low: np.uint64) -> float:
-    """Returns a number of the open interval (0, 1) from two 32-bit words.
+    """Returns a number of the open interval (0, 1) that is made of two random 32-bit words.
 
         (52 random bits + 1/2) / 2^52
 
     The result is exact. With 53 bits the largest number would round to 1.
+
+    Args:
+        high: Word that gives the upper bits.
+        low: Word that gives the lower bits.
     """
     upper_bits = float(high >> _TO_26) * _TWO_26
     lower_bits = float(low >> _TO_26)
@@ -95,13 +99,14 @@ def unit_interval(high: np.uint64, low: np.uint64) -> float:
 def uniforms(key: DrawKey, sample: int, purpose: int, attempt: int) -> tuple[float, float]:
     """Returns two random numbers, uniform on the open interval (0, 1).
 
-    Draws with different arguments are independent.
+    The same arguments always give the same numbers, and draws with different arguments are
+    independent.
 
     Args:
-        key: the key of the link.
-        sample: the index of the sample.
-        purpose: the purpose of the draw.
-        attempt: the attempt of a method that rejects draws, from 0.
+        key: Key of the link for whose samples the numbers are drawn.
+        sample: Index of the sample.
+        purpose: What the numbers are for; it separates the draws of one sample.
+        attempt: Attempt of a method that rejects draws, from 0.
     """
     index = np.uint64(sample)
     a, b, c, d = philox(
@@ -117,12 +122,14 @@ def uniforms(key: DrawKey, sample: int, purpose: int, attempt: int) -> tuple[flo
 
 @leaf
 def standard_normal(key: DrawKey, sample: int, purpose: int, attempt: int) -> float:
-    """Returns a standard normal number by the method of Box and Muller.
+    """Returns a random number with the normal distribution of mean 0 and deviation 1.
+
+    The method is that of Box and Muller. The same arguments always give the same number.
 
     Args:
-        key: Key of the link.
+        key: Key of the link for whose samples the number is drawn.
         sample: Index of the sample.
-        purpose: Purpose of the draw.
+        purpose: What the number is for; it separates the draws of one sample.
         attempt: Attempt of a method that rejects draws, from 0.
     """
     u, v = uniforms(key, sample, purpose, attempt)

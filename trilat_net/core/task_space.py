@@ -346,7 +346,7 @@ def add_task_torque(s: Row, gains: Array, values: Array, factor: float, torque: 
 def update_wrench(s: Row) -> None:
     """Computes the force and torque at the end effector that correspond to tau_x.
 
-    The wrench is (J J')^-1 J tau_x, where J is the Jacobian of the end effector and tau_x the
+    This wrench is (J J')^-1 J tau_x, where J is the Jacobian of the end effector and tau_x the
     exogenous torque of the joints. It is written into the row of the site.
     """
     b = s.b

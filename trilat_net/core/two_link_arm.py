@@ -51,12 +51,16 @@ class ArmLinks(NamedTuple):
 
 
 def theta_from_links(links: ArmLinks) -> Array:
-    """Returns the parameters theta of Eq. (24), on which the arm's dynamics depend, shape (5,).
+    """Returns the parameters theta on which the dynamics of the planar arm depend, Eq. (24).
 
-    The first three entries are inertial, in kg m^2; the last two belong to gravity, in kg m.
+    The torque of the arm is linear in theta. The first three entries are inertial, in kg m^2;
+    the last two belong to gravity, in kg m.
 
     Args:
         links: Lengths, masses and inertias of the two links.
+
+    Returns:
+        The parameters, shape (5,).
     """
     l1, m1, lc1, I1, _, m2, lc2, I2 = links
     theta_1 = m1 * lc1**2 + m2 * (l1**2 + lc2**2) + I1 + I2

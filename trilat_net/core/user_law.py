@@ -79,9 +79,10 @@ def _make_operator(operate: Callable[[Any, Any], Any]) -> Any:
 
 
 class LawVector(list[Any]):
-    """List of numbers with arithmetic by number: `-5.0 * (now.q - now.q_des) - 2.0 * now.qd`.
+    """List of numbers with arithmetic, in which a law in plain Python receives its vectors.
 
-    The other operand is a number, or a list with as many numbers.
+    Operations act number by number, as in `-5.0 * (now.q - now.q_des) - 2.0 * now.qd`. The
+    other operand is a number, or a list with as many numbers.
     """
 
     __add__ = __radd__ = __iadd__ = _make_operator(operator.add)
@@ -374,12 +375,12 @@ def write_memory(law: Any, memory: Sequence[float]) -> None:
 
 
 def restore_law(law: UserLaw, site: str, memory: Sequence[float]) -> None:
-    """Restores a law from the memory in a record.
+    """Restores a law to its state after a tick, from the record of that tick.
 
     Args:
         law: The law, which is changed.
         site: Name of the site, for the error.
-        memory: Numbers of the record.
+        memory: Numbers of the law's memory in the record.
 
     Raises:
         LawFailed: The law raised an exception.

@@ -186,11 +186,14 @@ class AdaptiveKinematics(ControlLaw):
         self.g_m_s2 = facts.g_m_s2
 
     def torque(self, now: LawInput) -> None:
-        """Writes the torque and the estimate of theta, and sends the end effector's motion.
+        """Computes torque and estimates in one tick, and sends the end effector's motion.
 
         The steps are: measure the end effector; compute the error e and its derivative; advance
         the estimate of the lengths; compute v, a and r; compute the torque and advance
         theta_hat. All symbols are defined at the top of this module.
+
+        Args:
+            now: Inputs and outputs of the law in this tick.
         """
         q = (now.q[0], now.q[1])
         qd = (now.qd[0], now.qd[1])

@@ -315,11 +315,11 @@ class LinearForm:
         self.blocks: dict[tuple[BlockKey, BlockKey], Array] = {}
 
     def add(self, row: BlockKey, column: BlockKey, gain: Any) -> None:
-        """Adds a gain to a block.
+        """Adds a gain to a block of the matrix; a missing block counts as zero.
 
         Args:
-            row: Row of the block.
-            column: Column of the block.
+            row: Row of the block, the quantity that depends on the other.
+            column: Column of the block, the quantity on which it depends.
             gain: A number for all joints, a number per joint, or a matrix of shape (n, n).
         """
         block = np.asarray(gain, dtype=np.float64)
@@ -329,7 +329,7 @@ class LinearForm:
         self.blocks[row, column] = previous + block
 
     def list_receivers(self) -> list[int]:
-        """Returns the indices of the peers that the law sends to, in ascending order."""
+        """Returns the peers to which the law sends signals, as indices in ascending order."""
         receivers = set()
         for row, _ in self.blocks:
             if isinstance(row, tuple):

@@ -86,17 +86,24 @@ class LawSettings(Frozen, frozen=True):
 
     @property
     def plugged(self) -> bool:
-        """True if the law computes its torque itself, False if the kernel computes it."""
+        """True if the class of the law computes the torque, false if the kernel computes it.
+
+        The kernel is the compiled code of a tick. It contains some of the laws.
+        """
         return hasattr(self.kind, "torque")
 
     @property
     def books_energy(self) -> bool:
-        """True if the law balances energy with its peers, so that all sites must have it."""
+        """True if the law balances energy between the sites.
+
+        Then all sites must have this law, because each end accounts for what the other end
+        sends.
+        """
         return self.plugged and issubclass(self.kind, EnergyLaw)
 
     @property
     def tag(self) -> str:
-        """Name of the law in a scenario."""
+        """Name by which a scenario selects the law, for example "p_d"."""
         return str(self.__struct_config__.tag)
 
     def check(self, path: str, sites: int) -> None:
@@ -164,10 +171,13 @@ class LawSettings(Frozen, frozen=True):
         return ""
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:  # noqa: ARG002
-        """Returns the stability condition of the law at a site, or None if none is known.
+        """Returns the stability condition of the law at a site, evaluated for a scenario.
 
         Args:
             situation: The site, its peers and the delays between them.
+
+        Returns:
+            The condition. None if no condition is known for the law.
         """
         return None
 
@@ -197,6 +207,8 @@ class LawSettings(Frozen, frozen=True):
 
     def explain_idle_shares(self, situation: LawSituation) -> str:  # noqa: ARG002
         """Explains to the user why the dominance factors of a site have no effect.
+
+        A dominance factor is the weight with which a site follows a peer.
 
         Args:
             situation: The site, and the laws of all sites.

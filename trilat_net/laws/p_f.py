@@ -21,16 +21,19 @@ from .interface import DAMPING, STIFFNESS, ControlLaw, TuningSite
 class PF(ControlLaw):
     """Direct force reflection with known gravity: tau = G(q) - K e - d qd + k_f felt.
 
-    `felt` is the torque of operators and environments on the peers' arms as received, weighted
-    by dominance. A slave has K > 0 and k_f = 0, a master K = 0 and k_f > 0. The law serves one
-    master and one slave. The loop is stable in free motion. With any passive operator and any
+    G(q) is the gravity torque. The error e is the position less the reference, which is the
+    position of the peers, weighted by the dominance factors. `felt` is the torque of operators
+    and environments on the peers' arms as received, with the same weights.
+
+    A slave has K > 0 and k_f = 0, a master K = 0 and k_f > 0. The law serves one master and one
+    slave. The loop is stable in free motion. With any passive operator and any
     wall the master needs d >= k_f (2 K T + d_s)^2 / (4 d_s), where K and d_s are the slave's.
 
     Attributes:
-        K: stiffness per joint, N m/rad.
-        d: damping per joint, N m s/rad.
-        k_f: gain of the reflected force, per joint, dimensionless.
-        gravity: share of the true gravity that the law compensates; 1 is exact.
+        K: Stiffness per joint, N m/rad.
+        d: Damping per joint, N m s/rad.
+        k_f: Gain of the reflected force, per joint, dimensionless.
+        gravity: Factor of the true gravity that the law compensates; 1 is exact.
     """
 
     K: NotNegativeCoordinates = (0.0,)

@@ -18,14 +18,16 @@ from .interface import DAMPING, ERROR_DAMPING, STIFFNESS, ControlLaw
 class PdD(ControlLaw):
     """PD+d with known gravity: tau = G(q) - K e - d qd - Kd ed.
 
-    For constant delays and a ratio Kd / K that is the same at all sites, the condition of P+d
-    on K and d is sufficient.
+    G(q) is the gravity torque. The error e is the position less the reference, which is the
+    position of the peers, weighted by the dominance factors; ed is its derivative. For constant
+    delays and a ratio Kd / K that is the same at all sites, the condition of P+d on K and d is
+    sufficient.
 
     Attributes:
-        K: stiffness per joint, N m/rad.
-        Kd: damping of the error's velocity, per joint, N m s/rad.
-        d: damping of the arm's velocity, per joint, N m s/rad.
-        gravity: share of the true gravity that the law compensates; 1 is exact.
+        K: Stiffness per joint, N m/rad.
+        Kd: Damping of the error's velocity, per joint, N m s/rad.
+        d: Damping of the arm's velocity, per joint, N m s/rad.
+        gravity: Factor of the true gravity that the law compensates; 1 is exact.
     """
 
     K: PositiveCoordinates = (10.0,)

@@ -35,7 +35,7 @@ class SaturatedPd(ControlLaw):
         K: stiffness of small errors, per joint, N m/rad.
         P: largest pull of all peers together, per joint, N m.
         d: damping of the arm's velocity, per joint, N m s/rad.
-        gravity: share of the true gravity that the law compensates; 1 is exact.
+        gravity: Factor of the true gravity that the law compensates; 1 is exact.
     """
 
     K: PositiveJoints = (10.0,)

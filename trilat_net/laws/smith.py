@@ -44,7 +44,7 @@ class Smith(ControlLaw):
         inertia: inertia of the slave's model, per joint, kg m^2. K, d and inertia are the same
             at both sites.
         predicts: true for the master.
-        gravity: share of the true gravity that the law compensates; 1 is exact.
+        gravity: Factor of the true gravity that the law compensates; 1 is exact.
     """
 
     K: PositiveJoints = (10.0,)

@@ -228,7 +228,10 @@ def find_known_energy(law: Any, now: LawInput, j: int, i: int) -> float:
 def limit_follower_velocity(
     law: Any, now: LawInput, j: int, i: int, force: float, price: float
 ) -> float:
-    """Writes the velocity by which peer j is followed: its own, reduced to the known energy.
+    """Limits the velocity by which peer j is followed to what the known energy pays.
+
+    The velocity of the peer is reduced if the energy that the leader put in does not suffice.
+    The result is written into `law.v_led`.
 
     Args:
         law: The law, whose velocity v_led of the coupling is written.
@@ -300,7 +303,9 @@ def compute_drift_velocity(
 
 @compiled
 def find_affordable_velocity(law: Any, now: LawInput, j: int, i: int, force: float) -> float:
-    """Returns the velocity by which peer j moves the goal, reduced to the known energy, rad/s.
+    """Returns the velocity with which peer j moves the goal of a joint, rad/s.
+
+    It is the velocity of the peer, reduced to what the known energy of the coupling pays for.
 
     Args:
         law: The law, with its energy accounts.
@@ -613,10 +618,13 @@ class Tdpa(EnergyLaw):
         self.inverse = [0.0] * (n * n)
 
     def torque(self, now: LawInput) -> None:
-        """Writes the torque of each joint, and sends torques and energies to the peers.
+        """Computes the torque of one tick, and sends torques and energies to the peers.
 
         The site first acts as a follower, then as a leader. The torque that the site feels as a
         leader is reduced if the torque of a joint would otherwise exceed its limit.
+
+        Args:
+            now: Inputs and outputs of the law in this tick.
         """
         n = now.joints
         peers = len(now.peers)
@@ -718,8 +726,9 @@ class Tdpa(EnergyLaw):
     def condition(self, situation: LawSituation) -> StabilityCondition | None:  # noqa: ARG002
         """Returns the stability condition: operators and environments must be passive.
 
-        In addition, the motion of the arms must be predictable, because the controllers plan
-        ahead. The version by velocity misses a small energy, which the text states.
+        In addition, the motion of the arms must be predictable, because the controllers of the
+        ends plan ahead. If work is computed by velocity, as published, a small energy is not
+        accounted for, which the text states.
         """
         text = (
             "couplings are passive for any delays, jitter, loss and shares, where "

@@ -112,10 +112,11 @@ def replay_wave(law: Any, index: int, fresh: float, energy: float, h: float) -> 
 
 @compiled
 def conceal_wave(law: Any, index: int, energy: float, h: float) -> float:
-    """Returns the wave of a tick without a new sample: the last wave, limited by known energy.
+    """Returns the wave that is played in a tick without a new sample.
 
-    The energy limits the wave so that it could be held for `CONCEALED_S`. The wave anticipates
-    the next sample, so its integral is subtracted from the owed integral.
+    It is the last wave, limited by the known energy so that it could be held for `CONCEALED_S`.
+    The wave anticipates the next sample, so its integral is subtracted from the owed integral,
+    the integral of waves that have not been played yet.
 
     Args:
         law: The law, with its energy accounts.
@@ -281,7 +282,9 @@ def close_wave_period(law: Any, now: LawInput, i: int) -> None:
 
 @compiled
 def send_waves(law: Any, now: LawInput, i: int, committed: float) -> None:
-    """Reduces the waves of a joint to the energy in the account H, and books their energy.
+    """Limits the waves of a joint to the energy in the account H, and books their energy.
+
+    H is the energy that this end of the lines may still put into them.
 
     Args:
         law: The law, with its energy accounts.
@@ -312,7 +315,7 @@ def send_waves(law: Any, now: LawInput, i: int, committed: float) -> None:
 
 
 def find_line_impedance(lines: Mapping[str, Any], site: str, peer: str) -> Any:
-    """Returns the impedance that the settings state for a line, whichever end is named first.
+    """Returns the impedance that the settings give a line, in either order of its ends.
 
     Args:
         lines: Impedances by line, as in {"m1-s": 18.0}.
@@ -526,15 +529,16 @@ class Wave(EnergyLaw):
         return None
 
     def resolve_shares(self, names: Sequence[str], alpha: Array) -> Any:
-        """Returns the law with the impedances of its lines as numbers.
+        """Returns the law with a number for the impedance of each line.
 
-        The impedances reproduce the dominance factors alpha of the start, if positive weights D
-        exist that make D_i alpha_ij symmetric:
+        The impedances reproduce the dominance factors alpha of the start, the weights with
+        which sites follow each other, if positive weights D exist that make D_i alpha_ij
+        symmetric:
 
             b_ij = D_i alpha_ij b / mean,    where D_i alpha_ij = D_j alpha_ji
 
-        and `mean` is the mean of D_i alpha_ij over all pairs of sites. Otherwise all lines keep
-        b.
+        Here b is the impedance in the settings, and `mean` is the mean of D_i alpha_ij over all
+        pairs of sites. If no such D exists, all lines keep b.
 
         Args:
             names: The names of the sites.
@@ -611,9 +615,10 @@ class Wave(EnergyLaw):
         return Gains(Law.KNOWN, known=(theta * self.gravity).tolist())
 
     def linear_form(self, situation: LinearSituation) -> LinearForm | None:
-        """Returns the linear form of the lines' ends, for waves that are never late or lost.
+        """Returns the ends of the lines at a site for small motions, for the linear analysis.
 
-        Time is continuous, and a line between two ends is a pure delay.
+        Time is continuous, a line between two ends is a pure delay, and waves are never late or
+        lost.
 
         Args:
             situation: The site and its arm.
@@ -671,7 +676,7 @@ class Wave(EnergyLaw):
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
         """Returns the stability condition: operators and environments must be passive.
 
-        The text also states the weights with which the lines let the site follow its peers.
+        Its text also states the weights with which the lines let the site follow its peers.
 
         Args:
             situation: The site and its lines.
