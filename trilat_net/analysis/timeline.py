@@ -48,11 +48,7 @@ class AppliedChange(NamedTuple):
 
     @property
     def subject(self) -> str:
-        """Name of what was changed: a link such as "m1->s", or a site.
-
-        For dominance factors, the weights with which a site follows its peers, it names the
-        site.
-        """
+        """What was changed: a link "j->i", a site, or the dominance factors of a site."""
         return self.change.link or self.change.site or f"shares of {self.change.dominance}"
 
     @property
@@ -202,14 +198,16 @@ def find_mode_intervals(part: SiteLog) -> list[ModeInterval]:
 
 
 class RaisedAlarm(NamedTuple):
-    """An alarm of a site: it held its position, was stopped, or had a fault.
+    """An interval in which a site raised an alarm: it held, was stopped, or had a fault.
 
-    Only sites whose rule for silent peers (`on_stale` of the scenario) is "glide" raise alarms.
+    Alarms exist only at sites whose rule for silent peers (`on_stale` of the scenario) is
+    "glide". With this rule an arm comes to rest smoothly when it no longer hears from its
+    peers.
 
     Attributes:
         site: Name of the site.
         word: Name of the alarm.
-        reason: Reason of the alarm.
+        reason: The reason for which the alarm was raised.
         from_s: Start of the alarm, in s.
         to_s: End of the alarm, in s.
     """

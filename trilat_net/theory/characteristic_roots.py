@@ -123,10 +123,11 @@ def _find_blas_functions() -> tuple[Callable[[], int], Callable[[int], None]] | 
 
 
 class Pencil(NamedTuple):
-    """The matrices of a loop with delays, from which its characteristic matrix follows.
+    """The matrices of a linear loop with delays, which determine its stability.
 
-    The loop is E x' = A x + sum_k A_k x(t - T_k). Its characteristic matrix is
-    Delta(s) = s E - A - sum_k A_k exp(-s T_k).
+    The loop is E x' = A x + sum_k A_k x(t - T_k) with the state x. Its characteristic matrix is
+    Delta(s) = s E - A - sum_k A_k exp(-s T_k). The characteristic roots s, at which Delta(s) is
+    singular, give the rates and frequencies of the loop's modes.
 
     Attributes:
         A: Matrix of the terms without delay, shape (n, n).
@@ -143,13 +144,21 @@ class Pencil(NamedTuple):
 
     @property
     def rate_matrix(self) -> Array:
-        """E as a matrix, the coefficient of s, shape (n, n)."""
+        """The matrix E, which is the coefficient of s in Delta(s), shape (n, n)."""
         if self.E is None:
             return np.eye(len(self.A))
         return np.diag(self.E)
 
     def evaluate(self, s: complex) -> tuple[Complex, Complex]:
-        """Returns Delta(s) and its derivative with respect to s, shape (n, n) each."""
+        """Evaluates the characteristic matrix Delta(s) and its derivative.
+
+        Args:
+            s: Complex frequency, in 1/s.
+
+        Returns:
+            Delta(s), shape (n, n).
+            Its derivative with respect to s, shape (n, n).
+        """
         E = self.rate_matrix
         exponentials = np.exp(-s * self.delays)
         delayed = exponentials[:, np.newaxis, np.newaxis] * self.Ad
@@ -160,14 +169,24 @@ class Pencil(NamedTuple):
         return delta.astype(np.complex128), derivative.astype(np.complex128)
 
     def sum_term_norms(self, s: complex) -> float:
-        """Returns the sum of the norms of the terms of Delta(s), which scales residuals."""
+        """Returns the sum of the norms of the terms of the characteristic matrix Delta(s).
+
+        A residual of Delta(s) counts as zero if it is small compared with this sum.
+
+        Args:
+            s: Complex frequency, in 1/s.
+        """
         growth = np.exp(-s.real * self.delays)
         delayed = growth @ np.linalg.norm(self.Ad, axis=(1, 2))
         undelayed = np.linalg.norm(self.A)
         return float(abs(s) + undelayed + delayed)
 
     def compute_taylor_coefficient(self, power: int) -> Array:
-        """Returns the coefficient of s^power in Delta's Taylor series at 0, shape (n, n)."""
+        """Returns a coefficient of the Taylor series of Delta(s) at s = 0, shape (n, n).
+
+        Args:
+            power: Power of s to which the coefficient belongs, from 0.
+        """
         undelayed: Array | float = 0.0
         if power == 0:
             undelayed = -self.A
@@ -195,7 +214,9 @@ states, each of which has a root at zero.
 
 
 def extract_moving_part(pencil: Pencil, names: Sequence[str]) -> MovingPart:
-    """Removes the states that are constant or act on no other state, see `MovingPart`.
+    """Removes the states of a loop that are constant or act on no other state.
+
+    Such states do not influence the other modes, see `MovingPart`.
 
     Args:
         pencil: Matrices of the loop.
@@ -250,7 +271,7 @@ class CharacteristicRoot(NamedTuple):
 
     @property
     def description(self) -> str:
-        """The states that participate most, grouped by name, as in "q2 of m1, m2, s"."""
+        """Names of the states that move most in this mode, grouped, as in "q2 of m1, m2, s"."""
         sites: dict[str, list[str]] = {}
         for state in self.states:
             site, _, name = state.partition(".")
@@ -262,13 +283,16 @@ class CharacteristicRoot(NamedTuple):
 
 
 class Spectrum(NamedTuple):
-    """The rightmost characteristic roots of a loop.
+    """The rightmost characteristic roots of a loop, which decide its stability.
+
+    A root is zero by structure if it is zero for every value of the gains, because all arms can
+    rest in other poses too, or because nothing excites an estimate.
 
     Attributes:
         roots: The rightmost roots that are not zero by structure, by falling real part.
         zeros: Number of roots that are zero by structure.
-        drifting: Number of those zeros without a vector of their own. Their modes grow with
-            time.
+        drifting: Number of those zeros without an eigenvector of their own. Their modes grow
+            with time.
         dropped: Number of guesses from which Newton's method reached no root.
         order: Order of the discretisation that gave the guesses. 0 if none was needed.
         span_s: Time over which the roots are computed, in s: the period after which delays and
@@ -423,14 +447,18 @@ def _measure_participation(pencil: Pencil, s: complex) -> tuple[int, Array] | No
 def count_zero_roots(pencil: Pencil) -> tuple[int, int]:
     """Counts the roots that are zero by structure, and how many of them drift.
 
-    With Delta(s) = D_0 + s D_1 + s^2 D_2 + ..., the block Toeplitz matrix of D_0 ... D_(m-1)
-    has as many null vectors as there are roots at zero, with each Jordan chain counted up to
-    length m. When the number no longer rises with m, all roots are counted. Roots in chains
-    longer than 1
-    drift: their modes grow with time.
+    The characteristic matrix has the Taylor series Delta(s) = D_0 + s D_1 + s^2 D_2 + .... A
+    root at zero can belong to a Jordan chain, a sequence of modes of which each drives the
+    next. The block Toeplitz matrix of D_0 ... D_(m-1) has as many null vectors as there are
+    roots at zero, with each chain counted up to length m. When the number no longer rises with
+    m, all roots are counted. Roots in chains longer than 1 drift: their modes grow with time.
+
+    Args:
+        pencil: Matrices of the loop.
 
     Returns:
-        The number of roots at zero, and the number of those that drift.
+        The number of roots at zero.
+        The number of those that drift.
     """
     counts = [0]
     for length in range(1, _LONGEST_CHAIN + 1):
@@ -473,7 +501,8 @@ def refine_roots(
         wanted: Number of roots. A conjugate pair counts once.
 
     Returns:
-        The rightmost `wanted` roots, and the number of guesses without a root.
+        The `wanted` rightmost roots, or fewer if there are not as many.
+        The number of guesses from which no root was reached.
     """
     roots: list[CharacteristicRoot] = []
     dropped = 0
@@ -604,14 +633,19 @@ def _agree(previous: list[CharacteristicRoot], roots: list[CharacteristicRoot]) 
 
 
 def discretise_generator(pencil: Pencil, order: int) -> Array:
-    """Returns the infinitesimal generator of a loop with delays, discretised to a matrix.
+    """Approximates a loop with delays by a system of ordinary differential equations.
 
-    Its states are the states of the loop, and then the history of the delayed states at the
-    Chebyshev nodes over the time from -T_max to 0, with the longest delay T_max.
+    The state of a loop with delays includes its history over the longest delay T_max. The
+    history of the delayed states is represented by its values at Chebyshev nodes in the time
+    from -T_max to 0. The eigenvalues of the resulting matrix approximate the rightmost
+    characteristic roots.
 
     Args:
         pencil: Matrices of the loop, with at least one delay.
         order: Degree of the interpolating polynomials.
+
+    Returns:
+        The matrix. Its states are the states of the loop, and then the history.
     """
     delayed = pencil.delayed_states
     longest_s = float(pencil.delays.max())
@@ -663,12 +697,15 @@ def chebyshev_interpolation(order: int, x: Array) -> Array:
 
 
 def chebyshev_differentiation(order: int) -> Array:
-    """Returns the matrix that turns values at the Chebyshev nodes into derivatives.
+    """Returns the matrix that differentiates a polynomial given at the Chebyshev nodes.
 
-    The derivatives are those of the interpolating polynomial at the nodes.
+    It turns the values at the nodes into the derivatives at the nodes.
 
     Args:
         order: Degree of the polynomial.
+
+    Returns:
+        Matrix of shape (order + 1, order + 1).
     """
     nodes = chebyshev_nodes(order)
     basis_at_nodes = chebvander(nodes, order)

@@ -153,10 +153,14 @@ def set_common_delay(loop: LinearLoop, delay_s: float) -> LinearLoop:
 
 
 def find_delay_margin(loop: LinearLoop) -> DelayMargin:
-    """Finds the common delays for which a loop is stable. Its own delays are ignored.
+    """Finds for which delays a loop is stable, if all of its links have the same delay.
 
-    The unstable roots are counted at half the delay of the first crossing. From there on, every
-    crossing changes the count by the number of roots that cross.
+    The loop's own delays are ignored. The unstable roots are counted at half the delay of the
+    first crossing of the imaginary axis. From there on, every crossing changes the count by the
+    number of roots that cross.
+
+    Args:
+        loop: The loop.
     """
     crossings, lossless = find_axis_crossings(loop)
     if lossless:
@@ -213,12 +217,18 @@ def _count_unstable_roots(loop: LinearLoop) -> int:
 
 
 def find_axis_crossings(loop: LinearLoop) -> tuple[list[AxisCrossing], bool]:
-    """Finds all common delays at which roots cross the imaginary axis.
+    """Finds the delays, common to all links, at which roots cross the imaginary axis.
+
+    The stability of a loop can change only at such delays.
+
+    Args:
+        loop: The loop. Its own delays are ignored.
 
     Returns:
         The crossings for delays up to `MAX_COMMON_DELAY_S`.
-        True if the loop is lossless: G has an eigenvalue of modulus 1 at every frequency, so
-        that roots are on the axis for every delay. There are no crossings then.
+        True if the loop is lossless: its open-loop response G has an eigenvalue of modulus 1 at
+        every frequency, so that roots are on the axis for every delay. There are no crossings
+        then.
     """
     pencil, *_ = characteristic_roots.find_moving_part(set_common_delay(loop, 1.0))
     if not len(pencil.delays):

@@ -64,13 +64,13 @@ Its direction leads to further equilibria.
 
 
 def extend_scenario(scenario: Scenario, duration_s: float) -> Scenario:
-    """Returns the experiment with a longer duration, in which nothing new begins.
+    """Returns the same experiment with a longer duration, so that it can come to rest.
 
-    Operators and environments that are present at the original end stay. Chirps and multisines
-    are removed.
+    Nothing new begins in the additional time. Operators and environments that are present at
+    the original end stay. Chirps and multisines are removed, as they never rest.
 
     Args:
-        scenario: The experiment.
+        scenario: The description of the experiment.
         duration_s: The longer duration, in s.
     """
     end_s = scenario.duration_s
@@ -104,10 +104,17 @@ def extend_scenario(scenario: Scenario, duration_s: float) -> Scenario:
 
 
 def compute_equilibrium_residual(conditions: OperatingConditions, rest: Equilibrium) -> Array:
-    """Returns the rates of the loop's states at a pose, shape (states,).
+    """Computes how far a pose is from an equilibrium: the rates of the loop's states.
 
     They are zero at an equilibrium. The rates of the angles are zero by definition, because all
     arms are at rest. The others are the accelerations and the rates of the estimates.
+
+    Args:
+        conditions: The sites, gains and delays of the loop.
+        rest: The pose, with parameter estimates.
+
+    Returns:
+        Rates, shape (states,).
     """
     arguments = linear_loop.gather_site_arguments(conditions, rest)
     states = []
@@ -126,11 +133,14 @@ def _select_loop_states(conditions: OperatingConditions, states: Sequence[Array]
 
 @limit_blas_threads()
 def find_nearest_equilibrium(conditions: OperatingConditions, rest: Equilibrium) -> Equilibrium:
-    """Finds the equilibrium nearest to a pose, by Gauss-Newton steps of least norm.
+    """Finds the equilibrium of a loop that is nearest to a given pose.
+
+    It is found by Gauss-Newton steps, each of which is the smallest that solves the linearised
+    equations.
 
     Args:
-        conditions: The numbers of the loop.
-        rest: The pose, with estimates.
+        conditions: The sites, gains and delays of the loop.
+        rest: The pose, with parameter estimates.
 
     Raises:
         ScenarioError: A site in task space is in a singular pose.
@@ -341,7 +351,12 @@ def find_equilibrium(scenario: Scenario, pose: tuple[float, ...] | None = None) 
 
 
 def predict_equilibrium(scenario: Scenario) -> Equilibrium:
-    """Returns the equilibrium that the linear loop predicts from the start poses.
+    """Predicts by linear analysis at which equilibrium the arms come to rest.
+
+    They begin in the start poses of the scenario.
+
+    Args:
+        scenario: The description of the experiment.
 
     Raises:
         ScenarioError: The scenario has no linear loop, or no equilibrium near the prediction.
@@ -351,14 +366,15 @@ def predict_equilibrium(scenario: Scenario) -> Equilibrium:
 
 
 def follow_equilibrium(scenario: Scenario, rest: Equilibrium) -> Equilibrium:
-    """Returns the equilibrium of a scenario nearest to the equilibrium of another scenario.
+    """Finds the equilibrium of a scenario that continues the one of a similar scenario.
 
-    If the other equilibrium is one of this scenario too, it is returned with completed
-    estimates.
+    It is the equilibrium nearest to the given one, so that an equilibrium can be followed while
+    a key of the scenario changes. If the given equilibrium is one of this scenario too, it is
+    returned with completed estimates.
 
     Args:
-        scenario: The experiment.
-        rest: Equilibrium of a similar scenario.
+        scenario: The description of the experiment.
+        rest: Equilibrium of the similar scenario.
 
     Raises:
         ScenarioError: The scenario has no linear loop, or no equilibrium near `rest`.
@@ -375,10 +391,14 @@ def follow_equilibrium(scenario: Scenario, rest: Equilibrium) -> Equilibrium:
 
 
 def choose_equilibrium(scenario: Scenario) -> Equilibrium:
-    """Returns the equilibrium of a scenario: predicted if possible, else at the end of a run.
+    """Finds the equilibrium of a scenario by the method that suits the scenario.
 
-    A prediction is possible if any shared pose is an equilibrium: no site has estimates, and no
-    operator or environment acts.
+    If any shared pose is an equilibrium, the linear loop predicts which one is reached. This is
+    so if no site has estimates, and no operator or environment acts. Otherwise the equilibrium
+    at the end of a run is found.
+
+    Args:
+        scenario: The description of the experiment.
 
     Raises:
         ScenarioError: The scenario has no linear loop, or no such equilibrium.
@@ -512,7 +532,13 @@ def reach_pose(site: SiteSetup, pose: Array) -> Array:
 
 
 def find_mean_pose(scenario: Scenario) -> tuple[float, ...]:
-    """Returns the mean of the poses that the sites share at the start, shape (m,)."""
+    """Returns the mean of the start poses that the sites share, shape (m,).
+
+    A shared pose consists of the joint angles, or in task space of the end effector's pose.
+
+    Args:
+        scenario: The description of the experiment.
+    """
     conditions = derive_operating_conditions(scenario)
     count = len(conditions.sites)
     q = pad_rows([site.q0 for site in conditions.sites])

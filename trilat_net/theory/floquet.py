@@ -84,12 +84,15 @@ def discretise_zero_order_hold(A: Array, B: Array, h_s: float) -> tuple[Array, A
 
 
 class SiteTickMap(NamedTuple):
-    """One site over a tick: X' = P X + Q w, with the inputs w from its peers.
+    """Linear model of one site over a tick: X' = P X + Q w.
+
+    X is the state of the site at a tick, X' the state at the next tick, and w the samples that
+    the site receives from its peers.
 
     Attributes:
         P: Matrix of the state, shape (n, n). X contains q, qd, the state eta of the estimate,
             and, for the scheme `second_order`, the torque of the previous tick.
-        Q: Matrix of the inputs, shape (n, inputs).
+        Q: Matrix of the inputs w, shape (n, inputs).
         output: Samples for the peers as a function of X, shape (3 m, n), as in `SiteJacobian`.
         names: Names of the states.
     """
@@ -199,9 +202,13 @@ class CoupledTicks(NamedTuple):
 
 
 def couple_ticks(conditions: OperatingConditions, rest: Equilibrium) -> CoupledTicks:
-    """Returns the sites over a tick, and their effects on each other.
+    """Builds the linear model of all sites over a tick, with their effects on each other.
 
-    States that are constant or without effect are left out.
+    States that are constant or have no effect are left out.
+
+    Args:
+        conditions: The sites, gains and delays of the loop.
+        rest: The equilibrium about which the sites are linearised.
     """
     jacobians = differentiate_rates(conditions, rest)
     maps = []
@@ -272,7 +279,10 @@ _SAME_ROOT = 1e-6
 
 
 class SamplesInUse(NamedTuple):
-    """The samples that sites use over a span of time that begins with a tick of every site.
+    """The samples that the sites use, tick by tick, over a span of time.
+
+    A sample is the state that a site publishes in one tick. The span begins with a tick of
+    every site.
 
     Attributes:
         span_s: Length of the span, in s.
@@ -341,9 +351,13 @@ def _find_period_s(links: Sequence[LinkBase], rates_hz: Sequence[int]) -> float 
 
 
 def find_samples_in_use(conditions: OperatingConditions) -> SamplesInUse:
-    """Returns the samples that the sites use over the period of delays and tick rates.
+    """Finds which samples the sites use, until delays and tick rates repeat.
 
-    If delays are drawn at random, a span with drawn delays takes the place of the period.
+    If delays are drawn at random, they never repeat. A span of fixed length with drawn delays
+    then takes the place of the period.
+
+    Args:
+        conditions: The sites, tick rates and links of the loop.
     """
     rates_hz = [site.rate_hz for site in conditions.sites]
     common_hz = math.gcd(*rates_hz)
@@ -696,11 +710,14 @@ def compute_sampled_spectrum(
     wanted: int = 6,
     uses: SamplesInUse | None = None,
 ) -> Spectrum | None:
-    """Computes the rightmost roots of the sampled loop.
+    """Computes the rightmost characteristic roots of a loop that is executed in ticks.
+
+    The states are followed over the period of delays and tick rates. The eigenvalues z of this
+    map correspond to the roots s with z = exp(s span).
 
     Args:
-        conditions: The numbers of the loop.
-        rest: The equilibrium.
+        conditions: The sites, gains and delays of the loop.
+        rest: The equilibrium about which the loop is linearised.
         wanted: Number of roots. Fewer result if the others are too close to -infinity.
         uses: The samples in use. None for those of the scenario's links.
 

@@ -52,12 +52,12 @@ class FrequencyBand(NamedTuple):
 
 
 class Minima(NamedTuple):
-    """A curve over frequency with resolved minima.
+    """A curve over frequency, sampled so finely that its minima are resolved.
 
     Attributes:
         w_rad_s: Frequencies, shape (F,), in rad/s.
         values: Values of the curve, shape (F,).
-        below: Bands in which the curve is below its level.
+        below: Bands of frequencies in which the curve is below a given level.
     """
 
     w_rad_s: Array
@@ -121,14 +121,17 @@ def find_resolved_hz(low_hz: float, high_hz: float, delay_s: float) -> float:
 
 
 def refine_frequencies(response: PortResponse, w_rad_s: Array) -> Array:
-    """Returns a grid on which the response changes by at most a tenth from point to point.
+    """Adds frequencies until a response changes little from one to the next.
 
-    The number of points is limited. At a pole on the imaginary axis, refinement stops when two
-    points differ by a millionth.
+    The change is at most a tenth. The number of points is limited. At a pole on the imaginary
+    axis, refinement stops when two points differ by a millionth.
 
     Args:
-        response: The response.
+        response: The response as a function of frequency.
         w_rad_s: First frequencies, rising, shape (F,), in rad/s.
+
+    Returns:
+        All frequencies, rising, in rad/s.
     """
 
     def find_large_changes(Y: Complex) -> NDArray[np.bool_]:
@@ -173,7 +176,15 @@ def _refine(
 
 
 def cache_response(response: PortResponse, w_rad_s: Array) -> PortResponse:
-    """Returns the same response, computed only once for this array of frequencies."""
+    """Returns the same function of frequency, with its values at some frequencies stored.
+
+    The values are computed once, and returned whenever the function is called with this very
+    array.
+
+    Args:
+        response: The function of frequency.
+        w_rad_s: The frequencies, shape (F,), in rad/s.
+    """
     cached = response(w_rad_s)
 
     def evaluate(w: Array) -> Complex:

@@ -88,7 +88,7 @@ class LogMetrics(Result):
     joint_names: tuple[str, ...] = ()
 
     def label(self, number: int) -> str:
-        """Returns the label of a joint, "1" or "3 elbow", or the name of an axis.
+        """Returns the name of a joint or an axis for a table, such as "1", "3 elbow" or "x".
 
         Args:
             number: Number of the joint or axis, from 1.
@@ -111,7 +111,7 @@ class LogMetrics(Result):
         return joint_unit
 
     def headline(self) -> str:
-        """Returns one line with the log, the count of known numbers, and the sites."""
+        """Returns one line for people: the log, the count of known numbers, and the sites."""
         known = 0
         for _, metric in self._list_values():
             known += metric.value is not None
@@ -165,7 +165,10 @@ class LogMetrics(Result):
         return reasons
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row for each quantity and each subject to which the quantity applies."""
+        """Returns the metrics as a table of plain values.
+
+        There is a row for each quantity and each subject (run, site, link or wall) that has it.
+        """
         rows = []
         for description, metric in self._list_values():
             if metric.applies:
@@ -187,26 +190,40 @@ class LogMetrics(Result):
                 yield description, metric
 
     def values_of(self, quantity: Quantity) -> dict[str, Metric]:
-        """Returns the metrics of a quantity by subject. The name of the run is empty."""
+        """Returns the metrics of one quantity for every subject that has it, by name.
+
+        A subject is a site, a link or a wall, or the whole run, whose name is empty.
+
+        Args:
+            quantity: The quantity.
+        """
         if quantity.of == "run":
             return {"": self.run[quantity.key]}
         metrics_by_name: dict[str, MetricValues] = getattr(self, f"{quantity.of}s")
         return {name: metrics[quantity.key] for name, metrics in metrics_by_name.items()}
 
     def run_value(self, quantity: Quantity) -> Metric:
-        """Returns the metric of a quantity for the whole run, see `reduce_to_run`."""
+        """Returns one number of a quantity for the whole run.
+
+        The numbers of sites, links or walls are reduced to their maximum or sum, see
+        `reduce_to_run`.
+
+        Args:
+            quantity: The quantity.
+        """
         return reduce_to_run(quantity, self.values_of(quantity))
 
 
 def reduce_to_run(quantity: Quantity, values_by_subject: Mapping[str, Metric]) -> Metric:
-    """Returns a quantity of the run: the largest value of its subjects, or their sum.
+    """Reduces the numbers of a quantity to one number of the whole run.
 
-    Subjects to which the quantity does not apply are left out. If the number of any other
-    subject is missing, the number of the run is missing as well.
+    It is the largest number of all subjects (sites, links or walls), or their sum. Subjects to
+    which the quantity does not apply are left out. If the number of any other subject is
+    missing, the number of the run is missing as well.
 
     Args:
         quantity: The quantity, which states whether the maximum or the sum is used.
-        values_by_subject: Its metric for each subject.
+        values_by_subject: The metric of each subject, by name.
     """
     numbers = []
     reasons = []
@@ -234,7 +251,13 @@ def reduce_to_run(quantity: Quantity, values_by_subject: Mapping[str, Metric]) -
 # overflow and NaN do not warn: a metric that is not finite becomes a reason
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def compute_log_metrics(log: Log) -> LogMetrics:
-    """Computes all metrics of a log, which may be torn, short or empty.
+    """Computes all metrics of a recorded run.
+
+    The log may be torn, short or empty. A number that it does not determine is replaced by the
+    reason.
+
+    Args:
+        log: The log of the run.
 
     Raises:
         LogError: A record cannot be read, or names a change that is not valid.
@@ -307,14 +330,14 @@ def find_quantity(key: str) -> Quantity:
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # as in compute_log_metrics
 def measure_run(log: Log, keys: Iterable[str]) -> dict[str, Metric]:
-    """Computes some quantities of a whole run, and nothing else.
+    """Computes only some quantities of a whole run, which is faster than all of them.
 
     Args:
         log: The log of the run.
         keys: Keys of the quantities.
 
     Returns:
-        Their metrics, by key.
+        The metrics of the run, by key.
 
     Raises:
         KeyError: No quantity has one of the keys.
@@ -433,11 +456,11 @@ def _values_to_json(metrics: MetricValues) -> dict[str, float | None]:
 
 
 class ComparisonRow(NamedTuple):
-    """A quantity of several runs.
+    """One quantity in several runs, as a row of a table.
 
     Attributes:
         quantity: The quantity.
-        entries: Its metric in every run, by column.
+        entries: The metric of the quantity in each run, in the order of the columns.
     """
 
     quantity: Quantity
@@ -491,7 +514,13 @@ def compare_metrics(logs: Sequence[Log], names: Sequence[str] = ()) -> MetricCom
 
 
 def comparison_to_json(comparison: MetricComparison) -> dict[str, Any]:
-    """Returns a comparison as plain values. Missing numbers are None, with a reason."""
+    """Returns a comparison of runs as plain values, ready for JSON.
+
+    A missing number is None, and the reason is given next to it.
+
+    Args:
+        comparison: The comparison.
+    """
     rows = []
     for row in comparison.rows:
         quantity = row.quantity

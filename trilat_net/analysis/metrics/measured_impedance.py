@@ -59,16 +59,19 @@ NO_SCRIPT_TEXT = "the scenario does not contain the hand's intention: the drive 
 
 
 class FrequencyResponse(NamedTuple):
-    """Ratio of an output to an input at one frequency. Undecided values are None.
+    """Ratio of an output to an input at one frequency, estimated from a recorded run.
+
+    Both signals are caused by a known drive. Values that the log does not determine are None.
 
     Attributes:
-        frequency_hz: Frequency of the spectral line.
+        frequency_hz: Frequency of the spectral line, in Hz.
         gain: Magnitude of the ratio, in the unit of output over input.
-        phase_rad: Phase of the ratio.
-        coherence: The smaller of both signals' coherences with the drive.
+        phase_rad: Phase of the ratio, in rad.
+        coherence: The smaller of the coherences of input and output with the drive, from 0 to
+            1.
         segments: Number of segments of equal power that would drive the line as much as all
             recorded segments do.
-        error: Random error of the magnitude: one standard deviation as a share of it.
+        error: Random error of the magnitude: one standard deviation, relative to the magnitude.
         why: The reason why the ratio is undecided. Empty if it is decided.
     """
 
@@ -89,17 +92,19 @@ def estimate_responses(
     rate_hz: int,
     least: float,
 ) -> list[FrequencyResponse]:
-    """Estimates the ratio of an output to an input at every driven frequency.
+    """Estimates the ratio of an output to an input at every frequency that is driven.
 
-    `scipy.signal.csd` is not used, because it cannot leave out segments with unusable rows.
+    Both signals are caused by a third one, the drive, and are compared through their cross
+    spectra with it. `scipy.signal.csd` is not used, because it cannot leave out segments with
+    unusable rows.
 
     Args:
-        drive: The signal that drives both, and that depends on no other signal, shape (K,).
+        drive: The signal that causes both and depends on no other signal, shape (K,).
         put_in: The input signal, shape (K,).
         came_out: The output signal, shape (K,).
         usable: True for rows that are recorded while no other drive is active, shape (K,).
         rate_hz: Rows per second.
-        least: Least amplitude of the drive at a driven frequency.
+        least: Least amplitude of the drive at which a frequency counts as driven.
 
     Returns:
         The responses, the one with the strongest drive first. If no frequency is driven, a
@@ -272,12 +277,20 @@ class ImpedanceEstimate(NamedTuple):
 
     @property
     def unit(self) -> str:
-        """The unit of the magnitude."""
+        """Unit of the magnitude: "N m s/rad" for an impedance. A reflection has no unit."""
         return "" if self.kind == "reflection" else "N m s/rad"
 
 
 def estimate_impedances(view: RunView) -> list[ImpedanceEstimate]:
-    """Estimates each operator's impedance, and its reflection of each environment elsewhere."""
+    """Estimates what each operator feels, as frequency responses of a recorded run.
+
+    For each operator the impedance is estimated, the operator's torque over the velocity of the
+    joint. For each environment at another site the reflection is estimated, the torque that the
+    operator feels over the torque of the environment.
+
+    Args:
+        view: The run.
+    """
     runs = view.shared
     operators = [site for site, run in runs.items() if run.torque.operator.any()]
     environments = [site for site, run in runs.items() if run.torque.environment.any()]

@@ -47,10 +47,10 @@ _NOT_FINITE = "it is no finite number"
 
 
 def metric(value: float | None, why: str = _NOT_FINITE) -> Metric:
-    """Returns the metric of a number.
+    """Wraps a number in a metric, which also says why a number is missing.
 
     Args:
-        value: The number, or None.
+        value: The number. None if there is none.
         why: The reason that is stated if the number is None or not finite.
     """
     if value is None or not math.isfinite(value):
@@ -65,13 +65,14 @@ def unavailable(
     of: str = "",
     applies: bool = True,
 ) -> MetricValues:
-    """Returns the metrics of a group of quantities, all without a number.
+    """Returns metrics without numbers for all quantities of a group, with a common reason.
 
     Args:
         group: Group of the quantities.
         why: The reason why there are no numbers.
-        of: Kind of subject to which the quantities are limited. Empty for every kind.
-        applies: See `Metric`.
+        of: Kind of subject to which the quantities are limited, such as "site". Empty for every
+            kind.
+        applies: False if the quantities cannot exist in any run of this scenario, see `Metric`.
     """
     return {
         quantity.key: Metric(None, why, applies)
@@ -88,7 +89,7 @@ def measure_shared(
     at_end: NDArray[np.bool_],
     why_not_at_end: str = _NOT_FINITE,
 ) -> MetricValues:
-    """Returns the RMS, the peak and the peak at the end of differences between sites.
+    """Measures how far the motions of two sites differ: RMS, peak, and peak at the end.
 
     Sites share joint angles in rad, positions of their end effectors in m, or whole poses,
     which have both units. The quantities of a unit that does not occur are marked as not
@@ -101,6 +102,9 @@ def measure_shared(
         differences: Differences in every row, shape (K, n).
         at_end: True for rows of the last second, shape (K,).
         why_not_at_end: The reason that is stated if no row is at the end.
+
+    Returns:
+        The metrics, by quantity.
     """
     columns_by_unit = {"rad": slice(None)}
     excluded = "sites share angles, not places"
@@ -124,13 +128,13 @@ def measure_shared(
 
 
 def rms(values: ArrayLike) -> float:
-    """Returns the root mean square of each column, and of these the largest.
+    """Returns the root mean square of the column for which it is largest.
 
     Args:
-        values: The values, shape (K, n).
+        values: Values of n quantities over time, shape (K, n).
 
     Returns:
-        The largest root mean square. NaN without rows.
+        The largest root mean square. NaN if there are no rows.
     """
     array = np.asarray(values, dtype=np.float64)
     if not array.size:
@@ -189,13 +193,15 @@ Measuring = Callable[[RunView, str], MetricValues]
 
 
 class Measure(NamedTuple):
-    """Quantities of a kind of subject, and the function that measures them.
+    """A function that measures some quantities, and how these are shown.
+
+    Measures are registered with the decorator `measures`.
 
     Attributes:
-        of: Kind of subject: "run", "site", "link" or "wall".
+        of: Kind of subject that is measured: "run", "site", "link" or "wall".
         group: Heading under which the quantities are shown.
-        quantities: The quantities.
-        measure: The function.
+        quantities: Definitions of the quantities.
+        measure: The function, which returns the numbers of one subject.
     """
 
     of: str
@@ -264,11 +270,11 @@ def measures(of: str, group: str, *quantities: Quantity) -> Callable[[Measuring]
 
 
 def list_measures() -> list[Measure]:
-    """Returns all registered measures, in the order in which they are shown."""
+    """Returns all functions that measure quantities, in the order in which they are shown."""
     rank = {group: n for n, group in enumerate(_GROUP_ORDER)}
     return sorted(_MEASURES, key=lambda measure: rank.get(measure.group, len(rank)))
 
 
 def quantities() -> list[Quantity]:
-    """Returns all quantities, in the order in which they are shown."""
+    """Returns the definitions of all quantities, in the order in which they are shown."""
     return [quantity for measure in list_measures() for quantity in measure.quantities]

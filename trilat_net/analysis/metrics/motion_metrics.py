@@ -78,7 +78,15 @@ _ERROR_UNITS = {"joints": "rad", "position": "m", "pose": "m or rad"}
     "site", TRACKING, Quantity("settle_s", "settled", "s"), *list_shared_quantities(_ERRORS)
 )
 def measure_tracking(view: RunView, site: str) -> MetricValues:
-    """Returns the settling time of a site, and the RMS and the peak of its error e."""
+    """Measures how well a site tracks its reference: settling time, RMS and peak of the error.
+
+    The error e is the difference between the coordinates of the site and their reference, the
+    weighted mean of what its peers sent.
+
+    Args:
+        view: The run.
+        site: Name of the site.
+    """
     log = view.log
     part = log[site]
     if not len(part):
@@ -194,7 +202,12 @@ def measure_following(view: RunView, link: str) -> MetricValues:
     Quantity("chatter_nm", "chatter, mean change of tau a tick", "N m"),
 )
 def measure_effort(view: RunView, site: str) -> MetricValues:
-    """Returns the effort of a site, and how often its torque is at the limit."""
+    """Measures the effort of a site's controller, and how often its torque is at the limit.
+
+    Args:
+        view: The run.
+        site: Name of the site.
+    """
     part = view.log[site]
     if not len(part):
         return unavailable(EFFORT, f"no records of {site}")
@@ -323,10 +336,12 @@ class ParameterEstimates(NamedTuple):
 
 
 def read_parameter_estimates(scenario: Scenario, records: AlignedRecords) -> ParameterEstimates:
-    """Returns the estimates of a site, with their least-squares slopes at the end of the run.
+    """Reads the parameter estimates of a site at the start and at the end of a run.
+
+    The slopes of straight lines fitted to the last seconds show whether they still change.
 
     Args:
-        scenario: Scenario of the run.
+        scenario: The description of the experiment.
         records: Records of the site.
     """
     spec = scenario.sites[records.site]
@@ -408,10 +423,15 @@ def _estimate_base_parameters(
     Quantity("unphysical_links", "unphysical links, at last", "", "sum"),
 )
 def measure_parameter_error(view: RunView, site: str) -> MetricValues:
-    """Returns the distance of the estimates from theta, and their rate of change at the end.
+    """Measures how far a site's parameter estimates are from the true values, and their drift.
 
-    Distance and energy of a chain are computed from its base parameters. Errors of the
-    estimates that cancel in the base parameters never change, and have no effect on the torque.
+    For a chain the distance and the energy of the errors are computed from base parameters, the
+    combinations of parameters that torques determine. Other errors of the estimates never
+    change, and have no effect on the torque.
+
+    Args:
+        view: The run.
+        site: Name of the site.
     """
     scenario = view.scenario
     estimates = view.compute_once(read_all_estimates).get(site)
@@ -502,7 +522,14 @@ def _compute_parameter_energy(
     Quantity("late_samples", "late samples", "", "sum"),
 )
 def measure_network(view: RunView, name: str) -> MetricValues:
-    """Returns the effective delay, the losses and the bursts of losses of a link."""
+    """Measures a link: the effective delay, lost samples and bursts of losses.
+
+    The effective delay is the age of the sample that the receiver uses.
+
+    Args:
+        view: The run.
+        name: Name of the link, such as "m1->s".
+    """
     link = view.links[name]
     age = link.age_ms
     unused = "no sample ever came into use"
@@ -533,9 +560,13 @@ def measure_network(view: RunView, name: str) -> MetricValues:
     Quantity("missing", "missing records", "", "sum"),
 )
 def measure_loop(view: RunView, site: str) -> MetricValues:
-    """Returns the timing of a site's control loop, and the number of its missing records.
+    """Measures the timing of a site's control loop, and counts its missing records.
 
     In virtual time no clock is read, so that the timing does not apply.
+
+    Args:
+        view: The run.
+        site: Name of the site.
     """
     log = view.log
     missing = {"missing": metric(log.missing(site))}

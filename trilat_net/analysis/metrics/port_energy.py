@@ -121,11 +121,15 @@ def mechanical_energy(arm: ArmRows, records: AlignedRecords) -> Array:
     Quantity("unaccounted_j", "unaccounted for", "J"),
 )
 def measure_port_energy(view: RunView, site: str) -> MetricValues:
-    """Returns the energies that an arm exchanged with controller, operator and environment.
+    """Measures the energies that an arm exchanged with controller, operator and environment.
 
-    Only tick periods with a record at both ends count. The stops of joints count as
+    Only tick periods with a record at both ends count. The mechanical stops of joints count as
     environment. Friction absorbs energy that the arm does not gain. The difference between the
-    energy gained and the energy supplied is reported as unaccounted.
+    energy gained and the energy supplied is reported as unaccounted, and should be small.
+
+    Args:
+        view: The run.
+        site: Name of the site that runs the arm.
     """
     if site not in view.sites:
         return unavailable(ENERGY, f"no records of {site}", of="site")
@@ -193,10 +197,15 @@ def measure_port_energy(view: RunView, site: str) -> MetricValues:
     Quantity("delay_most_j", "given by the delay at most", "J"),
 )
 def measure_delay_energy(view: RunView, link: str) -> MetricValues:
-    """Returns the energy that the delay of a link injects: at the end of the run, and at most.
+    """Measures the energy that the delay of a link injects, at the end and at its maximum.
 
-    Only tick periods count that follow from records alone, and in which the site follows its
-    peers. The torque is that of the law, before it is limited.
+    The delay makes a site follow an old position of its peer. The torque due to this difference
+    does work on the arm. It is the torque of the control law before it is limited. Only tick
+    periods count that rest on records alone, and in which the site follows its peers.
+
+    Args:
+        view: The run.
+        link: Name of the link, such as "m1->s".
     """
     runs = view.sites
     peer = view.links[link].peer

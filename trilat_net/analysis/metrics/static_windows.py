@@ -217,7 +217,11 @@ class StiffnessEstimate(NamedTuple):
 
 
 def estimate_stiffness(view: RunView) -> list[StiffnessEstimate]:
-    """Estimates stiffnesses between successive static windows, if a single operator moved.
+    """Estimates how stiff the teleoperator feels to an operator who moved it slowly.
+
+    Two successive static windows are compared, in which all arms rest. The stiffness is the
+    change of the operator's torque over the change of the angle. It is estimated only if a
+    single operator moved between the windows.
 
     Args:
         view: The run.
@@ -271,19 +275,23 @@ def _find_single_mover(before: StaticWindow, after: StaticWindow) -> str:
 
 
 class SharingRatio(NamedTuple):
-    """Force sharing between two loaded sites at a joint, in a static window.
+    """Force sharing at a joint: what one operator feels of a torque at another site.
+
+    It is measured in a static window, a time in which all arms rest, at a joint at which
+    exactly two sites are loaded.
 
     Attributes:
         from_s: Time of the window's first tick, in s.
         to_s: Time of the window's last tick, in s.
         joint: Number of the joint, from 1.
         pushed: Site at which the torque acts.
-        pushed_nm: Torque on the arm of this site.
+        pushed_nm: Torque on the arm of this site, in N m.
         by_wall: True if the environment contributes most of this torque.
         holds: Site of the operator that feels the torque.
-        felt_nm: Torque that this operator feels: the negative of the operator's torque on the
-            arm.
-        expected_nm: Torque that the operator should feel according to the dominance factors.
+        felt_nm: Torque that this operator feels, in N m: the negative of the operator's torque
+            on the arm.
+        expected_nm: Torque that the operator should feel according to the dominance factors,
+            the weights with which the sites follow each other, in N m.
     """
 
     from_s: float
@@ -307,17 +315,20 @@ class SharingRatio(NamedTuple):
 
 
 class JointLoad(NamedTuple):
-    """The torques of all loaded sites at a joint, in a static window.
+    """The torques of all loaded sites at a joint, while all arms rest.
+
+    At rest the weighted sum of these torques should be zero, by the equation of the module's
+    docstring.
 
     Attributes:
-        from_s: Time of the window's first tick, in s.
-        to_s: Time of the window's last tick, in s.
+        from_s: Time of the static window's first tick, in s.
+        to_s: Time of the static window's last tick, in s.
         joint: Number of the joint, from 1.
-        torque_nm: Torque on the arm of each loaded site.
-        weight: pi_i / K_i of each loaded site, scaled so that the largest value of all sites is
-            1.
-        imbalance: |sum of weight times torque| / largest |weight times torque|. It is 0 if the
-            torques obey the equation of the module's docstring.
+        torque_nm: Torque on the arm of each loaded site, by name, in N m.
+        weight: Weight pi_i / K_i of each loaded site in the sum, scaled so that the largest
+            weight of all sites is 1. The module's docstring defines pi and K.
+        imbalance: |sum of weight times torque| / largest |weight times torque|. 0 if the
+            torques obey the equation.
     """
 
     from_s: float
@@ -353,7 +364,14 @@ def find_joint_loads(view: RunView) -> list[JointLoad]:
 
 
 def count_static_windows(view: RunView) -> Metric:
-    """Returns the number of static windows of a run, or the reason why there are none."""
+    """Counts the static windows of a run, times in which all arms rest.
+
+    Args:
+        view: The run.
+
+    Returns:
+        The number. If there are no windows, the metric contains the reason.
+    """
     if view.absent:
         return Metric(None, f"no records of {', '.join(view.absent)}")
     windows = view.compute_once(find_static_windows)
@@ -367,7 +385,13 @@ def count_static_windows(view: RunView) -> Metric:
     Quantity("sharing_off", "furthest from tau_s beta_s / beta_i"),
 )
 def measure_force_sharing(view: RunView, _run: str) -> MetricValues:
-    """Returns how far felt torques deviate from those that the dominance factors predict."""
+    """Measures how far felt torques deviate from those that the dominance factors predict.
+
+    A dominance factor is the weight with which a site follows another site.
+
+    Args:
+        view: The run.
+    """
     ratios = view.compute_once(find_sharing_ratios)
     deviations = [ratio.off for ratio in ratios if ratio.off is not None]
     if deviations:

@@ -56,10 +56,16 @@ def _not_applicable(reason: str) -> Metric:
 
 
 def read_user_shares(view: RunView) -> UserShares | Metric:
-    """Returns the dominance factors of the users at the slave's ticks.
+    """Reads how a slave divided its motion between its users, at the slave's ticks.
+
+    Each user moves a master, and the slave follows the masters with weights, the dominance
+    factors.
+
+    Args:
+        view: The run.
 
     Returns:
-        The factors and the leading user. A metric with the reason if no users share a slave, or
+        The weights and the leading user. A metric with the reason if no users share a slave, or
         if their records are missing.
     """
     slave, users = find_users(view.scenario)
@@ -186,10 +192,14 @@ def _identify_shares(view: RunView) -> list[float] | Metric:
     Quantity("lead_jump", "largest step of q_id while shares change, to that of the rest"),
 )
 def measure_sharing(view: RunView, _run: str) -> MetricValues:
-    """Returns how the users of a slave disagree, intervene and take over.
+    """Measures how the users of a slave disagree, intervene and take over.
 
-    A user intervenes while another user leads than the scenario plans. A takeover is a change
-    of the leader.
+    Each user moves a master, and the slave follows the masters with weights. The user with the
+    largest weight leads. A user intervenes while another user leads than the scenario plans. A
+    takeover is a change of the leader.
+
+    Args:
+        view: The run.
     """
     shared = view.compute_once(read_user_shares)
     slave, users = find_users(view.scenario)
