@@ -266,7 +266,7 @@ class CharacteristicRoot(NamedTuple):
 
     @property
     def damping(self) -> float:
-        """Damping ratio, -re(s) / abs(s)."""
+        """Damping ratio of the mode, -re(s) / abs(s). It is negative if the mode grows."""
         return -self.s.real / abs(self.s)
 
     @property
@@ -312,7 +312,7 @@ class Spectrum(NamedTuple):
 
     @property
     def basis(self) -> str:
-        """A phrase that states the span of the analysis. Empty if all ticks are alike."""
+        """A phrase that states the analysed span of time. Empty if all ticks are alike."""
         if self.span_s is None:
             return ""
         if self.deviation_per_s is None:

@@ -184,14 +184,15 @@ def _discretise_arm(jacobian: SiteJacobian, h_s: float) -> tuple[Array, Array]:
 
 
 class CoupledTicks(NamedTuple):
-    """The sites over one tick each, and the effects of their states on their peers.
+    """Linear model of all sites over one tick, with the effects of sites on each other.
 
     Attributes:
-        S: Block diagonal matrix of the sites' own maps, shape (n, n).
-        effects: Effect of site j on site i, if there is one, shape (n, n) each, by (i, j).
+        S: Block diagonal matrix of the sites' own maps from tick to tick, shape (n, n).
+        effects: Effect of the state of site j on site i, shape (n, n) each, by (i, j). Pairs
+            without an effect are missing.
         names: Names of the states.
         owners: Index of the site to which each state belongs, shape (n,).
-        constant: Number of omitted states that are constant or without effect.
+        constant: Number of omitted states that are constant or have no effect.
     """
 
     S: Array

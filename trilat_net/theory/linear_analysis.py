@@ -63,19 +63,22 @@ SAMPLED_ROOT_DIFFERENCE = 0.01
 
 @dataclass(frozen=True, repr=False)
 class LinearAnalysis(Result):
-    """The linear analysis of a scenario, see `analyse_linear_loop`.
+    """Result of the linear stability analysis of a scenario, see `analyse_linear_loop`.
 
     Attributes:
-        scenario: The experiment.
-        conditions: The numbers of the loop: dominance factors, delays, operators in force.
-        rest: The equilibrium.
+        scenario: The description of the experiment.
+        conditions: The numbers from which the loop is built: dominance factors, delays,
+            operators and environments in force.
+        rest: The equilibrium about which the loop is linearised.
         loop: The loop linearised at the equilibrium.
-        continuous: Roots of the continuous loop, a delay-differential equation.
-        sampled: Roots of the sampled loop. None if a law can be linearised in continuous time
-            only.
-        margin: The common delays for which the continuous loop is stable.
-        scans: Edges of stability along the requested keys.
-        ports: Analysis of the haptic ports of the operators. None if it was not requested.
+        continuous: Characteristic roots of the continuous loop, a delay-differential equation.
+        sampled: Characteristic roots of the loop with its ticks. None if a law can be
+            linearised in continuous time only.
+        margin: The delays, common to all links, for which the continuous loop is stable.
+        scans: For each requested key of the scenario, the values at which the loop becomes
+            stable or unstable.
+        ports: Analysis of the joints at which operators act, the haptic ports. None if it was
+            not requested.
     """
 
     scenario: Scenario
@@ -98,7 +101,7 @@ class LinearAnalysis(Result):
 
     @property
     def decisive(self) -> Spectrum:
-        """The roots on which the verdict is based."""
+        """The characteristic roots on which the verdict is based: sampled or continuous."""
         return self.continuous if self.sampled is None else self.sampled
 
     @property
@@ -206,13 +209,16 @@ class LinearAnalysis(Result):
         return rows
 
     def find_sampled_root(self, root: CharacteristicRoot) -> CharacteristicRoot | None:
-        """Returns the sampled root nearest to a continuous root, if both differ by over 1 %.
+        """Finds the root of the sampled loop that corresponds to a root of the continuous loop.
+
+        It is the nearest one. It is worth showing only if both differ.
 
         Args:
             root: A root of the continuous loop.
 
         Returns:
-            The sampled root. None if both differ by less, or if there is no sampled root.
+            The sampled root. None if both differ by less than 1 %, or if there is no sampled
+            root.
         """
         if self.sampled is None or not self.sampled.roots:
             return None
@@ -329,14 +335,16 @@ def certify_run(
     own_laws: bool = False,
     twins: int = TWINS,
 ) -> Certificate:
-    """Issues the certificate of a log, with the roots at its end and with twins.
+    """Issues the full stability certificate of a recorded run.
 
-    A twin is a repeated execution of the run with a small push.
+    In addition to the checks of `certify`, the run is repeated with small pushes (twins), which
+    show whether disturbances grow, and the characteristic roots at its end pose are computed.
 
     Args:
-        log: The log.
-        min_coverage: Least share of the ticks of a site that must be recorded, see `certify`.
-        own_laws: True if the code of imported laws may be executed.
+        log: The log of the run.
+        min_coverage: Least fraction of the ticks of a site that must be recorded, see
+            `certify`.
+        own_laws: True if the code of imported control laws may be executed.
         twins: Number of twins that are executed. 0 for none.
 
     Raises:
@@ -350,7 +358,9 @@ def certify_run(
 
 
 def find_end_pose_roots(log: Log) -> EndPoseRoots:
-    """Returns the roots of the loop at the end of a recorded run.
+    """Computes whether small motions about the end pose of a recorded run die away.
+
+    The control loop is linearised at this pose, and its characteristic roots are computed.
 
     Args:
         log: The log of the run.

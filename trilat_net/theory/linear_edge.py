@@ -137,11 +137,11 @@ def find_contact_growth(scenario: Scenario, q: Array, theta_hat: Array) -> float
 
 
 class LinearEdge(NamedTuple):
-    """A value of a key at which a loop becomes stable or unstable.
+    """A value of a scenario's key at which a loop becomes stable or unstable.
 
     Attributes:
-        key: Key of the scenario.
-        value: Value of the key at the edge, in its own unit.
+        key: Key of the scenario, such as "control.d".
+        value: Value of the key at the edge, in the unit of the key.
         omega_rad_s: Frequency of the root that crosses the imaginary axis, in rad/s.
         stable_above: True if the loop is stable above the value and unstable below.
     """
@@ -153,13 +153,13 @@ class LinearEdge(NamedTuple):
 
 
 class EdgeScan(NamedTuple):
-    """All edges along a key.
+    """The values of a key, within a range, at which a loop becomes stable or unstable.
 
     Attributes:
-        key: Key of the scenario.
+        key: Key of the scenario, such as "control.d".
         low: Lower end of the scanned range.
         high: Upper end of the scanned range.
-        edges: The edges, by rising value.
+        edges: The values, rising, with the roots that cross there.
     """
 
     key: str
@@ -199,17 +199,19 @@ def iterate_linear_edges(
     points: int = EDGE_SCAN_POINTS,
     sampled: bool | None = None,
 ) -> Iterator[LinearEdge]:
-    """Yields all edges that a scan of a key finds, by rising value.
+    """Yields the values of a scenario's key at which the loop becomes stable or unstable.
+
+    The range is scanned, and each change of stability is then located. The values rise.
 
     Args:
-        scenario: The experiment.
+        scenario: The description of the experiment.
         key: Key of the scenario, such as "control.d".
         low: Lower end of the range.
         high: Upper end of the range.
         rest: Equilibrium of the scenario, if known. It is followed along the key.
         points: Number of values that the scan evaluates.
-        sampled: True to analyse the sampled loop, False to analyse the continuous loop. None to
-            choose as the module's docstring says.
+        sampled: True to analyse the loop with its ticks, False to analyse the continuous loop.
+            None to choose as the module's docstring says.
 
     Raises:
         ScenarioError: A value is not valid for that key, or the scenario has no linear loop.
@@ -330,14 +332,14 @@ class _GrowthRate:
 
 
 class GrowthColumn(NamedTuple):
-    """Growth rate of a loop over the values of a key.
+    """Growth rate of small motions of a loop, over the values of a scenario's key.
 
     Attributes:
-        growth_per_s: Real part of the rightmost root at each value, in 1/s. NaN if there is no
-            linear loop, and -infinity if nothing moves.
+        growth_per_s: Real part of the rightmost characteristic root at each value, in 1/s. NaN
+            if there is no linear loop, and -infinity if nothing moves.
         edges: Values at which the loop becomes stable or unstable, by the index of the next
             smaller value.
-        remarks: Remarks on the analysis, without repetition.
+        remarks: Remarks on the analysis for the user, without repetition.
     """
 
     growth_per_s: list[float]

@@ -40,14 +40,18 @@ _DEPENDENT = 1e-9
 
 
 class SiteJacobian(NamedTuple):
-    """The derivatives of one site's rates with respect to the states that the loop keeps.
+    """Linear model of one site: the derivatives of its rates at an equilibrium.
+
+    Only the states that the loop keeps are included. The columns are the site's state and what
+    it receives.
 
     Attributes:
-        layout: Layout of the columns. Without an estimate if the law learns nothing.
+        layout: Which column belongs to which quantity. Without an estimate if the law learns
+            nothing.
         rates: The derivatives, see `differentiate_site_rates`.
         states: Names of the states, such as "q1", "qd2", "theta4". "gravity2" is the learnt
             gravity torque of joint 2.
-        omitted_states: Number of estimates that no small motion changes or shows.
+        omitted_states: Number of parameter estimates that no small motion changes or shows.
     """
 
     layout: site_dynamics.ArgumentLayout
@@ -110,17 +114,25 @@ class LinearLoop(NamedTuple):
 
     @property
     def static_matrix(self) -> Array:
-        """A + sum_k A_k: the rates under a constant deviation."""
+        """The rates of the states under a constant deviation: A + sum_k A_k, shape (n, n).
+
+        A is the matrix of the present state, and A_k are the matrices of the delayed states.
+        """
         delayed = [term.A for term in self.delayed]
         return sum(delayed, self.A)
 
 
 def gather_site_arguments(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
-    """Returns the arguments of each site's rates at an equilibrium, shape (arguments,) each.
+    """Collects the arguments from which the rates of each site are computed at an equilibrium.
+
+    `ArgumentLayout` describes their order.
 
     Args:
-        conditions: The numbers of the loop.
+        conditions: The sites, gains and delays of the loop.
         rest: The equilibrium.
+
+    Returns:
+        A vector for each site, shape (arguments,).
     """
     layouts = [site_dynamics.lay_out_arguments(site) for site in conditions.sites]
     arguments = [np.zeros(layout.arguments) for layout in layouts]
@@ -146,7 +158,17 @@ def gather_site_arguments(conditions: OperatingConditions, rest: Equilibrium) ->
 
 
 def compute_shared_poses(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
-    """Returns the pose that each site shares at an equilibrium, shape (m,) each."""
+    """Computes the pose that each site sends to its peers at an equilibrium.
+
+    It consists of the joint angles, or in task space of the end effector's pose.
+
+    Args:
+        conditions: The sites, gains and delays of the loop.
+        rest: The equilibrium.
+
+    Returns:
+        A pose for each site, shape (m,).
+    """
     poses = []
     for site, q in zip(conditions.sites, rest.q, strict=True):
         joint_positions = q[: site.layout.joints]
@@ -155,7 +177,17 @@ def compute_shared_poses(conditions: OperatingConditions, rest: Equilibrium) -> 
 
 
 def compute_references(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
-    """Returns the reference that each site follows at an equilibrium, shape (m,) each."""
+    """Computes the pose that each site tries to reach at an equilibrium.
+
+    It is the mean of its peers' poses, weighted with the dominance factors.
+
+    Args:
+        conditions: The sites, gains and delays of the loop.
+        rest: The equilibrium.
+
+    Returns:
+        A reference for each site, shape (m,).
+    """
     poses = compute_shared_poses(conditions, rest)
     if not conditions.sites[0].layout.task:
         return list(conditions.alpha @ np.array(poses))
@@ -199,15 +231,18 @@ def compute_couplings(
     rest: Equilibrium,
     sites: list[SiteJacobian],
 ) -> dict[tuple[int, int], Array]:
-    """Returns the effect of site j's output on site i's inputs, by (i, j).
+    """Computes how the output of each site acts on the inputs of the sites that receive it.
 
-    Each effect is a matrix of shape (inputs, 3 m). An imported law receives each sample twice:
-    within the sums that are weighted with the dominance factors, and by itself.
+    An imported law receives each sample twice: within the sums that are weighted with the
+    dominance factors, and by itself.
 
     Args:
-        conditions: The numbers of the loop.
+        conditions: The sites, gains and delays of the loop.
         rest: The equilibrium.
         sites: Derivatives of each site's rates.
+
+    Returns:
+        By (i, j), the effect of site j's output on site i's inputs, shape (inputs, 3 m).
     """
     references = differentiate_references(conditions, rest)
     couplings = {}
@@ -231,9 +266,15 @@ def compute_couplings(
 
 
 def mask_loop_states(conditions: OperatingConditions) -> list[NDArray[np.bool_]]:
-    """Returns which states of each site are in the loop, shape (states,) each.
+    """Finds which states of each site belong to the loop.
 
-    Estimates are in the loop if the site's law learns.
+    Angles and velocities always do. Parameter estimates do if the site's law learns.
+
+    Args:
+        conditions: The sites and laws of the loop.
+
+    Returns:
+        For each site, True for each state in the loop, shape (states,).
     """
     masks = []
     for site in conditions.sites:
@@ -371,10 +412,13 @@ def linearise_loop(
     *,
     all_estimates: bool = False,
 ) -> LinearLoop:
-    """Returns the loop linearised at an equilibrium.
+    """Builds the linear model of the whole control loop at an equilibrium.
+
+    It contains all sites, the links between them with their delays, and the torques of
+    operators as inputs.
 
     Args:
-        conditions: The numbers of the loop.
+        conditions: The sites, gains and delays of the loop.
         rest: The equilibrium.
         all_estimates: True to make each estimate of a chain a state, see `differentiate_rates`.
     """
@@ -468,13 +512,13 @@ def add_law_forms(
     sites: Sequence[SiteJacobian],
     loop: LinearLoop,
 ) -> LinearLoop:
-    """Adds to a loop the states and the sent signals of the control laws (`LinearForm`).
+    """Adds to a loop the states and the sent signals of control laws that have their own.
 
-    A sent signal is an algebraic state: it has no rate, and the peer receives it after the
-    delay.
+    Such a law describes them as a `LinearForm`. A sent signal, such as a wave, is an algebraic
+    state: it has no rate, and the peer receives it after the delay.
 
     Args:
-        conditions: The numbers of the loop.
+        conditions: The sites, gains and delays of the loop.
         sites: Derivatives of each site's rates.
         loop: The loop without these states.
     """

@@ -41,15 +41,16 @@ _STILL = 1e-14
 
 
 class NumericLaw:
-    """The imported law of one site, as a function of numbers.
+    """A control law written by a user, as a function from numbers to numbers.
 
-    The law is built once. Calling the object returns the law itself, so that the object can
-    stand in for the law's factory in a `SiteSetup`.
+    The linear analysis differentiates this function. The law may store numbers from tick to
+    tick, its memory. The law is built once. Calling the object returns the law itself, so that
+    the object can stand in for the law's factory in a `SiteSetup`.
 
     Args:
         setup: Setup of the site.
         code: Name by which the scenario refers to the law.
-        shares: Dominance factors of the peers in force.
+        shares: Dominance factors with which the site follows its peers.
 
     Attributes:
         names: Names of the numbers in the memory, such as "error[1]".
@@ -117,11 +118,16 @@ class NumericLaw:
         return self._law
 
     def complete_memory(self, memory: Array | None) -> Array:
-        """Returns a full memory: the initial memory, overwritten by the known leading part.
+        """Returns all numbers that the law stores, of which some are given.
+
+        The given numbers overwrite the beginning of the initial memory.
 
         Args:
             memory: Known numbers: all of the memory, or at least the numbers that the law
                 itself remembers. Longer arrays are cut. None if nothing is known.
+
+        Returns:
+            The full memory.
         """
         full_memory: Array = self.memory.copy()
         if memory is None:
@@ -133,9 +139,9 @@ class NumericLaw:
         return full_memory
 
     def iterate_memory(self, x: Array, ticks: int) -> Array:
-        """Returns the memory after at most `ticks` ticks with constant other arguments.
+        """Executes the law for some ticks with constant inputs, and returns its memory.
 
-        The iteration ends early once the memory is constant.
+        The iteration ends early once the memory no longer changes.
 
         Args:
             x: Arguments in the order of `ArgumentLayout`, shape (arguments,).

@@ -76,15 +76,19 @@ class EffectiveDelay(NamedTuple):
 
 
 class OperatingConditions(NamedTuple):
-    """The numbers from which the linear loop is built, see `derive_operating_conditions`.
+    """The numbers from which the linear model of a loop is built.
+
+    They are those at the end of a run of the scenario, see `derive_operating_conditions`. N is
+    the number of sites.
 
     Attributes:
         sites: Setups of the sites in scenario order, with the operators and environments in
             force.
-        alpha: Matrix of dominance factors, shape (N, N), Eq. (6).
+        alpha: Matrix of dominance factors, shape (N, N), Eq. (6). Entry (i, j) is the weight
+            with which site i follows site j.
         age_s: Age of the sample of site j that site i uses, shape (N, N), in s. 0 if it uses
             none.
-        notes: Remarks on numbers that were left out or fixed.
+        notes: Remarks for the user on numbers that were left out or fixed.
         varying: True if ages vary during the run. `age_s` then contains their means.
         laws: Control law of each site.
         links: The link from j to i in force, and the key of its random draws, by (i, j).
@@ -99,7 +103,10 @@ class OperatingConditions(NamedTuple):
     links: Mapping[tuple[int, int], tuple[LinkBase, int]] = MappingProxyType({})
 
     def find_forms(self, inertia: Sequence[Array] = ()) -> list[LinearForm | None]:
-        """Returns the linear form of each site's law. None if its gains describe the law fully.
+        """Returns the linear form of each site's control law.
+
+        A law with states or signals of its own describes them in this form. The entry is None
+        for a law that its gains describe fully.
 
         Args:
             inertia: Inertia matrix of each arm, shape (n, n). Empty for unit matrices.
@@ -174,11 +181,11 @@ class OperatingConditions(NamedTuple):
 def derive_operating_conditions(
     scenario: Scenario, *, own_laws: bool = True
 ) -> OperatingConditions:
-    """Derives the numbers of the linear loop from a scenario: those at the end of a run.
+    """Derives the numbers of a scenario's linear loop, as they are at the end of a run.
 
     Args:
-        scenario: The experiment.
-        own_laws: True if the code of imported laws may be executed.
+        scenario: The description of the experiment.
+        own_laws: True if the code of imported control laws may be executed.
 
     Raises:
         ScenarioError: A law has no linear loop, an arm is not simulated, or the delay of a link

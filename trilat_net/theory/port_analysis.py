@@ -63,9 +63,11 @@ def freeze_external_torques(
 ) -> OperatingConditions:
     """Replaces operators and environments by the constant torque that they apply at rest.
 
+    The response of the arms then does not contain the stiffness and damping of operators.
+
     Args:
-        conditions: The numbers of the loop.
-        rest: The equilibrium.
+        conditions: The sites, gains and delays of the loop.
+        rest: The equilibrium, at which the torques are computed.
     """
     arguments = gather_site_arguments(conditions, rest)
     sites = []
@@ -78,10 +80,12 @@ def freeze_external_torques(
 
 
 def linearise_teleoperator(conditions: OperatingConditions, rest: Equilibrium) -> LinearLoop:
-    """Returns the linear loop without the operators and environments at its ports.
+    """Builds the linear model of the arms and their coupling, without operators.
+
+    Operators and environments act at its ports, the joints, and are not part of it.
 
     Args:
-        conditions: The numbers of the loop.
+        conditions: The sites, gains and delays of the loop.
         rest: The equilibrium.
     """
     frozen = freeze_external_torques(conditions, rest)
@@ -125,9 +129,17 @@ def build_proof_output(
 
 
 def compute_proof_weights(conditions: OperatingConditions) -> Array:
-    """Returns the weights of the sites in the energy function of the corrected proof.
+    """Computes the weights of the sites in the energy function of the stability proof.
 
-    They are beta_i = pi_i / c_i of docs/errata.md, shape (N,), and their sum is N.
+    They are beta_i = pi_i / c_i of docs/errata.md, where pi is the left eigenvector of the
+    dominance factors, and c_i are the factors between the gains of the sites. Their sum is N,
+    the number of sites.
+
+    Args:
+        conditions: The sites, gains and dominance factors of the loop.
+
+    Returns:
+        The weights, shape (N,).
     """
     Kd = np.full((len(conditions.sites), conditions.sites[0].layout.shared), np.nan)
     for site_Kd, site in zip(Kd, conditions.sites, strict=True):
@@ -137,15 +149,17 @@ def compute_proof_weights(conditions: OperatingConditions) -> Array:
 
 
 class TwoPort(NamedTuple):
-    """Llewellyn's criterion of absolute stability for one joint of two sites.
+    """Llewellyn's criterion for one joint of two sites: are they stable with any operators?
 
-    No operator acts at the other joints.
+    The criterion of absolute stability says whether a passive operator or environment at each
+    of the two joints can make the loop unstable. No operator acts at the other joints.
 
     Attributes:
         sites: The two sites.
-        joint: Number of the joint, or of the coordinate in task space, from 1 on.
+        joint: Number of the joint, or of the coordinate in task space, from 1.
         clamped: Name of the third site if it is clamped. Empty if it is free or does not exist.
-        minima: Llewellyn's parameter over frequency, and the bands in which it is below 1.
+        minima: Llewellyn's parameter over frequency, and the bands in which it is below 1, so
+            that the criterion is violated.
     """
 
     sites: tuple[str, str]
@@ -204,12 +218,12 @@ class PortAnalysis(NamedTuple):
 
     @property
     def kind(self) -> str:
-        """The kind of a port: "joint", or "axis" in task space."""
+        """The word for a port: "joint", or "axis" in task space."""
         return "axis" if self.axes else "joint"
 
     @property
     def speed(self) -> str:
-        """Symbol of the velocities at the ports."""
+        """The symbol of the velocities at the ports, for tables and figures."""
         return "xd" if self.axes else "qd"
 
     def name_port(self, number: int) -> str:
@@ -468,7 +482,13 @@ def _check_llewellyn(
 
 
 def ports_to_json(ports: PortAnalysis) -> dict[str, Any]:
-    """Returns a port analysis as plain values. Infinite numbers are None."""
+    """Returns a port analysis as plain values, ready for JSON.
+
+    Infinite numbers become None, as JSON does not know them.
+
+    Args:
+        ports: The analysis.
+    """
     measured = ports.measured
     return {
         "sites": list(ports.sites),
@@ -543,14 +563,28 @@ def _transparency_to_json(transparency: Transparency) -> dict[str, Any]:
 
 
 def list_followed_axes(site: SiteSetup) -> list[int]:
-    """Returns the coordinates that a site follows, from 1 on. In joint space all joints."""
+    """Lists the coordinates along which a site follows its peers.
+
+    Args:
+        site: Setup of the site.
+
+    Returns:
+        Numbers of the coordinates, from 1. In joint space they are all joints.
+    """
     if site.chain is None or site.chain.task is None:
         return list(range(1, site.layout.joints + 1))
     return [n for n, is_followed in enumerate(site.chain.task.axes, 1) if is_followed]
 
 
 def name_ports(conditions: OperatingConditions) -> dict[int, str]:
-    """Returns the name of each port number's axis in task space. Empty in joint space."""
+    """Returns the names of the axes along which the ports of a loop in task space move.
+
+    Args:
+        conditions: The sites of the loop.
+
+    Returns:
+        The name of each axis, by the number of the port. Empty in joint space.
+    """
     if not conditions.sites[0].layout.task:
         return {}
     followed = sorted({n for site in conditions.sites for n in list_followed_axes(site)})

@@ -55,15 +55,18 @@ _WEIGHT_TOLERANCE = 1e-3
 
 
 class Passivity(NamedTuple):
-    """Passivity at one set of ports.
+    """Whether a loop is passive at some ports: whether it never supplies net energy there.
+
+    Y is the admittance over frequency, the velocities at the ports per torque. The loop is
+    passive if Y + Y^H has no negative eigenvalue, where Y^H is the conjugate transpose.
 
     Attributes:
         minima: Least eigenvalue of Y + Y^H over frequency, in rad/s per N m, and the bands in
             which it is negative.
         size: Largest singular value of Y at these frequencies, shape (F,), in rad/s per N m.
             The eigenvalues of Y + Y^H lie within twice that.
-        lacking_nm_s_rad: Damping that would make the loop passive if each port had it, in
-            N m s/rad. Infinite if it grows without bound towards the lowest frequencies.
+        lacking_nm_s_rad: Damping that would make the loop passive if each port had it, in N m
+            s/rad. Infinite if it grows without bound towards the lowest frequencies.
     """
 
     minima: Minima
@@ -77,7 +80,10 @@ class Passivity(NamedTuple):
 
 
 class HandMatrices(NamedTuple):
-    """Measured impedance of an operator at the end effector: F = -(M a + B v + K x).
+    """Measured impedance of an operator who holds the end effector.
+
+    The operator resists a motion with the force F = -(M a + B v + K x), with the position x,
+    the velocity v and the acceleration a of the end effector.
 
     Attributes:
         M: Mass, shape (n, n), in kg.
@@ -168,13 +174,17 @@ def check_against_hands(
 
 
 def weight_response(Y: Complex, weights: Array) -> Complex:
-    """Returns D^1/2 Y D^-1/2 with D = diag(weights), shape (F, p, p).
+    """Scales the response at some ports, so that its passivity is judged with weights.
 
-    Its Hermitian part has the same signs of eigenvalues as D Y + Y^H D.
+    The result is D^1/2 Y D^-1/2 with D = diag(weights). The eigenvalues of its Hermitian part
+    have the same signs as those of D Y + Y^H D.
 
     Args:
         Y: Response, shape (F, p, p).
         weights: Positive weights of the ports, shape (p,) or (F, p).
+
+    Returns:
+        Scaled response, shape (F, p, p).
     """
     root = np.sqrt(weights)
     rows = root[..., :, np.newaxis]
@@ -183,7 +193,16 @@ def weight_response(Y: Complex, weights: Array) -> Complex:
 
 
 def find_least_eigenvalue(Y: Complex) -> Array:
-    """Returns the least eigenvalue of Y + Y^H, shape (F,), for Y of shape (F, p, p)."""
+    """Returns the least eigenvalue of Y + Y^H at each frequency.
+
+    A response Y is passive if it is never negative. Y^H is the conjugate transpose.
+
+    Args:
+        Y: Response, shape (F, p, p).
+
+    Returns:
+        Eigenvalues, shape (F,).
+    """
     eigenvalues = np.linalg.eigvalsh(Y + _conjugate_transpose(Y))
     # eigvalsh sorts them in rising order
     least = eigenvalues[..., 0]
@@ -275,12 +294,16 @@ def llewellyn_parameter(Y: Complex) -> Array:
 
 
 def llewellyn_rounding(Y: Complex) -> Array:
-    """Returns the rounding error of Llewellyn's parameter, shape (F,).
+    """Returns the rounding error of Llewellyn's parameter at each frequency.
 
-    The error is large if almost nothing is transmitted from port to port.
+    A value within this error of the limit decides nothing. The error is large if almost nothing
+    is transmitted from port to port.
 
     Args:
         Y: Admittance, shape (F, 2, 2).
+
+    Returns:
+        Error, shape (F,).
     """
     y12 = Y[:, 0, 1]
     y21 = Y[:, 1, 0]
@@ -292,12 +315,13 @@ def llewellyn_rounding(Y: Complex) -> Array:
 
 
 def clamp_ports(Y: Complex, keep: list[int], clamped: list[int]) -> Complex:
-    """Returns the admittance at some ports while other ports are clamped.
+    """Returns the admittance at some ports while the velocity of other ports is held at zero.
 
-    The result is a Schur complement. Ports in neither list are free: no operator is there.
+    The admittance is the velocity per torque. The result is a Schur complement. At ports in
+    neither list no torque acts, so that they move freely.
 
     Args:
-        Y: Admittance, shape (F, p, p).
+        Y: Admittance at all ports, shape (F, p, p).
         keep: Indices of the ports of the result.
         clamped: Indices of the ports whose velocity is zero.
     """

@@ -48,7 +48,9 @@ _NEGLIGIBLE = 1e-3
 
 
 class LoopOutput(NamedTuple):
-    """An output of the loop's present and past state: y(t) = C x(t) + sum_k C_k x(t - T_k).
+    """An output of a loop that depends on its present and on its past state x.
+
+    It is y(t) = C x(t) + sum_k C_k x(t - T_k).
 
     Attributes:
         C: Matrix of the present state, shape (p, n).
@@ -59,7 +61,16 @@ class LoopOutput(NamedTuple):
     delayed: tuple[tuple[float, Array], ...] = ()
 
     def evaluate(self, s: Complex) -> Complex:
-        """Returns C + sum_k C_k e^{-s T_k}, shape (F, p, n)."""
+        """Returns the matrix from the state to the output at complex frequencies.
+
+        It is C + sum_k C_k e^{-s T_k}.
+
+        Args:
+            s: Complex frequencies, shape (F,), in 1/s.
+
+        Returns:
+            Matrices, shape (F, p, n).
+        """
         total = _repeat_matrix(self.C, len(s))
         for delay_s, C in self.delayed:
             total += _evaluate_shift(s, delay_s) * C
@@ -80,7 +91,9 @@ def _evaluate_shift(s: Complex, delay_s: float) -> Complex:
 
 
 class PoleAtZero(NamedTuple):
-    """The pole of the response at zero frequency: Y(s) ~ residue / s + higher powers of 1 / s.
+    """Behaviour of the response Y(s) at zero frequency: does a constant torque accelerate it?
+
+    Near s = 0 the response is Y(s) ~ residue / s + higher powers of 1 / s.
 
     Attributes:
         order: Highest power of 1 / s. With 0 there is no pole, and the velocity under a
@@ -211,7 +224,12 @@ def group_ports_by_joint(loop: LinearLoop) -> dict[int, list[int]]:
 
 
 def select_ports(response: PortResponse, ports: list[int]) -> PortResponse:
-    """Returns the response at some ports, with no operator at the others."""
+    """Returns the response at some ports, while no operator acts at the others.
+
+    Args:
+        response: The response at all ports, as a function of frequency.
+        ports: Indices of the ports to keep.
+    """
 
     def evaluate_selected(w_rad_s: Array) -> Complex:
         rows = response(w_rad_s)[:, ports]
@@ -226,12 +244,16 @@ def find_longest_delay_s(loop: LinearLoop) -> float:
 
 
 def find_pole_at_zero(loop: LinearLoop) -> PoleAtZero:
-    """Returns the pole of the response at zero, by Cauchy's integral along a small circle.
+    """Finds how the response of a loop behaves at zero frequency.
 
-    Many roots of the loop are zero, because all arms can rest in other shared poses too, or
-    because nothing excites an estimate. Most of them are not poles of Y, because a resting arm
-    has no velocity. A loop without friction has a pole: Y(s) ~ 1 / (m s). Roots within
-    `ZERO_ROOT_RADIUS_PER_S` count as zero.
+    The response Y(s) is the velocity per torque. Its pole at zero is found by Cauchy's integral
+    along a small circle. Many roots of the loop are zero, because all arms can rest in other
+    shared poses too, or because nothing excites an estimate. Most of them are not poles of Y,
+    because a resting arm has no velocity. A loop of mass m without friction has a pole: Y(s) ~
+    1 / (m s). Roots within `ZERO_ROOT_RADIUS_PER_S` count as zero.
+
+    Args:
+        loop: The loop.
     """
     angles = 2j * math.pi * np.arange(_CIRCLE_POINTS) / _CIRCLE_POINTS
     unit_circle = np.exp(angles)
@@ -257,11 +279,19 @@ def find_pole_at_zero(loop: LinearLoop) -> PoleAtZero:
 
 
 def clamp_site(loop: LinearLoop, site: str) -> LinearLoop:
-    """Returns the loop with a site clamped: without its ports, velocities and angles.
+    """Returns the loop with the arm of a site held still by a clamp.
 
-    The torque of the clamp makes the site's accelerations zero,
-    u_c = -B_cc^-1 (A_c x + B_c u + delayed terms). It acts wherever the law uses the site's
-    torque.
+    The torque u_c of the clamp makes the site's accelerations zero: u_c = -B_cc^-1 (A_c x + B_c
+    u + delayed terms). Here x is the state, u the other torques, A_c and B_c are the rows of
+    the loop's matrices for these accelerations, and B_cc is the part of B_c that belongs to the
+    site's own torques. The torque acts wherever the law uses the site's torque.
+
+    Args:
+        loop: The loop.
+        site: Name of the site.
+
+    Returns:
+        The loop without the ports, velocities and angles of the site.
 
     Raises:
         UsageError: There is no such site, or two clamped sites reflect force onto each other.
@@ -359,12 +389,20 @@ class Transparency(NamedTuple):
 
     @property
     def softest_nm_s_rad(self) -> float:
-        """Mean magnitude of the free impedance over the band, on logarithmic axes."""
+        """Mean impedance that the operator feels when the other site is free, in N m s/rad.
+
+        It is the mean of the logarithm of the magnitude over the band, on a logarithmic axis of
+        frequency.
+        """
         return self._average_magnitude(self.free)
 
     @property
     def stiffest_nm_s_rad(self) -> float:
-        """Mean magnitude of the clamped impedance over the band, on logarithmic axes."""
+        """Mean impedance that the operator feels when the other site is clamped, in N m s/rad.
+
+        It is the mean of the logarithm of the magnitude over the band, on a logarithmic axis of
+        frequency.
+        """
         return self._average_magnitude(self.clamped)
 
     @property
@@ -415,15 +453,19 @@ class Transparency(NamedTuple):
 
 
 def measure_transparency(loop: LinearLoop, at: str, of: str) -> tuple[Transparency, ...]:
-    """Returns the transparency along each joint of a site, with another site free and clamped.
+    """Computes what an operator at one site feels of another site, free and clamped.
 
-    The impedance is Z(j w) = 1 / Y_ii(j w) with the admittance Y of the loop. All other ports
-    are free.
+    With ideal transparency the operator would feel no impedance while the other site is free,
+    and a rigid one while it is clamped. The impedance along each joint i is Z(j w) = 1 / Y_ii(j
+    w) with the admittance Y of the loop. All other ports are free.
 
     Args:
         loop: The loop.
         at: Site of the operator.
         of: Site that is free or clamped.
+
+    Returns:
+        The transparency along each joint of the operator's site.
 
     Raises:
         UsageError: There is no such site, or both are the same.

@@ -116,12 +116,15 @@ def place_arm(site: SiteSetup, q: Numbers) -> PlacedArm | PlacedChain:
 
 
 class SiteRates(NamedTuple):
-    """Rates and torques of a site. In its derivatives, each of them has a column per argument.
+    """Rates of a site's states, and its torques and outputs, for given arguments.
+
+    The trailing axes "..." stand for several arguments. In derivatives they have one column for
+    each entry of the argument vector.
 
     Attributes:
         qdd: Joint accelerations, shape (n, ...), in rad/s^2.
-        estimate: Derivative of theta_hat, shape (P, ...).
-        tau: Torque of the control law without its limit, shape (n, ...), in N m.
+        estimate: Time derivative of the parameter estimates theta_hat, shape (P, ...).
+        tau: Torque of the control law before it is limited, shape (n, ...), in N m.
         external: Torque of operators and environments that act continuously, shape (n, ...), in
             N m.
         held: Torque of operators and environments that act once per tick and hold their torque,
@@ -233,9 +236,14 @@ def evaluate_site_rates(site: SiteSetup, x: Numbers) -> SiteRates:
 
 
 def differentiate_site_rates(site: SiteSetup, x: Array) -> SiteRates:
-    """Returns the derivatives of the rates at x by a complex step.
+    """Returns the derivatives of a site's rates with respect to its arguments.
 
-    Each derivative has a column per argument.
+    They are computed by a complex step, which is exact up to rounding. Each derivative has a
+    column per argument.
+
+    Args:
+        site: Setup of the site.
+        x: Arguments in the order of `lay_out_arguments`, shape (arguments,).
     """
     steps = 1j * COMPLEX_STEP * np.eye(len(x))
     stepped = x[:, np.newaxis] + steps
@@ -245,7 +253,13 @@ def differentiate_site_rates(site: SiteSetup, x: Array) -> SiteRates:
 
 
 def has_estimate(site: SiteSetup) -> bool:
-    """Returns True if the site's state includes an estimate, or an imported law's memory."""
+    """Returns True if a site's state includes numbers besides angles and velocities.
+
+    They are the estimates of the arm parameters, or the memory of an imported law.
+
+    Args:
+        site: Setup of the site.
+    """
     if isinstance(site.law_factory, NumericLaw):
         return len(site.law_factory.memory) > 0
     return site.gains.law is Law.ADAPTIVE
@@ -436,7 +450,10 @@ def _evaluate_model(actor: TorqueSource, position: Numbers, velocity: Numbers) -
 
 
 def describe_switching_points(site: SiteSetup, x: Array) -> Iterator[str]:
-    """Yields a sentence for each switching point at x, where the derivative is one-sided.
+    """Yields sentences on everything that makes the linear model one-sided at a state.
+
+    At a switching point, such as a limit that is just reached, a rate has different derivatives
+    on both sides.
 
     Args:
         site: Setup of the site.
