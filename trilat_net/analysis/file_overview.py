@@ -74,7 +74,9 @@ class _Messages(NamedTuple):
 
 
 class FileInventory:
-    """Content of an MCAP file, or of all files of one log.
+    """What one or several MCAP files contain, read without interpreting the messages.
+
+    MCAP is the file format of the logs. Several files are treated as the parts of one log.
 
     Args:
         paths: The files.
@@ -82,7 +84,7 @@ class FileInventory:
             number of all bytes.
 
     Attributes:
-        files: Facts of every file, with keys that end in their unit.
+        files: Size, time span and other facts of every file, with keys that end in their unit.
         metadata: Metadata records of all files, by name. A later file replaces an earlier one.
 
     Raises:
@@ -138,14 +140,14 @@ class FileInventory:
         rates_hz: Mapping[str, int],
         absences: Absences,
     ) -> dict[str, JsonObject]:
-        """Returns the facts of every channel, by topic.
+        """Returns what each channel contains, by topic, as plain values for `trilat log info`.
 
         Gaps are counted only in channels of one session, whose tick rates are known.
 
         Args:
             session: Name of the session. Empty to count no gaps.
-            rates_hz: Tick rates of the session's sites.
-            absences: Ticks during which the sites were absent.
+            rates_hz: Tick rates of the session's sites, by name.
+            absences: Ticks during which the sites were absent from the session.
         """
         topics_in_order = dict.fromkeys([*self._channel_infos, *self._messages])
         channels = {}
@@ -258,7 +260,7 @@ class FileOverview(Result):
         return self.facts
 
     def to_rows(self) -> list[JsonObject]:
-        """Returns a row of plain values for each channel."""
+        """Returns the channels of the file as a table of plain values, one row for each."""
         return [
             {"topic": topic, **channel} for topic, channel in self.facts["channels"].items()
         ]
@@ -333,10 +335,16 @@ _LAST_EPOCH_NS = 253_402_300_799 * NS_PER_S
 
 
 def describe_session(log: Log) -> JsonObject:
-    """Returns the facts of a log's session as plain values.
+    """Collects the facts about the session of a log that `trilat log info` shows.
 
-    They are the start time, the length, the ends that the sites reported, the scenario, and the
-    versions of the programs that made the log.
+    They are the start time, the length, how each site ended, the scenario, and the versions of
+    the programs that made the log.
+
+    Args:
+        log: The log.
+
+    Returns:
+        The facts as plain values, ready for JSON.
     """
     session = log.session
     scenario = log.scenario
@@ -382,9 +390,16 @@ def describe_session(log: Log) -> JsonObject:
 
 
 def describe_site_health(log: Log, site: str) -> JsonObject:
-    """Returns the facts of a site's records and of the timing of its control loop.
+    """Collects how completely a site was recorded, and how punctual its control loop was.
 
     The timing is None in virtual time, in which no clock is read.
+
+    Args:
+        log: The log of the run.
+        site: Name of the site.
+
+    Returns:
+        The facts as plain values, ready for JSON.
     """
     part = log[site]
     spec = log.scenario.sites[site]
@@ -403,11 +418,19 @@ def describe_site_health(log: Log, site: str) -> JsonObject:
 
 
 def describe_link_health(log: Log, peer: str, site: str) -> JsonObject:
-    """Returns the facts of the link from a peer to a site.
+    """Collects how well the link from a peer to a site worked.
 
-    They are the delay that the scenario states, the age of the samples in use, the measured
-    one-way delay, the offset of the clocks, and the last counts that the site published. A fact
-    that the log does not contain is None.
+    The facts are the delay that the scenario prescribes, the age of the samples in use, the
+    measured one-way delay, the offset of the clocks, and the last counts that the site
+    published. A fact that the log does not contain is None.
+
+    Args:
+        log: The log of the run.
+        peer: Name of the sender.
+        site: Name of the receiver.
+
+    Returns:
+        The facts as plain values, ready for JSON.
     """
     clock = summarise_clock(log, peer, site)
     one_way_us = np.zeros(0, dtype=np.int64)  # not measured in virtual time
@@ -441,15 +464,15 @@ def compute_percentiles(
     shares: Mapping[str, float] = PERCENTILES,
     unit: float = 1.0,
 ) -> dict[str, float] | None:
-    """Computes percentiles, by name.
+    """Computes some percentiles of a list of numbers.
 
     Args:
-        values: The values.
-        shares: Percentage of each percentile, by name.
-        unit: Unit of the result, by which the values are divided.
+        values: The numbers.
+        shares: Percentage of each percentile, by the name that the result uses.
+        unit: Number by which the values are divided, to change their unit.
 
     Returns:
-        The percentiles. None without values.
+        The percentiles, by name. None if there are no numbers.
     """
     array = np.asarray(values)
     if not array.size:
@@ -459,10 +482,16 @@ def compute_percentiles(
 
 
 def count_executed_ticks(log: Log, site: str) -> int | None:
-    """Returns the number of ticks that a site executed, according to its last event "end".
+    """Returns the number of ticks that a site executed, as the site itself reported.
+
+    The site reports it at the end of a run, in its event "end".
+
+    Args:
+        log: The log of the run.
+        site: Name of the site.
 
     Returns:
-        The number. None if the site published no such event.
+        The number in the last such event. None if the site published none.
     """
     end_ticks = [
         event.ticks for event in log.events if event.kind == "end" and event.member == site
@@ -471,7 +500,11 @@ def count_executed_ticks(log: Log, site: str) -> int | None:
 
 
 def count_overruns(part: SiteLog) -> int:
-    """Returns the number of ticks that started later than a whole tick period."""
+    """Counts the ticks that started late, by more than a whole tick period.
+
+    Args:
+        part: Log of the site.
+    """
     return int(np.count_nonzero(part.late_us >= 1e6 / part.rate_hz))
 
 
@@ -481,7 +514,7 @@ def _parse_number(text: str) -> int | None:
 
 
 def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
-    """Returns the numbers of a recorded run, for `summary.json`.
+    """Collects the key numbers of a recorded run, for the file `summary.json`.
 
     The log may be torn, short or empty. Numbers that it does not determine are None.
 
@@ -489,6 +522,9 @@ def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
         log: The log of the run.
         twin: Log of the same run without operators, from which the effect of the operators is
             computed. None if there is no such log.
+
+    Returns:
+        The numbers as plain values, ready for JSON.
     """
     sites = {site: _summarise_site(log, site, twin) for site in log.sites}
     settling_times_s = [site["settle_s"] for site in sites.values()]

@@ -132,11 +132,14 @@ class PlacedLink(NamedTuple):
 
 
 class PlacedChain:
-    """A chain in given poses. It has the same methods as the planar arm, `PlacedArm`.
+    """Dynamics of a serial arm with n joints, evaluated in given poses.
+
+    It is written from textbook formulas, independently of the simulation. The trailing axes
+    "..." stand for the poses. It has the same methods as the planar arm, `PlacedArm`.
 
     Args:
-        chain: The chain.
-        q: Joint angles, shape (n, ...), in rad or m.
+        chain: Description of the links and joints.
+        q: Joint angles, shape (n, ...), in rad, or positions of prismatic joints in m.
     """
 
     def __init__(self, chain: ChainSetup, q: Numbers) -> None:
@@ -174,9 +177,15 @@ class PlacedChain:
         return _add_axes(values, (-1,), len(self._columns))
 
     def regressor_matrix(self, qd: Numbers, v: Numbers, a: Numbers) -> Numbers:
-        """Returns the regressor Y(q, qd, v, a) of the links without drives, Eq. (12).
+        """Returns the regressor Y(q, qd, v, a) of the links, Eq. (12), shape (n, 10 n, ...).
 
-        Its shape is (n, 10 n, ...).
+        Y theta is the torque that the links require, with their parameters theta. Drives and
+        friction are not included.
+
+        Args:
+            qd: Joint velocities, shape (n, ...).
+            v: Reference velocities of the joints, shape (n, ...).
+            a: Reference accelerations of the joints, shape (n, ...).
         """
         blocks = []
         gravity = np.array([*self._chain.gravity_m_s2, 0.0, 0.0, 0.0])
@@ -213,9 +222,16 @@ class PlacedChain:
         v: Numbers,
         a: Numbers,
     ) -> Numbers:
-        """Returns M(q) a + C(q, qd) v + G(q) + friction(v), shape (n, ...), in N m.
+        """Returns the torque that a reference motion requires, shape (n, ...), in N m.
 
-        M includes the inertia of the drives.
+        It is M(q) a + C(q, qd) v + G(q) + friction(v), with the inertia matrix M including the
+        drives, the Coriolis matrix C and the gravity torque G.
+
+        Args:
+            theta: Dynamic parameters of the links, shape (10 n, ...).
+            qd: Joint velocities, shape (n, ...).
+            v: Reference velocities of the joints, shape (n, ...).
+            a: Reference accelerations of the joints, shape (n, ...).
         """
         Y = self.regressor_matrix(qd, v, a)
         links = multiply_columns(Y, theta)
@@ -509,7 +525,17 @@ def _find_quaternion(R: Numbers) -> Numbers:
 
 
 def relative_rotation_vector(other: Numbers, R: Numbers) -> Numbers:
-    """Returns Log(R other'), the rotation from another orientation to R, in base axes."""
+    """Returns the rotation from another orientation to R, as a rotation vector in base axes.
+
+    It is Log(R other'), where Log maps a rotation matrix to axis times angle.
+
+    Args:
+        other: Rotation matrix of the other orientation, shape (3, 3, ...).
+        R: Rotation matrix, shape (3, 3, ...).
+
+    Returns:
+        Rotation vector, shape (3, ...), in rad.
+    """
     rotation = np.einsum("ab...,cb...->ac...", R, other)
     return vector_from_rotation(rotation)
 
@@ -572,13 +598,21 @@ class Following(NamedTuple):
     least: float = np.inf
 
     def to_joints(self, force: Numbers) -> Numbers:
-        """Returns the joint torque J' F of a force F on the coordinates, shape (n, ...)."""
+        """Returns the joint torque J'F that corresponds to a force F, shape (n, ...).
+
+        Args:
+            force: Force on the followed coordinates, shape (m, ...).
+        """
         if self.J is None:
             return force
         return multiply_columns(_transpose(self.J), force)
 
     def from_joints(self, torque: Numbers) -> Numbers:
-        """Returns the force A^-1 J tau on the coordinates of a joint torque, shape (m, ...)."""
+        """Returns the force A^-1 J tau that corresponds to a joint torque tau, shape (m, ...).
+
+        Args:
+            torque: Joint torque, shape (n, ...), in N m.
+        """
         if self.J is None or self.A is None:
             return torque
         along_axes = multiply_columns(self.J, torque)
@@ -592,7 +626,17 @@ def follow_joints(
     q_des: Numbers,
     qd_des: Numbers,
 ) -> Following:
-    """Returns how a site follows joint by joint, Eq. (9), (10): v = -Lambda (q - q_des)."""
+    """Computes how a site follows its reference joint by joint, Eq. (9) and (10).
+
+    The reference velocity of the joints is v = -Lambda (q - q_des).
+
+    Args:
+        Lambda: Gain of the error, shape (n,), in 1/s.
+        q: Joint angles, shape (n, ...).
+        qd: Joint velocities, shape (n, ...).
+        q_des: Reference of the angles, shape (n, ...).
+        qd_des: Reference of the velocities, shape (n, ...).
+    """
     e = q - q_des
     ed = qd - qd_des
     v = -Lambda * e
@@ -608,7 +652,14 @@ def follow_joints(
 
 
 def share_pose(task: TaskSetup, arm: PlacedChain) -> Numbers:
-    """Returns the pose that a site shares: position and rotation vector, or position only."""
+    """Returns the pose of the end effector that a site sends to its peers.
+
+    It is the position in m, and the rotation vector in rad if the task includes orientation.
+
+    Args:
+        task: The task, which states whether it includes orientation.
+        arm: The arm in its pose.
+    """
     position = task.scale * arm.end_effector_position()
     if len(task.axes) == POSITION:
         return position

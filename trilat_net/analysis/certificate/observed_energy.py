@@ -51,7 +51,10 @@ class ObservedFinding(StrEnum):
 
 
 class EnergyCurve(NamedTuple):
-    """An energy over time.
+    """An energy over time that a control law declares, with its independent computation.
+
+    Some laws store energy, or keep account of the energy on the way between sites. Such an
+    energy must never be below zero.
 
     Attributes:
         kind: "line" for the energy on the way from a peer to the site, "known" for the part of
@@ -60,8 +63,8 @@ class EnergyCurve(NamedTuple):
         site: Name of the site.
         peer: Name of the site at the other end of a line. Empty for other kinds.
         t_s: Times of the site's ticks, shape (K,), in s.
-        energy_j: Sum of the energy's parts, shape (K,).
-        least_j: Smallest part, shape (K,).
+        energy_j: The energy, summed over its parts such as joints, shape (K,), in J.
+        least_j: The smallest of its parts, shape (K,), in J.
     """
 
     kind: str
@@ -97,16 +100,16 @@ class LeastEnergy(NamedTuple):
 
 
 class ObservedEnergy(NamedTuple):
-    """Verdict on the energies that control laws declare, see `observe_energies`.
+    """Verdict on the energies that control laws declare, computed by `observe_energies`.
 
     Attributes:
         finding: What the energies show.
         text: The verdict as a sentence.
-        premises: The conditions under which the energies count as evidence.
-        least: Minimum of every energy.
-        largest_j: Largest of all energies.
-        residual_j: Largest error in the books of a law.
-        sampling_j: Largest energy that an arm got beyond what its law books.
+        premises: The conditions under which the energies count as evidence, each checked.
+        least: Minimum over time of every energy.
+        largest_j: Largest of all energies, in J.
+        residual_j: Largest error in the energy account of a law, in J.
+        sampling_j: Largest energy that an arm received beyond what its law accounts for, in J.
         curves: Every energy over time, and the energies that the arms gave to their laws.
     """
 
@@ -120,7 +123,7 @@ class ObservedEnergy(NamedTuple):
     curves: Sequence[EnergyCurve] = ()
 
     def to_json(self) -> JsonObject:
-        """Returns the verdict without its curves as plain values."""
+        """Returns the verdict as plain values, ready for JSON. The curves are left out."""
         content = self._asdict()
         del content["curves"]
         content["finding"] = self.finding.name.lower()

@@ -170,14 +170,15 @@ class FunctionalFacts(NamedTuple):
 
 
 class RunFacts(NamedTuple):
-    """What a log shows about its run: the constants of the sites, and V if it exists.
+    """Everything from a log on which the checks of the stability theorem are based.
 
     V is the energy function of the stability proof.
 
     Attributes:
         log: The log of the run.
-        constants: Constants of every site, by name. Empty if V does not exist for some site.
-        functional: Facts about V. None if V cannot be computed.
+        constants: Gains and limits of every site, by name. Empty if V does not exist for some
+            site.
+        functional: What the log shows about V. None if V cannot be computed.
         unknown: The reason why V cannot be computed. Empty if it can.
     """
 
@@ -188,10 +189,13 @@ class RunFacts(NamedTuple):
 
 
 def gather_facts(log: Log) -> RunFacts:
-    """Computes everything from a log on which the checks of the premises are based.
+    """Computes from a log what the checks of the stability theorem need.
 
-    The result states a reason instead of the facts about V if V does not exist for some site,
-    or if too few records overlap to compute it.
+    The energy function V of the proof does not exist for every control law, and cannot be
+    computed if too few records overlap. The result then contains the reason.
+
+    Args:
+        log: The log of the run.
 
     Raises:
         LogError: A record names a change that is not valid.
@@ -231,9 +235,11 @@ def gather_facts(log: Log) -> RunFacts:
 
 
 def check_premises(run: RunFacts) -> list[Premise]:
-    """Checks all premises of the theorem, and that sampled walls generate no energy.
+    """Checks the conditions (premises) of the stability theorem for a run.
 
-    Without the energy function V only the premises on the laws and on the walls can be checked.
+    It also checks that virtual walls, whose force is computed once per tick, generate no
+    energy. Without the energy function V of the proof, only the premises on the control laws
+    and on the walls can be checked.
 
     Args:
         run: Facts of the run, from `gather_facts`.
@@ -769,13 +775,15 @@ def _describe_stretch(energies: Mapping[str, SiteEnergy], from_s: float, to_s: f
 
 
 def find_unjudged_spans(balance: EnergyBalance) -> list[tuple[float, float]]:
-    """Returns the spans in which V cannot be judged because records are missing.
+    """Finds the spans of time in which V cannot be judged because records are missing.
+
+    V is the energy function of the stability proof.
 
     Args:
         balance: Energy balance of all sites.
 
     Returns:
-        The (start, end) of each span, in s.
+        The (start, end) of each span, in s. Empty if V can be judged all the time.
     """
     # Judged periods before and after the run give each span a start and an end.
     padded = np.concatenate([[True], balance.judged, [True]])
@@ -801,14 +809,16 @@ def _format_by_site(values: Mapping[str, float]) -> str:
 class Evidence(NamedTuple):
     """The records on which a certificate rests, and whether they suffice.
 
+    V is the energy function of the stability proof.
+
     Attributes:
         coverage: Recorded ticks and expected ticks of every site.
-        functional_share: Share of the periods of V that rest on records, counted only while no
-            site was absent. None if V is not judged.
-        min_coverage: Least share, of the ticks and of the periods, that suffices.
+        functional_share: Fraction of the tick periods in which V rests on records, counted only
+            while no site was absent. None if V is not judged.
+        min_coverage: Least fraction, of the ticks and of the periods, that suffices.
         integrity: Whether the log is unchanged since it was written.
-        unmet: Sites that a rerun took over as recorded, so that they did not react to the
-            rerun.
+        unmet: Sites whose records were taken over unchanged when the run was repeated, so that
+            they did not react to the other sites.
     """
 
     coverage: Coverage
@@ -819,7 +829,10 @@ class Evidence(NamedTuple):
 
     @property
     def reasons(self) -> list[str]:
-        """Sentences on everything in the evidence that leaves the judgement of the run open."""
+        """Sentences on every lack of evidence that leaves the judgement of the run open.
+
+        Empty if the evidence suffices.
+        """
         reasons = []
         if not self.integrity.passed:
             reasons.append(f"the log is not as it was made: {self.integrity.text}")

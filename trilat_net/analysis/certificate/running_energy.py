@@ -65,17 +65,20 @@ _RAMP_MARGIN_S = 1.0
 
 
 class RecordWindow:
-    """The newest records of one site, in arrays of fixed size.
+    """The newest records of one site during a session, in arrays of fixed size.
+
+    When a record arrives, the oldest one is overwritten. The energy function of a running
+    session is computed from these records.
 
     Args:
-        scenario: Scenario of the session.
+        scenario: The description of the experiment.
         site: Name of the site.
         kept_s: Least time that the window reaches back, in s.
 
     Attributes:
         site: Name of the site.
-        rate_hz: Tick rate of the site.
-        peers: Names of the site's peers.
+        rate_hz: Tick rate of the site, in Hz.
+        peers: Names of the site's peers, whose states it receives.
         first: Oldest tick of the window.
         newest: Newest recorded tick. -1 before the first record.
     """
@@ -118,7 +121,10 @@ class RecordWindow:
         self._last_resting_tick = _NEVER_TICK
 
     def receive(self, record: State) -> bool:
-        """Stores a record.
+        """Stores a record in the window.
+
+        Args:
+            record: The record.
 
         Returns:
             False if the record was not stored, because it is older than the window or belongs
@@ -218,13 +224,13 @@ class RecordWindow:
 
 
 class EnergyCourse(NamedTuple):
-    """The energy function V over a span of time.
+    """The energy function V of the stability proof over a span of time.
 
     Attributes:
-        t_s: Times of the ticks of the fastest site, shape (T,), in s.
+        t_s: Times of the ticks of the site with the highest tick rate, shape (T,), in s.
         V: The energy function, shape (T,), in J.
         supplied: Work of operators and environments since the first computed time, shape (T,),
-            in J.
+            in J. V may rise only by this work.
     """
 
     t_s: Array
@@ -233,11 +239,15 @@ class EnergyCourse(NamedTuple):
 
 
 class RunningEnergy:
-    """Computes V of a running session, one span of time after the other.
+    """Computes the energy function V of the stability proof while a session runs.
+
+    V is computed for one span of time after the other, as soon as all records of a span have
+    arrived.
 
     Args:
-        scenario: Scenario of the session.
-        windows: The newest records of every site, which their owner updates during the session.
+        scenario: The description of the experiment.
+        windows: The newest records of every site, by name. Their owner updates them during the
+            session.
 
     Attributes:
         reason: The reason why V cannot be computed. Empty if it can.
@@ -255,7 +265,10 @@ class RunningEnergy:
         self._supplied = 0.0
 
     def add_changes(self, site: str, changes: Iterable[CoreChange]) -> None:
-        """Applies changes of a site's dominance factors. Other changes have no effect on V.
+        """Takes into account that a command changed a site's dominance factors.
+
+        These are the weights with which the site follows its peers. Other changes are ignored,
+        as they have no effect on V.
 
         Args:
             site: Name of the site.
@@ -267,7 +280,7 @@ class RunningEnergy:
                 ramps.append(change.ramp)
 
     def compute_next(self, complete: Mapping[str, int]) -> EnergyCourse | None:
-        """Returns V since the last call.
+        """Computes the energy function V over the time since the last call.
 
         Args:
             complete: For every site, the last tick up to which each record has arrived or is

@@ -109,10 +109,10 @@ class FunctionalRise(NamedTuple):
 
 
 class StabilityVerdict(NamedTuple):
-    """What the energy function V shows about a run, with the numbers.
+    """What the energy function V of the stability proof shows about a run.
 
     Attributes:
-        finding: The finding.
+        finding: The finding, such as that V never rose.
         text: The finding as a sentence.
         rise: The largest rise of V beyond the tolerance. None if V did not rise.
         tolerance: Size that a rise must exceed to count, in J.
@@ -181,7 +181,10 @@ class Certificate(Result):
 
     @property
     def paper_weights_rise(self) -> FunctionalRise | None:
-        """The largest rise of V with the weights of the paper. None if V does not rise."""
+        """The largest rise of V if all sites had the same weight in it, as in the paper.
+
+        None if V does not rise.
+        """
         if self.paper_balance is None:
             return None
         return _find_largest_rise(self.paper_balance, self.verdict.tolerance)
@@ -250,10 +253,10 @@ class Certificate(Result):
 
     @property
     def stability(self) -> Stability:
-        """The judgement of the run.
+        """The stability judgement of the run, as a whole.
 
-        The end of the run and its twins decide. If they say "stable" but there are `reasons`
-        against it, the run is left open.
+        The end of the run decides, together with its twins, repeated runs with a small push. If
+        they say "stable" but there are `reasons` against it, the run is left open.
         """
         stability = self._twin_verdict.stability
         if stability is Stability.STABLE and self.reasons:
@@ -266,7 +269,7 @@ class Certificate(Result):
         return self.accepts(())
 
     def headline(self) -> str:
-        """Returns the judgement and the behaviour at the end of the run, in one line."""
+        """Returns one line for people: the judgement, and how the run ended."""
         text = f"{self.stability}: {self.end.behaviour}"
         if self.stability is Stability.STABLE and self.end.stability is not Stability.STABLE:
             text += ", yet every push dies away"
@@ -304,7 +307,7 @@ class Certificate(Result):
         }
 
     def to_rows(self) -> list[JsonObject]:
-        """Returns a row of plain values for each premise."""
+        """Returns the checked conditions of the theorem as a table of plain values."""
         return [premise._asdict() for premise in self.premises]
 
     def accepts(self, accepted: Collection[str]) -> bool:
