@@ -61,7 +61,10 @@ _LARGEST_RISE_FROM_ZERO = math.log(8.0 / 5.0)
 
 
 class EnvelopeTrend(StrEnum):
-    """Trend of an envelope at the end of a run. The value is the text for people."""
+    """Trend of an envelope, the bound of an oscillation, at the end of a run.
+
+    The value of each member is the text for people.
+    """
 
     DECAYS = "decays"
     HARDLY = "hardly decays"
@@ -90,14 +93,14 @@ class EnvelopeFit(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The trend as a verb."""
+        """The trend as a verb for people, such as "grows"."""
         if self.trend is EnvelopeTrend.UNDECIDED:
             return "shows no trend"
         return self.trend.value
 
     @property
     def rate_text(self) -> str:
-        """The rate of an envelope that grows or decays, otherwise the trend as a verb."""
+        """The trend for people: its rate if the envelope grows or decays, otherwise a verb."""
         if self.trend in (EnvelopeTrend.STEADY, EnvelopeTrend.UNDECIDED):
             return self.text
         return f"{self.rate_per_s:+.3g}/s"

@@ -385,21 +385,23 @@ def summarise_clock(log: Log, peer: str, site: str) -> ClockSummary | None:
 
 
 class SampleCounts(NamedTuple):
-    """Numbers of samples of a link, according to the receiver's records.
+    """Numbers of samples of a link, counted from the receiver's records.
 
-    docs/definitions.md defines them under `samples.*`.
+    A sample is the state that a site publishes in one tick. docs/definitions.md defines the
+    numbers under `samples.*`.
 
     Attributes:
         sent: Samples that the peer sent.
-        judged: Samples of which it is known whether they arrived.
+        judged: Samples of which the log shows whether they arrived.
         arrived: Samples that arrived, each counted once.
         missing: Judged samples that did not arrive.
-        lost: Samples that arrived, but that the emulated network loses.
+        lost: Samples that arrived, but that the emulated network loses, so that they were not
+            used.
         late: Samples that arrived after the tick in which they should have come into use.
         superseded: Samples that came too late to be used, because a newer sample was in use.
         duplicate: Further arrivals of samples that had arrived before.
         copies: Duplicates that the emulated network makes.
-        refused: Arrivals whose time stamp is out of range.
+        refused: Arrivals that the receiver rejected, because their time stamp is out of range.
     """
 
     sent: int

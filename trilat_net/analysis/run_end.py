@@ -88,7 +88,7 @@ MIN_SIGN_CHANGES = 6
 
 
 class Stability(StrEnum):
-    """The judgement of a run. The value is the word for people."""
+    """The stability judgement of a run. The value of each member is the word for people."""
 
     STABLE = "stable"
     NOT_STABLE = "not stable"

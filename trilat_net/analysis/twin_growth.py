@@ -372,7 +372,9 @@ def measure_twins(
     *,
     own_laws: bool = False,
 ) -> TwinGrowth:
-    """Repeats a recorded run with small pushes, and returns how the pushes develop.
+    """Repeats a recorded run with small pushes, and judges whether the pushes grow.
+
+    Each repetition with a push is called a twin.
 
     Args:
         log: The log of the run.
@@ -381,7 +383,8 @@ def measure_twins(
         own_laws: True to run the code of control laws that are not part of this program.
 
     Returns:
-        The growth of the pushes. Without pushes if the run cannot be repeated, with the reason.
+        The growth of the pushes. If the run cannot be repeated, the result contains no pushes,
+        and the reason.
 
     Raises:
         LogError: A record cannot be read.
@@ -399,12 +402,13 @@ def measure_virtual_twins(
     duration_s: float,
     count: int,
 ) -> TwinGrowth:
-    """Simulates a scenario with small pushes, and returns how the pushes develop.
+    """Simulates a scenario with small pushes, and judges whether the pushes grow.
 
-    This needs no log: the run and its twins are executed in virtual time.
+    This needs no log: the run and its repetitions with a push, the twins, are executed in
+    virtual time.
 
     Args:
-        scenario: Scenario of the run.
+        scenario: The description of the experiment.
         end: The end of the run, which states from when on the run is judged.
         duration_s: Length of the run, in s.
         count: Number of twins.
@@ -692,12 +696,14 @@ class LinearSizes(NamedTuple):
 class PushedTwins(Result):
     """Result of `trilat twin`: how pushes at a given time of a recorded run develop.
 
+    A push is a small disturbance in a repetition of the run, called a twin.
+
     Attributes:
         log: The log of the run.
         at_s: Time of the pushes, in s.
         growth: Growth of the pushes.
-        linear: Sizes for which the effect of a push is proportional to its size. None if the
-            user did not ask for several sizes.
+        linear: Range of sizes for which the effect of a push is proportional to its size. None
+            if the user did not ask for several sizes.
     """
 
     log: Log

@@ -198,11 +198,18 @@ def compute_references(conditions: OperatingConditions, rest: Equilibrium) -> li
 def differentiate_references(
     conditions: OperatingConditions, rest: Equilibrium
 ) -> dict[tuple[int, int], Array]:
-    """Returns the derivatives of the references with respect to the shared poses.
+    """Computes how the references of the sites depend on the poses that the sites share.
 
-    The derivative for (i, j) is that of site i's reference with respect to site j's pose, shape
-    (m, m). For positions it is alpha_ij times the unit matrix. A reference with an orientation
-    depends on the site's own pose too, as (i, i).
+    For positions the derivative is the dominance factor alpha_ij times the unit matrix. A
+    reference with an orientation depends on the site's own pose too, as (i, i).
+
+    Args:
+        conditions: The sites, gains and delays of the loop.
+        rest: The equilibrium.
+
+    Returns:
+        By (i, j), the derivative of site i's reference with respect to site j's pose, shape (m,
+        m).
     """
     derivatives = {}
     poses = compute_shared_poses(conditions, rest)
@@ -291,10 +298,12 @@ def differentiate_rates(
     *,
     all_estimates: bool = False,
 ) -> list[SiteJacobian]:
-    """Returns the derivatives of each site's rates at an equilibrium, without its peers.
+    """Builds the linear model of each site at an equilibrium, without its peers.
+
+    It consists of the derivatives of the site's rates with respect to its states and inputs.
 
     Args:
-        conditions: The numbers of the loop.
+        conditions: The sites, gains and delays of the loop.
         rest: The equilibrium.
         all_estimates: True to keep each estimate of a chain as a state, instead of only the
             learnt gravity torques.

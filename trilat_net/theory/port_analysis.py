@@ -253,7 +253,10 @@ def analyse_ports(
     band_hz: tuple[float, float] = (frequency_search.LOW_HZ, frequency_search.HIGH_HZ),
     hands: Sequence[HandMatrices] = (),
 ) -> PortAnalysis:
-    """Analyses the ports of a scenario at an equilibrium, over a band of frequencies.
+    """Analyses what operators feel at the joints of a teleoperator, and whether it is passive.
+
+    The arms are linearised at an equilibrium. The joints at which operators act are the ports.
+    Their response is computed over a band of frequencies.
 
     Args:
         scenario: The teleoperator.

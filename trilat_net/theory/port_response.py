@@ -127,15 +127,20 @@ def evaluate_transfer(
     s: Complex,
     output: LoopOutput | None = None,
 ) -> Complex:
-    """Returns the transfer function from torques to an output, shape (F, p, m).
+    """Computes the response of a loop to torques at complex frequencies.
 
-    The function is C(s) (s E - A - sum_k A_k e^{-s T_k})^{-1} (B + sum_k B_k e^{-s T_k}).
+    The transfer function is C(s) (s E - A - sum_k A_k e^{-s T_k})^{-1} (B + sum_k B_k e^{-s
+    T_k}), with the matrices of `LinearLoop`, and A_k and B_k those of the terms with the delay
+    T_k.
 
     Args:
         loop: The loop.
         s: Complex frequencies, shape (F,), in 1/s.
         output: The output C(s). None for the joint velocities, so that the result is the
             admittance Y(s), in rad/s per N m.
+
+    Returns:
+        The response, shape (F, p, m), with a row for each output and a column for each torque.
     """
     output = LoopOutput(loop.C) if output is None else output
     outputs = len(output.C)
@@ -215,7 +220,14 @@ def parse_port_joint(port: str) -> int:
 
 
 def group_ports_by_joint(loop: LinearLoop) -> dict[int, list[int]]:
-    """Returns the ports of each joint, by its number, in the order of the sites."""
+    """Groups the ports of a loop by the number of their joint, in the order of the sites.
+
+    Args:
+        loop: The loop.
+
+    Returns:
+        Indices of the ports, by the number of the joint.
+    """
     ports: dict[int, list[int]] = {}
     for port, name in enumerate(loop.inputs):
         joint = parse_port_joint(name)

@@ -90,9 +90,12 @@ class ArgumentLayout:
 
 
 def lay_out_arguments(site: SiteSetup) -> ArgumentLayout:
-    """Returns the layout of the arguments of a site's rates.
+    """Returns the positions of states and inputs in the argument vector of a site's rates.
 
-    The memory of an imported law takes the position of the estimate.
+    The memory of an imported law takes the position of the parameter estimate.
+
+    Args:
+        site: Setup of the site.
     """
     layout = site.layout
     if isinstance(site.law_factory, NumericLaw):
@@ -109,7 +112,12 @@ def lay_out_arguments(site: SiteSetup) -> ArgumentLayout:
 
 
 def place_arm(site: SiteSetup, q: Numbers) -> PlacedArm | PlacedChain:
-    """Returns the arm of a site in the poses q, shape (n, ...)."""
+    """Returns the model of a site's arm in given poses.
+
+    Args:
+        site: Setup of the site.
+        q: Joint angles, shape (n, ...), in rad.
+    """
     if site.chain is None:
         return PlacedArm(site.g_m_s2, site.lengths_m, q)
     return PlacedChain(site.chain, q)
@@ -193,9 +201,10 @@ def compute_shared_pose(site: SiteSetup, q: Numbers) -> Numbers:
 
 
 def evaluate_site_rates(site: SiteSetup, x: Numbers) -> SiteRates:
-    """Returns the rates of a site with the operators and environments in force.
+    """Computes how fast the states of a site change, with operators and environments in force.
 
-    The rates are Eq. (8)-(13) and (15) of the paper, or those of a law with known gravity.
+    The rates are those of Eq. (8)-(13) and (15) of the paper, or those of a law with known
+    gravity.
 
     Args:
         site: Setup of the site.

@@ -267,9 +267,15 @@ class PlacedChain:
         return M
 
     def joint_acceleration(self, theta: Numbers, qd: Numbers, torque: Numbers) -> Numbers:
-        """Returns the joint accelerations qdd under a torque, shape (n, ...).
+        """Returns the joint accelerations under a torque, shape (n, ...).
 
-        They solve M qdd + C qd + G + friction = torque + stops, Eq. (8).
+        The accelerations qdd solve the equation of motion M qdd + C qd + G + friction = torque
+        + stops, Eq. (8), where "stops" is the torque of the mechanical stops.
+
+        Args:
+            theta: Dynamic parameters of the links, shape (10 n, ...).
+            qd: Joint velocities, shape (n, ...).
+            torque: Torque of controller, operator and environment, shape (n, ...), in N m.
         """
         bias = self.required_torque(theta, qd, qd, np.zeros_like(qd))
         applied = torque + self._compute_stop_torque(qd)
@@ -322,10 +328,15 @@ class PlacedChain:
         return self._move_to_tip(self._links[-1].J)
 
     def pose_jacobian_rate(self, qd: Numbers) -> Numbers:
-        """Returns the time derivative of the pose Jacobian along qd, shape (6, n, ...).
+        """Returns the time derivative of the pose Jacobian along a motion, shape (6, n, ...).
 
         In the frame of the last link, the derivative of column k is X (V_k x S_k) - V x (X
-        S_k). The rotation of the frame adds to it.
+        S_k). V_k is the velocity of link k, S_k the axis of its joint, X the transformation
+        into the last link's frame, and V the velocity of the last link. The rotation of the
+        frame adds to it.
+
+        Args:
+            qd: Joint velocities, shape (n, ...).
         """
         last = self._links[-1]
         V_last = multiply_columns(last.J, qd)

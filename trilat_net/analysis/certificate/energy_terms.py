@@ -212,12 +212,13 @@ class SiteMotion:
 
     Attributes:
         records: Records of the site.
-        constants: Constants of the site.
-        dominance: Dominance factors of its peers.
-        peers: The motion of the peers as the site sees them, in the order of the dominance
+        constants: Gains and limits of the site, and its arm.
+        dominance: Dominance factors, the weights with which the site follows its peers.
+        peers: The motion of the peers as the site receives them, in the order of the dominance
             factors.
         torque: External torque on the arm, by source.
-        scheme: Whether the controller holds the torque for a tick, or extrapolates it.
+        scheme: Whether the controller holds the torque of a tick until the next tick, or
+            extrapolates it.
         common: For each coordinate, 1 if all sites follow along it, else 0. Empty if all sites
             follow along all coordinates.
     """
@@ -449,12 +450,14 @@ class SiteMotion:
 
 
 class FunctionalParts(NamedTuple):
-    """The four parts of V_i in the order of the module's docstring, shape (K,) each, in J.
+    """The four parts of a site's energy function V_i, shape (K,) each, in J.
+
+    They are the four terms of the equation in the module's docstring, in its order.
 
     Attributes:
-        kinetic: Energy of r.
-        parameter: Energy of the errors of the estimates.
-        position: Energy of the error e.
+        kinetic: Kinetic energy of the filtered error, 1/2 r'M r.
+        parameter: Energy of the errors of the parameter estimates.
+        position: Energy of the synchronisation error e.
         delay: Energy of the peers' motion that is under way on the links.
     """
 

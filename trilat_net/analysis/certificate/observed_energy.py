@@ -42,7 +42,10 @@ SAMPLING_SHARE = 1e-2
 
 
 class ObservedFinding(StrEnum):
-    """What the declared energies show about a run. The value is the text for people."""
+    """What the energies that control laws declare show about a run.
+
+    The value of each member is the text for people.
+    """
 
     PASSIVE = "observed energy never below zero"
     NEGATIVE = "observed energy below zero"

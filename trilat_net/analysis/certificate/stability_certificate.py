@@ -82,7 +82,10 @@ _REFUTING_FINDINGS = (ObservedFinding.NEGATIVE, ObservedFinding.BROKEN)
 
 
 class StabilityFinding(StrEnum):
-    """What the energy function V shows about a run. The value is the text for people."""
+    """What the energy function V of the stability proof shows about a run.
+
+    The value of each member is the text for people.
+    """
 
     COVERED = "covered by the theorem"
     DID_NOT_RISE = "outside the theorem, yet V did not rise"

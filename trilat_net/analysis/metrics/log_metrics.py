@@ -473,7 +473,7 @@ class ComparisonRow(NamedTuple):
 
 
 class MetricComparison(NamedTuple):
-    """Metrics of several runs, side by side.
+    """Metrics of several runs, side by side, as a table.
 
     Attributes:
         columns: Names of the runs.
@@ -494,7 +494,7 @@ class MetricComparison(NamedTuple):
 
 
 def compare_metrics(logs: Sequence[Log], names: Sequence[str] = ()) -> MetricComparison:
-    """Computes the metrics of several logs, side by side.
+    """Computes the metrics of several logs, so that they can be shown in one table.
 
     Args:
         logs: The logs, which may be torn, short or empty.
