@@ -194,7 +194,7 @@ def find_user_shares(scenario: Scenario, alpha: Array, program: str = "") -> Use
 def find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:
     """Finds the times at which a site continued without a peer that it had lost.
 
-    A peer is lost if it leaves the session or stays silent, see `core.lost_peers`.
+    A peer is lost if nothing was heard of it for some time, see `core.lost_peers`.
 
     Args:
         log: The log of the run.

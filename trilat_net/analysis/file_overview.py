@@ -74,7 +74,7 @@ class _Messages(NamedTuple):
 
 
 class FileInventory:
-    """What one or several MCAP files contain, read without interpreting the messages.
+    """What one or several MCAP files contain, apart from the meaning of their messages.
 
     MCAP is the file format of the logs. Several files are treated as the parts of one log.
 
@@ -84,7 +84,8 @@ class FileInventory:
             number of all bytes.
 
     Attributes:
-        files: Size, time span and other facts of every file, with keys that end in their unit.
+        files: Size, compression, damage and other facts of every file, with keys that end in
+            their unit.
         metadata: Metadata records of all files, by name. A later file replaces an earlier one.
 
     Raises:

@@ -79,7 +79,7 @@ class PredictedDelivery(NamedTuple):
     def release(self, rate_hz: int) -> Ints:
         """Computes the ticks of the receiver in which the samples should come into use.
 
-        A sample that arrives too late comes into use in a later tick, or never.
+        A sample comes into use in this tick only if it has arrived by then.
 
         Args:
             rate_hz: Tick rate of the receiver, in Hz.

@@ -97,8 +97,8 @@ class PushGrowth(NamedTuple):
             to the rounding errors.
         joint: Name of the joint at which the difference is largest at the end.
         group: Index of the group of sites.
-        becomes_rad_s: Largest difference in the last second, in rad/s, converted back to the
-            size of the push.
+        becomes_rad_s: Largest difference in the last second, in rad/s, with all scalings of
+            the difference undone.
         ended_s: Time at which the twin ended before the run, in s, because the difference died
             down to the rounding errors or the twin diverged. None if the twin did not end
             early.

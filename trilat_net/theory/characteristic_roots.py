@@ -285,8 +285,8 @@ class CharacteristicRoot(NamedTuple):
 class Spectrum(NamedTuple):
     """The rightmost characteristic roots of a loop, which decide its stability.
 
-    A root is zero by structure if it is zero for every value of the gains, because all arms can
-    rest in other poses too, or because nothing excites an estimate.
+    Some roots are zero by structure, because all arms can rest in other poses too, or because
+    nothing excites an estimate. They say nothing about stability.
 
     Attributes:
         roots: The rightmost roots that are not zero by structure, by falling real part.

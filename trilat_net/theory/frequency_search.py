@@ -199,14 +199,17 @@ def find_minima(
     level: float = 0.0,
     tolerance: FrequencyCurve | None = None,
 ) -> Minima:
-    """Returns a curve with its minima resolved, and the bands in which it is below a level.
+    """Evaluates a curve over frequency, with more points near its minima.
+
+    The bands in which the curve is below a level are found as well.
 
     Args:
-        curve: The curve.
+        curve: The curve, as a function of frequency.
         w_rad_s: First frequencies, rising, shape (F,), in rad/s.
         level: The level.
-        tolerance: Rounding error of the curve. The curve must be below the level by more than
-            this error, and so must a minimum be below its neighbours. None for zero.
+        tolerance: Rounding error of the curve, as a function of frequency. The curve must be
+            below the level by more than this error, and so must a minimum be below its
+            neighbours. None for zero.
     """
 
     def find_rounding(w: Array) -> Array:

@@ -149,10 +149,10 @@ def compute_proof_weights(conditions: OperatingConditions) -> Array:
 
 
 class TwoPort(NamedTuple):
-    """Llewellyn's criterion for one joint of two sites: are they stable with any operators?
+    """Llewellyn's criterion of absolute stability for one joint of two sites.
 
-    The criterion of absolute stability says whether a passive operator or environment at each
-    of the two joints can make the loop unstable. No operator acts at the other joints.
+    The criterion says whether the loop is stable with every passive operator or environment at
+    each of the two joints. No operator acts at the other joints.
 
     Attributes:
         sites: The two sites.

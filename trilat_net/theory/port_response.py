@@ -91,9 +91,10 @@ def _evaluate_shift(s: Complex, delay_s: float) -> Complex:
 
 
 class PoleAtZero(NamedTuple):
-    """Behaviour of the response Y(s) at zero frequency: does a constant torque accelerate it?
+    """The pole of a loop's response Y(s) at zero frequency, if there is one.
 
-    Near s = 0 the response is Y(s) ~ residue / s + higher powers of 1 / s.
+    With a pole, a constant torque makes the velocity grow. Near s = 0 the response is Y(s) ~
+    residue / s + higher powers of 1 / s.
 
     Attributes:
         order: Highest power of 1 / s. With 0 there is no pole, and the velocity under a
@@ -190,7 +191,11 @@ def to_imaginary_axis(w_rad_s: Array) -> Complex:
 
 
 def parse_port_site(port: str) -> str:
-    """Returns the site of a port or a state, such as "m1" of "m1.tau2"."""
+    """Returns the name of the site to which a port or a state belongs.
+
+    Args:
+        port: Name of the port or state. For "m1.tau2" the site is "m1".
+    """
     return port.partition(".")[0]
 
 
@@ -215,7 +220,11 @@ def find_site_ports(loop: LinearLoop, site: str) -> list[int]:
 
 
 def parse_port_joint(port: str) -> int:
-    """Returns the number of a port's joint, such as 2 of "m1.tau2"."""
+    """Returns the number of the joint to which a port belongs.
+
+    Args:
+        port: Name of the port. For "m1.tau2" the number is 2.
+    """
     return int(port.rpartition("tau")[2])
 
 

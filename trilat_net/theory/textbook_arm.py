@@ -113,15 +113,19 @@ def _add_axes(values: Numbers, shape: tuple[int, ...], count: int) -> Numbers:
 
 
 class PlacedLink(NamedTuple):
-    """A link of a chain in some poses.
+    """Position and velocity map of one link of a chain, in some poses.
+
+    The trailing axes "..." stand for the poses. A spatial velocity has a linear half and an
+    angular half.
 
     Attributes:
         X: Transformation of spatial velocities from the frame of the link before into this
             link's frame, shape (6, 6, ...).
-        S: Spatial velocity of its joint at speed 1, shape (6,).
-        J: Jacobian of the link, shape (6, n, ...).
-        R_base: Orientation in the base, shape (3, 3, ...).
-        place_m: Origin in the base, shape (3, ...), in m.
+        S: Spatial velocity of the link's joint at speed 1, shape (6,).
+        J: Jacobian of the link, from joint velocities to its spatial velocity, shape (6, n,
+            ...).
+        R_base: Orientation of the link in the base, shape (3, 3, ...).
+        place_m: Origin of the link's frame in the base, shape (3, ...), in m.
     """
 
     X: Numbers
@@ -241,7 +245,14 @@ class PlacedChain:
         return torque
 
     def friction_torque(self, v: Numbers) -> Numbers:
-        """Returns the torque of the joints' friction at speeds v, shape (n, ...), in N m."""
+        """Returns the torque of the joints' friction, which opposes a motion, in N m.
+
+        Args:
+            v: Joint velocities, shape (n, ...).
+
+        Returns:
+            Torque, shape (n, ...), with the sign of the velocity.
+        """
         viscous = self._get_per_joint("viscous") * v
         # a smooth sign of the speed
         x = v / COULOMB_SPEED
@@ -250,12 +261,20 @@ class PlacedChain:
         return viscous + coulomb
 
     def gravity_torque(self, theta: Numbers) -> Numbers:
-        """Returns the gravity torque G(q), shape (n, ...), in N m."""
+        """Returns the torque G(q) that holds the chain against gravity, shape (n, ...), in N m.
+
+        Args:
+            theta: Dynamic parameters of the links, shape (10 n, ...).
+        """
         zeros = np.zeros_like(self._q)
         return self.required_torque(theta, zeros, zeros, zeros)
 
     def inertia_matrix(self, theta: Numbers) -> Numbers:
-        """Returns the inertia matrix M(q) with the drives' inertia, shape (n, n, ...)."""
+        """Returns the inertia matrix M(q), including the drives, shape (n, n, ...).
+
+        Args:
+            theta: Dynamic parameters of the links, shape (10 n, ...).
+        """
         armatures = [joint.armature_kg_m2 for joint in self._chain.joints]
         M = _repeat_columns(np.diag(armatures), self._columns)
         for i, link in enumerate(self._links):

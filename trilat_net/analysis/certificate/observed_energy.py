@@ -54,10 +54,9 @@ class ObservedFinding(StrEnum):
 
 
 class EnergyCurve(NamedTuple):
-    """An energy over time that a control law declares, with its independent computation.
+    """An energy over time, of a kind that a control law declares.
 
-    Some laws store energy, or keep account of the energy on the way between sites. Such an
-    energy must never be below zero.
+    Some laws store energy, or keep account of the energy on the way between sites.
 
     Attributes:
         kind: "line" for the energy on the way from a peer to the site, "known" for the part of
@@ -66,8 +65,9 @@ class EnergyCurve(NamedTuple):
         site: Name of the site.
         peer: Name of the site at the other end of a line. Empty for other kinds.
         t_s: Times of the site's ticks, shape (K,), in s.
-        energy_j: The energy, summed over its parts such as joints, shape (K,), in J.
-        least_j: The smallest of its parts, shape (K,), in J.
+        energy_j: The energy, summed over its parts, shape (K,), in J.
+        least_j: The smallest of the parts, shape (K,), in J. For "taken" it is the energy less
+            its largest earlier value, as a dissipated energy must not fall.
     """
 
     kind: str

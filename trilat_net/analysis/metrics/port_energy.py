@@ -94,11 +94,18 @@ def held_control_torque(records: AlignedRecords, scenario: Scenario) -> Array:
 
 
 def mechanical_energy(arm: ArmRows, records: AlignedRecords) -> Array:
-    """Returns the kinetic and potential energy of an arm at every record, shape (K,), in J.
+    """Computes the kinetic and potential energy of an arm at every record, in J.
 
     For the planar arm the energy is 1/2 qd'M qd + g (theta_4 sin q_1 + theta_5 sin(q_1 + q_2)),
-    with the inertia matrix M, the gravity g and the parameters theta. The potential energy is
-    zero when the arm is level.
+    with the inertia matrix M, the gravitational acceleration g and the parameters theta. The
+    potential energy is zero when the arm is level.
+
+    Args:
+        arm: The arm.
+        records: Records of the site that runs the arm.
+
+    Returns:
+        Energy, shape (K,).
     """
     momentum = arm.multiply_inertia(records.q, records.qd)
     qd_M_qd = np.einsum("kj,kj->k", records.qd, momentum)
