@@ -221,7 +221,14 @@ def find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:
 
 
 def list_losses(log: Log) -> list[str]:
-    """Returns a sentence for each span of time in which a site continued without a peer."""
+    """Describes when sites continued without a peer that they no longer heard.
+
+    Args:
+        log: The log of the run.
+
+    Returns:
+        A sentence for each span of time. Empty if no peer was lost.
+    """
     sentences = []
     for site in log.sites:
         part = log[site]
@@ -243,11 +250,17 @@ def list_losses(log: Log) -> list[str]:
 
 
 def list_scripted_ramps(scenario: Scenario, site: str) -> tuple[Array, list[DominanceRamp]]:
-    """Returns the dominance factors of a site at the start, and their changes in the scenario.
+    """Lists how the scenario plans to change the dominance factors of a site.
+
+    They are the weights with which the site follows its P peers.
+
+    Args:
+        scenario: The description of the experiment.
+        site: Name of the site.
 
     Returns:
         The factors at the start, shape (P,).
-        The ramps.
+        The planned changes, each a ramp from the old to the new factors.
     """
     factors = scenario.dominance[site]
     peers = scenario.peers(site)

@@ -127,7 +127,13 @@ def sample_ages_ms(log: Log, site: str) -> Array:
 
 
 def sites_with_operator(log: Log) -> list[str]:
-    """Lists the sites with operators in the scenario, or with recorded external torques."""
+    """Lists the sites at which somebody may act on the arm.
+
+    They have an operator in the scenario, or recorded external torques.
+
+    Args:
+        log: The log of the run.
+    """
     sites = []
     for site in log.sites:
         has_hands = bool(log.scenario.sites[site].hands)

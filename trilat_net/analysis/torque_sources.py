@@ -214,8 +214,8 @@ def compute_live_torque(
     """Computes the torque of an operator who acts live, on a web page or with a device.
 
     The operator's recorded action is a target to which a spring and a damper pull the arm, or a
-    force. The pull is reduced to the limit of the operator, and multiplied by the firmness of the
-    grip.
+    force. The pull is reduced to the limit of the operator, and multiplied by the firmness of
+    the grip.
 
     Args:
         source: The operator.

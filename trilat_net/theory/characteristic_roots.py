@@ -531,7 +531,13 @@ def refine_roots(
 
 
 def find_moving_part(loop: LinearLoop) -> MovingPart:
-    """Returns the matrices of a loop without idle states, see `MovingPart`."""
+    """Returns the matrices of a loop without the states that are constant or act on no other.
+
+    `MovingPart` explains why these states can be left out.
+
+    Args:
+        loop: The loop.
+    """
     delayed_matrices = np.array([term.A for term in loop.delayed])
     # without delays, an empty array of the right shape
     Ad = delayed_matrices.reshape(-1, *loop.A.shape)

@@ -259,7 +259,11 @@ def _describe_laws(scenario: Scenario) -> list[str]:
 
 
 def is_constant_link(link: LinkBase) -> bool:
-    """Returns True if a link delays every sample by the same time and loses none."""
+    """Returns True if a link delays every sample by the same time and loses none.
+
+    Args:
+        link: Delay model of the link, from the scenario.
+    """
     has_constant_model = link.to_core_model().kind == DelayKind.CONSTANT
     return has_constant_model and not link.loss and not link.measured
 

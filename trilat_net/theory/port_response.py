@@ -166,11 +166,14 @@ def evaluate_transfer(
 
 
 def build_admittance(loop: LinearLoop) -> PortResponse:
-    """Returns the admittance Y(j w) as a function of w.
+    """Returns the admittance Y(j w) of a loop as a function of the frequency w in rad/s.
 
     The admittance is the velocity of each joint per torque of an operator at each joint, in
-    rad/s per N m. The loop's outputs must be the velocities of the joints of its inputs, in
-    order.
+    rad/s per N m.
+
+    Args:
+        loop: The loop. Its outputs must be the velocities of the joints of its inputs, in
+            order.
     """
     velocities = loop.C.shape[0]
     torques = loop.B.shape[1]
@@ -207,7 +210,14 @@ def list_port_sites(loop: LinearLoop) -> tuple[str, ...]:
 
 
 def find_site_ports(loop: LinearLoop, site: str) -> list[int]:
-    """Returns the indices of a site's joints among the ports.
+    """Finds the ports of a site, the joints at which its operator acts.
+
+    Args:
+        loop: The loop.
+        site: Name of the site.
+
+    Returns:
+        Indices of the ports in the loop's inputs.
 
     Raises:
         UsageError: The loop has no such site.

@@ -145,7 +145,14 @@ def rms(values: ArrayLike) -> float:
 
 
 def peak(values: ArrayLike) -> float:
-    """Returns the largest absolute value. NaN without values."""
+    """Returns the largest absolute value of some numbers.
+
+    Args:
+        values: The numbers, of any shape.
+
+    Returns:
+        The largest absolute value. NaN if there are no numbers.
+    """
     array = np.asarray(values, dtype=np.float64)
     return float(np.abs(array).max()) if array.size else math.nan
 

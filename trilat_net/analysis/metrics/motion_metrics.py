@@ -109,11 +109,14 @@ def measure_tracking(view: RunView, site: str) -> MetricValues:
 
 @measures("run", SPREAD, *list_shared_quantities(_SPREADS))
 def measure_spread(view: RunView, _run: str) -> MetricValues:
-    """Returns the spread of a run: the largest difference of a joint angle between two sites.
+    """Measures the spread of a run: how far the sites are apart at the same instant.
 
-    The sites are compared at the same instant. In task space the positions of end effectors are
-    compared instead, along the axes that all sites follow. The instants are the ticks of the
-    first site at which every other site has a record of its latest tick.
+    It is the largest difference of a joint angle between two sites. In task space the positions
+    of end effectors are compared instead, along the axes that all sites follow. The instants
+    are the ticks of the first site at which every other site has a record of its latest tick.
+
+    Args:
+        view: The run.
     """
     log = view.log
     if view.absent:
@@ -152,11 +155,16 @@ def measure_spread(view: RunView, _run: str) -> MetricValues:
 
 @measures("link", FOLLOWING, *list_shared_quantities(_LAGS))
 def measure_following(view: RunView, link: str) -> MetricValues:
-    """Returns q_m(t - T) - q_s: how far a slave is from the delayed motion of its master.
+    """Measures how far a slave is from the delayed motion of its master.
 
-    T is the age of the sample in use. At every tick of the slave from its first sample of that
+    The distance is q_m(t - T) - q_s, where T is the age of the sample in use, the state of the
+    master that the slave has received. At every tick of the slave from its first sample of that
     master on, the slave's angles q_s are compared with the angles q_m in the master's record of
     that sample. In task space the poses of the end effectors are compared.
+
+    Args:
+        view: The run.
+        link: Name of the link from the master to the slave, such as "m1->s".
     """
     peer = view.links[link].peer
     site = view.links[link].site
@@ -246,11 +254,15 @@ def measure_effort(view: RunView, site: str) -> MetricValues:
     Quantity("end_hits", "hits, last 5 s", "", "sum"),
 )
 def measure_wall_contact(view: RunView, name: str) -> MetricValues:
-    """Returns force, hits and depth of the contact with a wall.
+    """Measures the contact of an end effector with a virtual wall: force, hits and depth.
 
     The numbers are given for the whole run and for its last 5 s. A contact in the first record,
     or in the first record after a gap, is not counted as a hit, because its beginning is
     unknown.
+
+    Args:
+        view: The run.
+        name: Name of the wall, such as "s/1" for the first wall of site s.
     """
     site, wall = view.walls[name]
     run = view.sites.get(site)
@@ -374,7 +386,14 @@ def read_parameter_estimates(scenario: Scenario, records: AlignedRecords) -> Par
 
 
 def read_all_estimates(view: RunView) -> dict[str, ParameterEstimates]:
-    """Returns the parameter estimates of every site with records, by name."""
+    """Reads the parameter estimates of all sites at the start and at the end of a run.
+
+    Args:
+        view: The run.
+
+    Returns:
+        The estimates, by name of the site. Sites without records are missing.
+    """
     return {
         site: read_parameter_estimates(view.scenario, run.records)
         for site, run in view.sites.items()
