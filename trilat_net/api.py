@@ -83,8 +83,8 @@ def simulate(
     Args:
         scenario: The scenario, which describes the experiment: the name of a shipped scenario,
             a path, a TOML text, its tables, or a `Scenario`.
-        set: Settings that replace those of the scenario ("overrides"), as in `{"control.Kd":
-            5}` or `["control.Kd=5"]`.
+        set: Settings that replace those of the scenario ("overrides"), as in
+            `{"control.Kd": 5}` or `["control.Kd=5"]`.
         duration_s: Duration of the run, in s. By default that of the scenario.
         seed: Seed of the random delays and losses of messages. By default that of the scenario.
 
@@ -344,8 +344,9 @@ def sweep(
     Args:
         scenario: The scenario, which describes the experiment: the name of a shipped scenario,
             a path, a TOML text, its tables, or a `Scenario`.
-        over: Axes of the grid: lists or arrays of values by key, as in `{"link.delay_ms":
-            range(0, 1601, 50)}`, or texts, as in `["link.delay_ms=0:1600:50"]`.
+        over: Axes of the grid: lists or arrays of values by key, as in
+            `{"link.delay_ms": range(0, 1601, 50)}`, or texts, as in
+            `["link.delay_ms=0:1600:50"]`.
         set: Settings that replace those of the scenario in all cells of the grid, as in
             `{"control.Kd": 5}`.
         seeds: Number of seeds of random delays and losses, or the seeds. Each cell, a point of
