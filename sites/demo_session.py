@@ -256,7 +256,8 @@ class ProcessStarter:
     def close(self) -> None:
         """Ends the starter, the process that starts all other processes of the session.
 
-        All other processes must have ended before.
+        The method must be called after all other processes have ended, because nobody could
+        start or signal processes any more.
         """
         self._pipe.close()
         self._starter.send_signal(signal.SIGINT)

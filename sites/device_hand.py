@@ -94,7 +94,10 @@ class DeviceHand:
         self.release()
 
     def release(self) -> None:
-        """Releases the arm until the clutch, a button of the device, is pressed again."""
+        """Releases the arm, so that the motion of the device no longer moves it.
+
+        The arm stays released until the person presses the clutch, a button of the device.
+        """
         self._hand.release()
         # The target is empty while the arm is not held.
         self._target: list[float] = []

@@ -469,7 +469,11 @@ def examine_rights() -> Iterator[DoctorFinding]:
 
 
 def examine_system() -> DoctorFinding:
-    """Reports which parts of the program are supported on this operating system."""
+    """Reports which parts of the program are supported on this operating system.
+
+    Returns:
+        A single finding. It is "ok" on Linux. On other systems, it names what is missing.
+    """
     name = {"Darwin": "macOS"}.get(platform.system(), platform.system())
     if name == "Linux":
         return DoctorFinding(
@@ -503,10 +507,10 @@ class Rehearsal(LoopStats):
         self._late_us: list[int] = []
 
     def run(self, clock: Clock) -> list[int]:
-        """Executes all ticks of the scenario in real time.
+        """Executes all ticks (periods of the control loop) of the scenario in real time.
 
         Returns:
-            The lateness of each tick, in us.
+            The lateness of each tick, the time from its due time to its beginning, in us.
         """
         inbox = PeerInbox(links=(), rings=(), boots=(), monitors=(), dropped=self.dropped)
         epoch_ns = clock.monotonic_ns() + NS_PER_S // 10
@@ -688,23 +692,29 @@ def examine_room(folder: Path) -> Iterator[DoctorFinding]:
 
 @dataclass(frozen=True, repr=False)
 class DoctorReport(Result):
-    """All findings about this machine, in the order of the checks.
+    """Results of all checks of this machine, whether it is ready for a session.
 
     Attributes:
-        findings: Result of each check.
+        findings: Result of each check, in the order of the checks.
     """
 
     findings: list[DoctorFinding]
 
     def headline(self) -> str:
-        """Returns one line with the numbers of failed checks, warnings and passed checks."""
+        """Returns a summary of the checks in one line.
+
+        The line contains the numbers of failed checks, of warnings and of passed checks.
+        """
         states = [finding.state for finding in self.findings]
         return (
             f"{states.count('fail')} fail, {states.count('warn')} warn, {states.count('ok')} ok"
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns plain values, as `trilat doctor --json` prints them."""
+        """Returns all findings as plain values, which can be written as JSON.
+
+        The keys are those that `trilat doctor --json` prints.
+        """
         return {"findings": self.to_rows()}
 
     def to_rows(self) -> list[dict[str, Any]]:

@@ -180,9 +180,10 @@ class ExternalArm:
         return warning if distance_rad > START_POSE_TOLERANCE_RAD else ""
 
     def poll(self) -> None:
-        """Receives the waiting measurements, and updates the time since the last accepted one.
+        """Receives the waiting measurements, and checks how long the arm has been silent.
 
-        The loop calls this method in every tick.
+        The silence is the time since the last accepted measurement. The loop calls this method
+        in every tick, a period of the control loop.
         """
         now_ns = self._clock.monotonic_ns()
         accepted_before = self.accepted

@@ -228,7 +228,11 @@ class SessionDisplay:
 
     @property
     def due(self) -> bool:
-        """True if enough time has passed since the last update of the display."""
+        """True if enough time has passed since the last update of the display.
+
+        Updates are limited in rate, because drawing a terminal takes time and no reader could
+        follow.
+        """
         period_ns = TABLE_NS if self._live else LINES_NS
         return self._clock.monotonic_ns() - self._updated_ns >= period_ns
 
@@ -307,7 +311,10 @@ class SessionMonitor:
         }
 
     def poll(self) -> None:
-        """Receives the messages that have arrived, and updates the display if that is due."""
+        """Receives the messages that have arrived, and updates the display if that is due.
+
+        Important events are printed as lines above the table. The method does not wait.
+        """
         scenario = self._scenario
         for stats in read_messages(self._links, LinkStats):
             if stats.site in self._states:

@@ -470,7 +470,10 @@ class NetworkBenchmark(Result):
 
     @property
     def good(self) -> bool:
-        """True if every transport is good enough for the scenario."""
+        """True if every transport that was measured is good enough for the scenario.
+
+        A transport is the protocol that carries the messages: TCP, TLS or QUIC.
+        """
         return all(verdict["good"] for verdict in self.judged)
 
     def to_dict(self) -> dict[str, Any]:

@@ -167,7 +167,11 @@ class TargetTopic:
             self._received_ns = self._clock.monotonic_ns()
 
     def watch(self) -> None:
-        """Releases the arm if the ROS program has sent no target for `SILENCE_NS`."""
+        """Releases the arm if the ROS program has sent no target for `SILENCE_NS`.
+
+        The bridge calls this method regularly, so that an arm is not held by a program that has
+        failed.
+        """
         with self._lock:
             if self._received_ns is None:
                 return
@@ -225,7 +229,9 @@ class DominanceTopic:
         self._requested = dict(zip(self._peers, shares, strict=True))
 
     def send_request(self) -> None:
-        """Requests the stored weights from the site, if they are new.
+        """Requests the newest weights that have arrived from the site, and waits for its reply.
+
+        Nothing is requested if no new weights have arrived.
 
         Raises:
             TrilatError: The site refuses the weights.
@@ -342,7 +348,10 @@ class RobotArm:
         return self.armed and len(torque) == len(self._joint_order)
 
     def send_safe_command(self) -> None:
-        """Sends the robot the command that its settings name for braking or holding still."""
+        """Sends the robot its safe command, which makes it brake or hold still.
+
+        The settings of the robot contain this command.
+        """
         self._safe_ns = self._clock.monotonic_ns()
         self._commands.put(self._pack(*self._safe_command))
 

@@ -136,7 +136,11 @@ class SessionPing:
         return elapsed_ns > GATHERING_NS and is_complete
 
     def report(self) -> PingReport:
-        """Returns the results of the measurement up to the present time."""
+        """Returns the results of the measurement up to the present time.
+
+        The rows of the members have the order of their names, and those of the links that of
+        the receiving sites. A delay of -1 was not measured.
+        """
         members = [self._describe_member(info) for _, info in sorted(self.infos.items())]
 
         links = []

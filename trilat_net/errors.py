@@ -70,7 +70,7 @@ class TrilatError(Exception):
 
 
 class UnknownName(TrilatError, KeyError):  # noqa: N818 - it names an outcome
-    """A name that results do not contain, for example a site that is not in a log."""
+    """A name that a result does not contain, for example a site that is not in a log."""
 
     exit_code = 2
 
@@ -253,7 +253,14 @@ def count_nouns(count: object, singular: str, plural: str = "") -> str:
 
 
 def pluralise(singular: str) -> str:
-    """Returns the plural of a noun, which is the last word of `singular`."""
+    """Returns the plural of a noun.
+
+    Args:
+        singular: The noun, possibly with words before it, as in "late sample".
+
+    Returns:
+        The same words, with the last one in the plural.
+    """
     *before, noun = singular.split(" ")
     if noun in _IRREGULAR:
         plural = _IRREGULAR[noun]

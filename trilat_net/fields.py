@@ -397,12 +397,15 @@ UNITS = {
 
 
 def split_unit(name: str) -> tuple[str, str]:
-    """Splits the name of a quantity into its words and its unit.
+    """Splits the name of a quantity into its words and its unit, as for the axis of a figure.
 
     If several endings of the name are units, the longest one counts.
 
     >>> split_unit("contact_stiffness_n_m")
     ('contact stiffness', 'N/m')
+
+    Args:
+        name: The name, with words and unit separated by underscores.
 
     Returns:
         The words, separated by spaces, and the unit. The unit is empty if the name has none.

@@ -82,6 +82,9 @@ def format_extra_install(extra: str) -> str:
       Makefile, which installs locked versions.
     - In another environment that uses a clone, the command is pip with the path of the clone.
     - Anywhere else, the command is pip with the name of the distribution.
+
+    Args:
+        extra: Name of the extra, a group of optional packages, as in `trilat-net[extra]`.
     """
     clone = Path(__file__).resolve().parents[1]
     if not all((clone / name).is_file() for name in ("Makefile", "pyproject.toml")):
@@ -263,6 +266,9 @@ def read_foreign_permissions(path: Path) -> int:
 def make_folder(folder: Path) -> Path:
     """Makes a folder and its parents unless they exist, and returns the folder.
 
+    Args:
+        folder: Path of the folder.
+
     Raises:
         UsageError: The folder cannot be made.
         LogRefused: The disk is full.
@@ -299,6 +305,9 @@ def refuse_link(path: Path) -> None:
 def make_subfolder(folder: Path) -> Path:
     """Makes a folder within an output folder unless it exists, and returns the folder.
 
+    Args:
+        folder: Path of the folder.
+
     Raises:
         UsageError: The path is a symbolic link, or the folder cannot be made.
     """
@@ -308,6 +317,9 @@ def make_subfolder(folder: Path) -> Path:
 
 def create_file(path: Path) -> BinaryIO:
     """Creates a file for writing without a buffer. An earlier file of that name is deleted.
+
+    Args:
+        path: Path of the file.
 
     Raises:
         UsageError: The path is a symbolic link.
@@ -320,6 +332,9 @@ def create_file(path: Path) -> BinaryIO:
 
 def extend_file(path: Path) -> BinaryIO:
     """Opens a file for appending without a buffer, and creates it if it does not exist.
+
+    Args:
+        path: Path of the file.
 
     Raises:
         UsageError: The path is a symbolic link.
@@ -537,7 +552,11 @@ def stage_output(path: Path, *, force: bool, manifest: str | None = None) -> Ite
 def sync_folder(folder: Path) -> None:
     """Writes the entries of a folder to the disk, so that its files survive a loss of power.
 
-    Nothing happens on platforms that do not support this.
+    Without this, a file may be stored completely, but its name may be lost. Nothing happens on
+    platforms that do not support this.
+
+    Args:
+        folder: The folder.
     """
     with suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)

@@ -50,6 +50,8 @@ class Result:
     def to_frame(self) -> "pandas.DataFrame":
         """Returns the result as a pandas data frame.
 
+        It has the rows of `to_rows`, and one column per key of these rows.
+
         Raises:
             UsageError: pandas is not installed.
         """

@@ -130,4 +130,8 @@ class SpaceMouse:
         return True
 
     def render(self, force_n: Vector) -> None:
-        """Does nothing, because a SpaceMouse has no motors."""
+        """Does nothing, because a SpaceMouse has no motors to apply a force.
+
+        Args:
+            force_n: Coordinates x, y and z of the force, in N. They are ignored.
+        """

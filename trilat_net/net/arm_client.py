@@ -200,7 +200,11 @@ class SiteClient:
 
     @property
     def over(self) -> bool:
-        """True once the run of the site has ended, or the process of the site is gone."""
+        """True once no more records of the site will arrive.
+
+        This is the case if the run of the site has ended, or if the process of the site is
+        gone.
+        """
         self._read_messages()
         return self._is_over
 

@@ -183,7 +183,10 @@ class Bus(Protocol):
         """
 
     def close(self) -> None:
-        """Closes the connection. Calling it again has no effect."""
+        """Closes the network connection. Calling it again has no effect.
+
+        Other members see that this member is gone, because its liveliness tokens disappear.
+        """
 
 
 @lru_cache(256)

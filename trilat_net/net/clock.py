@@ -24,7 +24,11 @@ class Clock(Protocol):
     """
 
     def monotonic_ns(self) -> int:
-        """Returns the reading of a clock that never steps, in ns. Its zero is arbitrary."""
+        """Returns the reading of a clock that never steps, in ns.
+
+        The zero of this clock is arbitrary, so that only differences of readings have a
+        meaning.
+        """
 
     def unix_ns(self) -> int:
         """Returns the time of day of the machine, as the time since 1970 in ns.
@@ -34,9 +38,11 @@ class Clock(Protocol):
         """
 
     def sleep_until(self, deadline_ns: int) -> None:
-        """Sleeps until the monotonic clock reads `deadline_ns`.
+        """Sleeps until the monotonic clock has reached a time.
 
-        Returns at once if that time has passed already.
+        Args:
+            deadline_ns: The time on the monotonic clock, in ns. If it has passed already, the
+                method returns at once.
         """
 
     def identity(self) -> str:
@@ -55,9 +61,11 @@ class SystemClock:
     unix_ns = staticmethod(time.time_ns)
 
     def sleep_until(self, deadline_ns: int) -> None:
-        """Sleeps until the monotonic clock reads `deadline_ns`.
+        """Sleeps until the monotonic clock has reached a time.
 
-        Returns at once if that time has passed already.
+        Args:
+            deadline_ns: The time on the monotonic clock, in ns. If it has passed already, the
+                method returns at once.
         """
         remaining_ns = deadline_ns - self.monotonic_ns()
         if remaining_ns > 0:
@@ -110,13 +118,20 @@ class SkewedClock:
         return self._start_ns + self._offset_ns + passed_ns + drift_ns
 
     def unix_ns(self) -> int:
-        """Returns the time of day of the other clock unchanged, in ns since 1970."""
+        """Returns the time of day of the other clock, in ns since 1970.
+
+        It is not skewed, because only the monotonic clock emulates another machine.
+        """
         return self._clock.unix_ns()
 
     def sleep_until(self, deadline_ns: int) -> None:
-        """Sleeps until the skewed clock reads `deadline_ns`, if that is in the future.
+        """Sleeps until the skewed clock has reached a time.
 
         The equation of this clock is solved for the reading of the other clock at that time.
+
+        Args:
+            deadline_ns: The time on the skewed clock, in ns. If it has passed already, the
+                method returns at once.
         """
         # Time from the start to the deadline, on this clock and on the other clock.
         passed_ns = deadline_ns - self._start_ns - self._offset_ns

@@ -17,7 +17,10 @@ _ENDPOINT = re.compile(r"[a-z]+(?:/|://)(\[[^\]]*\]|[^/?#]*):\d+(?:[/?#].*)?")
 
 
 class UnknownHost(UsageError):  # noqa: N818 - it names an outcome
-    """The host name of an endpoint cannot be resolved."""
+    """Error about an endpoint whose host name cannot be resolved to an address.
+
+    The name may be misspelt, or the name service may be away.
+    """
 
 
 def check_hosts(endpoints: Iterable[str]) -> None:

@@ -139,7 +139,7 @@ class Attachment(NamedTuple):
     gid: bytes
 
     def encode(self) -> bytes:
-        """Returns the attachment as 33 bytes."""
+        """Returns the attachment as the 33 bytes that ROS 2 programs expect."""
         return _ATTACHMENT.pack(self.number, self.sent_unix_ns, _GID_BYTES, self.gid)
 
 

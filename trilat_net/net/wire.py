@@ -106,19 +106,25 @@ def encode_state(
     sent_ns: int | None = None,
     echo: Sequence[Sequence[int]] = (),
 ) -> bytes:
-    """Encodes the record of one tick, the payload of a `State`.
+    """Encodes the result of one tick (period of the control loop) of a site as a `State`.
+
+    The result is called a record. It is stored in the log.
 
     Args:
         site: Name of the site.
         boot: Random number that identifies this start of the site's process.
         peers: Names of the site's peers, in the order of `used` in the output.
-        output: Output of the kernel for the tick.
+        output: Result of the tick, as the simulation kernel computed it.
         arrivals: Samples that the tick used as inputs, in their order.
         late_us: Time by which the tick began late, in us.
         busy_us: Computing time of the previous tick, in us.
         sent_ns: Time of sending, in ns since the epoch on the site's clock. None uses the
             nominal time of the tick, as in simulations.
-        echo: Newest sample that arrived from each peer, see `State.echo`.
+        echo: Newest sample that has arrived from each peer, by which the peer can measure the
+            delay to this site, see `State.echo`.
+
+    Returns:
+        The payload of the message.
 
     Raises:
         WireError: A number is not finite.
@@ -192,14 +198,21 @@ def encode_sample(
     sent_ns: int,
     echo: Sequence[Sequence[int]],
 ) -> bytes:
-    """Encodes the sample of one tick for the peers, the payload of a `PeerSample`.
+    """Encodes the sample of one tick, the state that a site sends its peers.
+
+    A tick is one period of the control loop. A sample is a shorter message than the record of
+    the same tick, because it contains only what the peers need.
 
     Args:
         site: Name of the site.
         boot: Random number that identifies this start of the site's process.
-        output: Output of the kernel for the tick.
+        output: Result of the tick, as the simulation kernel computed it.
         sent_ns: Time of sending, in ns since the epoch on the site's clock.
-        echo: Newest sample that arrived from each peer, see `State.echo`.
+        echo: Newest sample that has arrived from each peer, by which the peer can measure the
+            delay to this site, see `State.echo`.
+
+    Returns:
+        The payload of a `PeerSample`.
 
     Raises:
         WireError: A number is not finite.
@@ -229,6 +242,8 @@ def encode_sample(
 
 def join_states(payloads: Sequence[bytes]) -> Iterator[bytes]:
     """Joins consecutive records into blocks, which cost less to send than single records.
+
+    A record is the result of one tick, a period of a site's control loop.
 
     Args:
         payloads: The encoded records.
@@ -280,7 +295,17 @@ def split_states(block: bytes) -> Iterator[bytes]:
 
 
 def encode(message: _Sendable) -> bytes:
-    """Encodes a message other than a `State` or a `PeerSample`."""
+    """Encodes a message as the payload that is sent over the network.
+
+    Records (`State`) and samples (`PeerSample`), which are sent in every tick, are encoded by
+    faster functions instead: `encode_state` and `encode_sample`.
+
+    Args:
+        message: The message.
+
+    Returns:
+        The payload, which `decode` converts to an equal message.
+    """
     return _encode(message)
 
 

@@ -69,7 +69,10 @@ def share_threads() -> None:
 
 
 class RouterSilent(SessionError):  # noqa: N818 - it names an outcome
-    """A router does not answer (yet)."""
+    """Error of a process that connects to a router which does not answer, or not yet.
+
+    The caller may try again, because the router may be started later.
+    """
 
 
 class _ZenohRing(Generic[T]):
@@ -303,7 +306,13 @@ class ZenohBus:
         self._declarations.append(self._subscribe(key, handler))
 
     def query_inbox(self, key: str) -> QueryInbox:
-        """Returns a queue of the queries under a key, to which the caller replies."""
+        """Returns a queue of the queries that other members send under a key.
+
+        The caller removes the queries from the queue, and replies to them when it has time.
+
+        Args:
+            key: The key, which may contain wildcards.
+        """
         # Polling a Python ring costs a loop less than polling a ring of Zenoh.
         ring: BoundedRing[_ZenohQuery] = BoundedRing(64)
         handler: Any = handlers.Callback(
@@ -317,8 +326,8 @@ class ZenohBus:
 
         Args:
             key: The key.
-            answer: Function that returns the payload of the reply to a payload. If it returns
-                None, there is no reply.
+            answer: Function that receives the payload of a query, and returns the payload of
+                the reply. If it returns None, there is no reply.
         """
 
         def answer_at_once(query: zenoh.Query) -> None:
@@ -367,10 +376,14 @@ class ZenohBus:
         self._declarations.append(self._session.liveliness().declare_token(key))
 
     def presence(self, key: str) -> PresenceInbox:
-        """Returns a queue of pairs: the key of a token, and True if the token has appeared.
+        """Returns a queue that tells which other members have appeared or disappeared.
 
-        The first entries are the tokens that exist already. The tokens of this session are left
-        out.
+        An entry is the key of a liveliness token, by which a member shows that it is present,
+        and True if the token has appeared, or False if it has disappeared. The first entries
+        are the tokens that exist already. The tokens of this session are left out.
+
+        Args:
+            key: Key of the tokens, which may contain wildcards.
         """
 
         def read(sample: zenoh.Sample) -> tuple[str, bool] | None:
@@ -387,7 +400,7 @@ class ZenohBus:
         return _ZenohRing(tokens, read)
 
     def close(self) -> None:
-        """Closes the connection. Calling it again has no effect."""
+        """Closes the Zenoh session of this connection. Calling it again has no effect."""
         if not self._session.is_closed():
             self._session.close()
         self._declarations.clear()
