@@ -65,7 +65,8 @@ class WatchedCode:
     Args:
         name: Name of the code, as in "the law mylaw:MyLaw".
         rate_hz: How often the code is called, in 1/s.
-        fail: Function that returns the error to raise, from a tick and a problem.
+        fail: Function that receives a tick and the description of a problem, and returns the
+            error to raise.
         clock: Clock of this process.
         usage: Function that returns the computing time and the context switches of the thread.
 

@@ -50,7 +50,7 @@ class HandProcess(SiteClient):
     """Connection between a user's operator class and the site whose arm it moves.
 
     Args:
-        hand_site: Site of the operator, and settings of the class.
+        hand_site: Site whose arm the operator moves, and settings of the user's class.
         program: The operator, an object of the user's class.
         bus: Network connection to the session.
         clock: Clock of this process.

@@ -198,7 +198,7 @@ class RemoteHand(HandPlayer):
     accepted.
 
     Args:
-        hand_site: Site of the operator, and settings of the class.
+        hand_site: Site whose arm the operator moves, and settings of the user's class.
         boot: Random number that identifies this start of the site.
         inbox: Queue of the decisions.
         publish: Function that publishes a view.

@@ -47,12 +47,13 @@ class PeerMonitor:
 
     Attributes:
         boots: Boot (number of the process start) of each member of the session, by name.
-        recorders: Boots of the recorders that are present.
+        recorders: Boots of the recorders (processes that store the log) that are present.
         stored: Boots of the recorders that have stored all messages of this site.
         ended_by: Sentence of the event with which a member ended the run for all. Empty if
             there is none.
         ended_member: Name of that member.
-        departed: Sites that have left, by name: the time in ns since the epoch, and a sentence.
+        departed: For each site that has left, by its name: the time in ns since the epoch, and
+            a sentence for the user.
         admitted: Events with which sites announced their join, and that the site must still
             apply.
         changed: True once a peer has published a change of its settings.

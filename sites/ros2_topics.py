@@ -70,7 +70,7 @@ class SiteTopics:
 
     Attributes:
         frame: Name of the frame of the site's end effector.
-        shares: Weights with which the site follows its peers, over time.
+        shares: Weights with which the site follows its peers (the other sites), over time.
         newest: Record (result of one tick of the site) that was published last. None before the
             first one.
     """

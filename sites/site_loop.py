@@ -136,7 +136,9 @@ class PeerInbox:
         self._skipped_until[index] = self._last[index]
 
     def find_last_tick_of(self, index: int, boot: int) -> int | None:
-        """Returns the last tick received from a peer before the peer was restarted.
+        """Returns the last tick whose sample has arrived from a peer before its restart.
+
+        A tick is one period of the peer's control loop.
 
         Args:
             index: Index of the peer.
@@ -350,16 +352,17 @@ class StateBlock:
     ) -> bool:
         """Adds the record of a tick to the present block, and decides if the block is due.
 
+        A block is due once it is complete, or while an operator moves the arm. The operator's
+        program computes the rendered force from the records, and needs each of them at once.
+
         Args:
-            output: The record.
+            output: The record, the result of the tick.
             arrivals: Samples of the peers that the tick has received.
             late_us: Time by which the tick began late, in us.
             busy_us: Computing time of the previous tick, in us.
 
         Returns:
-            True if the block must be sent now: it is complete, or an operator moves the arm at
-            present. The operator's program computes the rendered force from the records, and
-            needs each of them at once.
+            True if the block must be sent now.
         """
         self._waiting_records.append((output, arrivals, late_us, busy_us))
         # The source of the operator's commands is 0 if no operator moves the arm.
@@ -454,6 +457,8 @@ def run_loop(
     Each round waits until a tick is due, receives the samples of the peers, computes the tick,
     and publishes the results. Work that is not urgent follows in the rest of the period.
 
+    A tick is one period of the control loop.
+
     Args:
         site: The site in the simulation kernel.
         boot: Random number that identifies this start of the site.
@@ -462,8 +467,8 @@ def run_loop(
         inbox: Samples of the peers.
         timing: Times at which ticks are due, and clocks of the peers.
         stats: Statistics of the loop.
-        states: Records on their way to the recorders.
-        io: Computes a tick, and handles messages and events.
+        states: Records (results of ticks) that wait to be sent to the recorders.
+        io: The running site, which computes each tick, and handles messages and events.
         first: Number of the first tick.
         catches_up: True if missed ticks are executed one after another, False if they are
             skipped.

@@ -113,7 +113,8 @@ class SiteParts:
         rings: Queues of the samples, the states that the peers publish, in the order of the
             links.
         buffer: Recent messages, for recorders that missed them.
-        states: Records on their way to the recorders.
+        states: Records (results of ticks of the control loop) that wait to be sent to the
+            recorders.
         monitor: Presence of the other members of the session.
         changes: Requests to change something during the run.
     """

@@ -288,7 +288,7 @@ class Membership:
         publisher: Publishes the events of this member.
         sites: Names of the scenario's sites. The first one is the leader. Empty for a recorder,
             which learns the sites from the members.
-        late: Rules about sites that join late.
+        late: Rules about sites that join while the session runs.
 
     Attributes:
         others: Identity of each other member that is present and has introduced itself, by

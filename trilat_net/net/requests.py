@@ -153,14 +153,16 @@ class ArmMeasurement(Request, frozen=True, kw_only=True):
 
     Attributes:
         site: Name of the site.
-        boot: Random number that identifies this start of the driver. A site follows one start.
+        boot: Random number that identifies this start of the driver. During a run, a site
+            accepts the measurements of one start only.
         n: Number of the measurement since that start, from 0.
         q: Joint angles in rad.
         qd: Joint velocities in rad/s.
         sent_ns: Time of sending on the driver's monotonic clock, or time of the measurement on
             the arm's clock, in ns. It is not compared with any other clock.
-        tau_x: Torque of the operator and the environment in N m, with the sign of a record: the
-            torque that acts ON the arm is the negative. Empty if the arm does not measure it.
+        tau_x: Torque of the operator and the environment on each joint, in N m. As in records,
+            the torque that acts ON the arm is the negative of this value. Empty if the arm does
+            not measure it.
     """
 
     site: str
@@ -210,10 +212,10 @@ class HandMessage(Request, frozen=True, kw_only=True):
     Attributes:
         site: Name of the site of the arm.
         boot: Random number above 0 that identifies the operator. Only one operator at a time
-            holds an arm.
+            moves an arm.
         source: Name of the person or program, for the users of the session.
         n: Number of the target or force, from 0. If it is repeated, nothing has changed.
-        grip: False to release the arm.
+        grip: True while the operator moves the arm, and False to release it.
         target: Target position of the end effector in m, or of the joints in rad. Empty for an
             operator who pushes.
         force: Force ON the end effector in N. Empty for all other operators.

@@ -360,7 +360,7 @@ class TopicPublisher:
 
     Args:
         declared: The publisher object of Zenoh.
-        gid: 16 bytes that identify the publisher.
+        gid: 16 bytes that identify the publisher to ROS 2 programs, see `make_gid`.
         clock: Clock for the times of sending.
         latched: True if late subscribers receive the last messages.
     """

@@ -67,7 +67,7 @@ class SessionJoin:
         session: Name of the session.
         publisher: Publishes the events of this member.
         sites: Names of the scenario's sites. The first one is the leader. Empty for a recorder.
-        late: Rules about sites that join late.
+        late: Rules about sites that join while the session runs.
 
     Attributes:
         refusal: Why a running site has refused this site. Empty if no site has refused it.

@@ -186,6 +186,9 @@ class LinkTimingMonitor:
     the peer to `receive`. Offsets are estimated from windows of time stamps. An impossible
     combination of stamps is a fault: it shows that a clock has stepped.
 
+    A link is the directed connection from one site to another. A sample is the state that a
+    site publishes in each period of its control loop.
+
     Args:
         peer: Clock of the sending peer.
         sent: Times at which this site sent its own samples.
@@ -439,6 +442,9 @@ class SiteTiming:
 
     The site asks for the time of its next wake-up, reports each sample that it sends, and calls
     `update_clocks` ten times a second.
+
+    A tick is one period of the control loop. A sample is the state that a site publishes in a
+    tick, and a link is the directed connection from one site to another.
 
     Args:
         epoch_ns: Time of tick 0 on the site's clock, in ns.
@@ -757,7 +763,8 @@ class LoopStats:
     """Statistics of a site's control loop and its links, published ten times a second.
 
     Args:
-        site: The site in the simulation kernel, which counts the samples of each link.
+        site: The site in the simulation kernel, which counts the samples that arrive on each
+            link.
         boot: Random number that identifies this start of the site's process.
 
     Attributes:
