@@ -116,7 +116,8 @@ def examine_machine(
         session: Name of a running session with whose members the clocks are compared. None if
             the comparison is not made.
         clock: Clock of this process.
-        insecure: True if everybody on the network is trusted.
+        insecure: True to permit connections without keys, because everybody on the network is
+            trusted.
 
     Yields:
         The findings, in the order of the checks.
@@ -188,7 +189,8 @@ def examine_links(
         connection: Endpoints to listen at and to connect to.
         folder: Folder of a member's keys. None if there is none.
         member_keys: The keys. None if there are no keys, or if they cannot be used.
-        insecure: True if everybody on the network is trusted.
+        insecure: True to permit connections without keys, because everybody on the network is
+            trusted.
 
     Yields:
         The findings about the endpoints. There is a single one if no endpoint can be used at
@@ -744,7 +746,8 @@ def doctor(
         keys: Folder of a member's keys. None if there is none.
         session: Name of a running session with whose members the clocks are compared.
         folder: Folder where results would be stored.
-        insecure: True if everybody on the network is trusted.
+        insecure: True to permit connections without keys, because everybody on the network is
+            trusted.
 
     Returns:
         The findings.

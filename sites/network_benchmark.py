@@ -208,7 +208,8 @@ def _open(
         endpoint: Endpoint to listen at or to connect to.
         keys: Keys of a site. They are used only if the endpoint is encrypted.
         listens: True for the far end.
-        insecure: True if everybody on the network is trusted.
+        insecure: True to permit connections without keys, because everybody on the network is
+            trusted.
 
     Returns:
         The connection, and the name of the end: that of its keys, otherwise "near" or "far".
@@ -255,7 +256,8 @@ def run_far_end(
         keys: Folder with the keys of a site, for encrypted endpoints.
         stopped: Function that returns True to end the call.
         duration_s: Longest duration, in s.
-        insecure: True if everybody on the network is trusted.
+        insecure: True to permit connections without keys, because everybody on the network is
+            trusted.
         say: Function that prints a line for the user.
 
     Raises:

@@ -52,8 +52,8 @@ class PeerMonitor:
         ended_by: Sentence of the event with which a member ended the run for all. Empty if
             there is none.
         ended_member: Name of that member.
-        departed: For each site that has left, by its name: the time in ns since the epoch, and
-            a sentence for the user.
+        departed: For each site that has left, by its name: the time in ns since the epoch (the
+            common start of the session), and a sentence for the user.
         admitted: Events with which sites announced their join, and that the site must still
             apply.
         changed: True once a peer has published a change of its settings.
@@ -110,7 +110,7 @@ class PeerMonitor:
 
         Args:
             publisher: Publishes the events of this site.
-            t_ns: Present time, in ns since the epoch.
+            t_ns: Present time, in ns since the epoch (the common start of the session).
         """
         joining: list[Event] = []
         for inbox in self._events.values():
@@ -135,7 +135,7 @@ class PeerMonitor:
             member: Name of the member.
             boot: Number that identifies the start of the member's process, as text.
             publisher: Publishes the events of this site.
-            t_ns: Present time, in ns since the epoch.
+            t_ns: Present time, in ns since the epoch (the common start of the session).
             alive: True if the token has appeared.
         """
         is_member = str(self.boots.get(member)) == boot
@@ -168,7 +168,7 @@ class PeerMonitor:
 
         Args:
             member: Name of the site.
-            t_ns: Present time, in ns since the epoch.
+            t_ns: Present time, in ns since the epoch (the common start of the session).
         """
         if member not in self.departed or self.boots.get(member) in self._ended:
             return
@@ -188,7 +188,7 @@ class PeerMonitor:
         Args:
             inbox: Queue of the events of the peer.
             publisher: Publishes the events of this site.
-            t_ns: Present time, in ns since the epoch.
+            t_ns: Present time, in ns since the epoch (the common start of the session).
 
         Yields:
             The events with which new starts of the peer request to join.
@@ -229,7 +229,7 @@ class PeerMonitor:
         Args:
             publisher: Publishes the events of this site.
             event: Event with which the new process requests to join.
-            t_ns: Present time, in ns since the epoch.
+            t_ns: Present time, in ns since the epoch (the common start of the session).
         """
         member = event.member
         previous_boot = self.boots.get(member)
@@ -271,7 +271,7 @@ class PeerMonitor:
             text: Sentence of the event.
             publisher: Publishes the events of this site.
             event: Event with which the new process requested to join.
-            t_ns: Present time, in ns since the epoch.
+            t_ns: Present time, in ns since the epoch (the common start of the session).
         """
         publisher.publish(
             kind,

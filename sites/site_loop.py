@@ -92,7 +92,8 @@ class PeerInbox:
         boots: Boot of each peer.
         monitors: Timing monitors of the links.
         dropped: Number of dropped samples by reason. The counts are increased in place.
-        from_ns: Time of the site's first tick, in ns since the epoch.
+        from_ns: Time of the site's first tick, in ns since the epoch (the common start of the
+            session).
     """
 
     def __init__(
@@ -159,7 +160,8 @@ class PeerInbox:
         """Removes the samples that have arrived, and returns those that pass all checks.
 
         Args:
-            since_epoch_ns: Present time, in ns since the epoch.
+            since_epoch_ns: Present time, in ns since the epoch (the common start of the
+                session).
 
         Returns:
             At most `MAX_ARRIVALS` samples, peer by peer, in the order of their arrival. Further
@@ -187,7 +189,8 @@ class PeerInbox:
             index: Index of the peer.
             sample: The sample, or the error with which its decoding failed.
             arrived_ns: Time of its arrival on the local clock, in ns.
-            since_epoch_ns: Present time, in ns since the epoch.
+            since_epoch_ns: Present time, in ns since the epoch (the common start of the
+                session).
 
         Returns:
             The sample as an input of the tick. None if the sample is dropped.
@@ -428,9 +431,9 @@ def _publish_sample(
         output: Record of the tick.
 
     Returns:
-        The time of sending in ns since the epoch, on the local clock; and the echoes, which
-        confirm the samples of the peers that have arrived, with the times of arrival. The peers
-        compute delays and round trip times from them.
+        The time of sending in ns since the epoch (the common start of the session), on the
+        local clock; and the echoes, which confirm the samples of the peers that have arrived,
+        with the times of arrival. The peers compute delays and round trip times from them.
     """
     sent_ns = timing.record_sent(output.tick, clock.monotonic_ns())
     echo = timing.pop_echo()

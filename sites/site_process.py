@@ -458,7 +458,7 @@ class RunningSite:
 
         Args:
             notices: Fields of the events.
-            t_ns: Time of the events, in ns since the epoch.
+            t_ns: Time of the events, in ns since the epoch (the common start of the session).
         """
         for notice in notices:
             self._publisher.publish(**notice, t_ns=t_ns)
@@ -519,7 +519,8 @@ class RunningSite:
 
         Args:
             k: Tick that was executed last.
-            t_ns: Nominal time of that tick, in ns since the epoch.
+            t_ns: Nominal time of that tick, in ns since the epoch (the common start of the
+                session).
         """
         parts = self._parts
         nominal_ns = tick_ns(k + 1, parts.site.rate_hz)
@@ -565,7 +566,8 @@ class RunningSite:
 
         Args:
             k: Tick that was executed last.
-            t_ns: Nominal time of that tick, in ns since the epoch.
+            t_ns: Nominal time of that tick, in ns since the epoch (the common start of the
+                session).
         """
         if self._skipped:
             ticks = " ".join(self._skipped)
@@ -581,7 +583,8 @@ class RunningSite:
 
         Args:
             k: Tick that was executed last.
-            t_ns: Nominal time of that tick, in ns since the epoch.
+            t_ns: Nominal time of that tick, in ns since the epoch (the common start of the
+                session).
         """
         output = self._output
         if output is None or output.mode not in (Mode.WAITING, Mode.HOLD):
@@ -600,7 +603,7 @@ class RunningSite:
         """Updates who takes part in the session, and checks if a peer is away for too long.
 
         Args:
-            t_ns: Present time, in ns since the epoch.
+            t_ns: Present time, in ns since the epoch (the common start of the session).
         """
         parts = self._parts
         monitor = parts.monitor
@@ -639,7 +642,7 @@ class RunningSite:
 
         Args:
             event: Event with which the peer announced its join.
-            t_ns: Present time, in ns since the epoch.
+            t_ns: Present time, in ns since the epoch (the common start of the session).
         """
         parts = self._parts
         index = parts.site.peers.index(event.member)
@@ -660,7 +663,7 @@ class RunningSite:
         once a second, until every peer whose samples arrive has confirmed samples of this site.
 
         Args:
-            t_ns: Present time, in ns since the epoch.
+            t_ns: Present time, in ns since the epoch (the common start of the session).
         """
         coming = self._epoch.coming  # None if this site was present from the start
         now_ns = self._parts.clock.monotonic_ns()
@@ -687,7 +690,7 @@ class RunningSite:
         Args:
             index: Index of the peer.
             coming: Event with which the new process of the peer announced its join.
-            t_ns: Present time, in ns since the epoch.
+            t_ns: Present time, in ns since the epoch (the common start of the session).
         """
         tick = self._inbox.find_last_tick_of(index, coming.boot)
         if tick is None:

@@ -518,7 +518,8 @@ class SiteTiming:
 
         Args:
             index: Index of the peer.
-            t_ns: Nominal time of the peer's first tick, in ns since the epoch.
+            t_ns: Nominal time of the peer's first tick, in ns since the epoch (the common start
+                of the session).
             epoch_ns: Time of the epoch on the peer's clock, as the peer states it, in ns.
             bound_ns: Largest error of `epoch_ns`, in ns. None if the peer runs on this machine.
 
@@ -574,7 +575,7 @@ class SiteTiming:
         Returns:
             For each peer from which a sample has arrived since the last call: the index of the
             peer, the tick in which it sent the sample, and the time of arrival in ns since the
-            epoch.
+            epoch (the common start of the session).
         """
         echo = []
         for index, monitor in enumerate(self.monitors):

@@ -118,8 +118,8 @@ def encode_state(
         arrivals: Samples that the tick used as inputs, in their order.
         late_us: Time by which the tick began late, in us.
         busy_us: Computing time of the previous tick, in us.
-        sent_ns: Time of sending, in ns since the epoch on the site's clock. None uses the
-            nominal time of the tick, as in simulations.
+        sent_ns: Time of sending, in ns since the epoch (the common start of the session) on the
+            site's clock. None uses the nominal time of the tick, as in simulations.
         echo: Newest sample that has arrived from each peer, by which the peer can measure the
             delay to this site, see `State.echo`.
 
@@ -207,7 +207,8 @@ def encode_sample(
         site: Name of the site.
         boot: Random number that identifies this start of the site's process.
         output: Result of the tick, as the simulation kernel computed it.
-        sent_ns: Time of sending, in ns since the epoch on the site's clock.
+        sent_ns: Time of sending, in ns since the epoch (the common start of the session) on the
+            site's clock.
         echo: Newest sample that has arrived from each peer, by which the peer can measure the
             delay to this site, see `State.echo`.
 
