@@ -540,7 +540,8 @@ class Rehearsal(LoopStats):
         Args:
             late_us: Time by which the tick began late, in us.
             busy_us: Computing time of the previous tick, in us.
-            skipped: Number of ticks that were skipped before this tick.
+            skipped: Number of ticks (periods of the control loop) that were skipped before this
+                tick.
         """
         super().count_tick(late_us, busy_us, skipped)
         self._late_us.append(late_us)
@@ -551,7 +552,7 @@ class Rehearsal(LoopStats):
         The loop calls the method in place of `RunningSite.step`.
 
         Args:
-            k: Number of the tick.
+            k: Number of the tick (period of the control loop).
             arrivals: Samples that have arrived, which is none.
 
         Returns:

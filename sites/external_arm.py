@@ -198,7 +198,7 @@ class ExternalArm:
         self._polled_ns = now_ns
 
     def pop_order(self, mode: Mode) -> SiteOrder:
-        """Returns the order to the site if measurements are missing, or have returned.
+        """Returns the order to the site if measurements are missing, or arrive again.
 
         Each order is returned once, except that "arm_lost" is repeated until the site is in the
         mode "fault".
@@ -295,12 +295,14 @@ class _Holder:
 
 
 class DeadManSwitch:
-    """The dead-man switch of one arm, for which several programs may report.
+    """State of the dead-man switch of one arm, for which several programs may report.
 
     The arm stops if any program that holds the switch releases it or falls silent. The others
     then have to release the switch and press it again. The age of a message is measured on the
     clock of this machine from its arrival. The switch therefore counts as released if this
     process was suspended.
+
+    A person holds the switch while the arm may move. Releasing it stops the arm.
 
     Args:
         site: Name of the site of the arm.
@@ -361,7 +363,9 @@ class DeadManSwitch:
         self._release([holder for holder in self._list_holders() if self._is_silent(holder)])
 
     def pop_order(self, mode: Mode, reason: LifeReason) -> SiteOrder:
-        """Returns the order to the site that follows from the switch.
+        """Returns the order to the site that follows from the state of the switch.
+
+        While the switch is released, the order is repeated until the arm is at rest.
 
         Args:
             mode: Present mode of the site.

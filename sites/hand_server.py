@@ -115,7 +115,7 @@ class HandServer:
         self.news: list[tuple[int, str]] = []
 
     def track(self, _site: Site, k: int) -> list[float]:
-        """Applies the waiting messages, and returns the operator's influence on a tick.
+        """Applies the waiting messages of operators, and returns their influence on a tick.
 
         Args:
             k: Number of the tick, a period of the control loop.
@@ -226,7 +226,7 @@ class RemoteHand(HandPlayer):
         self._source = hand_site.source
 
     def track(self, site: Site, k: int) -> list[float]:
-        """Applies the waiting decisions, and returns the operator's influence on a tick.
+        """Applies the waiting decisions of the user's class, and returns their influence.
 
         Args:
             site: The site in the simulation kernel.

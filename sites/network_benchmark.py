@@ -249,7 +249,7 @@ def run_far_end(
     insecure: bool = False,
     say: Callable[[str], None] = lambda _: None,
 ) -> None:
-    """Runs the far end: replies to benchmarks at some endpoints.
+    """Runs the far end of a benchmark, which sends every message back to the near end.
 
     Args:
         endpoints: Endpoints to listen at.

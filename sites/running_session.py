@@ -129,8 +129,8 @@ class ShareHistory:
 class RunningSession:
     """A session that is running, to be controlled and observed from Python.
 
-    `session` creates this object. Most methods send a request to some sites, and return the
-    replies, one sentence for each site.
+    `session` creates this object. Most methods send a request to some sites, the processes that
+    run one arm each. They return the replies, one sentence for each site.
 
     Args:
         name: Name of the session.
@@ -162,7 +162,8 @@ class RunningSession:
 
         Args:
             member: Name of the member under which the requests will be sent. If this object has
-                keys, they must be those of that member. Empty accepts the keys of any member.
+                keys, they must be those of that member. If empty, the keys of any member are
+                accepted.
             timeout_s: Longest wait for the reply of a site, in s.
 
         Yields:
@@ -472,7 +473,8 @@ class RunningSession:
 
         Args:
             site: Name of the site.
-            shares: New weight of each peer, as in `{"m1": 0.9, "m2": 0.1}`.
+            shares: New weight of each peer (the other sites that the site follows), as in
+                `{"m1": 0.9, "m2": 0.1}`.
             ramp_s: Duration of the change, in s.
 
         Returns:
@@ -499,7 +501,7 @@ class RunningSession:
 
         Args:
             site: Name of the site.
-            request: The change.
+            request: The requested change, for example of the delay of a link.
 
         Returns:
             The reply of the site, accepted or refused.
@@ -543,11 +545,12 @@ class RunningSession:
     def states(self, as_site: str = "") -> Iterator[Callable[[], dict[str, State]]]:
         """Subscribes to the newest record of each site, as a context manager.
 
-        With `as_site`, the records are those that the user of that site sees. These are the
-        newest record of the site itself, and of each peer the record of the sample that the
-        site uses at present. That sample is older than the newest one, because the link delays
-        it, or because the scenario delays the picture (`[sites.NAME.view]`). A peer is missing
-        if that record was made before the subscription, or more than `STATES_KEPT` ticks ago.
+        A record is the result of one tick, a period of a site's control loop. With `as_site`,
+        the records are those that the user of that site sees. These are the newest record of
+        the site itself, and of each peer the record of the sample that the site uses at
+        present. That sample is older than the newest one, because the link delays it, or
+        because the scenario delays the picture (`[sites.NAME.view]`). A peer is missing if that
+        record was made before the subscription, or more than `STATES_KEPT` ticks ago.
 
         >>> with tn.session("paper").states(as_site="m1") as find:  # doctest: +SKIP
         ...     find()["s"].q
@@ -640,15 +643,16 @@ class RunningSession:
 
     @contextmanager
     def shares(self, site: str) -> Iterator[Callable[[], dict[str, float]]]:
-        """Subscribes to the present dominance factors of a site, as a context manager.
+        """Subscribes to the weights with which a site follows its peers, as a context manager.
 
-        The dominance factor of a peer is the weight with which the site follows it.
+        These weights, the dominance factors, may change during the session. The peers are the
+        other sites that the site follows.
 
         Args:
             site: Name of the site.
 
         Yields:
-            A function that returns the present factors, by the name of the peer.
+            A function that returns the present weights, by the name of the peer.
         """
         with self.reach("") as bus:
             info = self._find_running(bus, site)
@@ -681,7 +685,8 @@ class RunningSession:
             timeout_s: Longest wait for replies, in s.
 
         Returns:
-            Round trip times, clock offsets, and the state of the links.
+            The round trip time to each member, the offset of its clock, and the delays of the
+            links between the sites.
         """
         report = ping_session(
             connection=self._connection,
@@ -728,8 +733,8 @@ def session(
 def start(*arguments: str | Path) -> "subprocess.Popen[bytes]":
     """Starts a process of a session, as a terminal would.
 
-    The process runs until its end, or until it is terminated. The commands are `trilat site`,
-    `hand`, `record`, `router`, `replay`, `watch`, `live` and `ros2`.
+    The process runs until it ends by itself, or until the caller terminates it. The commands
+    are `trilat site`, `hand`, `record`, `router`, `replay`, `watch`, `live` and `ros2`.
 
     >>> recorder = tn.start("record", "--session", "paper", "-o", "run.mcap")  # doctest: +SKIP
     >>> player = tn.start("replay", "run.mcap", "--rate", "2")  # doctest: +SKIP

@@ -129,7 +129,7 @@ class PeerInbox:
         Args:
             index: Index of the peer.
             boot: Number that identifies the new process of the peer.
-            first: First tick of the new process.
+            first: First tick (period of the control loop) of the new process.
         """
         self._boots[index] = boot
         self._newest[index] = None
@@ -360,7 +360,7 @@ class StateBlock:
 
         Args:
             output: The record, the result of the tick.
-            arrivals: Samples of the peers that the tick has received.
+            arrivals: Samples of the peers (their published states) that the tick has received.
             late_us: Time by which the tick began late, in us.
             busy_us: Computing time of the previous tick, in us.
 
@@ -377,7 +377,7 @@ class StateBlock:
         """Sends the waiting samples to the peers, unless they are held until a later tick.
 
         Args:
-            k: Number of the present tick.
+            k: Number of the present tick (period of the control loop).
             send: Function that sends the sample of a record. It returns the sending time and
                 the confirmations of received samples ("echoes") that the sample contained. Both
                 become part of the record.
@@ -457,8 +457,9 @@ def run_loop(
 ) -> TickRecord | None:
     """Executes the ticks of a site in real time, until the end of the run or an error.
 
-    Each round waits until a tick is due, receives the samples of the peers, computes the tick,
-    and publishes the results. Work that is not urgent follows in the rest of the period.
+    Each round waits until a tick is due, receives the samples of the peers (their published
+    states), computes the tick, and publishes the results. Work that is not urgent follows in
+    the rest of the period.
 
     A tick is one period of the control loop.
 

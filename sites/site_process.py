@@ -482,7 +482,8 @@ class RunningSite:
 
         Args:
             k: Number of the tick, a period of the control loop.
-            arrivals: Samples of the peers that have arrived since the previous tick.
+            arrivals: Samples of the peers (their published states) that have arrived since the
+                previous tick.
 
         Returns:
             The record of the tick. None if the user's own law, plant or operator failed, which
@@ -740,7 +741,7 @@ class RunningSite:
         Examples are a new delay of a link, and a new mode of the site, such as "fault".
 
         Args:
-            output: Record of the tick.
+            output: Record (stored result) of the tick.
         """
         parts = self._parts
         skipped = count_skipped_ticks(output.cmd)

@@ -54,7 +54,7 @@ def require_libraries(*names: str) -> None:
 
 
 def import_extra(module: str, extra: str, purpose: str) -> Any:
-    """Imports a module of an optional package.
+    """Imports a module of an optional package, which may not be installed.
 
     Args:
         module: Name of the module.
@@ -125,13 +125,13 @@ def find_page(name: str) -> Path:
 
 
 def open_regular(path: Path, **options: Any) -> Any:
-    """Opens a regular file for reading, as text if the options have `encoding`.
+    """Opens a file for reading. Pipes and devices are refused.
 
-    Pipes and devices are refused because they may have no end.
+    They are refused because they may have no end, so that reading would never return.
 
     Args:
         path: The file.
-        options: Further arguments of `open`.
+        options: Further arguments of `open`. With `encoding`, the file is opened as text.
 
     Raises:
         OSError: The path is a pipe or a device, or cannot be opened.
@@ -171,6 +171,8 @@ def decode_text(raw: bytes, *, any_code_page: bool = False) -> str:
     """Decodes the content of a text file.
 
     The encoding is UTF-8, or UTF-16 as Windows PowerShell writes it.
+
+    Some bytes at the start of the content, such as a byte order mark, show the encoding.
 
     Args:
         raw: Content of the file.
@@ -221,7 +223,10 @@ def _describe_kind(kind: str) -> str:
 
 @contextmanager
 def reading(path: Path, kind: type[TrilatError] = LogError) -> Iterator[BinaryIO]:
-    """Opens a regular file for reading, as a context manager.
+    """Opens a file for reading, as a context manager that converts errors.
+
+    Errors of the operating system become errors that a user can act on. Pipes and devices are
+    refused, because they may have no end.
 
     Args:
         path: The file.
@@ -570,6 +575,9 @@ def describe_write_error(
     path: Path, error: OSError, remedy: str = ""
 ) -> LogRefused | UsageError:
     """Returns the error of a failed write, for the caller to raise.
+
+    A full disk needs another remedy than a wrong path, so that the two cases have different
+    errors.
 
     Args:
         path: The file.

@@ -319,6 +319,8 @@ def raise_priority(nice: int) -> bool:
     If it is the calling thread, its priority is raised too. Only Linux has a nice value for
     each thread. On other systems, and without the privilege, nothing changes.
 
+    On a busy machine, these threads are then delayed less by other programs.
+
     Args:
         nice: The nice value. Values below 0 are above the normal priority, and -20 is the
             highest.

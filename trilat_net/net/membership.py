@@ -222,10 +222,11 @@ class MemberQuery:
         bus: Network connection of the member that sends the query.
         clock: Clock of that member.
         session: Name of the session.
-        member: Name of the member to query, or "*" for all members.
+        member: Name of the member to query. "*" queries all members.
 
     Attributes:
-        unreadable: For each member whose reply cannot be decoded, the reason.
+        unreadable: Reasons why replies cannot be decoded, by the name of the member that sent
+            the reply.
     """
 
     def __init__(
@@ -400,12 +401,14 @@ class Membership:
     def list_running(self) -> list[Info]:
         """Lists the running sites that agree on who takes part in the session.
 
-        Every running site states the boots of the members that it has admitted. Two sites agree
-        if they state the same boots. The boot of this member is ignored in the comparison,
-        because some sites may have admitted this member already while others have not.
+        Every running site states the members that it has admitted, each with its boot, the
+        number that identifies one start of a process. Two sites agree if they state the same
+        boots. The boot of this member is ignored in the comparison, because some sites may have
+        admitted this member already while others have not.
 
         Returns:
             The identities of the sites that agree with the first running site, sorted by name.
+            Empty if no site is running.
         """
         running = []
         for _, info in sorted(self.others.items()):
@@ -420,7 +423,10 @@ class Membership:
         return [info for info in running if info.boots | local_boot == expected_boots]
 
     def poll(self, *, may_have_started: bool) -> None:
-        """Receives identities, repeats the query for them, and removes members that are gone.
+        """Updates the list of members: adds those that reply, and removes those that are gone.
+
+        The query for the identities of the members is repeated when it is due. The method does
+        not wait.
 
         Args:
             may_have_started: True if this member has published that it is ready. From then on
@@ -547,6 +553,8 @@ class Epoch(NamedTuple):
 
     The epoch is the time of tick 0. `SessionJoin.poll` returns this object when the members
     have agreed on the epoch, or when this member was admitted to a running session.
+
+    A tick is one period of a site's control loop.
 
     Attributes:
         mono_ns: The epoch on the monotonic clock of this process.

@@ -150,10 +150,11 @@ class SessionJoin:
         return self._publisher.info
 
     def poll(self) -> Epoch | None:
-        """Receives messages, replies to them, and takes the next step towards the epoch.
+        """Receives messages, replies to them, and takes the next step towards the start.
 
-        A running session is joined if the rules permit it. Otherwise the leader proposes and
-        confirms an epoch, and the other members wait for its events.
+        A running session is joined if the rules permit it. Otherwise the leader, the first site
+        of the scenario, proposes and confirms an epoch (the common start time), and the other
+        members wait for the events in which it does so.
 
         Returns:
             The epoch once it is fixed. None until then.

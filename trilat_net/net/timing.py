@@ -85,7 +85,7 @@ class TickSchedule:
         """Returns the time at which a tick is due, on the site's clock, in ns.
 
         Args:
-            k: Number of the tick.
+            k: Number of the tick (period of the control loop).
         """
         passed_ns = k * NS_PER_S // self._rate_hz - self._base_nominal_ns
         return self._base_ns + passed_ns + int(passed_ns * self._slew_per_ns)
@@ -97,8 +97,8 @@ class TickSchedule:
         time constant `_CORRECTION_TIME_S`. It is limited to `SLEW_LIMIT`.
 
         Args:
-            k: Number of the tick. It must not be earlier than the tick of the previous
-                adjustment.
+            k: Number of the tick (period of the control loop). It must not be earlier than the
+                tick of the previous adjustment.
             error_ns: Lateness of the tick compared with the leader's schedule, in ns.
             drift: Rate of the leader's clock relative to the site's clock, in ns/s.
         """
@@ -136,7 +136,7 @@ class SentStamps:
         """Stores when the sample of a tick was sent. The oldest stored time is overwritten.
 
         Args:
-            tick: Number of the tick.
+            tick: Number of the tick (period of the control loop).
             sent_ns: Time of sending on the local clock, in ns.
         """
         slot = 2 * (tick % self._capacity)
@@ -149,7 +149,7 @@ class SentStamps:
         None if that time is not stored any more, or if no sample was sent in that tick.
 
         Args:
-            tick: Number of the tick.
+            tick: Number of the tick (period of the control loop).
         """
         slot = 2 * (tick % self._capacity)
         return self._entries[slot + 1] if self._entries[slot] == tick else None
@@ -314,9 +314,9 @@ class LinkTimingMonitor:
     def is_acknowledged(self, now_ns: int) -> bool | None:
         """Determines whether the peer still receives the samples of this site.
 
-        The samples of the peer confirm which samples of this site it has received. If they
-        arrive, but have confirmed nothing new for UNHEARD_NS, the peer does not receive this
-        site.
+        The samples of the peer (their published states) confirm which samples of this site it
+        has received. If they arrive, but have confirmed nothing new for UNHEARD_NS, the peer
+        does not receive this site.
 
         Args:
             now_ns: Present time on the local clock, in ns.
@@ -485,7 +485,7 @@ class SiteTiming:
         This is the time at which the tick is due, plus the delay `turn_ns`.
 
         Args:
-            k: Number of the tick.
+            k: Number of the tick (period of the control loop).
         """
         return self.schedule.due_ns(k) + self.turn_ns
 
@@ -556,7 +556,7 @@ class SiteTiming:
         """Stores when the sample of a tick was sent, so that its delay can be measured later.
 
         Args:
-            tick: Number of the tick.
+            tick: Number of the tick (period of the control loop).
             now_ns: Time of sending on the site's clock, in ns.
 
         Returns:
@@ -591,7 +591,8 @@ class SiteTiming:
         The leader is the first site of the scenario. All sites follow its schedule.
 
         Args:
-            k: Number of the next tick. The adjusted schedule applies from this tick on.
+            k: Number of the next tick (period of the control loop). The adjusted schedule
+                applies from this tick on.
             now_ns: Present time on the site's clock, in ns.
 
         Returns:
@@ -770,8 +771,8 @@ class LoopStats:
 
     Attributes:
         dropped: Number of messages that were dropped since the start, by reason.
-        overruns: Number of ticks since the start that began after the next tick was due, or
-            that were skipped.
+        overruns: Number of ticks (periods of the control loop) since the start that began after
+            the next tick was due, or that were skipped.
     """
 
     def __init__(self, site: Site, boot: int) -> None:
@@ -794,7 +795,8 @@ class LoopStats:
         Args:
             late_us: Time by which the tick began late, in us.
             busy_us: Computing time of the previous tick, in us.
-            skipped: Number of ticks that were skipped before this tick.
+            skipped: Number of ticks (periods of the control loop) that were skipped before this
+                tick.
         """
         self.overruns += skipped
         if late_us > self._late_max_us:
@@ -810,8 +812,8 @@ class LoopStats:
         are published after the next tick that was executed.
 
         Args:
-            k: The tick.
-            skipped: Number of ticks that were skipped before it.
+            k: The tick (period of the control loop).
+            skipped: Number of ticks (periods of the control loop) that were skipped before it.
         """
         # Number of ticks since the last tick at which statistics were due.
         ticks_since_due = k % self._ticks_per_stats

@@ -319,15 +319,18 @@ def decode(
     versions: Collection[int] = (VERSION,),
     layout: Layout | None = None,
 ) -> M:
-    """Decodes a payload and checks the message.
+    """Decodes a payload that has arrived from the network, and checks the message.
+
+    Payloads may come from any program on the network. Everything that could harm the caller is
+    therefore checked: the size, the version, the lengths of vectors and all numbers.
 
     Args:
         payload: The encoded message.
         kind: Expected type of the message.
         versions: Accepted versions of the schema. Logs may contain older versions, see
             `READABLE`.
-        layout: Numbers of joints, peers and parameters of the sender, from which the lengths of
-            the vectors follow. None accepts vectors of any length.
+        layout: Numbers of joints, peers and arm parameters of the sender, from which the
+            lengths of the vectors in the message follow. None accepts vectors of any length.
 
     Returns:
         The message.
@@ -352,9 +355,12 @@ def make_decoder(
 
     Args:
         kind: Expected type of the messages.
-        versions: Accepted versions of the schema.
+        versions: Accepted versions of the schema, the definition of the messages' fields.
         layout: Numbers of joints, peers and parameters of the sender. None accepts vectors of
             any length.
+
+    Returns:
+        The function, which raises WireError as `decode` does.
     """
     limit = _SIZE_LIMITS.get(kind, MAX_BYTES)
     parse = _DECODERS[kind].decode
