@@ -287,7 +287,7 @@ def run_demo(
     The session has the name of the scenario.
 
     Args:
-        scenario: The scenario.
+        scenario: The scenario, which describes the arms, their links and the run.
         folder: Folder for the log and for the output of the processes.
         console: Terminal of the user.
         attend: Function that watches the session and may end it. None if there is no such
@@ -372,7 +372,7 @@ def compile_core(scenario: Scenario, say: Callable[[str], None], interrupt: Inte
     The compilation may take minutes. A signal interrupts it.
 
     Args:
-        scenario: The scenario.
+        scenario: The scenario, which describes the arms, their links and the run.
         say: Function that tells the user that the code is being compiled.
         interrupt: Handler of the signals.
     """

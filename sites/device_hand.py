@@ -53,7 +53,7 @@ class DeviceHand:
 
     Args:
         hand: Connection to the site that runs the arm, in the role of its operator.
-        device: The device.
+        device: The input device, which a person moves.
         settings: How the device moves the arm, and how force is rendered.
         clock: Clock of this machine.
         reach: Region that the arm can reach. The target never leaves it.

@@ -498,7 +498,7 @@ class Rehearsal(LoopStats):
     was due.
 
     Args:
-        scenario: The scenario.
+        scenario: The scenario, which describes the arms, their links and the run.
         name: Name of the site.
     """
 

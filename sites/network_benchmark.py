@@ -342,7 +342,7 @@ def find_needs(scenario: Scenario) -> ScenarioNeeds:
     as long as the command `trilat linear`.
 
     Args:
-        scenario: The scenario.
+        scenario: The scenario, which describes the arms, their links and the run.
     """
     links = list(scenario.links.values())
     held_ms = []

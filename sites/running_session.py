@@ -314,7 +314,7 @@ class RunningSession:
         Args:
             sites: Names of the sites. Empty addresses all sites, or all that are present if the
                 scenario allows sites to leave.
-            order: The order.
+            order: The order: "stop", "enable" or "reset".
 
         Returns:
             The reply of each site, accepted or refused.

@@ -127,7 +127,7 @@ class PeerInbox:
         """Accepts samples of a restarted peer, and no more samples of its previous process.
 
         Args:
-            index: Index of the peer.
+            index: Index of the peer among all peers of this site.
             boot: Number that identifies the new process of the peer.
             first: First tick (period of the control loop) of the new process.
         """
@@ -142,7 +142,7 @@ class PeerInbox:
         A tick is one period of the peer's control loop.
 
         Args:
-            index: Index of the peer.
+            index: Index of the peer among all peers of this site.
             boot: Boot of the new process of the peer, whose samples are not accepted yet.
 
         Returns:
@@ -286,7 +286,7 @@ def may_hold_samples(scenario: Scenario, name: str) -> bool:
     and must send each sample at once after an event has reported a change.
 
     Args:
-        scenario: The scenario.
+        scenario: The scenario, which describes the arms, their links and the run.
         name: Name of the site.
     """
     for receiver in scenario.names:
@@ -470,7 +470,7 @@ def run_loop(
         clock: Clock of this process.
         inbox: Samples of the peers.
         timing: Times at which ticks are due, and clocks of the peers.
-        stats: Statistics of the loop.
+        stats: Statistics of the loop, which are updated in every tick.
         states: Records (results of ticks) that wait to be sent to the recorders.
         io: The running site, which computes each tick, and handles messages and events.
         first: Number of the first tick.

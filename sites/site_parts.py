@@ -372,7 +372,7 @@ def warm_up(scenario: Scenario, name: str, clock: Clock | None = None) -> None:
     The first ticks (periods of the control loop) of the actual site would otherwise be late.
 
     Args:
-        scenario: The scenario.
+        scenario: The scenario, which describes the arms, their links and the run.
         name: Name of the site.
         clock: Clock of this process. None creates one.
 
@@ -401,7 +401,7 @@ def watch_law(
     watchdog is a thread that limits its computing time. The built-in laws need no watchdog.
 
     Args:
-        scenario: The scenario.
+        scenario: The scenario, which describes the arms, their links and the run.
         site: The site in the simulation kernel.
         clock: Clock of this process.
 

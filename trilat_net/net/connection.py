@@ -276,7 +276,7 @@ def secure_connection(
     """Adds a member's keys to a connection, or checks that it is safe without keys.
 
     Args:
-        connection: The connection.
+        connection: The connection: endpoints, mode and keys of the process.
         keys: Keys of a member, or the folder that contains them. None if there are no keys.
         insecure: True to permit endpoints that other machines can reach without keys.
 

@@ -220,7 +220,7 @@ def send_change(
         clock: Clock of the caller.
         session: Name of the session.
         site: Name of the site.
-        request: The request.
+        request: The requested change, or an order such as "stop".
 
     Returns:
         The reply of the site, accepted or refused.

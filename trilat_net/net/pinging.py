@@ -135,7 +135,7 @@ def answer_backfill(
     """Replies to a recorder's query for messages that were lost on the way.
 
     Args:
-        query: The query.
+        query: The query as it has arrived from the recorder.
         member: Name of the member that replies.
         boot: Random number that identifies this start of the member.
         find: Function that looks up the requested messages. It returns the number of the first
@@ -204,7 +204,8 @@ class RoundTrips:
 
         Args:
             pinged_ns: Time at which the ping was sent, on the local clock, in ns.
-            pong: The reply.
+            pong: The reply of the member, with the times at which the ping arrived and the
+                reply left.
             now_ns: Time at which the reply arrived, on the local clock, in ns.
         """
         rtt_ns = now_ns - pinged_ns - (pong.left_ns - pong.came_ns)

@@ -193,10 +193,10 @@ def topic_key(
     """Returns the Zenoh key of a topic or a service.
 
     Args:
-        domain: Domain of ROS (ROS_DOMAIN_ID).
+        domain: Number of the ROS domain (ROS_DOMAIN_ID). Nodes of other domains are invisible.
         name: Name of the topic or service.
-        kind: Name of its type.
-        type_hash: Hash of the type.
+        kind: Name of its type, such as "std_msgs/msg/String".
+        type_hash: Hash of the type, which differs between versions of the type.
     """
     return f"{domain}/{name}/{name_dds_type(kind)}/{type_hash}"
 
@@ -205,7 +205,7 @@ class Ros2Member(NamedTuple):
     """Address of a node, from which its liveliness tokens are composed.
 
     Attributes:
-        domain: Domain of ROS (ROS_DOMAIN_ID).
+        domain: Number of the ROS domain (ROS_DOMAIN_ID). Nodes of other domains are invisible.
         zid: Identity of the node's Zenoh session.
         namespace: Namespace of the node. Empty for the root namespace.
         name: Name of the node.
@@ -238,9 +238,9 @@ class Ros2Member(NamedTuple):
             number: Number of the endpoint, unique in the Zenoh session.
             end: Kind of the endpoint.
             name: Name of the topic or service.
-            kind: Name of its type.
-            type_hash: Hash of that type.
-            qos: Quality of service.
+            kind: Name of its type, such as "std_msgs/msg/String".
+            type_hash: Hash of that type, which differs between versions of the type.
+            qos: Quality of service, for example if lost messages are sent again.
         """
         node = f"@ros2_lv/{self.domain}/{self.zid}/0/{number}/{end}/{self._path()}"
         return f"{node}/{_mangle('/' + name)}/{name_dds_type(kind)}/{type_hash}/{qos.encode()}"
@@ -410,7 +410,7 @@ class Ros2Graph:
         namespace: Namespace of the node.
         name: Name of the node.
         clock: Clock for the times of sending.
-        domain: Domain of ROS (ROS_DOMAIN_ID).
+        domain: Number of the ROS domain (ROS_DOMAIN_ID). Nodes of other domains are invisible.
         distro: Distribution of ROS 2, one of `DISTROS`. It determines the form of type hashes.
 
     Raises:
@@ -483,7 +483,7 @@ class Ros2Graph:
         Args:
             topic: Name of the topic.
             kind: Name of the message type.
-            qos: Quality of service.
+            qos: Quality of service, for example if lost messages are sent again.
 
         Returns:
             The publisher, which sends messages that are encoded in CDR.
@@ -605,7 +605,7 @@ class Ros2Graph:
 
         Args:
             service: Name of the service.
-            kind: Name of its type.
+            kind: Name of its type, such as "std_msgs/msg/String".
             answer: Function that receives a request and returns the response, both encoded in
                 CDR, the binary format of ROS 2.
         """

@@ -258,7 +258,8 @@ class LinkTimingMonitor:
         the peer's clock. The echo of a local sample gives the delay from this site to the peer.
 
         Args:
-            sample: The sample.
+            sample: The sample as it has arrived: the state of the peer in one tick, with
+                echoes.
             arrived_ns: Time of its arrival on the local clock, in ns.
 
         Returns:
@@ -517,7 +518,7 @@ class SiteTiming:
         is wide, because no time stamps have been exchanged yet.
 
         Args:
-            index: Index of the peer.
+            index: Index of the peer among all peers of this site.
             t_ns: Nominal time of the peer's first tick, in ns since the epoch (the common start
                 of the session).
             epoch_ns: Time of the epoch on the peer's clock, as the peer states it, in ns.

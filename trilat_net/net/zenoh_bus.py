@@ -167,7 +167,8 @@ def open_zenoh(
     Args:
         listen: Endpoints at which the session listens.
         connect: Endpoints to which the session connects.
-        mode: "peer", "client" or "router".
+        mode: "peer" to connect to members directly, "client" to connect to a router, or
+            "router" to be a router itself.
         settings: Settings that replace those of this program, from a user's file or from keys.
         silent: Text of the error if no router answers, with {} in place of the endpoints.
 
@@ -208,7 +209,8 @@ class ZenohBus:
     Args:
         listen: Endpoints at which the session listens.
         connect: Endpoints to which the session connects.
-        mode: "peer", "client" or "router".
+        mode: "peer" to connect to members directly, "client" to connect to a router, or
+            "router" to be a router itself.
         settings: Settings that replace those of this program, from a user's file or from keys.
 
     Raises:
