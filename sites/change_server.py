@@ -59,6 +59,8 @@ class ChangeServer:
 
     The control loop of the site calls `pop_changes` before each tick.
 
+    A request changes for example the delay of a link, or orders the site to stop its arm.
+
     Args:
         scenario: Scenario of the session.
         site: Name of the site.
@@ -71,8 +73,8 @@ class ChangeServer:
     Attributes:
         stopped: True if the next tick is the last one before a requested end of the run.
         marks: Marks that are not published yet: pairs of a tick and a text.
-        sources: Who requested an accepted change, by the text of the change in the record. The
-            entry is removed when the change is published.
+        sources: Who requested each accepted change, by the text of the change as the record of
+            the tick contains it. The entry is removed when the change is published.
     """
 
     def __init__(
@@ -115,7 +117,8 @@ class ChangeServer:
             k: Number of the next tick, a period of the control loop.
 
         Returns:
-            The changes that the site applies in that tick.
+            The changes that the site applies in that tick. Empty if none was accepted since the
+            last call.
         """
         self._update_stopped(k)
 

@@ -282,16 +282,18 @@ def run_demo(
     attend: SessionAttendant | None = None,
     begins: Callable[[], bool] | None = None,
 ) -> SessionResult:
-    """Runs a session of all sites and a recorder on this machine.
+    """Runs a session on this machine, with a process for each site and for the recorder.
 
     The session has the name of the scenario.
+
+    A site is a process that runs one arm and its control loop. The recorder writes the log.
 
     Args:
         scenario: The scenario, which describes the arms, their links and the run.
         folder: Folder for the log and for the output of the processes.
         console: Terminal of the user.
-        attend: Function that watches the session and may end it. None if there is no such
-            function.
+        attend: Function that watches the session, for example to serve a web page, and may end
+            it. None if there is no such function.
         begins: Function that returns True once the session may begin. Until then, for at most
             `WAIT_S`, the sites wait for the recorder. The session begins a second or two later.
             None lets it begin at once.
@@ -367,9 +369,10 @@ def run_demo(
 
 
 def compile_core(scenario: Scenario, say: Callable[[str], None], interrupt: Interrupt) -> None:
-    """Compiles the control code for the arms of a scenario, unless it is cached on disk.
+    """Compiles the code of the control loop for a scenario, unless it is cached on disk.
 
-    The compilation may take minutes. A signal interrupts it.
+    The code depends on the number of joints of the arms. The compilation may take minutes, and
+    a signal such as Ctrl-C interrupts it.
 
     Args:
         scenario: The scenario, which describes the arms, their links and the run.

@@ -74,6 +74,8 @@ def measure_busy_share(clock: Clock) -> float | None:
 def describe_load(busy_share: float | None) -> str:
     """Returns a warning about a busy machine, with a remedy.
 
+    On a busy machine, the control loops of the sites may be late.
+
     Args:
         busy_share: Fraction of time in which the processors are busy. None if it is not known.
 

@@ -87,6 +87,8 @@ class SingleSender:
     def admit(self, publisher: bytes) -> int:
         """Accepts a message of a publisher, or refuses it if another publisher is present.
 
+        While two publishers send messages, the messages of both are refused.
+
         Args:
             publisher: Identity of the publisher in its message, see `Attachment.gid`.
 
@@ -94,7 +96,7 @@ class SingleSender:
             The time since the previous message, in ns.
 
         Raises:
-            ValueError: Two programs publish.
+            ValueError: Another publisher has sent a message within `SENDER_TIMEOUT_NS`.
         """
         now_ns = self._clock.monotonic_ns()
         silent_ns = now_ns - self._received_ns
@@ -397,7 +399,7 @@ def find_joint_indices(joints: Sequence[Sequence[str]], state: cdr.RosJoints) ->
         state: The message.
 
     Returns:
-        For each joint, its index in the message.
+        For each joint of the arm, its index among the joints of the message.
 
     Raises:
         ValueError: A joint is missing or appears twice.
@@ -964,7 +966,7 @@ def refuse_other_robots(table: TopicTable, scenario: Scenario) -> None:
 
 
 def await_site(ends: BridgeEnds, stopped: Callable[[], bool], *, running: bool) -> Info | None:
-    """Waits until a site of the session replies.
+    """Waits until any site of the session replies to a query for its identity.
 
     Args:
         ends: Connections to ROS and to the session.

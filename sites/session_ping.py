@@ -71,6 +71,10 @@ class SessionPing:
 
     The caller calls `poll` repeatedly until `is_over` returns True, and then `report`.
 
+    The caller takes part in no control loop. It learns the members from their replies to a
+    query, measures the round trips to them by pings, and reads the delays of the links from the
+    statistics that the sites publish.
+
     Args:
         bus: Network connection that reaches the session.
         clock: Clock of this process.

@@ -59,7 +59,10 @@ from .site_loop import StateBlock, make_sample_readers, may_hold_samples
 
 @dataclass(frozen=True, slots=True)
 class SiteOptions:
-    """How a site joins a session, and how long it waits for others.
+    """Options of the user about how a site joins a session and waits for others.
+
+    A site is a process that runs one arm and its control loop. The options come from the
+    command line of `trilat site`.
 
     Attributes:
         session: Name of the session.

@@ -190,7 +190,7 @@ class Connection:
 
         Args:
             endpoints: Endpoints as text, or groups of endpoints from a user's Zenoh file. The
-                groups are not converted.
+                groups are returned unchanged.
         """
         if not self.keys_of:
             return list(endpoints)
@@ -217,7 +217,7 @@ class Connection:
         return ZenohBus(listen, connect, self.mode, self.settings)
 
     def require_keys_until(self, left_s: float) -> None:
-        """Raises an error if the validity of the keys ends before the planned end of a session.
+        """Checks that the keys of the member stay valid until the planned end of a session.
 
         An open connection continues after its certificate has expired, but no new connection
         can be opened. After a short interruption of the network, a member could not return.
@@ -621,7 +621,9 @@ def run_router(
     say: Callable[[str], None],
     until_idle_s: float | None = None,
 ) -> None:
-    """Runs a router, and prints which members join and leave.
+    """Runs a router until it is stopped, and prints which members join and leave.
+
+    Members that cannot reach each other directly communicate through a router.
 
     Args:
         bus: Network connection of the router, which forwards the messages by itself.

@@ -188,7 +188,10 @@ def list_endpoints(known_sites: Sequence[KnownSite]) -> list[Endpoint]:
 
 
 def find_known_endpoints(session: str, connection: "Connection") -> list[Endpoint] | None:
-    """Returns the endpoints of a session if all of its sites run on this machine.
+    """Finds the endpoints of a session whose sites all run on this machine.
+
+    Every running site stores its endpoints in a file, so that no search in the network is
+    needed.
 
     Args:
         session: Name of the session.

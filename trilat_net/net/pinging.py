@@ -31,6 +31,9 @@ QUERY_PERIOD_NS = 200_000_000
 class RepeatedQuery:
     """Sends a query repeatedly, and collects the replies to all of its copies.
 
+    A query may be lost, so that it is sent several times. Each reply is assigned to the copy of
+    the query that it answers, which gives the round trip time.
+
     Args:
         bus: Network connection of the member that sends the query.
         clock: Clock of that member.
@@ -138,9 +141,9 @@ def answer_backfill(
         query: The query as it has arrived from the recorder.
         member: Name of the member that replies.
         boot: Random number that identifies this start of the member.
-        find: Function that looks up the requested messages. It returns the number of the first
-            message, the payloads of consecutive messages, and the number of messages that the
-            member has published.
+        find: Function that looks up the requested messages among those that the member still
+            stores. It returns the number of the first message, the payloads of consecutive
+            messages, and the number of messages that the member has published.
 
     Returns:
         The number of messages in the reply. 0 if the query cannot be decoded; it then gets no

@@ -158,6 +158,8 @@ class SentStamps:
 class PeerClock(NamedTuple):
     """Clock of a peer, as known when the session starts or when the peer joins.
 
+    A peer is another site whose samples (states) this site receives.
+
     Attributes:
         name: Name of the peer.
         epoch_ns: Time of tick 0 on the peer's clock, in ns.
@@ -346,8 +348,8 @@ class LinkTimingMonitor:
                 in ns.
 
         Returns:
-            The new estimate. None if the window is not long enough yet, or if the peer runs on
-            this machine.
+            The new estimate. None if the window is not long enough yet. Also None if the peer
+            runs on this machine, where both sites use the same clock.
         """
         estimator = self.peer.estimator
         if estimator is None:
@@ -424,7 +426,7 @@ ClockNotice = dict[str, Any]
 
 
 def find_turn_ns(index: int, sites: int, rate_hz: int) -> int:
-    """Returns how long after the start of a period a site wakes up, in ns.
+    """Returns by how much a site wakes up after the start of a control period, in ns.
 
     If all sites of a machine woke up at the same time, they would compete for its processors.
     The sites are spread over half of a period. A sample of the last site thus still arrives
@@ -664,7 +666,7 @@ class SiteTiming:
         return notices
 
     def pop_measurements(self, now_ns: int) -> dict[str, Any]:
-        """Returns the state of the schedule, and the timing of all links since the last call.
+        """Returns the state of the schedule, and the delays measured since the last call.
 
         Args:
             now_ns: Present time on the local clock, in ns.

@@ -75,7 +75,11 @@ class KeyParts(NamedTuple):
 
 
 def presence_key(session: str, member: str) -> str:
-    """Returns the key that matches the liveliness tokens of all starts of a member.
+    """Returns the key under which the presence of a member can be observed.
+
+    A process shows that it is present by a liveliness token, whose key contains the number of
+    its start. The returned key contains a wildcard, and matches the tokens of all starts of the
+    member.
 
     Args:
         session: Name of the session.
@@ -102,12 +106,12 @@ def read_presence(inbox: PresenceInbox) -> Iterator[tuple[KeyParts, bool]]:
 
 
 def key(session: str, member: str, channel: str) -> str:
-    """Returns the key of one channel of a member.
+    """Returns the key under which a member publishes the messages of one channel.
 
     Args:
         session: Name of the session.
         member: Name of the member, or "*" for all members.
-        channel: Name of the channel.
+        channel: Name of the channel, one stream of messages, such as that of the events.
     """
     return f"{ROOT}/{session}/{member}/{channel}"
 
