@@ -247,7 +247,7 @@ class SessionDisplay:
     def show(
         self, title: str, rows: Sequence[SiteRow], alarms: Sequence[tuple[str, LifeAlarm]] = ()
     ) -> None:
-        """Shows the rows of all sites, with the alarms above them.
+        """Shows the present state of the session: a table of the sites, and alarms above it.
 
         Args:
             title: Title of the table.
@@ -285,7 +285,7 @@ class SessionMonitor:
         bus: Network connection that reaches the session.
         session: Name of the session.
         scenario: Scenario of the session.
-        display: Display for the rows of the sites.
+        display: Display on which the state of each site is one row of a table.
 
     Attributes:
         latest: Newest statistics of each site, by name.

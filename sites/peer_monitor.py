@@ -284,7 +284,9 @@ class PeerMonitor:
         )
 
     def read_stored(self, ticks: int) -> bool:
-        """Receives the confirmations of recorders that they have stored all data of this site.
+        """Receives the messages in which recorders confirm that they have stored all data.
+
+        After the run, the site waits until all recorders have the data of all of its ticks.
 
         Args:
             ticks: Number of ticks (periods of the control loop) that this site has executed.

@@ -95,9 +95,11 @@ class ScenarioError(TrilatError):
 
 
 class CodeWithheld(ScenarioError):  # noqa: N818 - it names an outcome
-    """A user's code that a log names, but that has not been allowed to run on this machine.
+    """A user's code that a log names, but that is not allowed to run on this machine.
 
-    The code is a control law, an operator or a plant.
+    The code is a control law, an operator (a program that moves an arm), or a plant (a
+    simulation of an arm). The user of this machine has to allow it first, because a log of
+    somebody else may name harmful code.
     """
 
     exit_code = 4
@@ -186,7 +188,7 @@ class CodeFailed(RunFailed):
         site: Name of the site that ran the code.
         code: The class, as in "package.module:Law".
         tick: Tick (period of the control loop) in which the code failed. None if the code
-            failed while it was resumed, before a tick.
+            failed before a tick, when its state was restored.
     """
 
     kind: ClassVar[str] = "code"
@@ -235,7 +237,7 @@ class RuntimeFault(TrilatError):  # noqa: N818 - a fault of ours, by its name in
 
 
 def count_nouns(count: object, singular: str, plural: str = "") -> str:
-    """Returns a number with the noun that it counts, in the singular for 1.
+    """Returns a number followed by the noun that it counts, in the singular or the plural.
 
     >>> count_nouns(1, "record"), count_nouns(2, "record")
     ('1 record', '2 records')

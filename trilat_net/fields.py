@@ -46,8 +46,8 @@ def find_kinds(package: str, base: type[K]) -> Iterator[type[K]]:
     is that of the files, and of the positions in each file.
 
     Args:
-        package: Dotted name of the package.
-        base: The base class.
+        package: Dotted name of the package whose files are searched.
+        base: The base class, for example that of all control laws.
     """
     folders = import_module(package).__path__
     for file in pkgutil.iter_modules(folders):
@@ -112,7 +112,7 @@ class VectorCounts(NamedTuple):
 
     @classmethod
     def of_chain(cls, joints: int, shared: int = 0) -> "VectorCounts":
-        """Returns the counts of an arm that is a serial chain in space.
+        """Returns the counts of an arm that is a serial chain of links and joints in space.
 
         Args:
             joints: Number of its joints.
@@ -128,7 +128,7 @@ class VectorCounts(NamedTuple):
 
 
 class KeyProblem(NamedTuple):
-    """A key of a table with an invalid value.
+    """A key of a scenario's table that has an invalid value.
 
     Attributes:
         key: Path of the key below the checked table. Empty for the table itself.
@@ -246,7 +246,7 @@ def is_distribution(value: Any) -> bool:
 
 
 def split_refusal(error: msgspec.ValidationError) -> tuple[str, str]:
-    """Splits the message of msgspec for a refused value.
+    """Splits the message with which the library msgspec refuses a value of a scenario.
 
     Args:
         error: The error, as in "Expected `float` - at `$.sites.m1`".
@@ -301,12 +301,15 @@ def suggest_nearest(word: str, valid: Sequence[str]) -> str:
 
 
 def check_keys(table: Any, valid: Sequence[str], path: str) -> TomlTable:
-    """Checks that a value is a table that contains only valid keys, and returns the table.
+    """Checks that a value of a scenario is a table that contains only valid keys.
 
     Args:
         table: A value of a scenario.
-        valid: The valid keys.
+        valid: The keys that the table may have.
         path: Dotted path of the table, for errors.
+
+    Returns:
+        The table, unchanged.
 
     Raises:
         ScenarioError: The value is not a table, or has an unknown key.

@@ -471,7 +471,7 @@ def publish_file(unfinished: Path, path: Path, *, force: bool) -> None:
 def write_whole(
     path: Path, data: bytes | str, *, force: bool = True, remedy: str = "", mode: int = 0o666
 ) -> None:
-    """Writes a file so that it exists completely or not at all.
+    """Writes a file in one step, so that readers never see a part of it.
 
     The data is written to a temporary file beside it, which then replaces it. A device or a
     pipe is written directly. A symbolic link is refused. A link that appears later is replaced,
@@ -481,7 +481,7 @@ def write_whole(
         path: The file.
         data: Its content. Text is encoded as UTF-8.
         force: True if an existing file may be replaced.
-        remedy: Advice in the error of a full disk.
+        remedy: Advice that the error contains if the disk is full.
         mode: Permissions of a new file, before the umask.
 
     Raises:

@@ -48,10 +48,10 @@ def pause_gc() -> Iterator[None]:
 
 
 def freeze_gc() -> None:
-    """Collects garbage once, and exempts all existing objects from later collections.
+    """Makes later collections of garbage faster, by exempting all objects that exist now.
 
-    Without this, each full collection traverses all objects of the imported modules, which
-    takes a quarter of a second.
+    Garbage is collected once before. Without this function, each full collection traverses all
+    objects of the imported modules, which takes a quarter of a second.
     """
     gc.collect()
     gc.freeze()
@@ -385,7 +385,7 @@ def worker_pool(count: int) -> Iterator[Executor]:
 
 @contextmanager
 def hold_sigint() -> Iterator[None]:
-    """Delays Ctrl-C until the end of the block, and hides it from processes started there.
+    """Delays Ctrl-C inside the `with` block, and hides it from processes started there.
 
     The signal mask is inherited by the started processes, which is its purpose. It does not
     delay Ctrl-C in this process if another thread receives the signal, because Python runs the

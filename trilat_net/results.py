@@ -25,6 +25,8 @@ class Result:
 
     A subclass overrides `to_dict` if its JSON keys differ from its fields, and `to_rows` if its
     table has several rows.
+
+    A result can be printed as text, as JSON, or converted to a pandas data frame.
     """
 
     def to_dict(self) -> dict[str, Any]:

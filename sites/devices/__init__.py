@@ -75,11 +75,11 @@ class Device(Protocol):
 
 
 def open_device(text: str) -> Device:
-    """Creates the device that the option --device names.
+    """Creates the object for the input device that the option --device names.
 
     Args:
-        text: Name of the device, optionally followed by "=" and its address, as in "spacemouse"
-            or "haply_inverse3=ws://127.0.0.1:10001".
+        text: Value of the option: the name of the device, optionally followed by "=" and its
+            address, as in "spacemouse" or "haply_inverse3=ws://127.0.0.1:10001".
 
     Raises:
         UsageError: There is no such device.

@@ -47,7 +47,10 @@ _CONNECT_OPTIONS: dict[str, Any] = {
 
 
 class HaplyInverse3:
-    """An Inverse3 of Haply with its wireless grip, through version 3 of the maker's service.
+    """An Inverse3 of Haply, a haptic device, as an input device that applies forces.
+
+    The device and its wireless grip are reached through version 3 of the maker's service, a
+    program that must run on this machine or another.
 
     >>> tn.session("play").lead("m1", tn.HaplyInverse3())  # doctest: +SKIP
 
@@ -93,7 +96,7 @@ class HaplyInverse3:
         self._open.close()
 
     def read(self) -> DeviceState:
-        """Waits for the next state from the service, and returns it.
+        """Waits for the next state of the device from the service, and returns it.
 
         Raises:
             ConnectionError: The service has no device, or has closed the connection.

@@ -43,7 +43,10 @@ def find_spacemouse(devices: Path = Path("/sys/class/hidraw")) -> str:
 
 
 class SpaceMouse:
-    """A SpaceMouse as an input device. Its first two buttons are "a" and "b". It has no force.
+    """A SpaceMouse, a cap that is deflected by hand, as an input device without forces.
+
+    The deflection of the cap is integrated to a position. The first two buttons are "a" and
+    "b".
 
     >>> tn.session("play").lead("m1", tn.SpaceMouse("/dev/hidraw3"))  # doctest: +SKIP
 

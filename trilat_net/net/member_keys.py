@@ -92,7 +92,10 @@ def create_keys(
     hosts: Sequence[str] = (),
     days: int = 30,
 ) -> list[Path]:
-    """Creates an authority and a folder of keys for each member, as `trilat keys new` does.
+    """Creates a folder of keys for each member of a session, as `trilat keys new` does.
+
+    With keys, the members encrypt their messages and prove their identities. The keys are
+    signed by an authority, which is created too and can renew them later.
 
     >>> [folder.name for folder in tn.create_keys("keys", ["m", "s", "recorder"])]
     ['m', 's', 'recorder']
@@ -509,8 +512,8 @@ def read_member_keys(folder: str | Path, *, stops: bool = False) -> MemberKeys:
 
     Args:
         folder: Folder of one member.
-        stops: True if the keys are only used to stop arms. Keys that have ended are then
-            accepted as long as their certificate is valid.
+        stops: True if the keys are only used to stop arms. Keys whose validity has ended are
+            then accepted for a further time, as long as their certificate is valid.
 
     Returns:
         The keys.

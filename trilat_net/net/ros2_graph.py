@@ -190,7 +190,7 @@ def topic_key(
     kind: str,
     type_hash: str,
 ) -> str:
-    """Returns the Zenoh key of a topic or a service.
+    """Returns the Zenoh key under which the messages of a ROS topic or service are sent.
 
     Args:
         domain: Number of the ROS domain (ROS_DOMAIN_ID). Nodes of other domains are invisible.
@@ -202,7 +202,10 @@ def topic_key(
 
 
 class Ros2Member(NamedTuple):
-    """Address of a node, from which its liveliness tokens are composed.
+    """Address of a ROS 2 node, from which its liveliness tokens are composed.
+
+    A liveliness token is a key that shows other programs that a node, or an endpoint of it,
+    exists.
 
     Attributes:
         domain: Number of the ROS domain (ROS_DOMAIN_ID). Nodes of other domains are invisible.
@@ -261,7 +264,7 @@ def describe_mismatch(token: str, domain: int, kind: str) -> str:
 
     Args:
         token: Liveliness token of the publisher.
-        domain: Domain of the subscription.
+        domain: Number of the ROS domain of the subscription.
         kind: Message type of the subscription.
 
     Returns:
@@ -478,7 +481,7 @@ class Ros2Graph:
         return bool(self._session.info.routers_zid())
 
     def publisher(self, topic: str, kind: str, qos: QualityOfService) -> TopicPublisher:
-        """Creates a publisher of a topic, which ROS programs see.
+        """Creates a publisher of a topic, and announces it to ROS programs.
 
         Args:
             topic: Name of the topic.
