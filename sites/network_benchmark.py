@@ -454,7 +454,9 @@ def judge_network(needs: ScenarioNeeds, row: Mapping[str, Any]) -> dict[str, Any
 
 @dataclass(frozen=True, repr=False)
 class NetworkBenchmark(Result):
-    """Result of a benchmark, with a verdict for each transport.
+    """Result of measuring a network for a scenario, with a verdict for each transport.
+
+    A transport is the protocol that carries the messages: TCP, TLS or QUIC.
 
     Attributes:
         scenario: Name of the scenario.

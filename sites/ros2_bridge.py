@@ -430,7 +430,7 @@ def read_joint_target(joints: Sequence[Sequence[str]], data: bytes) -> list[floa
 
     Args:
         joints: Names that each joint may have, in the order of the arm.
-        data: The encoded message.
+        data: The message, encoded in CDR, the binary format of ROS 2.
 
     Returns:
         The angles in rad, in the order of the arm's joints.
@@ -463,10 +463,10 @@ def read_vector_target(
     """Reads the position in a `PoseStamped` message, or the force in a `WrenchStamped`.
 
     Args:
-        frame: Frame in which the arm expects the vector.
+        frame: Name of the coordinate frame in which the arm expects the vector.
         axes: Number of coordinates to return.
         count: Number of numbers in the message: 7 in a pose, 6 in a wrench.
-        data: The encoded message.
+        data: The message, encoded in CDR, the binary format of ROS 2.
 
     Returns:
         The position in m, or the force in N.

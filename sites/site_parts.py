@@ -401,7 +401,7 @@ def watch_law(
     """Creates the function that computes a tick, and a watchdog of a user's control law.
 
     A control law that the user has written in Python may be too slow or never return. The
-    watchdog is a thread that limits its computing time. The built-in laws need no watchdog.
+    watchdog limits its computing time. The built-in laws need no watchdog.
 
     Args:
         scenario: The scenario, which describes the arms, their links and the run.
@@ -410,9 +410,8 @@ def watch_law(
 
     Returns:
         watchdog: The watchdog. It checks only the user's law, and nothing if the law is
-            built-in.
-        step: Function that computes one tick of the site. It raises LawFailed if the user's law
-            fails or is too slow.
+        built-in. step: Function that computes one tick of the site. It raises LawFailed if the
+        user's law fails or is too slow.
     """
     law = scenario.sites[site.name].control
     if not isinstance(law, ImportedLaw):

@@ -152,10 +152,10 @@ def join_and_run(parts: SiteParts) -> int:
     the first message from there.
 
     Args:
-        parts: Parts of the site.
+        parts: Parts of the site, such as its network connection and its arm.
 
     Returns:
-        Exit code of the process.
+        Exit code of the process, as `run_site` returns it.
 
     Raises:
         SessionError: The session could not begin.
@@ -182,7 +182,7 @@ def join_session(parts: SiteParts, give_up_ns: int) -> "RunningSite | None":
     The members agree on the epoch, the common start time of the session.
 
     Args:
-        parts: Parts of the site.
+        parts: Parts of the site, such as its network connection and its arm.
         give_up_ns: Time at which the site gives up, on the monotonic clock of this process.
 
     Returns:

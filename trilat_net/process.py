@@ -208,7 +208,10 @@ class Interrupt:
 
     @property
     def exit_code(self) -> int:
-        """Exit code of a process that the signal ended: 128 + its number, as in shells."""
+        """Exit code of this process if the first signal ends it, as shells define it.
+
+        It is 128 plus the number of the signal.
+        """
         return 128 + self.number
 
 

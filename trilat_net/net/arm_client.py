@@ -80,7 +80,7 @@ class SiteSender:
     numbered, so that the site detects lost, repeated and reordered messages.
 
     Args:
-        bus: Network connection.
+        bus: Network connection that reaches the site.
         clock: Clock of this process.
         session: Name of the session.
         site: Name of the site.
@@ -138,12 +138,15 @@ class SiteSender:
 
 
 class SiteClient:
-    """Connection of a program to one site, from which it receives the records and events.
+    """Connection of a program to one site, from which it receives records and events.
 
     The object is a context manager that closes the network connection.
 
+    A site is a process that runs one arm and its control loop. A record is the result of one
+    period of this loop.
+
     Args:
-        bus: Network connection.
+        bus: Network connection that reaches the site.
         clock: Clock of this process.
         session: Name of the session.
         site: Name of the site.
@@ -265,8 +268,11 @@ class OutsideClient(SiteClient):
     `ArmClient` and `SwitchClient` define the channel. The object is a context manager that
     closes the network connection.
 
+    A site is a process that runs one arm and its control loop. The channel is one stream of
+    messages to the site, for example that of the measurements of its arm.
+
     Args:
-        bus: Network connection.
+        bus: Network connection that reaches the site.
         clock: Clock of this process.
         session: Name of the session.
         site: Name of the site.
@@ -352,11 +358,11 @@ class SwitchClient(OutsideClient):
 
 
 class ArmClient(OutsideClient):
-    """Connection of the driver of an external arm to the site of the arm.
+    """Connection of the driver of an external arm to the site that controls the arm.
 
     The driver sends measurements with `send`, and reads the torque to apply with `torque`. The
-    attribute `record` is the newest record of the site. The object is a context manager that
-    closes the network connection.
+    attribute `record` is the newest record of the site, the result of one period of its control
+    loop. The object is a context manager that closes the network connection.
 
     >>> endpoints = ["tcp/127.0.0.1:10241"]
     >>> with tn.ArmClient.connected("two_sites", "s", endpoints) as client:  # doctest: +SKIP

@@ -449,7 +449,7 @@ def resolve_member_connection(
         routes: True if the process is a router itself.
 
     Returns:
-        The connection.
+        The connection: endpoints and mode, without keys.
 
     Raises:
         UsageError: The options and the file contradict each other.

@@ -163,7 +163,7 @@ def parse_attachment(content: Any) -> Attachment | None:
 
 
 def find_type_hash(kind: str, distro: str) -> str:
-    """Returns the hash of a message type, in the form that a ROS 2 distribution uses.
+    """Returns the hash by which a ROS 2 distribution identifies the version of a message type.
 
     Args:
         kind: Name of the type, such as "std_msgs/msg/String".
@@ -608,7 +608,7 @@ class Ros2Graph:
 
         Args:
             service: Name of the service.
-            kind: Name of its type, such as "std_msgs/msg/String".
+            kind: Name of its type, such as "std_srvs/srv/Trigger".
             answer: Function that receives a request and returns the response, both encoded in
                 CDR, the binary format of ROS 2.
         """

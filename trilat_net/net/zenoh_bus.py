@@ -240,7 +240,7 @@ class ZenohBus:
         """Returns a function that publishes payloads under a key.
 
         Args:
-            key: The key.
+            key: The key, without wildcards.
             patient: True if the function waits while the network is too slow, False if it drops
                 the message. A receiver that blocks a patient publisher for 5 s loses its
                 connection.
@@ -265,10 +265,10 @@ class ZenohBus:
         return self._session.declare_queryable(key, handler, allowed_origin=Locality.REMOTE)
 
     def inbox(self, key: str, capacity: int = RING_CAPACITY) -> Inbox:
-        """Returns a queue of the messages under a key, which may contain wildcards.
+        """Returns a queue of the messages that other members publish under a key.
 
         Args:
-            key: The key.
+            key: The key, which may contain wildcards.
             capacity: Number of messages that the queue holds. If it is full, the oldest message
                 is dropped.
         """
@@ -281,10 +281,10 @@ class ZenohBus:
         read: Callable[[bytes], T],
         capacity: int = RING_CAPACITY,
     ) -> StampedInbox[T]:
-        """Returns a queue of the messages under a key, each with its time of arrival.
+        """Returns a queue of decoded messages, each with its time of arrival.
 
         Args:
-            key: The key.
+            key: Key under which the messages are published. It may contain wildcards.
             now_ns: Function that reads the local clock, in ns.
             read: Function that decodes a payload, in a thread of Zenoh. It must not raise an
                 error.
@@ -327,7 +327,7 @@ class ZenohBus:
         """Replies to the queries under a key at once, in a thread of Zenoh.
 
         Args:
-            key: The key.
+            key: Key of the queries, which may contain wildcards.
             answer: Function that receives the payload of a query, and returns the payload of
                 the reply. If it returns None, there is no reply.
         """
