@@ -366,8 +366,8 @@ def _parse_xml(text: str) -> Element:
     Args:
         text: The document.
 
-    Args:
-        text: The document.
+    Returns:
+        The root element.
 
     Raises:
         ScenarioError: The text is too long, is not XML, contains a document type or entities,
@@ -433,9 +433,6 @@ def _name_elements(root: Element, tag: str) -> dict[str, Element]:
 
 def _read_tree(root: Element) -> _Robot:
     """Reads the tree of links and joints from a URDF document.
-
-    Args:
-        root: Root element of the document.
 
     Args:
         root: Root element of the document.
@@ -572,11 +569,6 @@ def _find_tip(robot: _Robot, base: str) -> str:
 
 def _find_path(robot: _Robot, base: str, tip: str) -> list[_Edge]:
     """Finds the joints on the way from the base of an arm to its tip.
-
-    Args:
-        robot: Tree of links and joints.
-        base: Name of the link that does not move.
-        tip: Name of the link at the end of the arm.
 
     Args:
         robot: Tree of links and joints.
