@@ -66,18 +66,18 @@ class ChainJoint(NamedTuple):
     """One joint of a chain; theta contains the parameters of the link that it moves.
 
     Attributes:
-        prismatic: true: the joint slides (m, N); false: it turns (rad, N m).
-        axis: axis of motion in the link's frame, length 1.
-        rotation: orientation of the link's frame in the previous link's frame at position 0,
+        prismatic: True: the joint slides (m, N); false: it turns (rad, N m).
+        axis: Axis of motion in the link's frame, length 1.
+        rotation: Orientation of the link's frame in the previous link's frame at position 0,
             three rows.
-        origin_m: origin of the link's frame in the previous link's frame, m.
-        armature_kg_m2: inertia of the drive at the joint, kg m^2; kg for a prismatic joint.
-        viscous: friction per speed, N m s/rad or N s/m.
-        coulomb: friction that hardly depends on the speed, N m or N, see `COULOMB_SPEED`.
-        lower: position of the lower stop, rad or m; -inf without a stop.
-        upper: position of the upper stop, rad or m; inf without a stop.
-        stop_stiffness: stiffness of both stops, N m/rad or N/m.
-        stop_damping: damping of both stops, N m s/rad or N s/m.
+        origin_m: Origin of the link's frame in the previous link's frame, m.
+        armature_kg_m2: Inertia of the drive at the joint, kg m^2; kg for a prismatic joint.
+        viscous: Friction per speed, N m s/rad or N s/m.
+        coulomb: Friction that hardly depends on the speed, N m or N, see `COULOMB_SPEED`.
+        lower: Position of the lower stop, rad or m; -inf without a stop.
+        upper: Position of the upper stop, rad or m; inf without a stop.
+        stop_stiffness: Stiffness of both stops, N m/rad or N/m.
+        stop_damping: Damping of both stops, N m s/rad or N s/m.
     """
 
     prismatic: bool
@@ -520,11 +520,11 @@ def _add_products(factor: float, x: Spatial, y: Spatial, first: int, gradient: A
     """Adds factor times the gradient of x' I(pi) y with respect to pi.
 
     Args:
-        factor: the factor.
+        factor: The factor.
         x: a spatial velocity.
         y: a spatial velocity.
-        first: index of the link's first parameter.
-        gradient: changed in its ten entries from `first`.
+        first: Index of the link's first parameter.
+        gradient: Changed in its ten entries from `first`.
     """
     x_lin, x_ang = x
     y_lin, y_ang = y

@@ -313,10 +313,10 @@ def _use_stage(s: Row, joints: int, weight: float, ahead_s: float) -> None:
     """Adds a stage's rates to the sums, and writes q and qd of the next stage.
 
     Args:
-        s: the site's row.
-        joints: the number of joints.
-        weight: weight of the stage in the sums, 1 or 2.
-        ahead_s: time of the next stage after the beginning of the period, s.
+        s: The site's row.
+        joints: The number of joints.
+        weight: Weight of the stage in the sums, 1 or 2.
+        ahead_s: Time of the next stage after the beginning of the period, s.
     """
     for i in range(joints):
         s.sum_qd[i] += weight * s.stage_qd[i]

@@ -72,27 +72,27 @@ class TorqueSource(NamedTuple):
     """One operator or environment; the meaning of its vectors depends on its kind.
 
     Attributes:
-        kind: the kind of operator or environment.
-        start_s: start of the action, s since the epoch.
-        end_s: end of the action, s.
-        move_start_s: start of the target's motion, s; CHIRP: start of the first sweep.
-        move_end_s: end of the target's motion, s; CHIRP: end of the first sweep.
+        kind: The kind of operator or environment.
+        start_s: Start of the action, s since the epoch.
+        end_s: End of the action, s.
+        move_start_s: Start of the target's motion, s; CHIRP: start of the first sweep.
+        move_end_s: End of the target's motion, s; CHIRP: end of the first sweep.
         a: PULSE, CHIRP: peak, N m. MULTISINE: amplitude of each sine, N m. HAND, TASK_HAND:
             target before the motion, rad or m. WALL: a point of the wall, m. Live hand: target
             or force.
         b: HAND, TASK_HAND: target after the motion. WALL: the normal that points away from the
             wall, length 1. CHIRP: frequencies at the start and the end of a sweep, Hz. Live
-            hand: position of the target one second later.
-        K: stiffness: HAND N m/rad, TASK_HAND N/m per axis, WALL N/m (first number).
-        B: damping: HAND and VISCOUS N m s/rad, TASK_HAND N s/m per axis, WALL N s/m (first
+            hand: Position of the target one second later.
+        K: Stiffness: HAND N m/rad, TASK_HAND N/m per axis, WALL N/m (first number).
+        B: Damping: HAND and VISCOUS N m s/rad, TASK_HAND N s/m per axis, WALL N s/m (first
             number).
-        sampled: true: evaluated once per tick and held.
+        sampled: True: evaluated once per tick and held.
         table: RECORDED: rows of time, s, and torque ON each joint, N m, shape (rows, 1 + n).
-            MULTISINE: rows of frequency, Hz, and phase at the start, turns; further columns are
+            MULTISINE: Rows of frequency, Hz, and phase at the start, turns; further columns are
             not used.
-        limit: live hand: the largest norm of its force, N, or torque, N m.
-        grip: live hand: share of its force that acts, 0 to 1.
-        model: user's kind: the object with its numbers and its function `act`, see `plugged`.
+        limit: Live hand: the largest norm of its force, N, or torque, N m.
+        grip: Live hand: part of its force that acts, 0 to 1.
+        model: User's kind: the object with its numbers and its function `act`, see `plugged`.
     """
 
     kind: TorqueKind
@@ -234,12 +234,12 @@ def _spring_along(
         K (target - at) + B (target' - speed),    target = a + progress (b - a)
 
     Args:
-        actor: the actor's row.
-        i: the coordinate.
-        progress: progress of the target from `a` to `b`.
-        rate: its derivative, 1/s.
-        at: position of the arm along the coordinate, rad or m.
-        speed: its derivative.
+        actor: The actor's row.
+        i: The coordinate.
+        progress: Progress of the target from `a` to `b`.
+        rate: Its derivative, 1/s.
+        at: Position of the arm along the coordinate, rad or m.
+        speed: Its derivative.
     """
     start: float = actor.a[i]
     distance: float = actor.b[i] - start

@@ -87,12 +87,12 @@ class ReplayedInputs(NamedTuple):
     """The arrivals and the live hands of a recorded run, which a fused run repeats.
 
     Attributes:
-        first: index into `samples` of the first arrival, by site, peer and tick, shape (N, P,
+        first: Index into `samples` of the first arrival, by site, peer and tick, shape (N, P,
             K + 1). With K = 0 each sample arrives at the first tick after its stamp.
-        samples: the stamps of the samples, in the order of their arrival.
-        hands: the action of the live hand by site and tick: grip, target, and target plus rate,
+        samples: The stamps of the samples, in the order of their arrival.
+        hands: The action of the live hand by site and tick: grip, target, and target plus rate,
             shape (N, K, 1 + 2 size). Without actions all hands are free.
-        hand_indices: per site the index of the live hand among the torque sources, shape (N,);
+        hand_indices: Per site the index of the live hand among the torque sources, shape (N,);
             -1: no live hand.
     """
 
@@ -155,14 +155,14 @@ def _accept_prompt_records(
     """Accepts a peer's records with a stamp before time t, as if they arrived without delay.
 
     Args:
-        k: the tick of the receiver.
-        t_ns: its nominal time, ns since the epoch.
-        rate_hz: its tick rate, Hz.
-        peer: the row of the peer.
-        records: the number of records that the peer has made.
-        next_sample: the first record that was not accepted yet.
-        sent: the last records of the peer.
-        link: the link from the peer.
+        k: The tick of the receiver.
+        t_ns: Its nominal time, ns since the epoch.
+        rate_hz: Its tick rate, Hz.
+        peer: The row of the peer.
+        records: The number of records that the peer has made.
+        next_sample: The first record that was not accepted yet.
+        sent: The last records of the peer.
+        link: The link from the peer.
 
     Returns:
         The first record that is not accepted yet.
@@ -210,13 +210,13 @@ def _update_peaks(
     """Updates the peaks of the present bucket by a record, and advances to the next bucket.
 
     Args:
-        row: the floats of the record.
-        t_ns: its nominal time, ns since the epoch.
-        settled_rad: errors below this are settled, rad.
-        s: the row of the site.
-        progress: the progress of the site.
-        peaks: the peaks of the site, see `run_until`, shape (buckets, 3 n).
-        sums: the sums of the site.
+        row: The floats of the record.
+        t_ns: Its nominal time, ns since the epoch.
+        settled_rad: Errors below this are settled, rad.
+        s: The row of the site.
+        progress: The progress of the site.
+        peaks: The peaks of the site, see `run_until`, shape (buckets, 3 n).
+        sums: The sums of the site.
     """
     largest_error = 0.0
     bucket = progress.bucket
@@ -620,19 +620,19 @@ def run_until(
     """Steps all sites up to a time, or to the instant at which a site diverges.
 
     Args:
-        last_ns: the last nominal time to step, ns since the epoch.
+        last_ns: The last nominal time to step, ns since the epoch.
         settled_rad: `unsettled_ns` is the last time of an |e| of this or more, rad.
-        progress: the progress of the sites, shape (N,), PROGRESS_DTYPE.
-        next_samples: the next sample of each peer to accept, shape (N, P).
-        sent: the last records of the sites.
-        feed: the inputs of a recorded run.
-        peaks: per bucket the largest |e| of each joint, then the largest |qd| of each joint,
+        progress: The progress of the sites, shape (N,), PROGRESS_DTYPE.
+        next_samples: The next sample of each peer to accept, shape (N, P).
+        sent: The last records of the sites.
+        feed: The inputs of a recorded run.
+        peaks: Per bucket the largest |e| of each joint, then the largest |qd| of each joint,
             then the last q of each joint; -1 where there is no record; shape (N, buckets, 3 n).
-        sums: the sums of the sites, shape (N,), see `sums_dtype`.
-        arrays: the arrays of all sites, see `stack_site_arrays`.
-        chains: its `chain` once more: as an argument that is None it keeps Numba from compiling
+        sums: The sums of the sites, shape (N,), see `sums_dtype`.
+        arrays: The arrays of all sites, see `stack_site_arrays`.
+        chains: Its `chain` once more: as an argument that is None it keeps Numba from compiling
             the leaves of chains.
-        laws: the users' compiled laws; None: there are none.
+        laws: The users' compiled laws; None: there are none.
     """
     count = progress.shape[0]
     while True:

@@ -119,8 +119,8 @@ class _CompilingNotice(event.Listener):
     During a compilation signals end the process at once.
 
     Attributes:
-        is_reported: true: the notice was reported, or must not be.
-        report: writes the notice; by default to standard error.
+        is_reported: True: the notice was reported, or must not be.
+        report: Writes the notice; by default to standard error.
     """
 
     def __init__(self) -> None:
@@ -363,7 +363,7 @@ class _LeafCompiler(Compiler):
     """Compiles a leaf, as an inner leaf or for calls from Python.
 
     Attributes:
-        depth: number of leaves whose compilation is in progress.
+        depth: Number of leaves whose compilation is in progress.
     """
 
     depth = 0

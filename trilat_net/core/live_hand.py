@@ -411,13 +411,13 @@ def _glide_tick(
     """Moves a target by a tick, and changes its velocity as `_find_limited_rate` does.
 
     Args:
-        left_s: time that remains until the target arrives at the goal, s.
-        h_s: the period, s.
-        speed_limit: largest speed of the target, m/s or rad/s.
-        acceleration: largest acceleration of the target, m/s^2 or rad/s^2.
-        goal: the goal, shape (size,).
-        target: the target; changed, shape (size,).
-        rate: its velocity; changed, shape (size,).
+        left_s: Time that remains until the target arrives at the goal, s.
+        h_s: The period, s.
+        speed_limit: Largest speed of the target, m/s or rad/s.
+        acceleration: Largest acceleration of the target, m/s^2 or rad/s^2.
+        goal: The goal, shape (size,).
+        target: The target; changed, shape (size,).
+        rate: Its velocity; changed, shape (size,).
     """
     size = target.shape[0]
     square = 0.0
@@ -569,9 +569,9 @@ def _find_limited_rate(
     within the limits, and so does any velocity between them.
 
     Args:
-        rules: the limits of the hand.
-        memory: its state, with the target already moved.
-        left_s: time that remains until the target arrives at the goal, s.
+        rules: The limits of the hand.
+        memory: Its state, with the target already moved.
+        left_s: Time that remains until the target arrives at the goal, s.
     """
     h_s = 1.0 / rules.rate_hz
     offset = [goal - x for goal, x in zip(memory.goal, memory.target, strict=True)]

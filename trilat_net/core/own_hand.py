@@ -78,19 +78,19 @@ class HandView(NamedTuple):
     ...     return now.pose + 0.3 * (self.goal_m - now.pose)
 
     Attributes:
-        k: the tick.
-        t_s: nominal time of the tick since the epoch, s.
-        q: joint angles of the arm, rad, shape (n,).
-        qd: joint velocities, rad/s.
-        pose: pose of the arm in the coordinates of the hand: its end effector, m, or its
+        k: The tick.
+        t_s: Nominal time of the tick since the epoch, s.
+        q: Joint angles of the arm, rad, shape (n,).
+        qd: Joint velocities, rad/s.
+        pose: Pose of the arm in the coordinates of the hand: its end effector, m, or its
             joints, rad.
-        q_des: the reference of the previous tick, rad or m, shape (m,).
-        tau_x: exogenous torque of the previous tick, N m; the torque ON the arm is its
+        q_des: The reference of the previous tick, rad or m, shape (m,).
+        tau_x: Exogenous torque of the previous tick, N m; the torque ON the arm is its
             negative.
-        target: the hand's current target, m or rad, or its force, N; zeros while it does not
+        target: The hand's current target, m or rad, or its force, N; zeros while it does not
             hold the arm.
-        grip: firmness of the hand's grip, 0 to 1.
-        peers: the peers in scenario order, by the samples that were in use at the previous
+        grip: Firmness of the hand's grip, 0 to 1.
+        peers: The peers in scenario order, by the samples that were in use at the previous
             tick: q and qd have m numbers, and ages are those at this tick.
     """
 

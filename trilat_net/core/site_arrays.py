@@ -70,18 +70,18 @@ class SiteArrays(NamedTuple):
     """The arrays of one site, or of several sites stacked along an additional first axis.
 
     Attributes:
-        site: state and constants, shape (1,), see `site_dtype`.
-        links: one row per peer, shape (P,), see `link_dtype`.
-        models: the models of the links' channels, shape (P, M), LINK_MODEL_DTYPE.
-        dues: due times of the links' newest samples, shape (P, D), ns; see `LinkArrays`.
-        calendars: the links' calendars, shape (P, pages), see `sample_dtype`.
-        points: traces and outages, shape (n, 2); stacked sites share one table.
-        ramps: changes of the dominance factors, shape (R, RAMP_COLUMNS + P).
-        actors: operators and environments, shape (A,), see `torque_source_dtype`.
-        table: their recorded torques, shape (rows, 1 + n); stacked sites share one table.
-        chain: the joints of a chain, shape (n,), see `chain_dtype`; None: the planar two-link
+        site: State and constants, shape (1,), see `site_dtype`.
+        links: One row per peer, shape (P,), see `link_dtype`.
+        models: The models of the links' channels, shape (P, M), LINK_MODEL_DTYPE.
+        dues: Due times of the links' newest samples, shape (P, D), ns; see `LinkArrays`.
+        calendars: The links' calendars, shape (P, pages), see `sample_dtype`.
+        points: Traces and outages, shape (n, 2); stacked sites share one table.
+        ramps: Changes of the dominance factors, shape (R, RAMP_COLUMNS + P).
+        actors: Operators and environments, shape (A,), see `torque_source_dtype`.
+        table: Their recorded torques, shape (rows, 1 + n); stacked sites share one table.
+        chain: The joints of a chain, shape (n,), see `chain_dtype`; None: the planar two-link
             arm.
-        channel: the numbers that the peers' laws send, per peer, for a user's law; None: the
+        channel: The numbers that the peers' laws send, per peer, for a user's law; None: the
             kernel computes the law.
     """
 
@@ -102,10 +102,10 @@ class TickBuffers(NamedTuple):
     """The input and the output of one tick.
 
     Attributes:
-        arrivals: the samples that arrived, shape (MAX_ARRIVALS,), see `arrival_dtype`.
-        forces: their exogenous torques, shape (MAX_ARRIVALS, m), N m.
-        sent: the numbers that the peers' laws sent with them, shape (MAX_ARRIVALS, C).
-        record: output: the floats of the record, see `Layout.columns`.
+        arrivals: The samples that arrived, shape (MAX_ARRIVALS,), see `arrival_dtype`.
+        forces: Their exogenous torques, shape (MAX_ARRIVALS, m), N m.
+        sent: The numbers that the peers' laws sent with them, shape (MAX_ARRIVALS, C).
+        record: Output: the floats of the record, see `Layout.columns`.
     """
 
     arrivals: RowArray
@@ -145,12 +145,12 @@ def build_site_arrays(
     """Returns the arrays of a site before its first tick.
 
     Args:
-        setup: the setup of the site.
-        spare: free rows for later changes: of each link's model, and of the dominance factors.
-        pages: pages of each calendar and due times that each link keeps; 0: pages for the
+        setup: The setup of the site.
+        spare: Free rows for later changes: of each link's model, and of the dominance factors.
+        pages: Pages of each calendar and due times that each link keeps; 0: pages for the
             delays of the setup, and due times for as long as a sample may be late.
-        layout: layout of the arrays if they are larger than the site needs.
-        plugged: true: with the arrays of a user's law even if the site has no such law.
+        layout: Layout of the arrays if they are larger than the site needs.
+        plugged: True: with the arrays of a user's law even if the site has no such law.
     """
     links = setup.links
     layout = layout or setup.layout
@@ -233,9 +233,9 @@ def widen_calendars(arrays: SiteArrays, k: int, pages: int) -> SiteArrays:
     """Returns arrays with larger calendars and the same waiting samples.
 
     Args:
-        arrays: the arrays before tick k.
-        k: the next tick that the calendars release.
-        pages: the new number of pages, a power of two.
+        arrays: The arrays before tick k.
+        k: The next tick that the calendars release.
+        pages: The new number of pages, a power of two.
     """
     ticks = np.arange(k, k + arrays.calendars.shape[1])
     # A tick's page is its lowest bits, as the number of pages is a power of two.
@@ -260,8 +260,8 @@ class CalendarSizer:
     that does not fit is refused in stage 1, like a sample whose stamp is out of range.
 
     Attributes:
-        newest: per peer the newest stamp that fits at the last tick and at all later ones.
-        most_pages: the largest number of pages.
+        newest: Per peer the newest stamp that fits at the last tick and at all later ones.
+        most_pages: The largest number of pages.
     """
 
     def __init__(self, setup: SiteSetup) -> None:
@@ -376,12 +376,12 @@ def apply_change(arrays: SiteArrays, change: CoreChange, t_ns: int) -> None:
     """Applies a change, or adds it to the planned ones; other planned changes stay planned.
 
     Args:
-        arrays: the arrays of the site.
-        change: the change.
+        arrays: The arrays of the site.
+        change: The change.
         t_ns: a time before which the site makes no more ticks, ns since the epoch.
 
     Raises:
-        ValueError: the arrays have no free row for the change.
+        ValueError: The arrays have no free row for the change.
     """
     s: Row = arrays.site[0]
     if change.order is LifeOrder.OVERRUN:
@@ -419,10 +419,10 @@ def stack_site_arrays(
     An array that is shorter than another site's is filled up with rows that are never read.
 
     Args:
-        setups: the setups of the sites.
-        spare: free rows for later changes, of each link and of each site's dominance factors.
-        longest_us: the longest delay of such a change, us.
-        late_ns: largest lateness of a sample, ns.
+        setups: The setups of the sites.
+        spare: Free rows for later changes, of each link and of each site's dominance factors.
+        longest_us: The longest delay of such a change, us.
+        late_ns: Largest lateness of a sample, ns.
     """
     for setup in setups:
         for link in setup.links:

@@ -98,10 +98,10 @@ class MotionLimits(NamedTuple):
     A limit is one number for all joints or coordinates, or one number per joint or coordinate.
 
     Attributes:
-        q_min: least joint angles, rad.
-        q_max: largest joint angles, rad.
-        qd_des_limit: largest speed of the reference, rad/s; in task space m/s.
-        tau_rate: largest rate of the control torque, N m/s.
+        q_min: Least joint angles, rad.
+        q_max: Largest joint angles, rad.
+        qd_des_limit: Largest speed of the reference, rad/s; in task space m/s.
+        tau_rate: Largest rate of the control torque, N m/s.
     """
 
     q_min: Vector = (-math.inf,)
@@ -115,9 +115,9 @@ class RestGains(NamedTuple):
 
     Attributes:
         damping: B, N m s/rad.
-        time_s: time constant in which B alone stops a joint of the inertia for which B was
+        time_s: Time constant in which B alone stops a joint of the inertia for which B was
             chosen, s.
-        deceleration: deceleration of the reference, rad/s^2.
+        deceleration: Deceleration of the reference, rad/s^2.
     """
 
     damping: Vector = (0.0,)
@@ -333,12 +333,12 @@ class TaskSetup(NamedTuple):
     """The setup of a site that follows its peers with its end effector.
 
     Attributes:
-        axes: per coordinate 1 if the site follows along it, otherwise 0. Three coordinates are
+        axes: Per coordinate 1 if the site follows along it, otherwise 0. Three coordinates are
             a position, six are a pose.
-        scale: metres of the task per metre of this arm.
-        posture: joint angles that the arm seeks as far as the task leaves it free, rad.
-        posture_rate: rate of the approach to the posture, 1/s.
-        singular_value: least singular value of the Jacobian without damping, m/rad.
+        scale: Metres of the task per metre of this arm.
+        posture: Joint angles that the arm seeks as far as the task leaves it free, rad.
+        posture_rate: Rate of the approach to the posture, 1/s.
+        singular_value: Least singular value of the Jacobian without damping, m/rad.
     """
 
     axes: tuple[float, ...]
@@ -352,11 +352,11 @@ class ChainSetup(NamedTuple):
     """The setup of an arm that is a chain of joints.
 
     Attributes:
-        joints: the joints, from the base on.
-        gravity_m_s2: gravitational acceleration in the frame of the base, m/s^2.
-        tip_m: position of the end effector in the frame of the last link, m.
-        tip_rotation: orientation of the end effector in that frame.
-        task: the setup in task space; None: the arm follows joint by joint.
+        joints: The joints, from the base on.
+        gravity_m_s2: Gravitational acceleration in the frame of the base, m/s^2.
+        tip_m: Position of the end effector in the frame of the last link, m.
+        tip_rotation: Orientation of the end effector in that frame.
+        task: The setup in task space; None: the arm follows joint by joint.
     """
 
     joints: tuple[ChainJoint, ...]
@@ -372,22 +372,22 @@ class Gains(NamedTuple):
     Diagonal matrices are vectors. A vector of one number has this number for all its entries.
 
     Attributes:
-        law: the law.
-        Lambda: shape (n,), 1/s.
-        Kp: shape (n,), N m s/rad.
-        Kd: shape (n,), N m s/rad.
-        Gamma: adaptation gain per parameter, shape (P,).
-        theta_hat0: the first estimate, shape (P,).
-        low: lower bound of each estimate, shape (P,).
-        high: upper bound, shape (P,).
-        known: the parameters that KNOWN assumes, shape (P,).
-        K: stiffness of KNOWN, shape (n,), N m/rad.
-        d: damping of KNOWN, shape (n,), N m s/rad.
-        k_f: gain of the reflected force of KNOWN, shape (n,), dimensionless.
-        rho: largest robust torque of ADAPTIVE, shape (n,), N m.
-        width: speed r at which the robust torque is 0.71 rho, shape (n,), rad/s.
-        friction: share of a chain's joint friction that ADAPTIVE compensates, shape (n,).
-        absolute: true: r of ADAPTIVE is qd + Lambda q, and Kp couples it to r of the peers;
+        law: The law.
+        Lambda: Shape (n,), 1/s.
+        Kp: Shape (n,), N m s/rad.
+        Kd: Shape (n,), N m s/rad.
+        Gamma: Adaptation gain per parameter, shape (P,).
+        theta_hat0: The first estimate, shape (P,).
+        low: Lower bound of each estimate, shape (P,).
+        high: Upper bound, shape (P,).
+        known: The parameters that KNOWN assumes, shape (P,).
+        K: Stiffness of KNOWN, shape (n,), N m/rad.
+        d: Damping of KNOWN, shape (n,), N m s/rad.
+        k_f: Gain of the reflected force of KNOWN, shape (n,), dimensionless.
+        rho: Largest robust torque of ADAPTIVE, shape (n,), N m.
+        width: Speed r at which the robust torque is 0.71 rho, shape (n,), rad/s.
+        friction: Part of a chain's joint friction that ADAPTIVE compensates, shape (n,).
+        absolute: True: r of ADAPTIVE is qd + Lambda q, and Kp couples it to r of the peers;
             only linear analysis uses this.
     """
 
@@ -413,31 +413,31 @@ class SiteSetup(NamedTuple):
     """All numbers and names from which a site is built.
 
     Attributes:
-        name: the site's name.
-        rate_hz: the tick rate, Hz.
-        scheme: the sampling of the law.
-        gains: the law and its gains.
-        theta: the true parameters of the arm, shape (P,).
-        g_m_s2: gravitational acceleration, m/s^2; a chain has that of its setup instead.
-        lengths_m: lengths of the two links, m; without effect for a chain.
-        tau_limit_nm: largest control torque of a joint, N m; one number, or one per joint.
-        qd_limit_rad_s: joint speed beyond which the run counts as diverged, rad/s.
-        q0: the start pose, rad.
-        qd0: the start velocity, rad/s.
-        actors: operators and environments.
-        links: the links from the peers, in scenario order.
-        ramps: the scripted changes of the dominance factors, in the order of their starts.
-        on_stale: the rule for a stale peer.
-        external: true: the arm is outside of the program: it is measured, and not integrated.
-        law_factory: creates the user's law; None: the kernel computes the law.
-        theta_known: false: `theta` does not describe the arm, which is external and not
+        name: The site's name.
+        rate_hz: The tick rate, Hz.
+        scheme: The sampling of the law.
+        gains: The law and its gains.
+        theta: The true parameters of the arm, shape (P,).
+        g_m_s2: Gravitational acceleration, m/s^2; a chain has that of its setup instead.
+        lengths_m: Lengths of the two links, m; without effect for a chain.
+        tau_limit_nm: Largest control torque of a joint, N m; one number, or one per joint.
+        qd_limit_rad_s: Joint speed beyond which the run counts as diverged, rad/s.
+        q0: The start pose, rad.
+        qd0: The start velocity, rad/s.
+        actors: Operators and environments.
+        links: The links from the peers, in scenario order.
+        ramps: The scripted changes of the dominance factors, in the order of their starts.
+        on_stale: The rule for a stale peer.
+        external: True: the arm is outside of the program: it is measured, and not integrated.
+        law_factory: Creates the user's law; None: the kernel computes the law.
+        theta_known: False: `theta` does not describe the arm, which is external and not
             identified.
-        chain: the arm if it is a chain; None: the planar two-link arm.
-        channel: the numbers that the site's law sends to its peers.
-        limits: limits of the motion.
-        rest: the gains with which the arm comes to rest.
-        bit: the bit of the site in sets of sites.
-        bodies: the number of bodies of the plant whose poses are recorded.
+        chain: The arm if it is a chain; None: the planar two-link arm.
+        channel: The numbers that the site's law sends to its peers.
+        limits: Limits of the motion.
+        rest: The gains with which the arm comes to rest.
+        bit: The bit of the site in sets of sites.
+        bodies: The number of bodies of the plant whose poses are recorded.
     """
 
     name: str

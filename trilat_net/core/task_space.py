@@ -98,9 +98,9 @@ def _update_jacobian_rate(s: Row, chain: RowArray, tip: Three) -> None:
     The axes turn with their links, and the joints' origins move.
 
     Args:
-        s: the site's row.
-        chain: the chain's rows, after `place_end_effector`.
-        tip: position of the end effector in base axes, m.
+        s: The site's row.
+        chain: The chain's rows, after `place_end_effector`.
+        tip: Position of the end effector in base axes, m.
     """
     zeros = (0.0, 0.0, 0.0)
     angular_velocity = zeros

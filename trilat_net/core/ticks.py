@@ -229,33 +229,33 @@ class TickRecord(NamedTuple):
 
     Attributes:
         tick: k.
-        t_ns: nominal time, ns since the epoch.
-        mode: the site's mode.
-        q: joint angles, rad.
-        qd: joint velocities, rad/s.
-        q_des: reference q_id, Eq. (6), rad.
-        qd_des: its derivative, rad/s.
-        tau: control torque, Eq. (13), N m.
-        tau_x: exogenous torque in the sign of Eq. (8), N m; the torque ON the arm is its
+        t_ns: Nominal time, ns since the epoch.
+        mode: The site's mode.
+        q: Joint angles, rad.
+        qd: Joint velocities, rad/s.
+        q_des: Reference q_id, Eq. (6), rad.
+        qd_des: Its derivative, rad/s.
+        tau: Control torque, Eq. (13), N m.
+        tau_x: Exogenous torque in the sign of Eq. (8), N m; the torque ON the arm is its
             negative.
-        theta_hat: estimate of the parameters.
-        used: tick of the sample in use, per peer in scenario order; -1 before the first.
+        theta_hat: Estimate of the parameters.
+        used: Tick of the sample in use, per peer in scenario order; -1 before the first.
         rx_crc: CRC-32 of the arrivals of this tick as the step received them, so that a changed
             input shows at its own tick. Each arrival is little-endian (peer i64, tick i64, q
             f64s, qd f64s), followed by its tau_x if the law reflects force.
-        cmd: texts of the changes that this tick applied.
-        mem: the memory of the site that no other field holds. In RUN and DIVERGED it is empty;
+        cmd: Texts of the changes that this tick applied.
+        mem: The memory of the site that no other field holds. In RUN and DIVERGED it is empty;
             otherwise it is the held pose, rad, and the time at which the return began, ns since
             the epoch (0 before). A site with a user's law always has these numbers, followed
             by the memory of the law. Under the rule `glide` a site always has the memory of
             `session_life` instead, see `Layout.count_life_memory`.
         x: in task space the shared pose of the end effector: position, m, and orientation;
             otherwise empty.
-        xd: derivative of x, m/s and rad/s.
+        xd: Derivative of x, m/s and rad/s.
         wrench: tau_x expressed at the end effector, N and N m.
-        ch: the numbers that the site's law sends, see `LawChannel`.
-        hand: the action of a live hand in this tick, see `live_hand`; empty without a hand.
-        bodies: poses of the bodies of the plant, seven numbers each: x, y, z in the arm's base
+        ch: The numbers that the site's law sends, see `LawChannel`.
+        hand: The action of a live hand in this tick, see `live_hand`; empty without a hand.
+        bodies: Poses of the bodies of the plant, seven numbers each: x, y, z in the arm's base
             frame, m, and the unit quaternion w, x, y, z; empty without bodies.
     """
 

@@ -30,14 +30,14 @@ class ArmLinks(NamedTuple):
     """Lengths, masses and inertias of the two links, which `theta_from_links` converts.
 
     Attributes:
-        l1_m: length of the first link, m.
-        m1_kg: mass of the first link, kg.
-        lc1_m: distance from the first joint to the link's centre of mass, m.
-        I1_kg_m2: inertia of the first link about its centre of mass, kg m^2.
-        l2_m: length of the second link, m.
-        m2_kg: mass of the second link, kg.
-        lc2_m: distance from the second joint to the link's centre of mass, m.
-        I2_kg_m2: inertia of the second link about its centre of mass, kg m^2.
+        l1_m: Length of the first link, m.
+        m1_kg: Mass of the first link, kg.
+        lc1_m: Distance from the first joint to the link's centre of mass, m.
+        I1_kg_m2: Inertia of the first link about its centre of mass, kg m^2.
+        l2_m: Length of the second link, m.
+        m2_kg: Mass of the second link, kg.
+        lc2_m: Distance from the second joint to the link's centre of mass, m.
+        I2_kg_m2: Inertia of the second link about its centre of mass, kg m^2.
     """
 
     l1_m: float
@@ -130,11 +130,11 @@ def regressor(g: float, q: Vector, qd: Vector, v: Vector, a: Vector) -> tuple[Fi
     needs the two velocities separately.
 
     Args:
-        g: gravitational acceleration, m/s^2.
-        q: joint angles, rad.
-        qd: joint velocities, on which C depends, rad/s.
-        v: reference velocity, which C multiplies, rad/s.
-        a: reference acceleration, which M multiplies, rad/s^2.
+        g: Gravitational acceleration, m/s^2.
+        q: Joint angles, rad.
+        qd: Joint velocities, on which C depends, rad/s.
+        v: Reference velocity, which C multiplies, rad/s.
+        a: Reference acceleration, which M multiplies, rad/s^2.
     """
     s1, c1 = sincos(q[0])
     s2, c2 = sincos(q[1])

@@ -268,16 +268,16 @@ def rk4_step(
     """Returns q and qd one period later, Eq. (8), by the classical Runge-Kutta method.
 
     Args:
-        t_s: time at the beginning of the period, s since the epoch.
-        h_s: the period, s.
-        q: joint angles at the beginning, rad.
-        qd: joint velocities at the beginning, rad/s.
-        u: torque that is held over the period (control and sampled actors), shape (2,), N m.
-        theta: the arm's parameters, shape (5,).
-        g: gravitational acceleration, m/s^2.
-        lengths: lengths of the two links, m.
-        actors: operators and environments.
-        table: their recorded torques.
+        t_s: Time at the beginning of the period, s since the epoch.
+        h_s: The period, s.
+        q: Joint angles at the beginning, rad.
+        qd: Joint velocities at the beginning, rad/s.
+        u: Torque that is held over the period (control and sampled actors), shape (2,), N m.
+        theta: The arm's parameters, shape (5,).
+        g: Gravitational acceleration, m/s^2.
+        lengths: Lengths of the two links, m.
+        actors: Operators and environments.
+        table: Their recorded torques.
     """
     half = 0.5 * h_s
     sixth = h_s / 6.0

@@ -101,11 +101,11 @@ def _jacobian_rate_times(lengths: Pair, length_rates: Pair, q: Pair, qd: Pair, v
     """Returns the derivative of the Jacobian times v.
 
     Args:
-        lengths: estimated lengths of the links, m.
-        length_rates: derivatives of these estimates, m/s.
-        q: joint angles, rad.
-        qd: joint velocities, rad/s.
-        v: the vector to multiply.
+        lengths: Estimated lengths of the links, m.
+        length_rates: Derivatives of these estimates, m/s.
+        q: Joint angles, rad.
+        qd: Joint velocities, rad/s.
+        v: The vector to multiply.
     """
     l1, l2 = lengths
     l1_rate, l2_rate = length_rates

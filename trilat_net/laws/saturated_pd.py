@@ -32,9 +32,9 @@ class SaturatedPd(ControlLaw):
     to varying time delay and bounded inputs", ISA Transactions 68, 2017.
 
     Attributes:
-        K: stiffness of small errors, per joint, N m/rad.
-        P: largest pull of all peers together, per joint, N m.
-        d: damping of the arm's velocity, per joint, N m s/rad.
+        K: Stiffness of small errors, per joint, N m/rad.
+        P: Largest pull of all peers together, per joint, N m.
+        d: Damping of the arm's velocity, per joint, N m s/rad.
         gravity: Factor of the true gravity that the law compensates; 1 is exact.
     """
 

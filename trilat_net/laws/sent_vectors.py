@@ -180,12 +180,12 @@ def convert_sends(sends: Any, code: str, path: str) -> SentVectorSpecs:
     """Returns the declaration of a law's class, converted to `SentVectorSpec`.
 
     Args:
-        sends: the value of the class attribute `sends`.
-        code: the law's name, for errors.
-        path: the path of the key, for errors.
+        sends: The value of the class attribute `sends`.
+        code: The law's name, for errors.
+        path: The path of the key, for errors.
 
     Raises:
-        ScenarioError: the value does not describe vectors.
+        ScenarioError: The value does not describe vectors.
     """
     try:
         return msgspec.convert(sends, SentVectorSpecs)

@@ -39,11 +39,11 @@ class Smith(ControlLaw):
     1957 (cited from memory).
 
     Attributes:
-        K: stiffness per joint, N m/rad.
-        d: damping of the arm's velocity, per joint, N m s/rad.
-        inertia: inertia of the slave's model, per joint, kg m^2. K, d and inertia are the same
+        K: Stiffness per joint, N m/rad.
+        d: Damping of the arm's velocity, per joint, N m s/rad.
+        inertia: Inertia of the slave's model, per joint, kg m^2. K, d and inertia are the same
             at both sites.
-        predicts: true for the master.
+        predicts: True for the master.
         gravity: Factor of the true gravity that the law compensates; 1 is exact.
     """
 

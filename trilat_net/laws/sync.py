@@ -38,10 +38,10 @@ class Sync(ControlLaw):
     46, 2010.
 
     Attributes:
-        Lambda: weight of the pose in r, per joint, 1/s.
-        K: gain towards the peers' outputs, per joint, N m s/rad.
-        Gamma: adaptation gain per parameter.
-        theta_hat0: first estimate of theta, Eq. (24).
+        Lambda: Weight of the pose in r, per joint, 1/s.
+        K: Gain towards the peers' outputs, per joint, N m s/rad.
+        Gamma: Adaptation gain per parameter.
+        theta_hat0: First estimate of theta, Eq. (24).
     """
 
     Lambda: PositiveJoints = (1.0,)

@@ -42,7 +42,7 @@ class Tanks(EnergyLaw):
             refills the tank from the motion of the arm.
         packet_1_s: Rate at which a tank is emptied towards the peers, 1/s.
         by_shares: True: the peers' packets are weighted by this site's dominance factors;
-            false: they are equal.
+            false: They are equal.
         acceleration_rad_s2: Largest acceleration a of a joint for which the tank reserves
             energy: in the coming period h the joint moves by up to qd h + a h^2 / 2.
     """
