@@ -533,7 +533,7 @@ def refine_roots(
 def find_moving_part(loop: LinearLoop) -> MovingPart:
     """Returns the matrices of a loop without the states that are constant or act on no other.
 
-    `MovingPart` explains why these states can be left out.
+    `MovingPart` describes the result.
 
     Args:
         loop: The loop.

@@ -223,7 +223,13 @@ def _shift_equilibrium(
 
 
 def pad_rows(rows: Sequence[Sequence[float] | Array]) -> Array:
-    """Returns vectors of different lengths as rows of one array, padded with zeros."""
+    """Returns vectors of different lengths as the rows of one array, padded with zeros.
+
+    Arms with different numbers of joints can then share an array.
+
+    Args:
+        rows: The vectors.
+    """
     longest = max(map(len, rows))
     padded = np.zeros((len(rows), longest))
     for padded_row, row in zip(padded, rows, strict=True):
@@ -247,16 +253,21 @@ def _refuse_singular_poses(conditions: OperatingConditions, rest: Equilibrium) -
 
 
 def predict_from_start(conditions: OperatingConditions, scenario: Scenario) -> Equilibrium:
-    """Predicts the equilibrium that the loop reaches from the start poses.
+    """Predicts the equilibrium that the loop reaches from the start poses of a scenario.
 
-    The prediction assumes that all modes decay except those at zero. A loop with roots at zero
-    keeps part of its history. With the null vectors W' S = 0 and S V = 0 of S = A + sum_k A_k,
-    and D = I + sum_k T_k A_k, this part is
+    The linear loop is x' = A x + sum_k A_k x(t - T_k), with the state x and the matrices A_k of
+    the terms with the delays T_k. It is assumed that all modes decay except those at zero. A
+    loop with roots at zero keeps part of its history. With the null vectors W' S = 0 and S V =
+    0 of S = A + sum_k A_k, and D = I + sum_k T_k A_k, this part is
 
         V (W' D V)^-1 W' (x(0) + sum_k A_k int_{-T_k}^0 x)
 
-    where A_k is the matrix of the terms with the delay T_k. Hale and Verduyn Lunel,
-    "Introduction to Functional Differential Equations" (1993), chapter 7.
+    Source: Hale and Verduyn Lunel, "Introduction to Functional Differential Equations" (1993),
+    chapter 7.
+
+    Args:
+        conditions: The sites, gains and delays of the loop.
+        scenario: The description of the experiment, with the start poses.
     """
     q = pad_rows([spec.q0_rad for spec in scenario.sites.values()])
     start = Equilibrium(q, _complete_estimates(conditions), "", 0.0)

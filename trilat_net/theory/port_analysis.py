@@ -95,11 +95,16 @@ def linearise_teleoperator(conditions: OperatingConditions, rest: Equilibrium) -
 def build_proof_output(
     conditions: OperatingConditions, loop: LinearLoop
 ) -> port_response.LoopOutput | None:
-    """Returns the output of the loop with respect to which the paper proves passivity.
+    """Returns the output of a loop with respect to which the paper proves passivity.
 
-    The output is r_i = qd_i + Lambda (q_i - sum_j alpha_ij q_j(t - T_ij)), Eq. (6), (9), (10),
-    with the dominance factors alpha_ij and the delays T_ij. In task space it is J r, with
-    positions in place of q.
+    It is the filtered error r_i = qd_i + Lambda (q_i - sum_j alpha_ij q_j(t - T_ij)) of each
+    site i, Eq. (6), (9), (10). q are the joint angles, qd the velocities, Lambda is a gain,
+    alpha_ij the dominance factor with which site i follows site j, and T_ij the delay from j to
+    i. In task space it is J r with the Jacobian J, and positions take the place of q.
+
+    Args:
+        conditions: The sites, gains and delays of the loop.
+        loop: The linear model of the loop.
 
     Returns:
         The output. None if there is no proof: for laws other than the paper's, for

@@ -48,7 +48,11 @@ _INERTIA_ENTRIES = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))
 
 
 def build_cross_matrix(a: Numbers) -> Numbers:
-    """Returns the matrix of the cross product with a, shape (3, 3, ...)."""
+    """Returns the matrix A with A b = a x b for every vector b, shape (3, 3, ...).
+
+    Args:
+        a: The left factor of the cross product, shape (3, ...).
+    """
     matrix: Numbers = np.einsum("ijk,j...->ik...", _EPSILON, a)
     return matrix
 

@@ -109,6 +109,9 @@ def explain_no_functional(scenario: Scenario) -> str:
     V needs the true parameters theta of the arm, a control law for which V is defined, and a
     task other than following orientations.
 
+    Args:
+        scenario: The description of the experiment.
+
     Returns:
         The sites and the reasons, separated by semicolons. Empty if V exists for every site.
     """
@@ -664,13 +667,16 @@ def _check_records(run: FunctionalFacts) -> Premise:
 
 
 def find_absent_spans(log: Log) -> list[AbsentSpan]:
-    """Returns the spans during which sites were absent from the session.
+    """Finds the spans of time during which sites were absent from the session.
 
     A site is absent while it has left and not yet joined again, and also from its last record
     to the end of the run if the session reported that it left or was lost.
 
+    Args:
+        log: The log of the run.
+
     Returns:
-        The spans, sorted by their start.
+        The spans, sorted by their start. Empty if no site was absent.
     """
     end_s = recorded_end_s(log)
     absent = []

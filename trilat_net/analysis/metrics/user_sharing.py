@@ -85,10 +85,15 @@ def read_user_shares(view: RunView) -> UserShares | Metric:
     Quantity("motion_share", "share in the slave's motion"),
 )
 def measure_authority(view: RunView, site: str) -> MetricValues:
-    """Returns the authority of a user: its weighted effort and its share in the slave's motion.
+    """Measures a user's authority over a slave: weighted effort, and share of its motion.
 
     The effort is h sum_k a_k |tau_h,k|^2, with the tick period h, the user's dominance factor
-    a_k at tick k, and the torque tau_h,k with which the user pushes the master.
+    a_k at tick k, which is the weight with which the slave follows the user's master, and the
+    torque tau_h,k with which the user pushes the master.
+
+    Args:
+        view: The run.
+        site: Name of the master that the user moves.
     """
     shared = view.compute_once(read_user_shares)
     slave, users = find_users(view.scenario)
