@@ -1,15 +1,18 @@
-"""Implements the paper's adaptive law, which learns the arm's parameters: Eq. (13) and (15).
+"""Implements the paper's adaptive law, which learns the parameters of its arm: Eq. (13) and (15).
 
-The law needs no model of the arm. It estimates the parameters theta (masses and inertias) from
-the motion while it controls the arm. Its symbols are
+The law needs no known model of the arm. While it controls the arm, it estimates the dynamic
+parameters theta, which are combinations of masses, lengths and inertias. Its symbols are
 
-    e        synchronisation error: position less the reference by the peers
+    q, qd    positions and velocities of the joints
+    e        synchronisation error: q less the reference, the weighted position of the peers
+    Lambda   gain: rate at which the error decays
     r        filtered error, qd + Lambda e
     Y        regressor: the matrix for which Y theta is the torque of the arm's dynamics
 
-The simulation kernel computes this law (`core.control.adaptive_torque` and `update_estimate`);
-`Adaptive.compute_torque` and `Adaptive.advance_estimate` state the same law in plain Python,
-and `tests/control_laws/test_plain_torques.py` compares the two.
+The simulation kernel, the compiled code of a tick, computes this law
+(`core.control.adaptive_torque` and `update_estimate`). `Adaptive.compute_torque` and
+`Adaptive.advance_estimate` state the same law in plain Python, and
+`tests/control_laws/test_plain_torques.py` checks that both give the same numbers.
 """
 
 from collections.abc import Mapping

@@ -1,8 +1,12 @@
-"""Implements P+d: a spring to the peers and a damper, with known gravity.
+"""Implements P+d: a spring pulls the arm towards its peers, and a damper brakes it.
 
-The simulation kernel computes this law (`core.control.damped_torque`). `PD.compute_torque`
-states the same law in plain Python, and `tests/control_laws/test_plain_torques.py` compares the
-two.
+The peers are the arms that this arm follows. The spring (P) acts on the position error, and
+the damper (d) on the arm's own velocity. The law also adds the arm's gravity torque, which it
+computes from known masses.
+
+The simulation kernel, the compiled code of a tick, computes this law
+(`core.control.damped_torque`). `PD.compute_torque` states the same law in plain Python, and
+`tests/control_laws/test_plain_torques.py` checks that both give the same torques.
 """
 
 from typing import ClassVar

@@ -1,8 +1,13 @@
-"""Implements direct force reflection: the master feels the external torque on the slave's arm.
+"""Implements direct force reflection: a master feels the external torque on the slave's arm.
 
-The simulation kernel computes this law (`core.control.damped_torque`). `PF.compute_torque`
-states the same law in plain Python, and `tests/control_laws/test_plain_torques.py` compares the
-two.
+A master is an arm that a person moves, and the slave is the arm that follows it. The slave is
+pulled towards the master by a spring. The torque that the environment exerts on the slave is
+sent back and added to the master's torque. Both arms are damped and compensate their gravity
+torque, which is computed from known masses.
+
+The simulation kernel, the compiled code of a tick, computes this law
+(`core.control.damped_torque`). `PF.compute_torque` states the same law in plain Python, and
+`tests/control_laws/test_plain_torques.py` checks that both give the same torques.
 """
 
 from collections.abc import Mapping, Sequence

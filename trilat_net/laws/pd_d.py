@@ -1,8 +1,12 @@
-"""Implements PD+d: spring and damper to the peers and a damper of the arm, with known gravity.
+"""Implements PD+d: a spring and a damper couple the arm to its peers, and a damper brakes it.
 
-The simulation kernel computes this law (`core.control.damped_torque`). `PdD.compute_torque`
-states the same law in plain Python, and `tests/control_laws/test_plain_torques.py` compares the
-two.
+The peers are the arms that this arm follows. The spring (P) acts on the position error, the
+first damper (D) on the derivative of this error, and the second (d) on the arm's own velocity.
+The law also adds the arm's gravity torque, which it computes from known masses.
+
+The simulation kernel, the compiled code of a tick, computes this law
+(`core.control.damped_torque`). `PdD.compute_torque` states the same law in plain Python, and
+`tests/control_laws/test_plain_torques.py` checks that both give the same torques.
 """
 
 from typing import ClassVar
