@@ -1,9 +1,11 @@
-"""The built-in control laws, one per file.
+"""Contains the built-in control laws, one per file.
+
+A control law computes the torque of an arm from the motion of the arm and of its peers.
 
 Invariant:
     - File, class and scenario name of a law correspond: `four_channel.py` holds `FourChannel`,
-      and a scenario writes law = "four_channel".
-    - A law is written as a user writes one (docs/own-controller.md). Its `torque` is compiled:
-      it loops over numbers and creates no lists.
+      and a scenario, the file that describes an experiment, states law = "four_channel".
+    - A built-in law is written as a user writes one (docs/own-controller.md). Its method
+      `torque` is compiled, so it loops over numbers and creates no lists.
     - Other modules find the laws by listing this folder, see `scenario.laws`.
 """

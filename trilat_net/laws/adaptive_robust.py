@@ -1,9 +1,12 @@
-"""Implements the adaptive law in a box with a bounded term against unmodelled torque.
+"""Implements the bounded adaptive law with an additional torque against unknown disturbances.
 
-The additional term opposes torque that no estimate of the parameters explains, such as friction
-or an operator. The simulation kernel computes this law (`core.control.robust_torque`).
-`AdaptiveRobust.compute_torque` states the same law in plain Python, and
-`tests/control_laws/test_plain_torques.py` compares the two.
+The law estimates the dynamic parameters of its arm within a box, as `AdaptiveBox` does. The
+additional torque opposes what no value of these parameters explains, such as friction or the
+torque of an operator. It never exceeds a bound that the user states.
+
+The simulation kernel, the compiled code of a tick, computes this law
+(`core.control.robust_torque`). `AdaptiveRobust.compute_torque` states the same law in plain
+Python, and `tests/control_laws/test_plain_torques.py` checks that both give the same torques.
 """
 
 from collections.abc import Mapping

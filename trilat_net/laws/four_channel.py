@@ -1,13 +1,17 @@
 """Implements the four-channel law, which exchanges positions and forces in both directions.
 
-The quantities q_des, qd_des, qdd_des and felt are the peers' position, velocity, acceleration
-and external torque, weighted by the dominance factors, the weights with which a site follows
-its peers; tau_h is the torque ON the site's arm by its operator or environment. In Lawrence's
-symbols, for two sites, C2 and C6 are gains of the master, and C3 and C5 gains of the slave. A
-gain of zero removes a channel.
+Each arm is pulled towards the positions of its peers, and also gets the external torques that
+act on their arms. The quantities q_des, qd_des, qdd_des and felt are the peers' position,
+velocity, acceleration and external torque. They are weighted by the dominance factors, the
+weights with which a site follows its peers. The torque by which an operator or environment acts
+ON the site's own arm is tau_h.
+
+Lawrence, who introduced the law for two sites, calls its force gains C2 and C6 at the master,
+and C3 and C5 at the slave. A gain of zero removes a channel.
 
 Invariant:
-    - The law sends the acceleration that the arm's model has under the torques of the tick.
+    - The acceleration that a site sends is computed, not measured: it follows from the model of
+      the arm and the torques of the tick.
 """
 
 from typing import Any, ClassVar

@@ -1,7 +1,7 @@
 """Implements P+d: a spring pulls the arm towards its peers, and a damper brakes it.
 
-The peers are the arms that this arm follows. The spring (P) acts on the position error, and
-the damper (d) on the arm's own velocity. The law also adds the arm's gravity torque, which it
+The peers are the arms that this arm follows. The spring (P) acts on the position error, and the
+damper (d) on the arm's own velocity. The law also adds the arm's gravity torque, which it
 computes from known masses.
 
 The simulation kernel, the compiled code of a tick, computes this law

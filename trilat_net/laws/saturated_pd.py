@@ -1,11 +1,13 @@
-"""Implements P+d whose coupling torque saturates separately for each peer.
+"""Implements P+d with a limit on the pull of each peer.
 
-P+d is a spring to the peers and a damper. A peer that is far away would pull strongly; here its
-pull approaches a largest value instead.
+P+d couples an arm to its peers, the arms that it follows, by a spring (P), and brakes it by a
+damper (d). The spring of P+d would pull strongly towards a peer that is far away. Here the pull
+grows with the distance like a hyperbolic tangent and approaches a largest value.
 
 Invariant:
-    - No peer pulls with more than alpha_ij P, at any distance, where alpha_ij is the dominance
-      factor, the weight with which site i follows peer j.
+    - No peer pulls with more than alpha_ij P at any distance. P is the largest pull of all
+      peers together, a gain of the law, and alpha_ij is the dominance factor, the weight with
+      which site i follows peer j.
 """
 
 from typing import ClassVar

@@ -1,12 +1,13 @@
 """Reads and checks which vectors a control law sends to its peers.
 
-A law may send more than the motion of its arm, for example waves or energies. Its class
-declares these vectors in the class variable `sends`.
+Each site, a process that runs one arm, sends the motion of its arm to the other sites. Its law
+may send more, for example waves or energies. The class of the law declares these vectors, with
+their names and lengths, in the class variable `sends`.
 
 Invariant:
-    - A declaration is a literal in the class of the law, so reading it runs no user code.
-    - The declaration is part of the resolved scenario, so the scenario suffices to read the
-      law's records.
+    - A declaration is a literal in the source of the law, so reading it runs no user code.
+    - The declaration is stored with the resolved scenario, the complete description of an
+      experiment. No other file is needed to read what the law sent in a run.
 """
 
 import ast

@@ -1,8 +1,9 @@
-"""Implements the four-channel law of two users and a slave with a single dominance factor a.
+"""Implements the four-channel law of two users and a slave, with a single dominance factor a.
 
-The torque is that of `FourChannel`. The law only requires that the dominance matrix of the
-scenario, whose rows are the weights with which the sites follow each other, is that of the
-factor a.
+A dominance factor is the weight with which a site, a process that runs one arm, follows a peer.
+The dominance matrix of a scenario (the file that describes an experiment) contains these
+weights, one row per site. The torque is computed as in `FourChannel`. In addition, this law
+requires that all weights in the matrix follow from the one factor a.
 """
 
 from typing import ClassVar

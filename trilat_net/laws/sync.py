@@ -1,12 +1,16 @@
-"""Implements adaptive synchronisation of outputs, with its defect under gravity.
+"""Implements adaptive synchronisation of outputs, including its known weakness under gravity.
 
-Each site compares its output r = qd + Lambda q with the outputs of its peers, and learns the
-parameters theta of its arm. The output contains the absolute pose. Under gravity every
-equilibrium satisfies Y_G' r = 0, where Y_G is the regressor of gravity, so the arms end at q =
-0.
+Each site, a process that runs one arm, compares its output r = qd + Lambda q with the outputs
+of its peers. Here q and qd are the positions and velocities of the joints, and Lambda is a
+gain. While it controls the arm, the law learns the dynamic parameters of the arm, such as
+masses.
+
+The output contains the pose itself instead of the difference between two poses. Under gravity
+every equilibrium satisfies Y_G' r = 0, where Y_G, the regressor of gravity, is the matrix whose
+product with the parameters is the gravity torque. Therefore all arms end at q = 0.
 
 Invariant:
-    - The estimate advances by the trapezoid rule, like the estimate of the adaptive law.
+    - The estimate of the parameters advances by the trapezoid rule, as in the adaptive law.
 """
 
 from collections.abc import Mapping
