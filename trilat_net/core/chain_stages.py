@@ -1,11 +1,12 @@
-"""Computes the stages of a tick that depend on the arm, for a chain of n joints.
+"""Computes those stages of a tick that depend on the arm, for an arm that is a chain of n joints.
 
-The dynamics are recursions over the joints. `chain` holds the rows of the site's joints, see
-`chain_dtype`.
+A tick is one period of the control loop, and a stage is one of the eight steps in which
+`kernel` computes a tick. The dynamics of the arm are computed by recursions from joint to
+joint. The argument `chain` holds one row of numbers per joint, described in `chain_dtype`.
 
 Invariant:
-    - `two_link_stages` has the same functions for the planar two-link arm; `kernel` calls one
-      or the other.
+    - `two_link_stages` has the same functions for the planar two-link arm, and `kernel` calls
+      the functions of one module or the other.
 """
 
 from math import isfinite

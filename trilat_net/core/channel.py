@@ -1,14 +1,15 @@
-"""Computes the network's effect on each sample of a link: its due time, or its loss.
+"""Computes what the network does to each sample of a link: when it arrives, or that it is lost.
 
-A link is the directed connection between two sites. It delays each sample that a site sends,
-and may lose or duplicate it.
+A link is the directed connection between two sites, the processes that run one arm each. A
+sample is the state that a site sends in one tick (period of its control loop), and its stamp is
+the number of this tick. A link delays each sample, and may lose or duplicate it.
 
 Invariant (L4):
 
-- The delivery of sample m is a function of the link's key, of m, and of the model in force at
-  the stamp of m.
-- All memory (bursts of loss, correlated delay, order) advances from sample to sample by index,
-  whatever the order in which samples arrive.
+- What happens to sample m depends only on the key of the link (the seed of its random numbers),
+  on m, and on the network model in force at the stamp of m.
+- Models with a memory (bursts of loss, correlated delays, order of samples) advance from sample
+  to sample by index, in whatever order samples arrive.
 """
 
 from .delay import (

@@ -1,13 +1,16 @@
-"""Computes the delay of each sample on a link by a delay model.
+"""Computes by how much a simulated network delays each sample.
 
-A link is the directed connection between two sites, and a sample is the state that a site sends
-in one tick. A delay model is a distribution of delays, a function of time, or a recorded trace.
+A link is the directed connection between two sites, the processes that run one arm each. A
+sample is the state that a site sends in one tick (period of its control loop), and its stamp is
+the number of this tick. A delay model is a distribution of delays, a function of time, or a
+recorded trace.
 
 Invariant (L4):
 
-- A delay is a function of the link's key, the sample's index and its stamp, rounded to whole
-  microseconds.
-- Only AR1 depends on the previous sample. It advances by index, not by arrival.
+- A delay depends only on the key of the link (the seed of its random numbers), on the sample's
+  index and on its stamp. It is rounded to whole microseconds.
+- Only the model AR1, with correlated delays, depends on the previous sample as well. It advances
+  by the index of the samples, not in the order in which they arrive.
 """
 
 import math

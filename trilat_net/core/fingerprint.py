@@ -1,11 +1,12 @@
-"""Computes a fingerprint of the platform's arithmetic from its results.
+"""Computes a fingerprint of the platform's arithmetic, to know where runs can be repeated exactly.
 
-Simulations are reproducible to the last bit only on platforms whose arithmetic is equal.
+Simulations are reproducible to the last bit only on platforms whose arithmetic is equal. The
+fingerprint is a hash of the results of a fixed computation: many sines and cosines, and a short
+run of two simulated arms that are connected by links with random delays.
 
 Invariant (L5):
-    - Two platforms with the same fingerprint gave the same bits for many sines and cosines, and
-      for a short run of two sites with random links. Verification requires equal bits only
-      between platforms with the same fingerprint.
+    - The verification of a log requires equal bits only if the log was written on a platform
+      with the same fingerprint.
 """
 
 import hashlib

@@ -1,13 +1,15 @@
-"""Runs all sites in virtual time in one compiled call, and reduces the run to peaks and sums.
+"""Simulates all sites of an experiment in one compiled call, for studies of many runs.
 
-A site is an arm with its control loop. Such a run writes no log. It keeps only the largest
-errors and speeds and a few sums.
+A site is an arm with its control loop. The run takes place in virtual time: the clock of the
+simulation jumps from one tick (period of the loop) to the next. Such a run writes no log. It
+keeps only the largest errors and speeds and a few sums.
 
 Invariant:
 
-- Its leaves are those of `Site.step`, in the order of the virtual-time driver: by nominal time,
-  then by the scenario's order of sites.
-- Its numbers are those of that driver, bit for bit.
+- The call uses the same compiled functions as `Site.step`, which computes a single tick.
+- The ticks are computed in the same order as in an ordinary run in virtual time: by nominal
+  time, and at equal times in the order of the sites in the scenario file.
+- The numbers are equal to those of an ordinary run, bit for bit.
 """
 
 from functools import cache

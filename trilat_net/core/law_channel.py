@@ -1,14 +1,14 @@
 """Describes the vectors that a control law sends to its peers besides the motion of its arm.
 
-A law may send for example waves or energies. Some vectors go to all peers, others to one peer
-alone. All numbers of a law stand one after another in a single row, which a record contains in
-its field `ch`. A peer receives the part of the row that is meant for it, so the vectors that a
-site received can be found in the sender's record.
+A peer is a site (a process that runs one arm) that exchanges its state with this site. A law
+may send for example waves or energies. Some vectors go to all peers, others to one peer alone.
+All these numbers stand one after another in a single row. The record of a tick, its stored
+result, contains the row in the field `ch`. A peer receives the part of the row that is meant
+for it, so what a site received can be found in the sender's record.
 
 Invariant:
-    - A law declares its vectors once.
-    - The order of the row is: first the vectors that go to all peers, then, per peer in
-      scenario order, the vectors that go to that peer alone.
+    - The row contains first the vectors that go to all peers. The vectors for a single peer
+      follow, peer by peer in the order of the scenario, the file that describes the experiment.
 """
 
 from collections.abc import Iterator, Sequence

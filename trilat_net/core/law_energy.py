@@ -1,9 +1,9 @@
 """Describes the energies that prove a control law passive, as functions of its site's records.
 
 A law is passive if it never gives more energy than it received. Some laws keep accounts of
-energy: what they sent to peers, what they took, and what they store. Such a law returns these
-accounts for the records of a run, and the certificate compares them with the motion of the
-arms.
+energy: what they sent to peers (the sites that they follow), what they took, and what they
+store. Such a law computes these accounts from the records of a run, the stored results of each
+tick. The certificate, a check after the run, compares them with the motion of the arms.
 
 Invariant:
     - A peer takes no more energy than has arrived from the law that gave it.

@@ -1,12 +1,13 @@
-"""Gives a control law its input in each tick, from the rows of its site and links.
+"""Gives a control law its input in each tick: the motion of its arm and of its peers.
 
-The state of a site is stored in rows of arrays, on which the compiled stages of a tick work. A
-compiled law reads the rows directly. For a law in plain Python, this module copies the rows to
-lists and writes the results back.
+A tick is one period of the control loop. The state of a site, the process that runs an arm, is
+stored in rows of arrays, which the compiled stages of a tick read and write. A compiled law
+reads the rows directly. For a law in plain Python, this module copies the rows to lists and
+writes the results back.
 
 Invariant:
     - The compiled and the plain form of a law see the same numbers.
-    - A sent vector keeps its numbers until the law writes it again.
+    - A vector that the law sends to its peers keeps its numbers until the law writes it again.
 """
 
 from collections.abc import Sequence

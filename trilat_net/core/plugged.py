@@ -1,13 +1,14 @@
-"""Compiles functions of operators and delay models, which the kernel calls by their address.
+"""Compiles the functions of operators and delay models, which the kernel calls by their address.
 
-The kernel is the compiled code that computes a tick. A model, for example an operator who moves
-an arm, has a few numbers and a function that computes with these numbers and a row of the
+The kernel is the compiled code that computes a tick, one period of a control loop. A model
+describes, for example, an operator who moves an arm, or the delays of a network. It consists of
+a few numbers and of a function. The function computes with these numbers and with a row of the
 kernel's arrays.
 
 Invariant:
-    - A function is compiled for the layout of its numbers and of its row.
-    - The numbers themselves are in a table, so that new values need no compilation.
-    - No function recompiles the kernel, because the kernel knows only addresses.
+    - A function is compiled for the layout of its numbers and of its row. The numbers themselves
+      are stored in a table, so new values need no compilation.
+    - A new function does not recompile the kernel, because the kernel knows only its address.
 """
 
 import hashlib

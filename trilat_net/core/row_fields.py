@@ -1,14 +1,16 @@
-"""Lists the fields of the core's rows: shape, unit, meaning, and the stage that writes each.
+"""Lists the fields of the rows that hold a site's state: shape, unit, meaning, and writing stage.
 
-A row is one record of a NumPy structured array. Each class below is a row at once as a reader
-and mypy see it (its attributes and their types) and as NumPy lays it out: `row_dtype` reads the
-`Field` of each attribute. `FIELDS` collects the tables; README.md of this folder shows them.
+A row is one record of a NumPy structured array, and a stage is a part of a tick, one period of
+the control loop. Each class below describes a row twice: its attributes tell readers and mypy
+the types, and `row_dtype` reads the `Field` of each attribute to lay the row out in memory.
+`FIELDS` collects the tables, which README.md of this folder shows.
 
 Invariant:
 
 - The order of the attributes is the order of the fields in memory. Digests of runs, cached
   machine code and users' compiled laws depend on it.
-- A row has no other fields, and the kernel keeps no state outside of its rows and tables.
+- A row has no other fields, and the kernel (the compiled code of a tick) keeps no state outside
+  of its rows and tables.
 """
 
 from collections.abc import Mapping

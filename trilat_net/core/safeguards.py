@@ -1,10 +1,13 @@
-"""Limits the speed of the reference, and blends the torque from rest to that of the law.
+"""Limits the speed of a site's reference, and blends its torque from rest to the control law.
 
-The reference is the position that the control law of a site aims at.
+A site is a process that runs one arm. The reference is the position that its control law aims
+at. When an arm leaves its rest, the torque changes gradually from the torque that holds the arm
+to the torque of the law.
 
 Invariant:
 
-- The reference moves no faster than its limit, whatever the peers do.
+- The reference moves no faster than its speed limit, whatever the peers (the sites that it
+  follows) do.
 - A reference without a speed limit is not changed.
 """
 

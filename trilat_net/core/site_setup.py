@@ -1,10 +1,12 @@
-"""Defines the setup of a site: the resolved numbers and names from which a site is built.
+"""Defines the setup of a site: the numbers and names from which a site is built.
 
 A site is a process that runs one arm and its control loop. Its setup is derived from a
-scenario, the file that describes an experiment.
+scenario, the file that describes an experiment: defaults are filled in, and names are replaced
+by the numbers that they stand for.
 
 Invariant:
-    - Besides the setup, only the inputs of the ticks influence a site's numbers.
+    - The numbers that a site computes depend only on its setup and on the inputs of its ticks,
+      the periods of the loop.
 """
 
 import math

@@ -1,13 +1,16 @@
-"""Defines ticks: their nominal times, the input and record of a tick, and texts about modes.
+"""Defines ticks: their nominal times, their inputs and records, and texts about a site's modes.
 
-A tick is one period of a site's control loop. Its input are the samples that arrived from other
-sites and the commands since the previous tick; its record is the stored result.
+A site is a process that runs one arm, and a tick is one period of its control loop. The input
+of a tick consists of the samples (states) that arrived from other sites, and of the commands,
+since the previous tick. Its record is the stored result.
 
 Invariant:
 
-- (L1) Tick k of a loop of `rate_hz` lies at `k * 10^9 // rate_hz` nanoseconds after the epoch:
-  integers with one rounding rule, so that no drift builds up.
-- (L3) The record of a tick names the inputs of the tick. The sample in use is an output.
+- (L1) Tick k of a loop of `rate_hz` lies at `k * 10^9 // rate_hz` nanoseconds after the epoch,
+  the common start of the session. These are integers with one rounding rule, so that no drift
+  builds up.
+- (L3) The record of a tick names the inputs of the tick. Which sample of a peer was in use is
+  a result of the tick, not an input.
 """
 
 from collections.abc import Sequence

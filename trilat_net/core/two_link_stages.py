@@ -1,10 +1,12 @@
-"""Computes the stages of a tick that depend on the arm, for the planar two-link arm.
+"""Computes those stages of a tick that depend on the arm, for the planar two-link arm.
 
-The loops over two joints are unrolled, so that the numbers stay in registers.
+A tick is one period of the control loop, and a stage is one of the eight steps in which
+`kernel` computes a tick. The loops over the two joints are written out, so that the compiled
+code keeps the numbers in registers.
 
 Invariant:
-    - `chain_stages` has the same functions for a chain of n joints, with the chain's rows as an
-      additional argument; `kernel` calls one or the other.
+    - `chain_stages` has the same functions for a chain of n joints. They have one more argument,
+      the rows of the joints. `kernel` calls the functions of one module or the other.
 """
 
 from math import inf, isfinite

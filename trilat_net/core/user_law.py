@@ -1,11 +1,13 @@
-"""Calls a user's control law in plain Python: its input, its results and its memory.
+"""Calls a user's control law in plain Python: prepares its input, and stores results and memory.
 
 A control law is a class with a method `torque`, which computes the torque of an arm in each
-tick of the control loop. Between ticks a law may keep numbers, its memory.
+tick (period) of the control loop. Between ticks a law may keep numbers, its memory.
 
 Invariant:
-    - A law is part of the site's step and a function of its input and its memory.
-    - The record of each tick contains the memory, so a log can resume in the middle of a run.
+    - A law is a function of its input and its memory: equal inputs and an equal memory give
+      equal torques.
+    - The record of each tick, its stored result, contains the memory. A run can therefore be
+      resumed from the middle of its log.
 """
 
 import math

@@ -1,12 +1,12 @@
-"""Defines types of the core's numbers: arrays, rows of structured arrays, vectors as tuples.
+"""Defines the types of the core's numbers: arrays, rows of arrays, and vectors as tuples.
 
-A leaf is a compiled function of the core.
+The functions of the core that are compiled are called leaves.
 
 Invariant:
 
-- A leaf reads vectors by index, so that they may be tuples or rows of arrays.
-- A leaf returns vectors as tuples, which stay in registers while a tick is computed. Results in
-  arrays are written by `put`.
+- A leaf reads vectors by index, so that a vector may be a tuple or a row of an array.
+- A leaf returns vectors as tuples, because these stay in registers while a tick (period of the
+  control loop) is computed. The function `put` writes a result into an array.
 """
 
 from collections.abc import Sequence
