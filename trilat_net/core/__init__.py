@@ -6,8 +6,8 @@ the state of a site, and each file.
 
 Invariant:
 
-- Nothing in this package reads a clock, opens a socket or logs. All random numbers are seeded by
-  the scenario, the file that describes an experiment. Only `jit` and `plugged` use files, for
-  compiled code.
+- Nothing in this package reads a clock, opens a socket or logs. All random numbers are seeded
+  by the scenario, the file that describes an experiment. Only `jit` and `plugged` use files,
+  for compiled code.
 - The package depends on the standard library, NumPy, Numba, `errors` and `process` alone.
 """

@@ -1,4 +1,4 @@
-"""Computes those stages of a tick that depend on the arm, for an arm that is a chain of n joints.
+"""Computes those stages of a tick that depend on the arm, for a chain of n joints.
 
 A tick is one period of the control loop, and a stage is one of the eight steps in which
 `kernel` computes a tick. The dynamics of the arm are computed by recursions from joint to

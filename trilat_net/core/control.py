@@ -1,12 +1,17 @@
-"""Computes the kernel's control laws: the paper's adaptive law, and laws of known gravity.
+"""Computes the torques of built-in control laws: the adaptive law, and laws of known gravity.
 
-The functions are for the planar two-link arm; `chain_stages` has the same laws for chains.
-Gains are diagonal matrices, written as vectors with one number per joint (N m s/rad; Lambda in
-1/s) or per parameter. Angles are in rad, speeds in rad/s, torques in N m.
+The functions are part of the kernel, the compiled code that computes a tick (one period of the
+control loop). They are for the planar two-link arm; `chain_stages` has the same laws for chains
+of joints. Gains are diagonal matrices, written as vectors with one number per joint (N m s/rad;
+the convergence rate Lambda in 1/s) or per dynamic parameter. Angles are in rad, speeds in
+rad/s, torques in N m.
+
+The adaptive law estimates the dynamic parameters of its arm, such as masses. Its regressor is
+the matrix whose product with the parameters is the torque of the arm's dynamics.
 
 Invariant:
-    - The errors and the regressor of tick k do not depend on the estimate of tick k. Therefore
-      the second-order update of the estimate needs no equation to be solved.
+    - The errors and the regressor of a tick do not depend on the estimate of the same tick.
+      Therefore the second-order update of the estimate needs no equation to be solved.
 
 Source: Eq. (9)-(13), (15) of the paper; P+d and PD+d after Nuno, Basanez, Ortega and Spong,
 "Position Tracking for Non-linear Teleoperators with Variable Time Delay", Int. J. Robotics

@@ -9,8 +9,8 @@ Invariant (L4):
 
 - A delay depends only on the key of the link (the seed of its random numbers), on the sample's
   index and on its stamp. It is rounded to whole microseconds.
-- Only the model AR1, with correlated delays, depends on the previous sample as well. It advances
-  by the index of the samples, not in the order in which they arrive.
+- Only the model AR1, with correlated delays, depends on the previous sample as well. It
+  advances by the index of the samples, not in the order in which they arrive.
 """
 
 import math

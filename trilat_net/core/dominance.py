@@ -1,22 +1,23 @@
-"""Computes with dominance factors, the weights with which sites follow each other.
+"""Computes with dominance factors, the weights with which arms follow each other.
 
-Site i follows site j with the dominance factor alpha_ij, also called its share. Its reference,
-the position that its control law aims at, is the sum of alpha_ij q_j over its peers, Eq. (6).
-Upsilon = I - alpha is the matrix of the coupling, and beta are the weights of the sites in V,
-the energy function of the stability proof.
+A site is a process that runs one arm. Site i follows site j with the dominance factor alpha_ij,
+also called its share. The reference of site i, the position that its control law aims at, is
+the sum of alpha_ij q_j over its peers j, where q_j is the position of arm j, Eq. (6). In the
+stability proof, Upsilon = I - alpha is the matrix of the coupling, with the identity I, and
+beta are the weights of the sites in V, the energy function of the proof.
 
 Invariant:
 
-- Each row of alpha sums to 1, Eq. (7), and the diagonal is zero.
+- Each row of the matrix alpha sums to 1, Eq. (7), and its diagonal is zero.
 - beta is the LEFT null vector of Upsilon.
-- While factors change, they are a function of time and of the ramps alone. Between two rows
-  that sum to 1, every row sums to 1.
-- A stale peer stops the reference. The reference then returns from the held pose to the peers
-  along the smooth polynomial 3 x^2 - 2 x^3.
+- Factors change along ramps. Every row sums to 1 during a ramp too, and the factors at a time
+  depend on this time and the ramps alone.
+- If a peer is stale (its samples stay away), the reference stops. It later returns from the
+  held pose to the peers along the smooth polynomial 3 x^2 - 2 x^3, with x from 0 to 1.
 
-Source: Eq. (6), (7), (20) of the paper. The paper uses beta = (1, 1, 1). That is the right null
-vector of Upsilon, and a left one only if the columns sum to 1 as well. The left null vector
-of an irreducible matrix is its Perron vector, positive and unique up to its length.
+Source: Eq. (6), (7), (20) of the paper. The paper uses beta = (1, 1, 1). This is the right null
+vector of Upsilon, and a left null vector only if the columns sum to 1 as well. The left null
+vector of an irreducible matrix is its Perron vector, positive and unique up to its length.
 """
 
 import numpy as np

@@ -1,13 +1,15 @@
-"""Computes the exogenous torque, the effect of operators and environments on an arm.
+"""Computes the torques by which operators and environments act on an arm.
 
 An operator is a person or program that moves the arm; an environment is, for example, a wall.
-Scenarios state the torque ON the arm; the paper's tau_x, which Eq. (8) subtracts, is the
-negative of this torque. In the code an actor is an operator or an environment.
+In the code both are called actors, and their torque is the exogenous torque. A scenario, the
+file that describes an experiment, states the torque ON the arm. The paper's tau_x, which Eq.
+(8) subtracts, is the negative of this torque.
 
 Invariant:
-    - The torque is a function of time and of the arm's state, so each stage of the integrator
-      evaluates it.
-    - A `sampled` source is evaluated once per tick and held, as in a digital haptic wall.
+    - The torque depends on time and on the state of the arm. Therefore it is computed anew at
+      each evaluation of the integrator, several times per tick (period of the control loop).
+    - A source that is marked `sampled` is evaluated once per tick and then held, as in a
+      digital haptic device that renders a wall.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Computes a fingerprint of the platform's arithmetic, to know where runs can be repeated exactly.
+"""Computes a fingerprint of the platform's arithmetic, to tell where runs repeat exactly.
 
 Simulations are reproducible to the last bit only on platforms whose arithmetic is equal. The
 fingerprint is a hash of the results of a fixed computation: many sines and cosines, and a short

@@ -1,19 +1,20 @@
-"""Lets a site go on without a lost peer, whose dominance factor goes to the other peers.
+"""Lets a site continue without a lost peer, and gives the weight of this peer to the others.
 
-A peer is another site whose states this site receives. It is lost if none of its samples came
-into use for some time. The dominance factor, or share, is the weight with which a site follows
-a peer.
+A site is a process that runs one arm, and a peer is another site whose states (samples) this
+site receives. A peer is lost if none of its samples came into use for some time. The dominance
+factor, or share, is the weight with which a site follows a peer.
 
 Invariant:
 
-- Each decision follows from the samples in use and from the memory of the site, tick by tick.
+- Each decision follows from the samples in use and from the memory of the site, tick by tick (a
+  tick is one period of the control loop).
 - A peer is only dropped if the remaining sites all reach each other without it, and if it is
-  not the last peer that the site follows. Otherwise the site holds.
-- The reference never jumps: the site aligns with the remaining peers, and again with a peer
-  that returns.
+  not the last peer that the site follows. Otherwise the site holds its pose.
+- The reference, the position that the arm follows, never jumps. The site aligns smoothly with
+  the remaining peers, and later with a peer that returns.
 
-`gone` of a link is 0 while the peer is present, and -1 while the peer is lost. When a lost peer
-is heard again, `gone` becomes the time of that tick, ns since the epoch.
+The field `gone` of a link is 0 while the peer is present, and -1 while the peer is lost. When a
+lost peer is heard again, `gone` becomes the time of that tick, ns since the epoch.
 """
 
 from .chain import add, scale, three

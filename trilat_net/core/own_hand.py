@@ -1,14 +1,14 @@
-"""Runs a user's hand program: a program that acts as the operator of an arm.
+"""Runs a user's hand program, which acts as the operator of an arm.
 
-The program decides at a fixed rate. For each decision it receives a view of what its site
-knows, and returns a target for the arm or a force on it.
+The program decides at a fixed rate. For each decision it receives a view of what its site, the
+process that runs the arm, knows in a tick (period of the control loop). It returns a target for
+the arm or a force on it.
 
 Invariant:
-    - A decision that is based on tick k acts a fixed time after tick k, wherever it is made, as
-      a sample is in use a fixed time after its stamp (L2).
-    - A decision that arrives later than that acts at once.
-    - The action is an input of the tick, as for any live hand, so a log repeats it without the
-      program.
+    - A decision that is based on tick k acts a fixed time after tick k, wherever the program
+      runs. A decision that arrives later than this acts at once.
+    - The action is an input of the tick and is stored with it, so a log repeats the action
+      without the program.
 """
 
 import math

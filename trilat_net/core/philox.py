@@ -1,14 +1,16 @@
-"""Draws random numbers as pure functions of their arguments, without state or order.
+"""Draws random numbers as functions of their arguments, without a state.
 
-A counter-based generator encrypts a counter instead of updating a state.
+A usual generator updates a state, so its numbers depend on the order of the draws. This
+counter-based generator encrypts a counter instead.
 
 Invariant (L4):
-    - A draw is a function of (seed, link, sample index, purpose) alone, and is therefore the
-      same on every machine, in every driver, and in any order of arrival.
+    - A draw depends on the seed, the link (directed connection between two arms), the index of
+      the sample on the link and the purpose of the draw alone. It is therefore the same on
+      every machine, in simulated and in real time, and in any order in which samples arrive.
 
 The generator is Philox-4x32 with ten rounds: Salmon, Moraes, Dror and Shaw, "Parallel Random
-Numbers: As Easy as 1, 2, 3", SC 2011. NumPy has Philox too, but compiled leaves need it for
-each sample. The tests contain known-answer vectors.
+Numbers: As Easy as 1, 2, 3", SC 2011. NumPy has Philox too, but the compiled functions of the
+core need it for each sample. The tests compare it with published results.
 """
 
 import hashlib

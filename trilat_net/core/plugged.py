@@ -1,4 +1,4 @@
-"""Compiles the functions of operators and delay models, which the kernel calls by their address.
+"""Compiles functions of operators and delay models, which the kernel calls by their address.
 
 The kernel is the compiled code that computes a tick, one period of a control loop. A model
 describes, for example, an operator who moves an arm, or the delays of a network. It consists of
@@ -6,8 +6,8 @@ a few numbers and of a function. The function computes with these numbers and wi
 kernel's arrays.
 
 Invariant:
-    - A function is compiled for the layout of its numbers and of its row. The numbers themselves
-      are stored in a table, so new values need no compilation.
+    - A function is compiled for the layout of its numbers and of its row. The numbers
+      themselves are stored in a table, so new values need no compilation.
     - A new function does not recompile the kernel, because the kernel knows only its address.
 """
 

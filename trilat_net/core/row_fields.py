@@ -1,4 +1,4 @@
-"""Lists the fields of the rows that hold a site's state: shape, unit, meaning, and writing stage.
+"""Lists the fields of the rows that hold a site's state: shape, unit, meaning and stage.
 
 A row is one record of a NumPy structured array, and a stage is a part of a tick, one period of
 the control loop. Each class below describes a row twice: its attributes tell readers and mypy

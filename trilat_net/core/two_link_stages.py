@@ -5,8 +5,8 @@ A tick is one period of the control loop, and a stage is one of the eight steps 
 code keeps the numbers in registers.
 
 Invariant:
-    - `chain_stages` has the same functions for a chain of n joints. They have one more argument,
-      the rows of the joints. `kernel` calls the functions of one module or the other.
+    - `chain_stages` has the same functions for a chain of n joints. They have one more
+      argument, the rows of the joints. `kernel` calls the functions of one module or the other.
 """
 
 from math import inf, isfinite

@@ -1,4 +1,4 @@
-"""Calls a user's control law in plain Python: prepares its input, and stores results and memory.
+"""Calls a user's control law in plain Python: its input, its results and its memory.
 
 A control law is a class with a method `torque`, which computes the torque of an arm in each
 tick (period) of the control loop. Between ticks a law may keep numbers, its memory.

@@ -1,4 +1,4 @@
-"""Implements the paper's adaptive law, which learns the parameters of its arm: Eq. (13) and (15).
+"""Implements the paper's adaptive law, which learns the arm's parameters: Eq. (13) and (15).
 
 The law needs no known model of the arm. While it controls the arm, it estimates the dynamic
 parameters theta, which are combinations of masses, lengths and inertias. Its symbols are

@@ -1,16 +1,17 @@
 """Defines what a control law states about itself: its stability condition and its linear form.
 
 The stability condition of a law tells the user for which gains and delays the law is stable.
-`trilat scenario check` and `trilat linear` print it. The linear form of a law describes the law
-for small motions around a pose at rest. The linear analysis of a session assembles the linear
-forms of all sites to one linear system with delays.
+The commands `trilat scenario check` and `trilat linear` print it. The linear form of a law
+describes the law for small motions around a pose at rest. The linear analysis combines the
+linear forms of all sites (the processes that run one arm each) to one linear system with
+delays.
 
 Invariant:
-    - A law states both once, as methods of its `Settings`.
+    - A law states both once, as methods of its `Settings`, the record of its gains.
     - The text of a condition says whether the condition is only sufficient, and who proved it.
-    - A linear form consists of blocks of a matrix. It describes a law with states, or a law
-      that sends more than the motion. The part that the law shares with a law of known gravity
-      (`linear_gains`) is not among these blocks.
+    - A linear form consists of blocks of a matrix. It is needed for laws that have states or
+      send more than the motion of the arm. The spring and dampers that a law has in common with
+      the simple laws of known gravity (`linear_gains`) are not among these blocks.
 """
 
 from collections.abc import Sequence

@@ -3,15 +3,18 @@
     impedance     M qdd + B (qd - qd_ref) + K (q - q_ref) = tau_h + sum_j f_j(t - T)
     inner loop    tau = M(q) qdd + C qd + G - tau_h
 
-Here M, B and K are the inertia, damping and stiffness that the user chooses, q_ref is the
-reference, tau_h is the torque of the operator or environment on the arm, and f_j is the force
-that peer j sends. The inner loop computes with the arm's model M(q), C and G which torque gives
-the arm the acceleration qdd of the impedance.
+In the first equation q, qd and qdd are position, velocity and acceleration of the joints. M, B
+and K are the inertia, damping and stiffness that the user chooses; q_ref and qd_ref are the
+reference and its velocity; tau_h is the torque of the operator or environment on the arm; f_j
+is the force that peer j sends, and T its delay. The inner loop computes the torque tau that
+gives the arm the acceleration qdd of this equation. It uses the arm's inertia matrix M(q),
+Coriolis matrix C and gravity torque G.
 
-The reference of a master is its start pose at rest. The reference of the slave is the pose of
-the masters, weighted by the slave's dominance factors alpha_j. The slave sends f_j = alpha_j
-tau_h to master j, so each master feels the environment's force in proportion to its share of
-the lead. Masters send zeros.
+A master is an arm that a person moves, and the slave follows the masters. The reference of a
+master is its start pose at rest. The reference of the slave is the pose of the masters,
+weighted by its dominance factors alpha_j (the weights with which it follows them). The slave
+sends f_j = alpha_j tau_h to master j, so each master feels the environment's force in
+proportion to its share of the lead. Masters send zeros.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,14 +1,16 @@
-"""Couples sites by springs whose work is paid for by a tank of energy at each site.
+"""Couples arms by springs whose work is paid for by a tank of energy at each arm.
 
-The controller of a site has two layers. The transparency layer is a spring and dampers, which
-couple the arm to its peers. The passivity layer below it keeps a tank, an account of the energy
-that the site may spend, and reduces the torque of the transparency layer to that energy.
+A site, the process that runs one arm, has a controller of two layers. The transparency layer is
+a spring and dampers, which couple the arm to its peers, the arms that it follows. The passivity
+layer below it keeps a tank, an account of the energy that the site may spend, and reduces the
+torque of the transparency layer so that it spends no more.
 
 Invariant:
-    - The work that the arm does on its controller and the energy packets of the peers fill the
-      tank. The work of the torque on the arm, tau times the step in q, empties it.
+    - The tank is filled by the work that the arm does on its controller, and by packets of
+      energy from the peers. It is emptied by the work of the torque on the arm, which is the
+      torque tau times the change of the position q in a tick (period of the control loop).
     - While the tank is empty, the transparency layer has no torque.
-    - Packets are sent as cumulative sums, so no energy is lost with a lost sample.
+    - Packets are sent as cumulative sums, so no energy is lost with a lost message.
 """
 
 from typing import Any, ClassVar
