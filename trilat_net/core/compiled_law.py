@@ -1,8 +1,9 @@
 """Compiles a user's control law, so that it runs at the speed of the simulation kernel.
 
-A control law is a class with a method `torque`. This module compiles that method with Numba.
-The compiled method returns exactly the same numbers as the Python method, down to the last bit,
-so that a law can be developed in plain Python and compiled later.
+A control law is a class with a method `torque`, which computes the torque of an arm. This
+module compiles that method with Numba. The compiled method returns exactly the same numbers as
+the Python method, down to the last bit, so that a law can be developed in plain Python and
+compiled later.
 
 Invariant:
     - The gains of a law are passed in a row of floats, so that new gains need no compilation.

@@ -1,7 +1,7 @@
 # mypy: disallow-untyped-calls=False, disable-error-code="no-any-return"
 """Compiles functions of the core with Numba, and stores their machine code.
 
-A leaf is a compiled function of numbers and arrays; the decorator `leaf` makes a function one.
+A leaf is a function of numbers and arrays that is compiled; the decorator `leaf` marks it.
 
 Machine code is kept in the user's cache directory, in a folder named after a hash of all
 sources of the core. (Numba alone notices a change of the file that holds a leaf, but not of the

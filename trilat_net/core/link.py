@@ -1,8 +1,9 @@
 """Applies the delay of a link, at its receiving end.
 
-A link is the directed connection from site j to site i. Site j sends a sample, the state of its
-arm, in each of its ticks; the number of the tick is the stamp of the sample. The delay of the
-network is simulated by keeping each sample until it is due.
+A site is a process that runs one arm, and a link is the directed connection from site j to site
+i. Site j sends a sample, the state of its arm, in each tick (period of its control loop). The
+number of the tick is the stamp of the sample. The delay of the network is simulated by keeping
+each sample until it is due.
 
 A link is a calendar: a ring of pages, one for each of the receiver's next ticks.
 `accept_sample` files a sample in the page of the tick that releases it, unless that page holds

@@ -1,7 +1,9 @@
 """Lets an arm come to rest where it is, and keeps it there.
 
-An arm rests while its site waits, holds, is stopped or in fault. The reference of a joint
-starts at the joint's angle q and speed v, and comes to rest within T. Per period h,
+An arm rests while its site, the process that runs the arm, waits, holds, is stopped or in
+fault. The reference q_ref is the position at which the control law aims, and qd_ref is its
+velocity. The reference of a joint starts at the joint's angle q and speed v, and comes to rest
+within the time T. In each period h of the control loop, at the time t since the start,
 
     |qd_ref| falls by the factor 1 - h / T_left,
     T_left = max(LEAST_STOP_S - t, max_i |qd_ref_i| / a_i),
@@ -13,15 +15,15 @@ down sooner, this is qd_ref = v (1 - t / T) with T = max(LEAST_STOP_S, max_i |v_
 is the integral of qd_ref. While an arm is fast (see below) or a torque is at its limit, q_ref
 moves along with a joint that would otherwise move away from it.
 
-The torque is that of the law on this reference. The gravity torque, as far as it is known or
-estimated, replaces the law's torque
+The control law computes the torque for this reference. The gravity torque, as far as it is
+known or estimated, replaces the law's torque
 
 - if the law failed,
 - if a user's law does not declare (`holds = True`) that it is right while its reference rests,
 - in task space, unless the law is a kernel law of known gravity,
 - while the arm is fast: while B |qd| of some joint exceeds the limit of its torque.
 
-To either torque the kernel adds
+To either torque the kernel, the compiled code of the control loop, adds
 
     w - B s,    s = qd - qd_ref + Lambda (q - q_ref),    w' = -k B s
 

@@ -1,14 +1,17 @@
 """Changes the mode of a site under the rule `glide`: it waits, aligns, follows, and holds.
 
-The rule `glide` lets a site start and end smoothly when its peers, the other sites whose states
-it receives, appear or fall silent. Its modes are:
+A site is a process that runs one arm, and its peers are the other sites whose states it
+receives. The rule `glide` lets a site start and end smoothly when its peers appear or fall
+silent. The modes of a site are:
 
     WAITING -> RETURN (aligns) -> RUN (engaged) -> HOLD (a peer is silent) -> RETURN -> RUN
     any mode -> FAULT (limit exceeded, number not finite, arm lost) -- order RESET -> WAITING
     any mode -> STOPPED (order STOP, or switch released) -- order ENABLE or HELD -> WAITING
 
-While a site aligns, its reference is that of the peers plus an offset. The offset starts at the
-difference between the site's reference and the peers' reference, and falls to zero within T:
+The reference of a site is the position that its arm follows; the reference of the peers is the
+weighted mean of their positions. While a site aligns, its reference is the reference of the
+peers plus an offset. The offset starts at the difference between the two, and falls to zero
+within T:
 
     offset(x) = D (1 - 3 x^2 + 2 x^3) + T D' x (1 - x)^2,    x = t / T from 0 to 1
     T = max(MIN_ALIGN_NS, 1.5 |D| / align_speed)

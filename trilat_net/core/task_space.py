@@ -2,14 +2,18 @@
 
 Without task space, sites compare joint angles, which requires equal arms.
 
-Let J be the Jacobian of the followed axes, Jd its derivative, x the pose of the end effector
-and e = x - x_des. The reference velocity v of the joints and its derivative a are
+Let q and qd be the positions and velocities of the joints, J the Jacobian of the followed axes,
+Jd its derivative, x the pose of the end effector, x_des the pose that it shall reach, e = x -
+x_des the error, Lambda the rate at which it decays, and y an auxiliary vector. The reference
+velocity v of the joints and its derivative a are
 
     v = psi + J' y          J J' y  = -Lambda e - J psi
     a = v'                  J J' y' = -Lambda e' - Jd psi - J psi' - (Jd J' + J Jd') y
 
-where psi = -k (q - q_posture) acts in the null space; v is J+ (-Lambda e) + (I - J+ J) psi. The
-velocity r = qd - v then satisfies J r = x' + Lambda e. A prime at a matrix is its transpose.
+where psi = -k (q - q_posture) pulls the joints to the preferred posture q_posture with the rate
+k, as far as this does not move the end effector. With the pseudoinverse J+, v equals J+
+(-Lambda e) + (I - J+ J) psi. The filtered error r = qd - v then satisfies J r = x' + Lambda e.
+A prime at a matrix means its transpose, and at a vector its derivative.
 
 Near singular poses, J J' is damped. The damping is zero while 1 / trace((J J')^-1), a lower
 bound of the square of the least singular value, is above the square of `singular_value`.

@@ -1,8 +1,10 @@
 """Computes the dynamics, the regressor and the kinematics of the planar two-link arm.
 
 Symbols: q are the joint angles, rad, qd their velocities, rad/s, g is the gravitational
-acceleration, m/s^2, and `lengths` are the lengths of the two links, m. Angles are measured from
-the horizontal; the second angle is relative to the first link.
+acceleration, m/s^2, `lengths` are the lengths of the two links, m, and theta are the five
+dynamic parameters, which combine masses, lengths and inertias. The regressor is the matrix
+whose product with theta is the torque of the arm's dynamics. Angles are measured from the
+horizontal; the second angle is relative to the first link.
 
 Source: "Adaptive Control of Dual User Teleoperation with Time Delay and Dynamic Uncertainty",
 Eq. (1)-(5), (8), (12), (24). Eq. (24) prints theta_5 = m2 l2, which holds only for lc2 = l2;

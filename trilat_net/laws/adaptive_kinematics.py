@@ -14,15 +14,21 @@ law and its estimates are
     theta_hat' = -Gamma Y' r
     l_hat'     = Gamma_l Y_k' Kd ed,    where Y_k l_hat = J_hat qd
 
+Here tau is the torque of the joints, theta_hat the estimate of the dynamic parameters theta
+(such as masses), ed the derivative of e, and Y_k the matrix of the kinematics. Lambda, Kp, Kd,
+Gamma and Gamma_l are gains. A prime at a matrix means its transpose, and at a vector its
+derivative.
+
 Stability: J_hat r = x' + Y_k (l_hat - l) + Lambda e. The wrong lengths add a term to
 -r' J_hat' Kd ed. The derivative of 1/2 (l_hat - l)' Gamma_l^-1 (l_hat - l) cancels this term,
-so V' is the same as with known lengths (docs/laws.md). The adaptive Jacobian is due to C. C.
+so the derivative of V, the energy function of the stability proof, is the same as with known
+lengths (docs/laws.md). The adaptive Jacobian is due to C. C.
 Cheah, C. Liu and J.-J. E. Slotine, Int. J. Robotics Research 25 (2006).
 
 Invariant:
     - Both estimates advance by the trapezoid rule, like the estimate of the adaptive law.
-    - The estimated lengths stay in their box. The projection can only lower the additional term
-      of V further.
+    - The estimated lengths stay in their box, an interval per length. The projection into the
+      box can only lower the additional term of V further.
 """
 
 from collections.abc import Mapping

@@ -1,7 +1,7 @@
 """Shares the authority over one slave arm between two users.
 
-A user is a person at a master arm. Each user feels the other user, but not the force of the
-environment on the slave:
+A user is a person at a master arm, and the slave is the arm that follows both. Each user feels
+the other user, but not the force of the environment on the slave:
 
     slave    tau = G + K (sum_j alpha_j q_j - q) - d qd
     user i   tau = G + K alpha_ij (q_j - q_i) - d qd_i,    j: the other user

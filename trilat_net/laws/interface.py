@@ -9,8 +9,9 @@ Invariant:
     - A law is one class. The annotations of the class are its gains, with ranges and defaults.
     - The `Settings` of a law are derived from these annotations. They take over the methods of
       the class that depend on gains alone, such as the stability condition.
-    - At a site, an instance of the class computes torques. The laws that the simulation kernel
-      computes have a method `gains` instead of `torque`.
+    - At a site, the process that runs an arm, an instance of the class computes the torques.
+      Laws that the simulation kernel (the compiled code of the control loop) computes have a
+      method `gains` instead of `torque`.
 """
 
 import ast

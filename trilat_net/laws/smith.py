@@ -8,13 +8,15 @@ remote side that has no delay, and corrects it by the delayed difference from th
     master   tau = G - K (q_m - x - w(t - T)) - d qd_m, where the model x is driven by q_m
     model    inertia x'' = K (q_m - x) - d x'
 
-Here q_m and q_s are the positions of master and slave, T is the delay, K a stiffness and d a
-damping. Both ends run the same model, so the law stores no past values, however long the delay
-is. The signal w is the part of the slave's motion that the model misses, for example in
-contact. The master is the site with `predicts` = true.
+Here q_m, q_s, qd_m and qd_s are the positions and velocities of master and slave, tau is the
+torque of an arm and G its gravity torque, T is the delay, K a stiffness and d a damping. Both
+ends run the same model, so the law stores no past values, however long the delay is. The signal
+w is the part of the slave's motion that the model misses, for example in contact. The master is
+the site with `predicts` = true.
 
 Invariant:
-    - The model moves like an arm whose torque is held over a tick (scheme `digital`).
+    - The model moves like an arm whose torque is held over each tick, a period of the control
+      loop (scheme `digital`).
 """
 
 from collections.abc import Mapping
