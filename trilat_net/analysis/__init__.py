@@ -1,4 +1,7 @@
-"""A log in numbers: delivery, delays, timeline, health, summary, certificate and metrics.
+"""Computes numbers from the log of a run: delays, timeline, stability certificate and metrics.
 
-Invariant: nothing here draws, formats or prints; `reporting` does.
+A log contains a record for every tick of every site, the process that runs one arm.
+
+Invariant:
+    - Nothing in this package draws, formats or prints. The package `reporting` does so.
 """

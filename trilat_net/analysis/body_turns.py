@@ -1,4 +1,8 @@
-"""Chooses the signs of the quaternions of moving bodies, so that they do not jump."""
+"""Chooses the signs of the quaternions of moving bodies, so that they do not jump.
+
+A quaternion and its negative describe the same orientation. The choice matters as soon as
+quaternions of successive times are plotted or interpolated.
+"""
 
 from collections.abc import Sequence
 

@@ -1,36 +1,40 @@
-"""Computes the characteristic roots of the sampled loop, by Floquet theory.
+"""Computes the stability of the control loop as it is executed: in ticks, with delayed samples.
 
-The sampled loop is the loop as it is executed: the controllers compute in ticks, and the arms
-move continuously. Tick rates and delays may differ between sites and links, and repeat after a
-period T. Each site is linearised over one tick of its own rate:
+The controllers of the sites (the processes that each run one arm) compute once per tick, while
+the arms move continuously. Tick rates and delays may differ between sites and links, but the
+whole pattern repeats after a period T. Such a periodic system is analysed by Floquet theory.
+Each site is linearised over one tick of its own rate:
 
     X_i[k + 1] = P_i X_i[k] + sum_j P_ij X_j[m_ij(k)]
 
-with the state X_i of site i and the sample m_ij(k) of site j that site i uses at its tick k.
-The multipliers mu of the map
-M over a period T, M v = mu v, give the roots s = ln(mu) / T. They are Ritz values of a block
-Krylov space (block Arnoldi): Saad, "Numerical Methods for Large Eigenvalue Problems", second
-edition (2011), chapter 6.
+Here X_i[k] is the state of site i at its tick k, P_i and P_ij are constant matrices, and
+m_ij(k) is the number of the sample of site j that site i uses at tick k. Over a period, these
+equations form a linear map M. Its eigenvalues mu, called multipliers, give the characteristic
+roots s = ln(mu) / T, and the loop is stable if all roots have a negative real part. The largest
+multipliers are approximated in a block Krylov space (block Arnoldi; Saad, "Numerical Methods
+for Large Eigenvalue Problems", second edition (2011), chapter 6).
 
-Scheme `second_order`: theta_k = theta_{k-1} + h/2 (f_{k-1} + f_k) with f the rate of the
-estimate, and the torque on the arm is 1.5 tau_k - 0.5 tau_{k-1}. With the state
-eta_k = theta_{k-1} + h/2 f_{k-1} that is theta_k = eta_k + h/2 f_k and
-eta_{k+1} = eta_k + h f_k.
+The integration scheme of the scenario defines how a controller updates its parameter estimates
+theta, whose rate of change is f, and which torque it applies. With the computed torque tau_k,
+the tick h, and a stored estimate eta:
 
-Scheme `digital`: theta_k = eta_k, eta_{k+1} = eta_k + h f_k, and the torque on the arm is
-tau_k.
+- Both schemes store eta_{k+1} = eta_k + h f_k.
+- The scheme `digital` uses theta_k = eta_k and applies tau_k.
+- The scheme `second_order` uses theta_k = eta_k + h/2 f_k and applies
+  1.5 tau_k - 0.5 tau_{k-1}.
 
-The memory m of an imported law is treated as an estimate with h f = m_k - m_{k-1}: eta is then
-the law's own value.
+A control law that a user wrote may have a memory m. It is treated as an estimate with
+h f_k = m_k - m_{k-1}, so that eta is the law's own value.
 
 Invariant:
-    - No delay is averaged. Where delays and rates repeat after T, the roots are exact. Where
-      delays are drawn or recorded, the roots are those of a span T as though it repeated, with
-      their deviation between the span's parts.
-    - Constant motions (shared poses, estimates without excitation), which exist for any delays,
-      are divided out.
-    - The arm is exact between ticks under a held torque (zero-order hold); the controller runs
-      its stages in their order.
+    - Delays are never replaced by their mean. The roots are exact if delays and rates repeat
+      after T.
+    - If delays are random or recorded, the roots are computed as though a span of length T
+      repeated forever. The deviation of the roots between parts of the span is reported.
+    - Motions that stay constant for any delays, such as a shift of all arms to another common
+      pose, are removed before the roots are computed.
+    - Between ticks the torque is held (zero-order hold), and the motion of the linearised arm
+      is computed exactly.
 """
 
 import math

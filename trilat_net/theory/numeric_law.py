@@ -1,17 +1,23 @@
-"""Differentiates a control law that a user wrote, by central differences.
+"""Linearises a control law that a user wrote, by central differences.
 
-Such an imported law is known by its code only. It is evaluated as a function of numbers for one
-tick,
+The equations of such a law are unknown, because only its code exists. For one tick of the
+control loop, the code is treated as a function of numbers:
 
-    (tau_k, m_k) = f(q, qd, m_{k-1}, q_des, qd_des, felt, peers, torque ON the arm)
+    (tau_k, m_k) = f(q, qd, m_{k-1}, q_des, qd_des, felt, peers, torque)
 
-with its memory m. In continuous time the memory has the rate m' = (m_k - m_{k-1}) / h with the
-tick h; the sampled loop multiplies that rate by h and so recovers m_k exactly.
+The results are the torque tau_k that the law commands at tick k, and its memory m_k, the
+numbers that it keeps for the next tick. The arguments are the joint angles q and velocities qd,
+the desired angles q_des and velocities qd_des, the external torque `felt` that the law
+perceives, the states of the peers (the arms that it follows), and the external torque on the
+arm. Each argument is changed by a small step in both directions, and the differences of the
+results give the derivatives. In continuous time the memory changes at the rate
+m' = (m_k - m_{k-1}) / h, where h is the tick.
 
 Invariant:
-    - The law reads the same rows as at its site, without the torque clamp.
-    - The memory m holds the numbers that the law itself remembers. It also holds the torque and
-      the angles of the previous tick if the law uses them.
+    - The law receives the same inputs as in a run. Its torque is not limited.
+    - The memory also contains the torque and the angles of the previous tick if the law uses
+      them.
+    - The analysis of the sampled loop multiplies m' by h, and thus recovers m_k exactly.
 """
 
 from collections.abc import Sequence

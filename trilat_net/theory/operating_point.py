@@ -1,17 +1,18 @@
-"""Determines the operating point at which the control loop is linearised.
+"""Determines the delays, weights and operators with which the control loop is linearised.
 
-The scenario may change during a run: delays, dominance factors (the weights with which sites
-follow each other) and operators. A linear loop has one set of numbers, which are those at the
+A scenario, the description of a run, may change during the run: the delays of the links, the
+dominance factors (the weights with which an arm follows its peers), and the operators. A linear
+loop has only one set of these numbers, its operating point. It consists of the numbers at the
 end of the run.
 
-A link has an effective delay: the age of the peer's sample that a site uses in a tick. With a
-constant delay T and equal tick rates 1 / h it is max(1, ceil(T / h)) ticks. In all other cases
-it is the mean over the same random draws that a run makes.
+A link is the connection from one site (the process that runs one arm) to another. Its effective
+delay is the age of the peer's sample that the site uses in a tick. With a constant delay T and
+the same tick h at both sites, the effective delay is max(1, ceil(T / h)) ticks. Otherwise it is
+the mean over the same random draws that a run makes.
 
 Invariant:
-    - The numbers are those in force at the end of the run.
-    - A note reports every number that differed earlier or is random.
-    - Numbers that cannot be known before the run are refused.
+    - A note reports every number that differed earlier in the run or that is random.
+    - An operating point that cannot be known before the run is refused.
 """
 
 import math

@@ -1,23 +1,35 @@
-"""Computes the frequency response of the loop at its haptic ports, free or with a site clamped.
+"""Computes how the arms respond to an operator's torque at each frequency.
 
-A port is where an operator touches an arm. The admittance of a port is its velocity per torque
-of the operator, and the impedance is the inverse. Impedance and admittance of ports after
-Hogan, "Impedance control: an approach to manipulation", ASME J. Dynamic Systems, Measurement,
-and Control 107 (1985); teleoperators as networks of ports after Hannaford, "A design framework
-for teleoperators with kinesthetic feedback", IEEE Trans. Robotics and Automation 5 (1989).
+A haptic port is where an operator touches an arm. The admittance of a port is the joint
+velocity per torque of the operator, as a function of frequency, and the impedance is its
+inverse. Both are computed from the linearised control loop of all sites (the processes that
+each run one arm), while the other arms are free or one of them is clamped.
 
-Transparency compares the impedance at a site with another site free and clamped. It is torque
-over velocity along one joint, N m s/rad, with no torque of the operator on the other joints.
-Means are taken on a logarithmic frequency axis over a stated band. Transmitted impedance after
-Lawrence, "Stability and transparency in bilateral teleoperation", IEEE Trans. Robotics and
-Automation 9 (1993). The difference of both impedances is the Z-width of Hashtrudi-Zaad and
-Salcudean, "Analysis and evaluation of stability and performance robustness for teleoperation
-control architectures", ICRA (2000); the ratio is our own measure (docs/ports.md).
+The transparency of the system is judged by the impedance that an operator feels at one site, in
+N m s/rad, while another site is free and while it is clamped. A large difference means that the
+operator feels the difference between free space and a rigid object. The impedance belongs to
+one joint, while the operator applies no torque to the other joints. Means over a band of
+frequencies are taken on a logarithmic axis.
+
+Sources:
+    - Impedance and admittance: Hogan, "Impedance control: an approach to manipulation", ASME J.
+      Dynamic Systems, Measurement, and Control 107 (1985).
+    - Teleoperators as networks of ports: Hannaford, "A design framework for teleoperators with
+      kinesthetic feedback", IEEE Trans. Robotics and Automation 5 (1989).
+    - Transmitted impedance: Lawrence, "Stability and transparency in bilateral teleoperation",
+      IEEE Trans. Robotics and Automation 9 (1993).
+    - The difference of the free and the clamped impedance (Z-width): Hashtrudi-Zaad and
+      Salcudean, "Analysis and evaluation of stability and performance robustness for
+      teleoperation control architectures", ICRA (2000). The ratio of the two impedances is our
+      own measure (docs/ports.md).
 
 Invariant:
-    - Torque is ON the joint: torque times velocity is the power that the operator puts in.
-    - A law that reflects force reflects the torque of a clamp like any torque on the joint.
-    - Frequencies are rad/s; those shown to people are Hz, and their names end in _hz.
+    - Torques act on the joint, so that torque times velocity is the power that the operator
+      supplies.
+    - A control law that reflects external torques to the other sites also reflects the torque
+      of a clamp.
+    - Frequencies are in rad/s. Frequencies that are shown to people are in Hz, and their names
+      end in _hz.
 """
 
 import math

@@ -1,29 +1,39 @@
-"""Computes a chain of joints in plain NumPy, and how a site follows its peers.
+"""Computes the dynamics of an arm from textbook equations, for the linear analysis.
 
-The linear analysis differentiates these textbook equations. They share no code with the
-compiled simulation kernel, so that both check each other. The planar arm is
-`analysis.arm_rows.PlacedArm`. Vectors have their components on the first axis and any number of
-columns behind it: shape (n,) or (n, B).
+The arm is a chain of joints. The module also computes the motion that a site, the process that
+runs the arm, demands of it in order to follow other sites (its peers). All equations are
+written in plain NumPy and share no code with the compiled simulation kernel, so that both check
+each other. The planar arm with two joints is in `analysis.arm_rows.PlacedArm`. Vectors have
+their components on the first axis and any number of columns behind it.
 
-A spatial vector has its linear half first, at the origin of the link's own frame. Link i has
-the Jacobian J_i and the velocities V_i = J_i qd and W_i = J_i v. Its acceleration, which
-includes gravity, is A_i = X A_p + S a + V_i x (S v), with A_p the acceleration of the link
-before. Link i needs the force
+The equations use spatial vectors, which join a linear and an angular half (Featherstone, "Rigid
+Body Dynamics Algorithms", 2008). The linear half comes first, at the origin of the link's own
+frame. Let q be the joint angles, qd their velocities, and v the reference velocity of the
+control law. Link i has the Jacobian J_i and the velocities V_i = J_i qd and W_i = J_i v. Its
+acceleration, which includes gravity, is
 
-    f_i = I A_i + 1/2 (V_i x* I W_i + W_i x* I V_i - I (V_i x W_i))
+    A_i = X A_p + S a + V_i x (S v)
 
-which is linear in its ten parameters: f_i = F_i pi_i. Therefore Y = (J_1' F_1 ... J_n' F_n),
-Eq. (12), and M = sum_i J_i' I_i J_i. Spatial vectors after Featherstone, "Rigid Body Dynamics
-Algorithms" (2008).
+with the acceleration A_p of the link before, the transformation X from that link's frame, the
+axis S of the joint, and the reference acceleration a. The force on link i, whose spatial
+inertia is I_i, is
 
-Following in task space is that of `analysis.following.find_task_reference`, with
-psi = -k (q - posture). A force F at the end effector is the torque J' F, and a torque tau is
-the force A^-1 J tau. Sources are in `core.task_space` and docs/laws.md.
+    f_i = I_i A_i + 1/2 (V_i x* I_i W_i + W_i x* I_i V_i - I_i (V_i x W_i))
+
+Here x and x* are the cross products of motions and of forces. The force is linear in the ten
+inertial parameters pi_i of the link: f_i = F_i pi_i. This gives the regressor
+Y = (J_1' F_1 ... J_n' F_n) of Eq. (12) of the paper, and the inertia matrix
+M = sum_i J_i' I_i J_i.
+
+If sites follow in task space, where end effectors instead of joints follow each other, the
+reference is computed as in `analysis.following.find_task_reference`. docs/laws.md has the
+equations and sources.
 
 Invariant:
-    - Nothing is imported from the compiled core's arithmetic.
-    - Every function is analytic in every argument, except where a chain meets a stop (there the
-      real part decides), so that a complex step gives derivatives exact to rounding.
+    - The arithmetic of the compiled kernel is not used.
+    - Every function is analytic in every argument, so that a complex step gives derivatives
+      that are exact to rounding. The only exception is a chain that meets a joint stop, where
+      the real part of the argument decides.
 """
 
 from collections.abc import Sequence

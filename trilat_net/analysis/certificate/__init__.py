@@ -1,4 +1,5 @@
-"""Stability certificate of a log.
+"""Checks with a recorded run that the stability theorem of the paper holds for it.
 
-The theorem's premises, the corrected functional, its energy balance, the verdict.
+The certificate checks the premises (conditions) of the theorem, evaluates the energy function V
+of its proof, verifies that the energy balance of the records is closed, and states a verdict.
 """

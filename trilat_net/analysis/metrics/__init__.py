@@ -1,4 +1,5 @@
-"""Metrics of a run.
+"""Computes the metrics of a recorded run, numbers that describe the run or a part of it.
 
-Tracking, effort, energy, contact, force sharing, impedance, parameter error, network and loop.
+They cover tracking, effort, energy, contact, force sharing, impedance, parameter error, network
+and control loop.
 """

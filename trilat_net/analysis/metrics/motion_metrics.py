@@ -1,16 +1,21 @@
-"""Metrics of motion, effort, contact, learning, links and control loops.
+"""Computes metrics of motion, effort, contact forces, learning, links and control loops.
 
-Metrics of links and of the control loops use the definitions of docs/definitions.md.
+A metric is a number that describes a recorded run or a part of it. A site is the process that
+runs one arm, as a master that a person moves or as a slave. Its error e, Eq. (9) of the paper,
+is the difference between its joint angles and the weighted mean of the angles of the arms that
+it follows, as they arrive over delayed links. docs/metrics.md and docs/definitions.md define
+every metric.
 
 Invariant:
-    - The error e of a site is that of Eq. (9), and includes the delay of the links.
-    - The spread compares all sites at the same instant, without the delay.
-    - A slave is compared with its master at the time at which the sample in use was sent.
-    - Effort counts the recorded torque: Eq. (13) within its limit, with gravity compensation.
-    - The force of a wall is computed from the scenario's wall and the recorded states. Ticks
-      without a record contribute nothing.
-    - A parameter counts if the control law adapts it (Gamma > 0). If the true parameters theta
-      are unknown there is no error, but the estimates are still reported.
+    - The error e includes the delay of the links, whereas the spread compares all arms at the
+      same instant. A slave is compared with its master at the time at which the sample that it
+      uses was sent.
+    - The effort is computed from the recorded motor torque, after the torque limit and with
+      gravity compensation.
+    - The force of a wall is computed from the wall in the scenario and the recorded states.
+      Ticks without a record contribute nothing.
+    - The error of a parameter estimate is reported only if the control law adapts the parameter
+      and the true value is known. Otherwise only the estimate is reported.
 """
 
 from typing import NamedTuple

@@ -1,20 +1,20 @@
-"""Metrics of energy: of a site's ports, of its arm, and of the delay of each link.
+"""Computes the energy that enters each arm, and the energy that delays of the links inject.
 
-A port is where energy enters an arm: the controller, the operator or the environment. The work
-of a torque tau during a motion dq is int tau' dq. A torque that is held during a tick period
-does exactly the work tau_k' (q_{k+1} - q_k). For a torque that follows the motion, the
-trapezoid rule is used, which is exact for springs. The running energy of a port is that of a
-passivity observer (Hannaford and Ryu 2002).
+Energy enters an arm through its ports: the controller, the operator and the environment. The
+work of a torque tau during a motion dq of the joints is int tau' dq. If the torque tau_k is
+held during tick k, its work is exactly tau_k' (q_{k+1} - q_k), where q_k are the joint angles.
+If the torque follows the motion, the trapezoid rule is used, which is exact for springs. The
+sum over the ticks is known as a passivity observer (Hannaford and Ryu 2002).
 
-The delay of a link injects energy as well. The control torque is affine in the motion of a
-peer: it equals the torque that the same law would compute without delay, plus a term for each
-    link
-from peer j to site i. The energy of this term is
+The delay of a link injects energy as well. The control torque of a site, the process that runs
+one arm, equals the torque that the same law would compute without delay, plus a term for each
+link from a peer j to the site i. The energy of this term is
 
     E_ij = int qd_i' dtau_ij dt,   dtau_ij = S_i ( p_j(t - T_ij) - p_j(t) ),
 
-where qd_i is the site's velocity, p_j the signal that the link carries, T_ij its delay, and S_i
-the gain of the law. docs/metrics.md gives p_j and S_i for each law, and the sources.
+where qd_i is the joint velocity of the site, p_j the signal that the link carries, T_ij its
+delay, and S_i the gain of the law. docs/metrics.md gives p_j and S_i for each law, and the
+sources.
 """
 
 import numpy as np
