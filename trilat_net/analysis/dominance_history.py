@@ -1,17 +1,20 @@
-"""Traces the dominance factors of the sites over time, and computes the weights of the proof.
+"""Traces over time with which weights the arms follow each other, and derives the proof's weights.
 
-The dominance factor alpha_ij of Eq. (6) is the weight with which site i follows site j. The
-energy function V of the stability proof is a weighted sum over the sites. Their Lyapunov
-weights are beta_i = pi_i / c_i, where pi is the left Perron vector of alpha (pi' alpha = pi'),
-and c_i the scalar in Kd_i = c_i Kbar, with a gain Kbar that all sites share. Both conditions
-are
-necessary: beta' Upsilon <= 0 together with Upsilon 1 = 0 forces equality, so that there is no
-slack. pi as the weight of a delayed consensus is a known result (docs/errata.md). The paper
-uses weights of 1.
+The dominance factor alpha_ij of Eq. (6) of the paper is the weight with which site i, the
+process that runs one arm, follows site j. The factors may change during a run, at once or in a
+ramp. The energy function V of the stability proof is a weighted sum over the sites with the
+Lyapunov weights
+
+    beta_i = pi_i / c_i
+
+Here pi is the left Perron vector of the matrix alpha, which satisfies pi' alpha = pi', and c_i
+is the scalar of site i in Kd_i = c_i Kbar, where Kd_i is the damping gain of the site and Kbar
+a matrix that all sites share. The proof is impossible with any other weights, and with gains
+Kd_i that are not of this form (docs/errata.md). The paper itself uses weights of 1.
 
 Invariant:
-    - alpha depends only on time and on the applied changes.
-    - A ramp starts from the value that the ramp before it has at that time.
+    - The factors depend only on time and on the applied changes.
+    - A ramp starts from the value that the preceding ramp has reached at that time.
 """
 
 from collections.abc import Sequence

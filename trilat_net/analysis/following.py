@@ -1,17 +1,20 @@
-"""Maps errors of the reference to motion and torque of the joints, for all records at once.
+"""Translates the errors with which an arm follows others into motion and torque of its joints.
 
-A site follows its peers joint by joint, or in task space with its end effector. In task space
-an error of the end effector must be translated to the joints with the inverse of the Jacobian
-J, which is damped near singular poses. `JointFollowing` and `TaskFollowing` have the same
-methods for both cases.
+A site, the process that runs one arm, follows its peers (other arms) either joint by joint, or
+in task space with its end effector. In task space, the error of the end effector is translated
+to the joints with an inverse of the Jacobian J, which is damped near singular poses. The
+classes `JointFollowing` and `TaskFollowing` have the same methods for the two cases. Their
+functions work on all records of a run at once.
 
 Invariant:
-    - All maps are written with NumPy from the equations of `docs/laws.md`, independently of the
-      simulation kernel.
-    - Axes that are not followed have no effect: only the rows of J and J' of the other axes
-      count.
-    - With the reference of `find_task_reference`, J v = -Lambda e - damping y. Near a singular
-      pose the end effector therefore lacks the velocity damping y.
+    - All functions are written with NumPy from the equations of `docs/laws.md`, independently
+      of the simulation kernel.
+    - Axes of space that are not followed have no effect, because only the rows of J and of its
+      derivative J' that belong to followed axes are used.
+    - The reference velocity v of the joints satisfies J v = -Lambda e - damping y, where e is
+      the error of the end effector, Lambda a gain, and y the damped inverse's intermediate
+      vector. Near a singular pose the end effector therefore misses its demanded velocity by
+      damping y.
 """
 
 from collections.abc import Callable

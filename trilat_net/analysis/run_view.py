@@ -1,8 +1,9 @@
 """Provides one view of a recorded run, from which all metrics are computed.
 
-The view contains the records of the sites, the torques by source, the dominance factors (the
-weights with which sites follow each other), the links and the walls. Metrics ask the view for
-what they need, so that nothing is computed twice.
+The view contains the records of the sites, which are the results of the ticks of each arm's
+control loop. It also contains the torques by source, the dominance factors (the weights with
+which the arms follow each other), the links and the walls. Metrics request from the view what
+they need.
 
 Invariant:
     - Each quantity is derived from the log only once, by `RunView.compute_once` or by a cached

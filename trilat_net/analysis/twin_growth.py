@@ -1,21 +1,22 @@
 """Measures whether small disturbances of a run grow or die away, by repeating the run.
 
 A twin is a repeated execution of a run in which a joint received a small push. This module
-judges the difference d between a twin and the run, which is sampled at 20 Hz. The amplitude A
-of the difference is
+judges the difference between the joint velocities of the twin and those of the run, which is
+called d and is sampled at 20 Hz. The amplitude A of the difference is
 
     A^2 = sum over joints of d^2 + (d' / w)^2,
 
 where d' is the time derivative of d. The frequency w, in rad/s, is chosen so that both parts
-are equal on average. For a single mode, A is proportional to exp(rate t), without the
-oscillation of the mode. The rate is the slope of log A over the judged part of the run, with
-the bounds and the classes of trends of `envelope_trend`.
+are equal on average. For a single mode that grows or decays at a certain rate, A is
+proportional to exp(rate t) over the time t, without the oscillation of the mode. The rate is
+the slope of log A over the judged part of the run. `envelope_trend` defines the bounds of the
+slope, and the classes such as "grows" and "decays".
 
 Invariant:
-    - Differences are those of the joint velocities. If a push merely shifts all arms to another
-      rest position, its difference becomes zero.
-    - Groups of sites that do not follow each other are judged separately, so that growth in one
-      group does not hide the other groups.
+    - If a push merely shifts all arms to another rest position, the difference becomes zero,
+      because velocities are compared.
+    - Groups of arms that do not follow each other are judged separately, so that growth in one
+      group does not hide the behaviour of the other groups.
 """
 
 import math

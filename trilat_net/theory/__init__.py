@@ -1,11 +1,12 @@
-"""Linear analysis of the closed loop: roots, delay margin, stability edges, haptic ports.
+"""Predicts stability, delay margins and haptic properties of the arms by linear analysis.
 
-The loop is linearised about its equilibrium. Definitions, equations and sources are in
-docs/linear.md and docs/ports.md.
+The control loop of all arms, with its delays and ticks, is linearised about a pose in which all
+arms rest. Its characteristic roots tell whether small motions die away. docs/linear.md and
+docs/ports.md have the definitions, equations and sources.
 
 Invariant:
     - The equations are written a second time in plain NumPy and share nothing with the compiled
-      core, so that roots and runs check each other.
+      core, so that roots and simulated runs check each other.
     - The simulation only supplies the pose at which a run comes to rest.
 """
 

@@ -1,21 +1,24 @@
-"""Linearises the control loop of all sites about an equilibrium, with its delays.
+"""Linearises the control loop of all arms about an equilibrium, with the delays of the network.
 
-The result is a delay-differential equation:
+The result is a differential equation with delays, for small deviations from the equilibrium:
 
     x'(t) = A x(t) + sum_k A_k x(t - T_k) + B u(t) + sum_k B_k u(t - T_k),    y(t) = C x(t)
 
-x contains the deviations of all states from the equilibrium, in the order of the scenario's
-sites: joint angles, joint velocities, and the estimates of the control laws. u are the torques
-that operators add on the joints, y the joint velocities, and T_k the delays of the links.
+Here x contains the deviations of all states: for each site, the process that runs one arm, its
+joint angles, its joint velocities, and the parameter estimates of its control law. The sites
+have the order of the scenario. The inputs u are the torques that operators add on the joints,
+the outputs y are the joint velocities, T_k are the delays of the links, and A, A_k, B, B_k and
+C are constant matrices.
 
-An arm with n joints (a chain) has ten estimates per link. Only one combination of them per
-joint takes part in small motions: the learnt gravity torque z = Y_G theta_hat in N m, with the
-regressor Y_G at rest and the rate z' = -Y_G Gamma Y' r. In the loop of chains, z replaces the
-estimates as state. Each omitted combination is constant or has no effect, and adds one root at
-zero.
+An arm that is a chain of n joints has ten parameter estimates theta_hat per link. Only one
+combination of them per joint takes part in small motions, the learnt gravity torque
+z = Y_G theta_hat in N m. It changes at the rate z' = -Y_G Gamma Y' r, where Y_G is the
+regressor (the matrix that multiplies the parameters) at rest, Y the regressor of the control
+law, Gamma the adaptation gain and r the filtered error. Therefore z replaces the estimates in
+x. Each omitted combination is constant or has no effect, and adds one root at zero.
 
-Sites that follow in task space are coupled through the shared poses `SiteRates.x` and their
-velocities.
+If the sites follow in task space, where end effectors instead of joints follow each other, they
+are coupled through the poses `SiteRates.x` of their end effectors and the velocities of these.
 """
 
 from collections.abc import Sequence

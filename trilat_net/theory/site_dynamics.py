@@ -1,15 +1,17 @@
-"""Computes the rates of one site as a continuous system, and their derivatives.
+"""Computes how fast the state of one arm and its controller changes, and the derivatives of this.
 
-The state of a site is its joint angles, its joint velocities, and the estimates of its control
-law. The derivatives come from a complex step: f'(x) = Im f(x + i h) / h with h = 1e-30, exact
-to rounding because nothing is subtracted. Squire and Trapp, "Using complex variables to
-estimate derivatives of real functions", SIAM Review 40 (1998).
+A site is the process that runs one arm. Its state consists of the joint angles, the joint
+velocities, and the parameter estimates of its control law. The linear analysis needs the
+derivatives of the rates of change with respect to the state. They are computed with a complex
+step: the derivative of a function f at x is Im f(x + i h) / h, where i is the imaginary unit
+and h = 1e-30. Nothing is subtracted, so that the result is exact to rounding (Squire and Trapp,
+"Using complex variables to estimate derivatives of real functions", SIAM Review 40, 1998).
 
 Invariant:
     - All arithmetic is plain NumPy on `textbook_arm`, without the compiled simulation kernel,
       so that this module and the kernel check each other.
-    - If a law has branches (a wall, the bounds of an estimate), the real part decides, so that
-      a complex step yields the derivatives of the branch in force.
+    - If a law has branches, for example at a wall or at the bounds of an estimate, the real
+      part of the argument selects the branch whose derivatives are returned.
 """
 
 from collections.abc import Iterator

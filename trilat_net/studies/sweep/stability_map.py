@@ -1,29 +1,27 @@
 """Builds a stability map, which shows for which parameters a scenario is stable.
 
-A sweep runs one scenario at every point of a grid of parameters, usually with several seeds of
-the random numbers. The map draws the first two numeric parameters as axes x and y. Every other
-swept parameter, and the control law, has one panel per setting. Each grid point of a panel
-shows how many of its runs were stable. A column is the set of grid points with the same x.
+A scenario is the description of a run, and a sweep runs one scenario at every point of a grid
+of parameters, usually with several seeds of the random numbers. The map draws the first two
+numeric parameters as axes x and y. Every other swept parameter, and the control law, has one
+panel per setting. Each grid point of a panel shows how many of its runs were stable. A column
+is the set of grid points with the same x.
 
-On top of these measurements the map draws limits from theory as lines: the limit of a stability
-criterion in closed form, and the values at which the rightmost root of the linearised loop
-crosses the imaginary axis.
+On top of these measurements the map draws limits from theory as lines. One kind of limit is a
+stability criterion in closed form. It is used only if all of its hypotheses hold. The other
+kind consists of the values at which the rightmost characteristic root of the linearised loop
+crosses the imaginary axis. The criterion of the law P+d accounts for the computation in ticks.
+The line of the roots does so only under the integration scheme `digital`.
 
 Invariant:
     - The measurements come from the results alone, and the lines from the plan alone.
-    - Every run is counted at exactly one grid point of one panel.
-    - The label of an axis names the scenario key, with the unit in which the key ends. A gain
-      has the unit that its control law states.
-    - The majority of the decided runs decides whether a grid point is stable. A draw leaves the
-      grid point undecided.
+    - Every run is counted at exactly one grid point of one panel. The majority of the decided
+      runs decides whether a grid point is stable, and a draw leaves it undecided.
     - A measured edge lies between two decided grid points of a column, one of them stable and
       the other not. If undecided grid points lie between the two, the edge is wider.
-    - A line is the zero set of a quantity from theory. The crossing of a line with a column
-      lies between two neighbouring grid points, of which the theory calls exactly one stable.
-    - A criterion is used only if all of its hypotheses hold. Its excess, the margin by which
-      its inequality is met, is positive if the criterion promises stability.
-    - The criterion of the law P+d accounts for the computation in ticks. The line of the roots
-      does so only under the integration scheme `digital`.
+    - A line from theory crosses a column between two neighbouring grid points, of which the
+      theory calls exactly one stable.
+    - The label of an axis names the scenario key with its unit. A gain has the unit that its
+      control law states.
 """
 
 import math

@@ -1,28 +1,29 @@
 """Runs and scores one candidate of a tuning: a control law with a choice of gains.
 
-The score contains the error of the run, its effort and its class. The error is measured against
-the pose q* at which weightless arms would agree. Here site i runs one arm with the joint angles
-q_i, and alpha_ij is the dominance factor, the weight with which site i follows site j.
+The score contains the error of the run, its effort and its class. The error is the distance of
+the arms from the pose q* on which weightless arms would agree. Site i is the process that runs
+arm i, q_i(0) are the arm's joint angles at the start, and alpha_ij is the dominance factor, the
+weight with which site i follows site j. The left Perron vector beta of the matrix alpha
+satisfies beta' alpha = beta'.
 
-- Before any operator acts, q* = sum_i beta_i q_i(0). Here beta is the left Perron vector of the
-  matrix alpha, and q* is the limit of x_i' = sum_j alpha_ij x_j - x_i.
+- Before any operator acts, q* = sum_i beta_i q_i(0). This is the limit of the consensus
+  x_i' = sum_j alpha_ij x_j - x_i that starts at x_i = q_i(0).
 - While operators pull at arms like springs, q* = sum_i beta_i K_i x_i / sum_i beta_i K_i per
   joint. The operator at site i has the target x_i and the stiffness K_i. The equation follows
-  from sum_i beta_i tau_i = 0 in statics, where tau_i is the torque of the operator.
+  from sum_i beta_i tau_i = 0 at rest, where tau_i is the torque of the operator.
 - After the operators have released the arms, q* stays.
 
 Other torques and walls determine no pose. A scenario with such torques or walls is judged by
 its twin, which in this module means the same scenario without them.
 
 Invariant:
-    - The scenario of a candidate is loaded with the same settings that its command names.
     - A score is a function of the scenario alone. The errors of a run that does not reach its
       end are None.
     - Neither gains nor control laws enter the pose q*.
-    - A run has exactly one class. Only a settled run may be part of a Pareto front: a run that
-      is stable by the general judgement (`analysis.run_end`) and ends at the pose.
-    - Arms that hang down have strayed, however close to each other they are. An arm hangs if
-      both links point down at the end and did not at the start.
+    - Only a settled run may be part of a Pareto front. A run is settled if it is stable by the
+      general judgement (`analysis.run_end`) and ends at the pose q*.
+    - An arm counts as strayed if both of its links point down at the end and did not at the
+      start, even if all arms hang close to each other.
     - The arms of a log have fallen if their mean pose ends more than 0.2 rad from q* although
       no operator or wall could explain the distance.
 """
