@@ -1,17 +1,18 @@
-"""Aligns the records of a site on its ticks, and shows its peers as the site sees them.
+"""Gives each arm's records a row for every tick, and shows the peers as the arm sees them.
 
-Analyses need a row for every tick, also if the log lacks some records. They also need the
-motion of a peer at times between its ticks, for example at the time at which a delayed sample
-was sent.
+A site is the process that runs one arm, and its peers are the sites that it follows. A record
+is the result of one tick of its control loop. Analyses need a row for every tick, also if the
+log lacks some records. They also need the motion of a peer at times between its ticks, for
+example at the time at which a delayed sample was sent.
 
 Invariant:
     - A gap in the records is filled by interpolation, so that sums have all their terms and
-      rows keep their times. Filled rows are not `known`, and no metric uses them.
-    - Between two records a peer moves along a cubic polynomial through angles and velocities.
-      Before its first record it rests (rule L7 of docs/design.md).
-    - Within a tick period the sample in use is assumed to grow no older, as under the constant
-      delay of the stability theorem. The difference from the sample in use at the next tick is
-      treated as a jump at the end of the period.
+      rows keep their times. Filled rows are not marked as `known`, and no metric uses them.
+    - Between two records a peer moves along a cubic polynomial that meets the recorded angles
+      and velocities. Before its first record it rests (rule L7 of docs/design.md).
+    - Within a tick period the sample in use is assumed to keep its age, as under the constant
+      delay of the stability theorem. At the end of the period, the difference from the sample
+      that is used next is treated as a jump.
 """
 
 from collections.abc import Sequence

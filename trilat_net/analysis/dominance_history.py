@@ -1,4 +1,4 @@
-"""Traces over time with which weights the arms follow each other, and derives the proof's weights.
+"""Traces the weights with which the arms follow each other, and derives those of the proof.
 
 The dominance factor alpha_ij of Eq. (6) of the paper is the weight with which site i, the
 process that runs one arm, follows site j. The factors may change during a run, at once or in a
@@ -9,8 +9,8 @@ Lyapunov weights
 
 Here pi is the left Perron vector of the matrix alpha, which satisfies pi' alpha = pi', and c_i
 is the scalar of site i in Kd_i = c_i Kbar, where Kd_i is the damping gain of the site and Kbar
-a matrix that all sites share. The proof is impossible with any other weights, and with gains
-Kd_i that are not of this form (docs/errata.md). The paper itself uses weights of 1.
+a matrix that all sites share. Both these weights and this form of the gains are necessary for
+the proof (docs/errata.md). The paper itself uses weights of 1.
 
 Invariant:
     - The factors depend only on time and on the applied changes.

@@ -11,10 +11,9 @@ Invariant:
       of the simulation kernel.
     - Axes of space that are not followed have no effect, because only the rows of J and of its
       derivative J' that belong to followed axes are used.
-    - The reference velocity v of the joints satisfies J v = -Lambda e - damping y, where e is
-      the error of the end effector, Lambda a gain, and y the damped inverse's intermediate
-      vector. Near a singular pose the end effector therefore misses its demanded velocity by
-      damping y.
+    - Near a singular pose the end effector misses the demanded velocity -Lambda e, where e is
+      its error and Lambda a gain. The reference velocity v of the joints then satisfies
+      J v = -Lambda e - damping y, where y is the solution of the damped system of equations.
 """
 
 from collections.abc import Callable

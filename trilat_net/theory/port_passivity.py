@@ -1,31 +1,33 @@
-"""Checks passivity and absolute stability at the haptic ports of a teleoperator.
+"""Checks whether the arms stay stable with every passive operator, at any frequency.
 
-A port is where an operator touches an arm. The admittance Y of the ports is the matrix from
-their torques u to their velocities. Torques u supply the mean power 1/4 u^H (Y + Y^H) u to the
-loop.
-A stable loop is passive if Y + Y^H has no negative eigenvalue at any frequency. A passive loop
-is stable with every passive environment, also with operators who are coupled to each other.
+A port is where an operator touches an arm. The admittance Y of the ports is the matrix that
+maps their torques u to their velocities at one frequency. The torques u supply the mean power
+1/4 u^H (Y + Y^H) u to the control loop, where ^H is the conjugate transpose. A stable loop is
+passive if Y + Y^H has no negative eigenvalue at any frequency. A passive loop is stable with
+every passive environment, also with operators who are coupled to each other.
 
-For independent operators at the sites a weaker condition suffices: the loop is absolutely
-stable if at each frequency there are positive weights D, one per site, with D Y + Y^H D >= 0.
+For independent operators a weaker condition suffices. The loop is absolutely stable if at each
+frequency there is a diagonal matrix D of positive weights, one per site (the process that
+runs one arm), for which D Y + Y^H D has no negative eigenvalue.
 
 Sources:
     - Passive environments: Colgate and Hogan, "Robust control of dynamically interacting
       systems", Int. J. Control 48 (1988).
     - Two scalar ports: Llewellyn, "Some fundamental properties of transmission systems", Proc.
-      IRE 40 (1952); the parameter that must not be below 1: Adams and Hannaford, "Stable haptic
-      interaction with virtual environments", IEEE Trans. Robotics and Automation 15 (1999).
-    - Several joints and sites: Li, Tavakoli and Huang, "Absolute stability of multi-DOF
-      multilateral haptic systems", IEEE Trans. Control Systems Technology (2014), for some
-      classes.
-    - Weights: those of the structured singular value, exact for up to three blocks: Packard and
-      Doyle, "The complex structured singular value", Automatica 29 (1993).
+      IRE 40 (1952). The stability parameter, which must not be below 1: Adams and Hannaford,
+      "Stable haptic interaction with virtual environments", IEEE Trans. Robotics and Automation
+      15 (1999).
+    - Several joints and sites, for some classes of systems: Li, Tavakoli and Huang, "Absolute
+      stability of multi-DOF multilateral haptic systems", IEEE Trans. Control Systems
+      Technology (2014).
+    - Weights as in the structured singular value, which are exact for up to three blocks:
+      Packard and Doyle, "The complex structured singular value", Automatica 29 (1993).
 
 Invariant:
     - Passivity with positive weights per site proves stability for passive operators that are
       not coupled to each other.
-    - The condition of absolute stability is also necessary for up to three sites, and
-      sufficient beyond.
+    - The condition of absolute stability is sufficient for any number of sites, and also
+      necessary for up to three sites.
 """
 
 from collections.abc import Sequence

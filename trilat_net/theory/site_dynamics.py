@@ -1,4 +1,4 @@
-"""Computes how fast the state of one arm and its controller changes, and the derivatives of this.
+"""Computes the rates of change of one arm's and its controller's state, and their derivatives.
 
 A site is the process that runs one arm. Its state consists of the joint angles, the joint
 velocities, and the parameter estimates of its control law. The linear analysis needs the

@@ -1,15 +1,19 @@
-"""Computes the energy balance of each site, and of all sites together.
+"""Checks that the energy of each arm, and of all arms together, changes only by known causes.
 
-V_i is the energy function of site i, see `energy_terms`. For each site, without weights:
+A site is the process that runs one arm. V_i is the energy function of site i in the stability
+proof, which `energy_terms` defines, and V_i(0) its value at the start. For each site:
 
     V_i - V_i(0) + dissipation + transfer - work = 0
 
-The transfer is energy that a site gives to the sites that follow it. In the sum over all sites
-with the weights beta, which depend on the dominance factors, the transfers cancel:
+The dissipation is the energy that the controller of the site has removed. The transfer is the
+energy that the site has given to the sites that follow it. The work is the energy that
+operators and environments have supplied. In the weighted sum over all sites, the transfers
+cancel, so that the total energy function V satisfies
 
     V - V(0) + dissipation - work = 0
 
-Both equations hold whatever the operators do, because their work is part of the work.
+The weights are called beta and depend on the dominance factors, with which the sites follow
+each other. Both equations hold for any behaviour of the operators.
 
 Invariant:
     - If these sums do not vanish, the records were not produced by the equations that the log

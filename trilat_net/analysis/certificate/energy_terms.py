@@ -1,24 +1,29 @@
-"""Evaluates the energy function V_i of a site, and all terms that change it, in J.
+"""Evaluates the energy function of an arm in the stability proof, and all terms that change it.
 
-The stability proof uses the sum of these functions over all sites. Here r = qd + Lambda e is
-the filtered error of a site, e its error and ed the derivative of e, M the inertia matrix of
-the arm, theta its parameters and theta_hat their estimates, Gamma, Lambda, Kp and Kd gains, and
-alpha_ij the dominance factor with which site i follows peer j:
+A site is the process that runs one arm. Site i follows site j with the weight alpha_ij, its
+dominance factor. The stability proof uses the weighted sum of the energy functions V_i, in J,
+of all sites:
 
     V_i = 1/2 ( r'M r + (theta_hat - theta)' Gamma^-1 (theta_hat - theta) + e' Lambda Kd e
                 + sum_j alpha_ij int qd_j' Kd qd_j ds )
 
-The integral runs from the time at which the sample in use was sent to now. This is the paper's
-Eq. (16) with the integral that its Eq. (22) needs (docs/errata.md). With |x|^2 = x'Kd x, its
-derivative is
+Here e is the error of the site, the difference between its joint angles and those that it
+follows, and ed is the derivative of e. The filtered error is r = qd + Lambda e, where qd are
+the joint velocities (qd_i for site i). M is the inertia matrix of the arm, theta its dynamic
+parameters such as masses, theta_hat their estimates, and Gamma, Lambda, Kp and Kd are gains.
+The integral runs over the time s, from the time at which the sample in use was sent until now.
+
+This is Eq. (16) of the paper with the integral that its Eq. (22) needs (docs/errata.md). If
+|x|^2 stands for x'Kd x, and T for the delay from site j, the derivative without external
+torques is
 
     V_i' = -r'Kp r - 1/2 sum_j alpha_ij |qd_i - qd_j(t - T)|^2
            - 1/2 |qd_i|^2 + 1/2 sum_j alpha_ij |qd_j|^2
 
 The terms of the first line dissipate energy. The terms of the second line transfer it between
-sites, and cancel in the sum over all sites with the weights beta. In task space e and qd_j are
-errors and velocities of end effectors, and r belongs to the task (see `following`).
-docs/certificate.md has the rest.
+sites, and cancel in the sum over all sites with the weights beta of the proof. If the sites
+follow in task space, e and qd_j are errors and velocities of end effectors, and r is defined by
+`following`. docs/certificate.md has the rest.
 
 Within a tick period each term is integrated by the trapezoid rule, with an error of second
 order in the period. At the end of the period a new sample comes into use, so that e jumps. The
@@ -26,9 +31,9 @@ energy of the jump is computed exactly, and divided among the links, the changes
 factors, and the rule for silent peers.
 
 Invariant:
-    - Operators and environments do work on r and not on qd, because the theorem requires that
-      they are passive with respect to r.
-    - A site has an energy function if its control law is the paper's, and theta is known.
+    - The work of operators and environments is computed with r instead of qd, because the
+      theorem requires that they are passive with respect to r.
+    - A site has an energy function only if its control law is the paper's, and theta is known.
 """
 
 from collections.abc import Mapping

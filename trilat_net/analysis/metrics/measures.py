@@ -1,16 +1,14 @@
-"""Declares the metrics of recorded runs.
+"""Registers the metrics of recorded runs, so that tables and commands find them by name.
 
-A metric is a number that describes a run or a part of it, for example the RMS error of a site.
+A metric is a number that describes a run or a part of it, for example the RMS error of an arm.
 Each file of this folder contains functions that compute such numbers. The decorator `measures`
-registers a function together with the quantities that it returns, so that tables, comparisons
-and the command line find them. A subject is what a number describes: the run, a site, a link or
-a wall.
+registers a function together with the quantities that it returns. A subject is what a number
+describes: the run, a site (the process that runs one arm), a link or a wall.
 
 Invariant:
     - A value is a finite number, or None with a reason.
-    - Every key is defined in exactly one place: beside its function in this folder, and in
-      docs/metrics.md. Everything that shows, compares or requests a metric uses this
-      definition.
+    - A quantity is defined beside its function in this folder and explained in docs/metrics.md.
+      Everything that shows, compares or requests a metric uses this definition.
 """
 
 import math

@@ -1,21 +1,23 @@
-"""Metrics at rest: static windows, rendered stiffness and force sharing.
+"""Computes what arms at rest reveal: the stiffness that users feel, and how forces are shared.
 
-In a static window all arms rest under constant torques. The torques tau_i on the arms then obey
+In a static window all arms rest under constant torques. A site is the process that runs one
+arm, and the dominance factors are the weights with which the sites follow each other. The
+torques tau_i on the arms then satisfy
 
     sum_i (pi_i / K_i) tau_i = 0   for every joint,
 
-where pi is the left eigenvector of the matrix of dominance factors for the eigenvalue 1 (its
-Perron vector), and K_i the stiffness with which site i holds its error e_i. If one operator
-pushes and another holds, the equation predicts the torque that the holder feels: this is force
-sharing. docs/metrics.md defines and derives each metric.
+where pi is the Perron vector of the matrix of dominance factors (its left eigenvector for the
+eigenvalue 1), and K_i is the stiffness with which site i holds its error, the difference from
+what it follows. If one operator pushes and another holds, the equation predicts the torque that
+the holder feels. This is called force sharing. docs/metrics.md defines and derives each metric.
 
 Invariant:
     - A stiffness is reported only if nothing but a single operator changed between two static
       windows.
-    - A stiffness is the ratio of changes along the path of the arm, on which the other joints
-      move as well.
-    - If a law learns the gravity of its arm, its estimates take up the load. No torque is
-      predicted then.
+    - A stiffness is the ratio of the changes of torque and angle between the windows. The other
+      joints of the arm may have moved as well.
+    - No torque is predicted if a control law learns the gravity of its arm, because its
+      estimates then take up the load.
 """
 
 from collections.abc import Mapping

@@ -1,13 +1,13 @@
-"""Metrics of users who share a slave arm: authority, disagreement, interventions and takeovers.
+"""Computes how several users share one slave arm: authority, disagreement and takeovers.
 
-The users are the operators at the masters of the scenario, and the shared slave is its first
-slave. The slave follows each user's master with a weight, the dominance factor of the user,
-which may change during the run.
+The users are the operators who move the master arms of the scenario, and the shared slave is
+its first slave. The slave follows each user's master with a weight, the dominance factor of the
+user, which may change during the run.
 
 Invariant:
     - The user with the largest dominance factor leads.
-    - Torques are those with which the operators push their arms, without the environment's. In
-      task space they are forces at the end effectors.
+    - Only the torques with which the operators push their arms count, and not those of walls
+      and other environments. In task space, forces at the end effectors replace them.
     - Ticks without a record do not count.
 """
 
