@@ -1,9 +1,10 @@
 """Summarises the links of a recorded run: their delays, losses, sample counts and clocks.
 
-A link is the directed connection from one site (the peer) to another. The peer publishes a
-sample of its state in every tick, and the receiving site uses the newest sample that has
-arrived and is due. The effective delay of the link is the age of the sample in use at a tick
-(age of information; Kaul, Yates and Gruteser 2012). docs/definitions.md defines each quantity.
+A site is the process that runs one arm. A link is the directed connection from one site (the
+peer) to another. The peer publishes a sample of its state in every tick of its control loop,
+and the receiving site uses the newest sample that has arrived and whose emulated delay has
+passed. The effective delay of the link is the age of the sample in use at a tick (age of
+information; Kaul, Yates and Gruteser 2012). docs/definitions.md defines each quantity.
 
 The program itself delays samples, to emulate a network. The delay of each sample is a function
 of the seed, the link and the number of the sample. This module computes these delays again from
@@ -11,12 +12,12 @@ the scenario, and compares them with the recorded arrivals.
 
 Invariant:
     - A quantity that the log does not determine is None.
-    - Estimates of clocks are those that were used while the session ran. They are not improved
-      later.
+    - The reported estimates of clocks are those that were used while the session ran. They are
+      not improved later.
     - The delays of samples that never arrived are known too (rule L4 of docs/design.md),
       because the scenario and the recorded changes of the link determine them.
-    - A record names the samples that it received (rule L3). If that record is missing, it is
-      unknown whether they arrived, and they count neither as arrived nor as missing.
+    - A record, the result of one tick, names the samples that the site received (rule L3). If a
+      record is missing, its samples count neither as arrived nor as missing.
 """
 
 from typing import NamedTuple

@@ -1,24 +1,24 @@
-"""Judges a run by its end: stable, not stable, or open.
+"""Judges by the motion at the end of a run whether it is stable, not stable, or open.
 
-The judgement uses the errors e of the sites (the differences from what they follow) and the
-joint velocities qd, and no theory. The largest |e| and |qd| of every joint in intervals of
-1 / 20 s are its envelopes. The trends of these envelopes over the second half of the run, which
-`envelope_trend` defines, decide the behaviour of the joint: it converges, decays, oscillates,
-drifts or grows.
+A site is the process that runs one arm. The judgement uses the error e of each site (the
+difference between its motion and the motion that it follows) and the joint velocities qd, and
+no theory. The envelopes of a joint are the largest |e| and |qd| in intervals of 1 / 20 s. Their
+trends over the second half of the run, which `envelope_trend` determines, decide whether the
+joint converges, decays, oscillates, drifts or grows.
 
 If an operator acts or the loop changes within this half, the time after the last action or
 change is judged instead, provided that it is long enough.
 
-A sustained oscillation of any size is steady. However, several modes that all decay may beat,
-so that a joint is steady for a while because it receives energy from a faster joint of the
-coupled sites. If such a faster joint decays, the steady joint is undecided.
+A sustained oscillation of any size counts as steady. However, an oscillation that decays may
+look steady for a while, because the joint receives energy from a faster joint of the coupled
+arms. If such a faster joint decays, the steady joint is undecided.
 
 Invariant:
     - All commands use the judgement of this module (docs/definitions.md, "Stable").
     - Each joint of each site is judged separately, and the worst joint decides.
     - A judgement describes the record and predicts nothing.
-    - Further knowledge about a run (its energy function V, the roots at its end pose) may turn
-      a stable run into an open one, never the reverse.
+    - Further knowledge about a run, such as its energy function V from the stability proof or
+      its characteristic roots, may turn a stable run into an open one, but never the reverse.
 """
 
 import math

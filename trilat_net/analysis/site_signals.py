@@ -1,14 +1,15 @@
-"""Defines the signals of a site, its settling time, and how signals are reduced for plots.
+"""Defines the signals of an arm, its settling time, and how signals are reduced for plots.
 
-A signal is an array with a row for each record of a site, such as the errors of the joints. For
-plots, the rows are reduced: each bucket of records keeps the minimum and the maximum of each
-column, so that a spike of a single tick at 1 kHz stays visible. A gap in the records that is
-wider than a bucket becomes a row of NaN, so that no line is drawn across it.
+A signal is an array with a row for each record (the result of one tick of the arm's control
+loop), such as the errors of the joints. For plots, the rows are reduced: each bucket of records
+keeps the minimum and the maximum of each column, so that a spike of a single tick at 1 kHz
+stays visible. A gap in the records that is wider than a bucket becomes a row of NaN, so that no
+line is drawn across it.
 
 Invariant:
     - Each signal has one definition, for figures, pages, summaries and metrics.
-    - Torques of operators and environment are those on the arm, which are the negative of the
-      recorded tau_x of Eq. (8).
+    - The torques of operators and environment are reported as they act on the arm. Their sign
+      is the opposite of the recorded tau_x, the external torque in Eq. (8) of the paper.
     - Empty logs give empty arrays.
 """
 

@@ -1,19 +1,21 @@
 """Computes the characteristic roots of a linear control loop with delays.
 
-The roots are the solutions s of Delta(s) v = 0 with a vector v that is not zero. The loop is
+A motion v exp(s t) with a constant vector v is possible in the loop if Delta(s) v = 0, where
+Delta(s) is the characteristic matrix of the loop. These numbers s are the roots. The loop is
 stable if all roots have a negative real part. A loop with delays has infinitely many roots;
 this module computes the rightmost ones, in two steps:
 
-1. Guesses for the continuous loop are the eigenvalues of the Chebyshev pseudospectral
-   discretisation of the infinitesimal generator. Its order doubles until the wanted roots
+1. Guesses for the continuous loop are eigenvalues of a matrix that approximates the loop
+   together with its stored past (the Chebyshev pseudospectral discretisation of the
+   infinitesimal generator). The order of the approximation doubles until the wanted roots
    agree. Breda, Maset and Vermiglio, "Pseudospectral differencing methods for characteristic
    roots of delay differential equations", SIAM J. Scientific Computing 27 (2005); nodes after
    Trefethen, "Spectral Methods in MATLAB" (2000).
-2. Newton's method refines the guesses, in the form of successive linear problems: solve
-   Delta(s) v = mu Delta'(s) v and subtract the smallest mu from s. The method converges
-   quadratically for simple roots, and for multiple roots if they have as many vectors, as in
-   loops of identical sites. Ruhe, "Algorithms for the nonlinear eigenvalue problem", SIAM J.
-   Numerical Analysis 10 (1973).
+2. Newton's method refines each guess by a sequence of linear problems: solve
+   Delta(s) v = mu Delta'(s) v, where Delta' is the derivative of Delta, and subtract the
+   smallest eigenvalue mu from s. The method converges quadratically for simple roots. It also
+   does so for multiple roots that have as many vectors v, as in loops of identical arms. Ruhe,
+   "Algorithms for the nonlinear eigenvalue problem", SIAM J. Numerical Analysis 10 (1973).
 
 `limit_blas_threads` keeps OpenBLAS on one thread for these small matrices. OpenBLAS otherwise
 divides products of a hundred rows among all cores and waits for them actively, which takes a
@@ -22,8 +24,8 @@ hundred times as long if another process occupies a core.
 Invariant:
     - A root solves the equation to rounding, for every discretisation that supplies its guess.
     - Some roots are zero for every delay, because the equations do not change if all arms are
-      shifted, or if an estimate changes that nothing excites. Such roots are counted, and never
-      called the rightmost.
+      shifted, or if a parameter estimate changes that no motion affects. Such roots are
+      counted, and never called the rightmost.
 """
 
 import ctypes

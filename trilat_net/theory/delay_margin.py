@@ -1,15 +1,17 @@
-"""Computes the delay margin: the common delays of all links for which the loop is stable.
+"""Computes the delay margin: how long the common delay of all links may be until the arms swing.
 
-The loop is x' = A x + A_d x(t - T), with the same delay T on all links. Only some states act
-after a delay. A root of the loop lies on the imaginary axis at j w if
+The linearised control loop is x' = A x + A_d x(t - T), with the state x, constant matrices A
+and A_d, and the same delay T on all links. Only some components of x act after the delay. A
+characteristic root of the loop lies on the imaginary axis at j w, where j is the imaginary
+unit and w an angular frequency, if
 
-    det(I - exp(-j w T) G(j w)) = 0,
+    det(I - exp(-j w T) G(j w)) = 0.
 
-where G(j w) consists of the delayed states' rows of (j w I - A)^-1 A_d. Such a root exists if
-and only if G(j w) has an eigenvalue of modulus 1 with the phase w T modulo 2 pi. If T
-increases, a pair of roots moves to the right if the modulus of this eigenvalue falls with w,
-and to the left if it rises. Counting these crossings from a small delay on gives the number of
-unstable roots for every delay.
+G(j w) consists of those rows of (j w I - A)^-1 A_d that belong to the delayed components. Such
+a root exists if and only if G(j w) has an eigenvalue of modulus 1 whose phase is w T modulo
+2 pi. If T increases, a pair of roots moves into the unstable half plane if the modulus of this
+eigenvalue falls with w, and out of it if the modulus rises. These crossings are counted from a
+small delay on, which gives the number of unstable roots for every delay.
 
 Sources:
     - Chen, Gu and Nett, "A new method for computing delay margins for stability of linear delay

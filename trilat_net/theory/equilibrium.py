@@ -1,11 +1,11 @@
-"""Finds equilibria of the control loop: poses in which all arms and estimates rest.
+"""Finds equilibria of the control loop: poses in which all arms and parameter estimates rest.
 
 An equilibrium is needed to linearise the loop. It may be the one at the end of a run, the one
 nearest to a given pose, or the one that the linear loop predicts from the start poses.
 
-Equilibria are not isolated: any pose on which the sites agree may be an equilibrium. Every
-result is therefore the equilibrium nearest to a stated pose. The simulation supplies starting
-values only.
+Equilibria are not isolated, because any pose on which the arms agree may be an equilibrium.
+Therefore every result is the equilibrium nearest to a stated pose. The simulation supplies
+starting values only.
 
 Invariant:
     - The result solves the equations to 1e-10, or a note states that it does not.

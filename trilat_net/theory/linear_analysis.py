@@ -1,17 +1,20 @@
-"""Analyses the linear loop of a scenario, or of the end of a recorded run.
+"""Predicts whether small motions of the coupled arms die away, for a scenario or a recorded run.
 
-The analysis answers whether small motions about an equilibrium die away. It contains the
-equilibrium, the characteristic roots of the continuous and the sampled loop, the delay margin,
-and, if requested, the edges of stability and the haptic ports.
+The control loop is linearised about an equilibrium, a pose in which all arms rest. The analysis
+contains this equilibrium, the characteristic roots of the loop (the loop is stable if all have
+a negative real part), the delay margin, and, if requested, the edges of stability and the
+haptic ports. The roots are computed for the sampled loop, whose controllers compute in ticks,
+and for its continuous approximation.
 
-At the end of a recorded run, the roots belong to the log's last pose and estimates, under the
-conditions at the log's end. If delays are drawn at random or measured, the roots are computed
-with the samples that the last quarter of the records uses. For laws that can be linearised in
-continuous time only, mean ages replace these samples. Nothing is executed again but twins.
+At the end of a recorded run, the roots belong to the log's last pose and parameter estimates,
+under the conditions at the log's end. If delays are random or measured, the roots are computed
+with the samples that the last quarter of the records uses. If a control law can be linearised
+in continuous time only, the mean ages of these samples replace them. The run is not executed
+again, except for its twins, repeated runs with a small push.
 
 Invariant:
-    - The verdict is that of the sampled loop, at any tick rates and delays. If a law can be
-      linearised in continuous time only, the verdict is that of the continuous loop.
+    - The verdict is based on the sampled loop, at any tick rates and delays. If a law can be
+      linearised in continuous time only, the verdict is based on the continuous loop.
     - The verdict holds for small motions about the equilibrium only.
 """
 

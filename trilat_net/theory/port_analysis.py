@@ -1,22 +1,24 @@
-"""Analyses the haptic ports of a teleoperator: passivity, absolute stability, transparency.
+"""Analyses what operators feel, and whether the arms stay stable with any passive operator.
 
-A port is where an operator or an environment touches an arm: the torque tau that acts on a
-joint, and the joint's velocity qd. The teleoperator is passive at its ports if it never returns
-more energy than it received. It is absolutely stable if it is stable with any passive
-operators. Transparency compares what an operator feels while another site moves freely or is
-clamped.
+A haptic port is where an operator or an environment touches an arm. It has two variables: the
+torque that acts on a joint, and the velocity of the joint. The coupled arms are passive at
+their ports if they never return more energy than they received. They are absolutely stable if
+they are stable with any passive operators. Transparency compares what an operator feels while
+another arm moves freely or is clamped.
 
-Sites that follow in task space have ports at their end effectors, along the followed axes. They
-are the same loop in other coordinates. With J the Jacobian of a site's followed axes at rest
-and N a basis of the joint motions that leave these axes unchanged, x = J q and z = N' q replace
-q. A force F on the end effector is the torque J' F, and its velocity is x'. A port has the
-number of its coordinate: 1 to 3 for the position, 4 to 6 for rotations. The state of its
-position is called "q" with that number, as for a joint.
+If the sites, the processes that each run one arm, follow in task space, the ports are at the
+end effectors, along the followed axes. The same loop is then described in other coordinates.
+The joint angles q are replaced by x = J q and z = N' q, where J is the Jacobian of the followed
+axes at rest, and N a basis of the joint motions that leave these axes unchanged. A force F on
+the end effector acts as the joint torque J' F, and the velocity of its port is x', the
+derivative of x. A port has the number of its coordinate: 1 to 3 for the position, 4 to 6 for
+rotations. The state of its position is called "q" with that number, as for a joint.
 
 Invariant:
-    - Operators and environments are removed. Their torque at the equilibrium stays as a
-      constant, so that a held pose can be analysed too.
-    - An unstable loop has no steady oscillations, so that only its instability counts.
+    - Operators and environments are removed from the loop. Their torque at the equilibrium
+      stays as a constant, so that a held pose can be analysed too.
+    - For an unstable loop only the instability is reported, because such a loop has no steady
+      oscillations.
     - Every result holds for the analysed band of frequencies.
 """
 
