@@ -1,8 +1,9 @@
-"""Lists what happened in a run over time: changes, link models, modes of sites, and alarms.
+"""Lists what happened in a run over time: changes, link models, modes of the arms, and alarms.
 
-A change is a command that alters the run: another delay of a link, other dominance factors
-(the weights with which a site follows its peers), or an order to a site such as "stop". A mode
-is what a site does in a tick: it follows its peers, holds its position, brakes or returns.
+A site is the process that runs one arm. A change is a command that alters the run: another
+delay of a link, other dominance factors (the weights with which a site follows its peers), or
+an order to a site such as "stop". A mode is what a site does in a tick of its control loop: it
+follows its peers, holds its position, brakes or returns.
 
 Invariant:
     - Every entry comes from the scenario or from a record. No entry is inferred from the motion

@@ -1,16 +1,17 @@
 """Splits the external torque on an arm by its sources, and evaluates models of the sources.
 
-An arm is pushed by operators and by environments such as walls. The scenario contains a model
-of each, and the records contain their total torque. All functions work over all records of a
-log at once. Torques act on the arm.
+An arm is pushed by operators and by environments such as walls. The scenario, the description
+of the run, contains a model of each. The records, the results of the ticks of the control loop,
+contain their total torque. All functions work on all records of a log at once. A torque is
+positive if it acts on the arm in the direction of the joint.
 
 Invariant:
     - All torques are computed from the definitions in the scenario, independently of the
       simulation kernel. The tests compare the two.
-    - The recorded torque less the environment's torque is the operator's, even if the scenario
-      does not explain it.
-    - The plan of an operator (its script) is known only if the operator's torque agrees with
-      the scenario.
+    - The recorded torque less the environment's torque is attributed to the operator, even if
+      the scenario does not explain it.
+    - The planned motion of an operator is known only if the operator's torque agrees with the
+      scenario.
 """
 
 from collections.abc import Iterable

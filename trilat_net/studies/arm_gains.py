@@ -1,19 +1,20 @@
 """Finds the largest gains with which equal arms can follow each other over a delay.
 
 Two or three equal arms follow one another over links with the given delay. Each joint has a
-stiffness K, a damping d of its own velocity, and for some laws a damping Kd of the velocity of
-its error. All gains lie on a ray with one parameter k:
+stiffness K, a damping d of its own velocity, and for some control laws a damping Kd of the
+velocity of its error. All gains are determined by one number k:
 
     K = k m,    d + Kd = 2 zeta sqrt(k) m,
 
-where zeta is the damping ratio and m the inertia of the joint: the largest diagonal element
-M_ii of the inertia matrix in some poses, or less. The edge is the least k at which small
-motions of the sampled loop grow in one of these poses. The result has the damping at the edge,
-and the stiffness at the edge divided by a margin. Simulated runs then confirm the edge.
+where zeta is the damping ratio and m the inertia of the joint. The inertia is the largest
+diagonal element of the inertia matrix that the joint has in some poses, or less. The edge is
+the least k at which small motions of the sampled control loop grow in one of these poses. The
+result has the damping at the edge, and the stiffness at the edge divided by a margin. Simulated
+runs then confirm the edge.
 
-The gains keep the same margin to the sampled-data limit, at which a damping torque that is held
-for a tick makes the lightest motion swing from tick to tick. If several joints share a light
-motion, their m is reduced.
+The gains keep the same margin to a second limit: a damping torque is held for a tick of the
+controller, and if it is too large, the lightest motion of the arm swings from tick to tick. If
+several joints take part in this light motion, their m is reduced.
 
 For a single joint at a wall such edges are known: J. J. Gil, A. Avello, A. Rubio and J. Florez,
 "Stability analysis of a 1 DOF haptic interface using the Routh-Hurwitz criterion", IEEE Trans.

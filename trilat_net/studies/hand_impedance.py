@@ -23,8 +23,8 @@ Sources:
       (1982).
 
 Invariant:
-    - The force is that of the hand ON the arm, in N. Sines that act at the same site are not
-      part of it.
+    - F is the force, in N, with which the hand pushes the arm. The force of sines that act on
+      the same arm is not part of it.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""Computes the delay margin: how long the common delay of all links may be until the arms swing.
+"""Computes for which network delays the control loop is stable, and thus its delay margin.
 
 The linearised control loop is x' = A x + A_d x(t - T), with the state x, constant matrices A
 and A_d, and the same delay T on all links. Only some components of x act after the delay. A

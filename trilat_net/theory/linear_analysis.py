@@ -1,4 +1,4 @@
-"""Predicts whether small motions of the coupled arms die away, for a scenario or a recorded run.
+"""Predicts whether small motions of the coupled arms die away, for a scenario or a log.
 
 The control loop is linearised about an equilibrium, a pose in which all arms rest. The analysis
 contains this equilibrium, the characteristic roots of the loop (the loop is stable if all have

@@ -1,7 +1,7 @@
 """Checks whether a recorded run meets the conditions of the stability theorem.
 
-The theorem says that an energy function V of all arms never rises, unless an operator supplies
-energy. It is the paper's theorem, with the weights and the repaired proof of docs/errata.md. It
+A site is the process that runs one arm. The theorem says that an energy function V of all arms
+never rises, unless an operator supplies energy. It is the paper's theorem, with the weights and the repaired proof of docs/errata.md. It
 holds only under certain conditions, which this package calls premises:
 
 - The delays are constant.
@@ -9,14 +9,16 @@ holds only under certain conditions, which this package calls premises:
   reaches every other site through them.
 - The gain Kd is the same at every site, up to a scalar per site.
 - Every site uses the adaptive law, which estimates the parameters theta of its arm.
-- No operator moves an arm, or the operators are passive with respect to the filtered error r.
+- No operator moves an arm, or the operators are passive with respect to the filtered error r,
+  the joint velocity plus Lambda times the position error, with a gain Lambda.
 
 A certificate also states on how many records it rests. This module collects that evidence.
 
 Invariant:
     - A premise holds, fails, or cannot be decided, and always states its evidence.
     - Missing information never makes a run stable. The run is left open if too few of its
-      ticks or periods of V can be judged, or if a rerun took some sites over as recorded.
+      ticks or periods of V can be judged, or if a repeated execution of the run copied the
+      motion of some sites from the log.
     - A log that was changed after it was written does not pass.
 """
 

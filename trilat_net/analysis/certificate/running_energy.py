@@ -1,12 +1,13 @@
 """Computes the energy function V, and the work of operators, while a session runs.
 
-V is the function of the stability proof, see `energy_terms`. `certify` computes it from a whole
-log. This module receives the records as they arrive, keeps the newest ones of every site in a
-window, and computes V with the same functions over these windows.
+V is the energy function of the stability proof, see `energy_terms`. `certify` computes it from
+a whole log. A record is the result of one tick of an arm's control loop. This module receives
+the records as they arrive, keeps the newest ones of every arm in a window, and computes V with
+the same functions over these windows.
 
 Invariant:
-    - V equals the V of `certify` at the same times, up to rounding, because the windows reach
-      back to the oldest sample in use.
+    - V equals the result of `certify` at the same times, up to rounding, because the windows
+      reach back to the oldest sample in use.
     - Nothing is extrapolated. V at a time is computed when all records up to it have arrived,
       and is left out if records are lost.
     - The size of a window is bounded.

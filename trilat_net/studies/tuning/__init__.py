@@ -7,8 +7,8 @@ in both. docs/fair-comparison.md has the procedure, the formulas and the search 
 Invariant:
     - Every law gets the same number of candidates, the same torque limit, duration, seeds,
       information about gravity, and classification of its runs.
-    - The error e of a site against its peers does not rank laws by itself, because arms that
-      hang down together have e = 0.
+    - The error between an arm and those that it follows does not rank laws by itself, because
+      it is zero for arms that hang down together.
 """
 
 from .tuning_plan import TuningPlan, TuningResult, plan_tuning

@@ -1,19 +1,20 @@
 """Defines which gains of each control law are tuned, and within which ranges.
 
 A search space lists the gains of a law, each with its unit and range. `SearchSpace.controls`
-turns a choice of gains into the table [control] of every site. To be fair, all laws get the
-same information about the model of their arm.
+turns a choice of gains into the table [control] of every site, the process that runs one arm.
+Gains are searched uniformly in their logarithms. To be fair, a quantity has the same range in
+every law: the stiffness, which is called K or Kp Lambda, and the damping, which is called d or
+Kp.
 
 Invariant:
-    - Gains are searched uniformly in their logarithms.
-    - A gain is a single number for both joints, and for all sites of a role.
-    - A quantity has the same range in every law: the stiffness is K or Kp Lambda, and the
-      damping is d or Kp.
+    - A gain is a single number for both joints of an arm, and for all sites with the same role,
+      such as the masters.
     - For a chain of joints, the number is the gain of the joint with the largest inertia. The
       gains of the other joints are fractions of it, see `weigh_joints`.
-    - All laws get the same gravity parameters: the true ones times a common factor.
-    - No law gets the inertia. A law that estimates the inertia starts at zero. The law `known`
-      is the exception.
+    - All laws get the same parameters of gravity, which are the true ones times a common
+      factor.
+    - No law except `known` gets the inertia of the arm. A law that estimates the inertia starts
+      at zero.
 """
 
 import inspect
