@@ -7,9 +7,10 @@ the arguments are the records.
 A chain has ten inertial parameters per link, but its torques depend only on some linear
 combinations of them, the base parameters. Adaptive laws move estimates along these combinations
 only, so errors of estimates are stated in them. The combinations follow from the geometry: the
-regressors of many random states are stacked, and a QR decomposition goes through their columns.
-A column that depends linearly on the columns before it adds no combination, and its parameter
-joins theirs.
+regressors (the matrices that yield the torques when multiplied by the parameters) of many
+random states are stacked, and a QR decomposition goes through their columns. A column that
+depends linearly on the columns before it adds no combination. Its parameter becomes part of the
+combinations of these columns.
 
 Sources: M. Gautier, "Numerical calculation of the base inertial parameters of robots", J.
 Robotic Systems 8 (1991), for the QR decomposition; P. M. Wensing, S. Kim, J.-J. Slotine,
@@ -21,7 +22,6 @@ Invariant:
       simulation kernel that executed the run.
     - A chain is computed by the compiled functions of the kernel, which the tests compare with
       Pinocchio.
-    - Both arms have the same methods, so that few callers need to know which arm they use.
 """
 
 import math

@@ -16,13 +16,14 @@ The classes, with "quarters" for the four quarters of the second half:
   the first step. At least 0.45 of the first step suffices if the maxima rise by more than a
   factor of 8/5 in all, because no response that starts at zero and saturates does that. In the
   first half of the record the maxima must not fall by 1 % or more from quarter to quarter: a
-  fall followed by a rise is a V, and needs a longer record.
+  fall followed by a rise needs a longer record.
 - DECAYS: the upper bound is negative, the line falls by a factor of two or more over the half,
   and the last step is a fall of at least half the size that it has in a steady fall by a factor
   of two. An envelope whose last quarter does not exceed `FLOOR_RAD` decays as well.
 - HARDLY: the line falls by 4 % or more, but the conditions of DECAYS do not hold.
 - STEADY: the bounds exclude that the envelope doubles or halves within the half.
-- UNDECIDED: the record is too short or too irregular, growth slows down, or there is a V.
+- UNDECIDED: the record is too short or too irregular, growth slows down, or a fall is
+  followed by a rise.
 
 Every class but GROWS and UNDECIDED requires that the maximum of the last quarter is at most
 twice the maximum of the quarter before.

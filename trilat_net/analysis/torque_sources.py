@@ -2,8 +2,8 @@
 
 An arm is pushed by operators and by environments such as walls. The scenario, the description
 of the run, contains a model of each. The records, the results of the ticks of the control loop,
-contain their total torque. All functions work on all records of a log at once. A torque is
-positive if it acts on the arm in the direction of the joint.
+contain their total torque. All functions work on all records of a log at once. All torques
+are those that act on the arm.
 
 Invariant:
     - All torques are computed from the definitions in the scenario, independently of the

@@ -1,8 +1,9 @@
 """Checks whether a recorded run meets the conditions of the stability theorem.
 
 A site is the process that runs one arm. The theorem says that an energy function V of all arms
-never rises, unless an operator supplies energy. It is the paper's theorem, with the weights and the repaired proof of docs/errata.md. It
-holds only under certain conditions, which this package calls premises:
+never rises, unless an operator supplies energy. It is the paper's theorem, with the weights and
+the repaired proof of docs/errata.md. It holds only under certain conditions, which this package
+calls premises:
 
 - The delays are constant.
 - The dominance factors, with which the sites follow each other, are constant, and every site

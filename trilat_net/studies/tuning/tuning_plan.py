@@ -14,8 +14,8 @@ Invariant:
       or on their speed.
     - The candidates are a function of the seed, the search space and the scores of earlier
       rounds. Their number is the budget.
-    - Only stable runs that end at the common pose of the arms compete. Of two equal runs the
-      first one stays.
+    - Only stable runs that end at the common pose of the arms compete. Of two runs with equal
+      objectives the first one is kept.
     - The gains that the paper prints are measured, but they are not searched and belong to no
       front.
 """
