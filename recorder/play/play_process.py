@@ -1,7 +1,12 @@
-"""Plays a log as a process, from the start of the session to the summary for the user.
+"""Plays a log on the network as a process, from the start of the session to the final summary.
+
+A log contains the messages of a session, a joint run of several arms. The process opens the
+log, publishes its messages at the times of the original session, and reports to the user how
+late they were. To recorders and viewers, it looks like a running session.
 
 Invariant:
-    - The process stays until its recorders have every message, or send no more requests.
+    - After the last message, the process stays on the network until its recorders have every
+      message, or send no more requests for missing ones.
 """
 
 import math

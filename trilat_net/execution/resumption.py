@@ -1,13 +1,15 @@
 """Provides the recorded inputs of a site, and restores its state in the middle of a log.
 
-A log contains a record for each tick of a site. If records are missing, the site cannot be
-executed through the gap, but it can be restored after the gap.
+A site is a process that runs one arm. A log contains a record for each tick, a period of its
+control loop: the inputs and the results of this tick. If records are missing, the site cannot
+be executed through the gap, but it can be restored after the gap. A sample is the state that a
+site sends to the other sites in one tick.
 
 Invariant (L3):
     - Two consecutive records, and the samples in transit on the links, suffice to restore a
       site.
-    - The arrivals in ticks without a record are not known. Samples that no record lists are
-      assumed to have arrived in these ticks.
+    - If records are missing, the arrivals of samples in their ticks are not known. Samples that
+      no record lists are assumed to have arrived in these ticks.
 """
 
 from bisect import bisect_left

@@ -4,9 +4,11 @@ The difference between a twin and the run shows whether small disturbances grow 
 disturbance is called a push: a small displacement of the state at one time.
 
 A difference that has become large is scaled down again (Benettin, Galgani, Giorgilli and
-Strelcyn, Meccanica 15, 1980). Every number x of the twin's state, including the samples in
-transit, becomes x_run + factor (x - x_run), and the logarithm of the factor is added to the
-growth. If the difference has decayed to rounding errors, the twin is pushed again.
+Strelcyn, Meccanica 15, 1980). Let x be a number of the twin's state, which includes the samples
+in transit on the network, and x_run the same number in the run. Then x is replaced by
+x_run + factor (x - x_run), with the same factor for all numbers. The total growth of the
+difference accounts for all factors, by the sum of their logarithms. If the difference has
+decayed to rounding errors, the twin is pushed again.
 
 Invariant:
     - The run is executed again from its recorded inputs, and compared with its records.

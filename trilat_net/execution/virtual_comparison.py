@@ -1,7 +1,10 @@
-"""Compares a log with virtual time, and finds the samples that arrived late or were lost.
+"""Compares a log with a simulation of it, and finds the samples that arrived late or were lost.
 
-A sample is the state that a site publishes in one tick. A receiver uses it when it is due, that
-is after the delay of the link.
+A site is a process that runs one arm. A sample is the state that a site sends to the others in
+one tick, a period of its control loop. The scenario gives each link between two sites a delay,
+and the receiver uses a sample when this delay has passed; then the sample is due. The log is
+compared with a run in virtual time, in which a counter replaces the clocks and a simulated
+network replaces the real one.
 
 Invariant (L2):
     - If a run in virtual time receives the samples in the ticks in which they arrived according

@@ -1,4 +1,9 @@
-"""Scenarios: experiments that are typed, frozen and validated.
+"""Describes experiments as scenarios: reads them from files, completes them and checks them.
+
+A scenario describes one experiment: the robot arms, the control law of each arm, the network
+links between the arms with their delays, and the people or programs that move the arms. Its
+author writes it as a TOML file. The program converts it to typed objects that cannot be changed
+afterwards.
 
 Invariant:
     - A scenario that loads also runs. Every mistake that a person can make is refused when the

@@ -1,5 +1,8 @@
 """Collects the control laws that a scenario can choose, by name.
 
+A control law computes the torques of an arm from its own state and from the delayed states of
+the other arms. A scenario, the description of an experiment, names the law of each arm.
+
 Invariant:
     - A law is found by its file in the package `trilat_net.laws`. The class in this file has
       the same name as the file. There is no other list of laws.

@@ -1,7 +1,10 @@
 """Defines masses and inertias that a scenario states for links, and balances impossible ones.
 
-Some URDF files contain inertias that no body can have. Balancing replaces such an inertia by
-the nearest possible one.
+A link is here one body of a robot arm, which a URDF file (an XML description of a robot)
+defines with its mass and its inertia. A scenario, the description of an experiment, may state
+other values. Some URDF files contain inertias that no body can have, for example because one
+principal moment exceeds the sum of the other two. Balancing replaces such an inertia by the
+nearest possible one.
 
 Invariant:
     - A key in the scenario replaces the value in the file. Without the key, the file applies.

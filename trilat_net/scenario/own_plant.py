@@ -1,13 +1,16 @@
 """Runs a user's plant: a class that computes the motion of an arm and of other bodies.
 
-In a scenario, the plant of a site is named by its class:
+A plant takes the place of the built-in simulation of an arm. At each tick, a period of the
+control loop, it receives the torque of the control law and returns the new state of the arm. In
+a scenario, the description of an experiment, the plant of an arm is named by its class:
 
     plant = "my_plant:Scene"            # or a table: { class = "my_plant:Scene", mass_kg = 2 }
 
 Invariant:
-    - The state that a plant returns is treated as a measurement, like that of a real robot. It
-      becomes q, qd and tau_x of the next record. Therefore the control can be executed again
-      from a log without the plant, and the motion of the plant is not judged.
+    - The state that a plant returns is treated as a measurement, like the state of a real
+      robot. The log stores it as the joint positions q, the joint velocities qd and the
+      external torques tau_x. Therefore the control can be executed again from a log without the
+      plant, and no check of a log judges the motion of the plant.
 """
 
 import math

@@ -1,11 +1,13 @@
 """Bounds how an arm comes to rest: the time, the largest speeds, and the load of the motors.
 
-If a site must stop, damping brings its arm to rest (`core.resting`). The bounds follow from the
-model of the arm, the limits of its torques, and this rule. docs/links.md derives them; the
-numbers in comments are those of its equations.
+If a site, a process that runs one arm, must stop, its controller damps the joints until the arm
+is at rest (`core.resting`). The bounds of this motion follow from the model of the arm, from
+the limits of its torques, and from the rule by which the controller damps. docs/links.md
+derives the bounds. Numbers of equations in comments refer to this document.
 
 Invariant:
-    - The bounds of a scenario are always the same, because poses are drawn with a fixed seed.
+    - The bounds of a scenario are always the same, because the poses at which the model is
+      evaluated are drawn with a fixed seed.
 """
 
 import math

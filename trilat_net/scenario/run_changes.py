@@ -1,13 +1,14 @@
 """Checks and describes changes during a run: of links, dominance factors, or a site's mode.
 
-A dominance factor is the weight with which a site follows a peer. Changes are planned in the
-timeline of a scenario, or requested during the run. Commands to a site, such as stop, enable
-and reset, are changes as well.
+A site is a process that runs one arm, and a link is the directed network connection between two
+sites. A dominance factor is the weight with which a site follows another one. Changes are
+planned in the timeline of a scenario (the description of the experiment), or requested during
+the run. Commands to a site, such as stop, enable and reset, are changes as well.
 
 Invariant:
-    - A requested change is completed with the state before it, and its text in a record
-      contains the whole change. Therefore every reader derives the same `CoreChange` from a
-      record.
+    - A request may state only a part of a link's or site's settings. The settings before the
+      change complete it, and the log contains the complete change as a text. Therefore every
+      reader of the log derives the same `CoreChange`, the form that the controller uses.
 """
 
 import re

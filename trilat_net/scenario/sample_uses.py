@@ -1,12 +1,14 @@
 """Computes in advance which samples of its peers a site uses, and which samples its user sees.
 
-A sample is the state that a site publishes in one tick. Its delay and loss are random, but they
-are a function of the scenario and its seed. Therefore the same draws can be made without a run.
+A site is a process that runs one arm, and the other sites are its peers. A sample is the state
+that a site publishes in one tick, a period of its control loop. The delay and the loss of a
+sample are random, but the generator starts from the seed in the scenario (the description of
+the experiment). Therefore the same random numbers can be drawn without a run.
 
 Invariant:
-    - The random draws are those of the link's key, as in a run.
-    - The samples that a user sees are a function of the scenario, the seed and the tick.
-      Therefore logs need not contain them.
+    - The random numbers of a link are drawn with the same key of the generator as in a run.
+    - The samples that a user sees depend only on the scenario, its seed and the tick. Therefore
+      logs need not contain them.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

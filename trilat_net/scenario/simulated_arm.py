@@ -1,8 +1,11 @@
 """Simulates an arm of a scenario step by step, for programs that stand in for a robot or plant.
 
+A scenario describes an experiment, including the mass and the geometry of each arm. The
+simulation computes joint accelerations from torques and integrates them over time.
+
 Invariant:
-    - The arm has the dynamics of the arm in the scenario, Eq. (8). A planar arm is simulated as
-      a chain of two joints.
+    - The arm obeys the equation of motion that the scenario's arm obeys in a run, Eq. (8) of
+      the project. A planar arm is simulated as a chain of two joints.
 """
 
 import numpy as np

@@ -1,7 +1,10 @@
 """Defines the operators and environments that the simulation kernel computes itself.
 
-Each class translates the keys of a scenario to a `TorqueSource` of a certain `TorqueKind`. The
-documentation of `TorqueSource` defines the meaning of its vectors for each kind.
+An operator is a person or program who moves an arm, and an environment is a wall or another
+body that acts on it. The kernel is the compiled code that advances a simulation. Each class
+translates the keys of a scenario, the description of an experiment, to a `TorqueSource`, the
+form in which the kernel receives an operator. Its `TorqueKind` selects the function that
+computes the torque. The documentation of `TorqueSource` defines its vectors for each kind.
 
 Invariant:
     - An operator for whom no start pose is written holds the arm at the start pose of the arm,
