@@ -1,8 +1,10 @@
 """Requests missing messages from a site, which keeps its recent messages in a buffer.
 
-A missing message is noticed by a gap in the numbers. If the last messages of a site are
-missing, there is no gap. Therefore, if nothing arrives from a site for a while, the recorder
-requests its newest messages (a probe). No function waits: the present time is an argument.
+A site is a process that runs one arm and publishes numbered messages. The recorder writes them
+to a log, and notices a missing message by a gap in the numbers. If the last messages of a site
+are missing, there is no gap. Therefore, if nothing arrives from a site for a while, the
+recorder requests its newest messages (a probe). No function waits: the present time is an
+argument.
 
 Invariant:
     - At most one request to a site is open at a time.

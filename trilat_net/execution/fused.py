@@ -1,15 +1,17 @@
 """Executes runs of all sites of a scenario in one compiled loop, without writing a log.
 
-The loop runs about 1000 times faster than real time. In place of records, it stores the largest
-values of every interval of 50 ms, and sums over the run. It is used for parameter studies and
-for twins: repeated runs with a small disturbance.
+A scenario describes an experiment with several sites, each of which controls one arm. The loop
+runs about 1000 times faster than real time. In place of the result of every tick (period of the
+control loop), it stores the largest values of every interval of 50 ms, and sums over the run.
+It is used for parameter studies and for twins: repeated runs with a small disturbance.
 
 Invariant:
-    - The results equal those of `execution.virtual` with its default network, bit for bit.
-      Scenarios that the compiled loop cannot execute are refused.
-    - A run with the inputs of a log equals the recorded run, bit for bit. A sample that arrived
-      before its own time stamp (the clocks of two computers may differ) is delivered in the
-      first tick after the stamp, because it is not used earlier (L2).
+    - The results equal the results of `execution.virtual` with its default network, bit for
+      bit. Scenarios that the compiled loop cannot execute are refused.
+    - A run with the inputs of a log equals the recorded run, bit for bit. A sample, the state
+      that a site sends to the others, may arrive before its own time stamp, because the clocks
+      of two computers may differ. It is then delivered in the first tick after the stamp,
+      because a site does not use it earlier (L2).
     - `FusedRun.scale_difference` mixes only the floating-point numbers of two states. Counters,
       times and modes are copied from the other run. Numbers that are equal in both runs keep
       their bits.

@@ -1,16 +1,18 @@
 """Checks the request for a rerun of a log, and executes the sites of the rerun.
 
-A rerun executes some or all sites of a log again, possibly with changed settings. Only executed
-sites can be changed: a setting that concerns only recorded sites is refused. A setting that
-concerns both kinds of sites changes only the executed ones, and the result reports this.
+A site is a process that runs one arm. A rerun executes some or all sites of a log again,
+possibly with changed settings. Only executed sites can be changed: a setting that concerns only
+recorded sites is refused. A setting that concerns both kinds of sites changes only the executed
+ones, and the result reports this. Sites exchange samples, their states at each tick (period) of
+the control loop.
 
 Invariant:
     - A site advances only by `Site.step`.
     - A site receives the recorded samples of recorded peers, and the newly computed samples of
       executed peers. Each sample arrives in the tick in which it arrived according to the log.
     - Without changed settings, the execution stops at a gap of the log, and resumes after two
-      consecutive records. If the log does not contain enough to execute a tick, its record is
-      copied.
+      consecutive records. If the log does not contain enough to execute a tick, the recorded
+      result of the tick is copied.
     - With changed settings, the ticks of a gap are executed with assumed arrivals.
 """
 

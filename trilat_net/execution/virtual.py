@@ -1,8 +1,9 @@
 """Runs a scenario in virtual time: without real clocks, processes or a network.
 
-A counter takes the place of the clock, and a simulated network takes the place of the message
-bus. The log of the run has the same form as the log of a live session: it contains the records
-of every tick, link statistics and events of every site.
+A scenario describes an experiment with several sites, each of which controls one arm. A counter
+takes the place of the clock, and a simulated network takes the place of the message bus. The
+log of the run has the same form as the log of a live session: it contains, for every site, the
+result of every tick (period of the control loop), statistics of the links, and events.
 
 Invariant:
     - A site advances only by `Site.step`. Ticks are executed in the order of their nominal

@@ -1,5 +1,8 @@
 """Defines the results of checks: whether each check passed, and the problems that it found.
 
+A check examines one property of a log, the file with the messages of a session, for example
+that no message is missing. Its result is called a finding.
+
 Invariant:
     - A check with a problem has not passed.
     - At most `MAX_LISTED_PROBLEMS` problems of a check are stored. Further ones are counted.

@@ -1,13 +1,14 @@
 """Merges the parts of a session's log into one log.
 
-A log has several parts if the recorder split it, or if several recorders recorded the session
-after one another or at the same time.
+A log contains the messages of a session, a joint run of several arms. It has several files, the
+parts, if the recorder split it, or if several recorders recorded the session after one another
+or at the same time.
 
 Invariant:
-    - A message that several parts contain counts once.
-    - Parts of different sessions are refused, and so are parts that contain different messages
-      with the same number.
-    - The order of the arguments does not matter.
+    - A message that several parts contain is written once.
+    - Parts of different sessions are refused. Parts that contain different messages with the
+      same number are refused as well.
+    - The order in which the user names the parts does not matter.
 """
 
 import hashlib

@@ -1,11 +1,14 @@
 """Describes scenarios in lines of text, and lists the differences between scenarios.
 
-The descriptions include facts that follow from a scenario, for example whether the condition of
-a control law for stability holds, and how long an arm needs to come to rest.
+A scenario is the description of an experiment: its arms, their control laws, and the network
+links between the sites, the processes that run the arms. The text includes facts that follow
+from a scenario, for example whether a control law satisfies its condition for stability, and
+how long an arm needs to come to rest.
 
 Invariant:
     - A difference that several sites or links have in common is listed once. If two sites have
-      control laws of different kinds, the laws are compared as a whole. So are links.
+      control laws of different kinds, the laws are compared as a whole. Two links with delay
+      models of different kinds are compared as a whole as well.
     - Names, titles and expectations only describe an experiment, and are not compared.
 """
 

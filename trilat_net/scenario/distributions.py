@@ -1,15 +1,16 @@
 """Draws numbers of a scenario that are given as probability distributions.
 
-An author may write `{ normal = [mean, deviation] }` or `{ uniform = [low, high] }` in place of
-a number, for example a start pose, a mass or a gain. The seed of the scenario determines the
-number.
+A scenario is a TOML file that describes an experiment. Its author may write
+`{ normal = [mean, deviation] }` or `{ uniform = [low, high] }` in place of a number, for
+example of a start pose, a mass or a gain. The seed, an integer in the scenario, determines the
+numbers that are drawn.
 
 Invariant (L4):
-    - A drawn number is a function of the seed and of the dotted key of the number. It is
-      rounded to nine digits.
-    - A resolved scenario contains the drawn number, and its distribution in the table `drawn`,
-      so that another seed draws the number again. A number that an override has replaced is not
-      drawn again.
+    - A drawn number depends only on the seed and on the place of the number in the scenario,
+      written as a dotted key such as `sites.s.control.Kd`. It is rounded to nine digits.
+    - A resolved scenario, in which nothing is left out, contains the drawn number, and its
+      distribution in the table `drawn`, so that another seed draws the number again. A number
+      that an override has replaced is not drawn again.
 """
 
 import re

@@ -1,4 +1,9 @@
-"""Renders an event of a session as a sentence for people, also for logs of older versions."""
+"""Renders an event of a session as a sentence for people, also for logs of older versions.
+
+An event reports something that happened during a session (a joint run of several arms), for
+example that the delay of a network link was changed. Older versions of the program stored the
+settings of such a change in place of a sentence. This module composes the missing sentence.
+"""
 
 from contextlib import suppress
 

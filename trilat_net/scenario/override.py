@@ -1,14 +1,15 @@
 """Applies overrides KEY=VALUE, which change single keys of a scenario.
 
-Overrides apply to the tables of a scenario file, or to a resolved scenario, in which every key
-of every site and link is written out.
+A scenario is a TOML file that describes an experiment: its sites, the processes that run one
+arm each, and the network links between them. Overrides change the tables of such a file, or a
+resolved scenario, in which every key of every site and link is written out.
 
 Invariant:
-    - In a resolved scenario, a key of a group (`control.Kd`, `link.delay_ms`, `rate_hz`)
-      applies to every site or link that can have it.
+    - In a resolved scenario, a key without the name of a site or link (`control.Kd`,
+      `link.delay_ms`, `rate_hz`) applies to every site or link that can have it.
     - A key of a single site or link (`sites.s.control.Kd`) has priority, regardless of the
       order.
-    - A key of `control` that no built-in law has is an argument of a user's law.
+    - A key of `control` that no built-in law has is an argument of a user's control law.
 """
 
 import tomllib

@@ -1,4 +1,9 @@
-"""Models the delay of low-orbit satellite networks, which reassign paths at fixed intervals."""
+"""Models the delay of low-orbit satellite networks, which reassign paths at fixed intervals.
+
+All terminals get a new path through the satellites at the same time, for example every 15 s,
+and the delay jumps at this time. The delay of a message is therefore the sum of a fixed delay,
+a random part that is drawn once per interval, and a random part that is drawn for each message.
+"""
 
 import math
 from typing import Annotated, Any

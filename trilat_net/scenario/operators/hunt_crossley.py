@@ -1,4 +1,9 @@
-"""Models a compliant body, such as tissue, into which the end effector presses."""
+"""Models a compliant body, such as tissue, into which the end effector presses.
+
+The contact force has an elastic part, which grows with the depth, and a damping part, which
+grows with the depth and with the speed of pressing (the model of Hunt and Crossley, 1975).
+Therefore the force begins and ends at zero, without a jump at contact.
+"""
 
 import math
 from collections.abc import Mapping
