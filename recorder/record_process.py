@@ -1,12 +1,16 @@
 """Runs the recorder as a process: joins a session, writes its messages, and ends with it.
 
+A session is a joint run of several sites, processes that control one arm each and publish
+messages on the network. The recorder writes these messages to a log. Each site keeps its recent
+messages in a buffer, from which the recorder requests those that it missed.
+
 Invariant:
     - No message is lost that has arrived, or that a site still has in its buffer.
     - Messages get the time of their arrival and wait in one bounded queue. One thread writes
       them.
     - The file is flushed about every 65 ms, and completed whenever the process ends in order.
-    - The first signal ends the recorder after it has received the messages that the sites still
-      have. The second signal ends it at once.
+    - The first signal, such as Ctrl-C, ends the recorder after it has received the messages that the
+      sites still have. The second signal ends it at once.
 """
 
 from collections.abc import Callable, Mapping

@@ -1,12 +1,14 @@
 """Supplies the player of a log with messages in the order in which they are played.
 
-Short logs are loaded into memory before. For long logs, a second process reads ahead and sends
-the messages through a pipe, so that the player never waits for the disk.
+To play a log means to publish its messages again, at the times of the original session. Short
+logs are loaded into memory before. For long logs, a second process reads ahead and sends the
+messages through a pipe, so that the player never waits for the disk.
 
 Invariant:
-    - Polling the source never waits.
-    - The memory of the reader process is bounded (L6): by `HORIZON_NS` of the log, the largest
-      distance between a message's place in the file and its turn, and by `LIMIT_BYTES`.
+    - To ask the source for the next messages never waits.
+    - The memory of the reader process is bounded (L6), by two constants. `LIMIT_BYTES` limits
+      the bytes of the stored messages. `HORIZON_NS` limits, as a duration of the log, how far a
+      message may be in the file from its place in the order of playing.
     - The reader process waits if the player does not read from the pipe. The two processes
       share nothing except this pipe.
 """

@@ -1,12 +1,15 @@
 """Reads the messages of a log that will be played, selected by channel and time.
 
+A log contains the messages of a session, a joint run of several sites, each of which controls
+one arm. To play it means to publish its messages again, at the times of the original session.
+Each start of a site has a random number, the boot, by which its messages are identified.
+
 Invariant:
-    - Payloads are passed on unchanged. Only the number of an event and the random number (boot)
-      that identifies the start of a sender are decoded.
+    - Payloads are passed on unchanged. Only the number of an event and the boot are decoded.
     - By default the messages of the sites are played, but neither the recorder's statistics nor
       the messages for viewers.
-    - The memory of a preloaded log is bounded (L6). Another process reads a larger log while it
-      is played (`message_source`).
+    - A log that is loaded before it is played has a limited size, so that the memory is bounded
+      (L6). Another process reads a larger log while it is played (`message_source`).
 """
 
 import math

@@ -1,8 +1,9 @@
 """Defines the layout of a log: its file names, its metadata and its channels.
 
-A log is the MCAP file of a run. A recording that is split has several files, the parts. The
-metadata of a log state the session, the filter of the recorded channels, and the provenance:
-the program that wrote the log, with its versions.
+A log contains the messages of a session, a joint run of several arms, in the file format MCAP.
+A channel contains the messages of one kind and sender. A recording that is split has several
+files, the parts. The metadata of a log state the session, the filter (which channels are
+recorded), and the provenance: the program that wrote the log, with its versions.
 
 Invariant:
     - A channel that the filter excludes is neither in the file nor in the counts of messages.

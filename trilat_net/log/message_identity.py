@@ -1,7 +1,8 @@
 """Identifies a message by its content: sender, channel, number and sending time.
 
-The checks and the recovery of logs use the identity to find messages that are in the wrong
-place of a file.
+A log contains the messages of a session, in chunks and numbered within channels. The checks
+and the recovery of logs use the identity to find messages that are in the wrong place of a
+file, for example because a damaged disk returned an old block.
 
 Invariant:
     - The identity depends only on the content of the message, and never on its place in the

@@ -7,8 +7,8 @@ how long an arm needs to come to rest.
 
 Invariant:
     - A difference that several sites or links have in common is listed once. If two sites have
-      control laws of different kinds, the laws are compared as a whole. Two links with delay
-      models of different kinds are compared as a whole as well.
+      control laws of different kinds, the laws are compared as a whole. Links are always
+      compared as a whole.
     - Names, titles and expectations only describe an experiment, and are not compared.
 """
 

@@ -1,8 +1,10 @@
 """Defines the expectations of a scenario: conditions that its runs must satisfy.
 
-An author writes them in the tables `[expect]` and `[[expect.windows]]`, and the command
-`trilat test` evaluates them. For example, `peak_error_max_rad = 0.1` requires that no
-synchronisation error exceeds 0.1 rad.
+A scenario is a TOML file that describes an experiment. Its author writes the expectations in
+the tables `[expect]` (for the whole run) and `[[expect.windows]]` (for an interval of time),
+and the command `trilat test` evaluates them. For example, `peak_error_max_rad = 0.1` requires
+that no synchronisation error, the difference between the angle of a joint and the angle that it
+should follow, exceeds 0.1 rad.
 
 Invariant:
     - The name of a key contains a quantity, a limit and a unit. Its docstring defines the

@@ -1,12 +1,13 @@
 """Loads scenarios from files, texts, tables or logs, and applies overrides of their keys.
 
-A scenario is a TOML file that describes an experiment. An override changes single keys of it
-without editing the file, for example `control.Kd=5`.
+A scenario is a TOML file that describes an experiment with several sites, processes that run
+one arm each. A log contains the scenario of its run. An override changes single keys of a
+scenario without editing the file, for example `control.Kd=5`.
 
 Invariant:
     - The scenario of a log or of another member of a session is not trusted. It may not name a
-      file, its code may not run until a person permits it, and its traces of delays must be
-      written out.
+      file, its code may not run until a person permits it, and its traces (recorded delays of a
+      network) must be written out.
 """
 
 import re

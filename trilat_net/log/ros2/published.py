@@ -1,14 +1,15 @@
 """Defines the topics of a session in ROS 2, and encodes their messages.
 
-`trilat ros2` publishes a running session as ROS 2 topics, and the export `ros2` converts a log
-to a bag, a recording of ROS 2. Both use this module. A bag contains a message for every record.
-The live bridge publishes a part of these messages.
+ROS 2 is the Robot Operating System. The command `trilat ros2` publishes a running session as
+ROS 2 topics (the live bridge), and the export `ros2` converts a log to a bag, a recording of
+ROS 2. Both use this module. A bag contains a message for every record, the result of one period
+of an arm's control loop. The live bridge publishes a part of these messages.
 
 Invariant:
     - The live bridge and a bag have the same topics with the same types and the same numbers,
       because this module encodes the messages of both.
-    - The quaternions of a topic do not jump: of the two signs, which are the same orientation,
-      the one is chosen that is nearest to the previous quaternion.
+    - The quaternions of a topic do not jump. Two quaternions of opposite sign are the same
+      orientation; of these, the one that is nearer to the previous quaternion is chosen.
     - A message is encoded only if its topic is wanted.
 """
 
