@@ -2,7 +2,8 @@
 
 A session consists of sites, processes that run one arm each. Each start of a site has a boot, a
 random number that identifies it. A site may be started again while the session runs. Its new
-start then continues the numbers of the records.
+start then continues the numbers of the records, the messages with the results of each period of
+the control loop.
 
 Invariant:
     - A message of the session is written once, byte for byte. Any other message is counted as

@@ -1,6 +1,7 @@
 """Stands in for the sites of a session while its log is played.
 
-To other programs, a log that is played looks like a running session. The stand-ins announce the
+A site is a process that runs one arm and publishes messages; a log contains these messages. To
+other programs, a log that is played looks like a running session. The stand-ins announce the
 sites on the network, reply to queries for their identities and to pings, and send messages
 again to recorders that missed them (backfill). `PlayedHistory` keeps the messages for this.
 

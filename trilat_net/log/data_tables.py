@@ -1,11 +1,12 @@
 """Converts a log to data tables, with a row per record, arrival, statistics message or event.
 
-The tables are exported to CSV, Parquet and data frames. A record is the result of one tick of a
-site's control loop, a site being a process that runs one arm.
+The tables are exported to CSV, Parquet and data frames. A site is a process that runs one arm.
+A record is the result of one tick, a period of the site's control loop. An arrival is the
+receipt of a sample, the state that another site sent.
 
 Invariant:
     - Every number is a number of the record, or follows from the record exactly (an age is a
-      difference of time stamps). The only exception are orientations. A record contains an
+      difference of time stamps). The only exceptions are orientations. A record contains an
       orientation as a rotation vector, which jumps where it passes half a turn. The table
       contains it as a unit quaternion, whose sign continues from row to row (see
       `orientations`), and the meaning of the column states that.
@@ -13,8 +14,8 @@ Invariant:
     - Units come from the schema of the messages, and meanings from the docstrings of the
       message types. Units and names of the numbers that a control law sends come from the
       law's declaration. Thus nothing is described in two places.
-    - A number out of range, or an arrival from a peer that a site does not have, raises a
-      `LogError` that names the file (`source`).
+    - A number out of range, or an arrival from a peer (another site) that a site does not have,
+      raises a `LogError` that names the file (`source`).
 """
 
 import dataclasses

@@ -1,7 +1,8 @@
 """Reads MCAP files chunk by chunk, and collects the messages of a log by topic.
 
-`McapReader` reads any MCAP file. `read_contents` uses it to read a log of trilat-net
-completely.
+An MCAP file stores messages in compressed chunks. Each message belongs to a channel, which has
+a topic (a name). `McapReader` reads any MCAP file. `read_contents` uses it to read a log of
+trilat-net, which contains the messages of a session, completely.
 
 Invariant:
     - The reader has one unpacked chunk in memory at a time. Parts that cannot be read are

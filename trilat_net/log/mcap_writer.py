@@ -1,10 +1,10 @@
-"""Writes MCAP files.
+"""Writes MCAP files, in which logs store their messages.
 
-Messages are collected into chunks, which are compressed and written to a stream. The index is
-written at the end of the file. The package `mcap` has a writer as well, but that writer keeps a
-dictionary for every chunk, which takes 46 MiB an hour at ten chunks a second with twelve
-channels, and needs three times the computing time. The tests read the files of this writer with
-that package.
+Messages are collected into chunks, which are compressed and written to a stream. The index,
+which states where the chunks are, is written at the end of the file. The package `mcap` has a
+writer as well, but that writer keeps a dictionary for every chunk, which takes 46 MiB an hour
+at ten chunks a second with twelve channels, and needs three times the computing time. The tests
+read the files of this writer with that package.
 
 Invariant:
     - The same calls produce the same bytes.

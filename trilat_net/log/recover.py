@@ -1,12 +1,12 @@
 """Recovers a damaged or unfinished MCAP file into a new, finished file.
 
-Any MCAP file is accepted. For a log of trilat-net, the numbers of received and missing messages
-(the accounts) are computed again from its messages.
+An MCAP file stores messages in compressed chunks, most of them with a checksum. Any MCAP file
+is accepted. For a log of trilat-net, the numbers of received and missing messages (the
+accounts) are computed again from its messages.
 
 Invariant:
     - Everything that can be read is copied byte for byte: messages with their times and
-      numbers, metadata and attachments.
-    - Everything that cannot be read is left out and reported.
+      numbers, metadata and attachments. Everything else is left out and reported.
     - Nothing is invented. A message of a trilat-net log is copied only if a valid checksum
       covers it or if its content proves it (`content_check`), and only from a chunk that is in
       its original place (`recovery_survey`).

@@ -2,13 +2,16 @@
 
 A scenario describes an experiment: a site is a process that runs one arm and its control loop,
 and each pair of sites is connected by two directed links. The types also translate a scenario
-into the setup from which the simulation kernel builds a site (`Scenario.setup`).
+into the setup from which the simulation kernel, the compiled control and simulation code,
+builds a site (`Scenario.setup`).
 
 Invariant:
-    - The name of a key ends in its unit. Symbols are those of the paper.
+    - The name of a key ends in its unit. Symbols are those of the paper on which the project is
+      based.
     - `Scenario.text` is canonical: loading it gives the same scenario. Its SHA-256 hash
       identifies the experiment.
-    - A change contains the time from which it holds, and the whole state after it.
+    - A change contains the time from which it holds, and the complete settings after it, so
+      that it can be understood without the earlier changes.
 """
 
 import hashlib
