@@ -1,7 +1,7 @@
 """Plays messages: publishes each message once, in order, at its deadline.
 
-The deadline of a message follows from its time in the log by a linear function, which contains
-the start time and the speed of playing. The player sleeps until shortly before a deadline and then polls the clock. It does
+The deadline of a message follows from its time in the log by a linear function, which
+contains the start time and the speed of playing. The player sleeps until shortly before a deadline and then polls the clock. It does
 other work (replies to other programs, reading in advance, progress) in the time that is left
 between deadlines. If no time is left, it does some of this work a hundred times a second
 nevertheless.

@@ -1,6 +1,8 @@
 """Manages permissions for code of users: which laws, operators and plants may run.
 
-A scenario may name classes that users wrote. Code that a user names in a scenario of his or her
+A scenario describes an experiment, and a log contains a recorded run of it. A scenario may name
+classes that users wrote: control laws, operators (programs that move an arm), and plants
+(simulations of an arm). Code that a user names in a scenario of his or her
 own may run. Code that a log, or another member of a session, names may run only if a person
 names its file, because a stranger may have written it. A person may also let the program
 remember a permission; it is then stored in the configuration folder.

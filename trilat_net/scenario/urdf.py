@@ -2,9 +2,9 @@
 
 URDF is an XML format for robots. A robot is a tree of links (bodies) and joints; an arm is the
 path from one link, the base, to another link, the tip. Links that are fixed to a link of the
-arm, and branches such as fingers, become part of its body. Units are those of URDF: kg, m, rad,
-N m, and N along a prismatic joint. The frame of a link is that of the joint that moves the
-link.
+arm, and branches such as fingers, become part of its body. The units are kg, m, rad, N m,
+and N along a prismatic joint, as in URDF. Each link has the coordinate frame of the joint that
+moves it.
 
 Invariant:
     - An arm is physically possible: every moving body has mass, and its principal moments of
@@ -15,8 +15,8 @@ Invariant:
     - A link on the way to the tip with an impossible inertia is refused with its name, unless
       the caller permits to balance inertias or states another inertia for the link.
     - The text is not trusted: no file that it names is opened, and no entity is expanded.
-    - The numbers of an arm have the same bits on every machine. Therefore sines and cosines are
-      those of `core.elementary.sincos`, and sums have a fixed order.
+    - The numbers of an arm have the same bits on every machine. Therefore
+      `core.elementary.sincos` computes sines and cosines, and sums have a fixed order.
 """
 
 import math

@@ -1,7 +1,8 @@
 """Defines what all delay models have in common: loss, duplicates, outages and order of samples.
 
-A link is the directed connection between two sites. Its delay model computes the delay of each
-sample. A model is one class in a file of this folder, and is found by its file; there is no
+A site is a process that runs one arm. A link is the directed network connection between two
+sites. Its delay model computes the delay of each sample, the state that a site sends in one
+period of its control loop. A model is one class in a file of this folder, and is found by its file; there is no
 list of models. Models that the simulation kernel computes itself name a `DelayKind`. Any other
 model has a function of its own, which is compiled.
 
