@@ -9,8 +9,8 @@ Invariant:
     - Messages get the time of their arrival and wait in one bounded queue. One thread writes
       them.
     - The file is flushed about every 65 ms, and completed whenever the process ends in order.
-    - The first signal, such as Ctrl-C, ends the recorder after it has received the messages that
-      the sites still have. The second signal ends it at once.
+    - The first signal, such as Ctrl-C, ends the recorder after it has received the messages
+      that the sites still have. The second signal ends it at once.
 """
 
 from collections.abc import Callable, Mapping

@@ -2,9 +2,9 @@
 
 URDF is an XML format for robots. A robot is a tree of links (bodies) and joints; an arm is the
 path from one link, the base, to another link, the tip. Links that are fixed to a link of the
-arm, and branches such as fingers, become part of its body. The units are kg, m, rad, N m,
-and N along a prismatic joint, as in URDF. Each link has the coordinate frame of the joint that
-moves it.
+arm, and branches such as fingers, become part of its body. The units are kg, m, rad, N m, and N
+along a prismatic joint, as in URDF. Each link has the coordinate frame of the joint that moves
+it.
 
 Invariant:
     - An arm is physically possible: every moving body has mass, and its principal moments of

@@ -2,9 +2,9 @@
 
 A site is a process that runs one arm. A link is the directed network connection between two
 sites. Its delay model computes the delay of each sample, the state that a site sends in one
-period of its control loop. A model is one class in a file of this folder, and is found by its file; there is no
-list of models. Models that the simulation kernel computes itself name a `DelayKind`. Any other
-model has a function of its own, which is compiled.
+period of its control loop. A model is one class in a file of this folder, and is found by its
+file; there is no list of models. Models that the simulation kernel computes itself name a
+`DelayKind`. Any other model has a function of its own, which is compiled.
 
 Invariant:
     - Each model states the mean and the standard deviation of its delay in closed form. The

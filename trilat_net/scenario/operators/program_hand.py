@@ -1,10 +1,10 @@
 """Runs a program of a user as the operator of an arm.
 
 An operator moves an arm by hand. Here a user's program takes the place of the hand: it is
-called at a fixed rate, and its actions apply in the ticks, the periods of the control loop. In a scenario, the description of an experiment, the program is named by its class:
-`{ kind = "own", class = "my_policy:Reach" }`.
-`ProgramHand` is the table in the scenario, and `HandPlayer` calls the program at a site, the
-process that runs one arm.
+called at a fixed rate, and its actions apply in the ticks, the periods of the control loop. In
+a scenario, the description of an experiment, the program is named by its class: `{ kind =
+"own", class = "my_policy:Reach" }`. `ProgramHand` is the table in the scenario, and
+`HandPlayer` calls the program at a site, the process that runs one arm.
 
 Invariant:
     - Naming the class does not run any of its code.
