@@ -2,8 +2,8 @@
 
 An operator moves an arm by hand. Here a user's program takes the place of the hand: it is
 called at a fixed rate, and its actions apply in the ticks, the periods of the control loop. In
-a scenario, the description of an experiment, the program is named by its class: `{ kind =
-"own", class = "my_policy:Reach" }`. `ProgramHand` is the table in the scenario, and
+a scenario, the description of an experiment, the program is named by its class:
+`{ kind = "own", class = "my_policy:Reach" }`. `ProgramHand` is the table in the scenario, and
 `HandPlayer` calls the program at a site, the process that runs one arm.
 
 Invariant:
