@@ -1,4 +1,10 @@
-"""Commands for the inputs of a run: scenarios, user-written code, measured delays, and keys."""
+"""Commands for the inputs of a run: scenarios, user-written code, measured delays, and keys.
+
+A scenario is a TOML file that describes an experiment. The code of a user may be a control law,
+an operator (a program that moves an arm) or a plant (a model of an arm). Delays that were
+measured on a network can be repeated in a simulation. Keys prove to the other processes of a
+session which process is connected.
+"""
 
 import sys
 from pathlib import Path

@@ -1,10 +1,11 @@
 """The commands `trilat log info`, `check`, `sign`, `recover`, `export` and `view`.
 
-A log is the MCAP file of a run.
+A log is the MCAP file that contains the scenario of a run and all records, the results of each
+period of the arms' control loops.
 
 Invariant:
-    - No command of this file executes the run of a log, or code that the log names. They are
-      therefore safe for logs of unknown origin.
+    - No command of this file repeats the run of a log, or executes code that the log names. The
+      commands are therefore safe for logs of unknown origin.
 """
 
 from contextlib import nullcontext

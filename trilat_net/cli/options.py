@@ -1,8 +1,9 @@
-"""Options that several commands share, and the objects that they describe.
+"""Defines the command-line options that several commands share.
 
-The objects are scenarios, network connections and logs. Options that belong together are fields
-of a tuple, for instance `Reach`. A command with a parameter of that type has all of its options
-(`expand_option_tuples`), and the tuple has methods that make the object.
+The options select a scenario, a network connection or a log. Options that belong together are
+fields of a named tuple, for instance `Reach`, which describes how a command reaches a session.
+A command that has a parameter of such a type accepts all options of the type
+(`expand_option_tuples`). The methods of the tuple then open the connection or read the file.
 """
 
 import inspect

@@ -1,4 +1,9 @@
-"""Commands that run a scenario in virtual time, and commands that evaluate the log of a run."""
+"""Commands that run a scenario in virtual time, and commands that evaluate the log of a run.
+
+A scenario describes an experiment: the arms, their control laws, the network and the people who
+move the arms. In virtual time, the program computes the run as fast as it can, with simulated
+arms and delays and without a network. The log is the MCAP file with all results of the run.
+"""
 
 from dataclasses import replace
 from enum import StrEnum

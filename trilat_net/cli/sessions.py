@@ -1,7 +1,8 @@
 """Commands that start, show, measure, change or stop a session, or check this machine.
 
-A session is a live run, in which the processes of several arms exchange their states over a
-network.
+A session is a live run. Several processes ("sites"), possibly on different machines, each
+control one robot arm and exchange the states of the arms over a network. The commands reach the
+sites over the same network.
 """
 
 import re

@@ -1,8 +1,13 @@
 """Commands that study several runs: tests, comparisons, tuning, benchmarks, experiments.
 
+A run is one execution of a scenario, which describes the arms, their control laws and the
+network. Such a command executes or reads many runs that differ in a law, a gain, a delay or the
+people who take part, and prints their results side by side.
+
 Invariant:
-    - Numbers are printed, and control laws are not ranked.
-    - An interrupted benchmark or experiment continues with the same command.
+    - The commands print measured numbers. They do not rank control laws, because which number
+      matters depends on the task.
+    - An interrupted benchmark or experiment continues if the same command is entered again.
 """
 
 import os

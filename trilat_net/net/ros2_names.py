@@ -1,4 +1,8 @@
-"""Checks the names of ROS 2 topics, services and nodes."""
+"""Checks the names of ROS 2 topics, services and nodes.
+
+A name that ROS 2 would not accept is refused with an explanation before it is used, because
+other ROS programs could not subscribe to a topic or call a service with such a name.
+"""
 
 import re
 

@@ -1,4 +1,6 @@
-"""Figures, the report page, text and exports.
+"""Presents the results of runs as figures, as a web page, as text and as files for other tools.
 
-Invariant: matplotlib is imported here and in the figures of `studies`, nowhere else.
+Invariant:
+    - Matplotlib is imported only in this package and in the figures of `studies`, so that
+      programs that draw nothing start fast.
 """
