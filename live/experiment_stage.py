@@ -7,9 +7,13 @@ judges a trial while its session runs.
 Invariant:
     - A reply counts only for the step that the page showed, and only from the first page of a
       user's site.
-    - A trial is judged by every record of the slave arm, as it is later judged by its log.
-    - Rests and absences are measured on the monotonic clock.
-    - The pages of users never show the condition of the experiment.
+    - A trial is judged by every record of the slave arm, the arm that follows the users. A
+      record is the stored result of one period of its control loop. The later evaluation of the
+      log uses the same records.
+    - Rests of the users and absences of pages are measured on the monotonic clock, which is
+      never set, so that a correction of the time of day changes no duration.
+    - The pages of users never show the condition of the experiment, such as the delay or the
+      control law, because this knowledge could influence the users.
 """
 
 from collections.abc import Collection, Sequence

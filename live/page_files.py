@@ -1,5 +1,8 @@
 """Selects the files that the page's server sends: the page, and the results of a session.
 
+The page shows a session, in which several processes each control one robot arm, in a browser.
+The results are the log of the session and the report that is computed from it.
+
 Invariant:
     - A page runs scripts of its own server only. A report runs its own scripts, isolated from
       the page, because it may come from somebody else's log.

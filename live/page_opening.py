@@ -1,7 +1,7 @@
 """Opens a browser at a link that contains a secret token.
 
-Whoever knows the token can take part in the session. Other users of the same machine must not
-see it.
+The link leads to the page on which people watch and control a session of robot arms. Whoever
+knows the token can take part in the session. Other users of the same machine must not see it.
 
 Invariant:
     - The token is in no command line, because every user of the machine can list these.

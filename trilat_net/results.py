@@ -1,4 +1,7 @@
-"""The result of a command as an object, which can become a line, a text, a table or JSON.
+"""Defines the result of a command: an object that can become a line, a text, a table or JSON.
+
+The commands of the terminal and the functions of the Python interface return the same objects.
+The terminal prints the text, and programs read the values.
 
 Invariant:
     - A result contains only values. Its text is composed by the package `reporting`, which is

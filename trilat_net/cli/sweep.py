@@ -1,8 +1,8 @@
 """`trilat sweep`: runs a scenario over a grid of its keys, maps stability, and finds edges.
 
 A scenario is a TOML file that describes an experiment, and its keys are the values that can be
-varied, such as a gain or a delay. A cell of the grid is a combination of values of the keys. An edge is the value of a key at
-which runs change from stable to not stable.
+varied, such as a gain or a delay. A cell of the grid is a combination of values of the keys. An
+edge is the value of a key at which runs change from stable to not stable.
 
 Invariant:
     - Everything that is printed is also written to the result files. Runs that take place live

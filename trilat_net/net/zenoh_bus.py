@@ -1,11 +1,13 @@
 """Implements the network connection of a member (`Bus`) over Eclipse Zenoh.
 
+A member is a process that takes part in a session, such as the process that controls an arm.
+Members publish messages, and send and answer queries. Zenoh is a library that transports both.
 Only this module and `ros2_graph` import `zenoh`.
 
 Invariant:
     - No method waits for the network, because the control loop of an arm calls them.
     - If the network is too slow, a publisher drops messages and does not delay its caller. Only
-      a patient publisher waits.
+      a publisher that was opened as patient waits.
     - Replies to a query are collected in a queue that the caller polls.
     - If a connection cannot be opened yet, an error is raised. The caller decides whether to
       try again.

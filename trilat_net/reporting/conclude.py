@@ -1,8 +1,10 @@
 """Concludes a finished run: checks its log, and writes its page and its summary.
 
-`conclude` does the work of `trilat report`. A check executes the sites of the log again, and
-compares the results with the records, bit for bit. The result is a `Conclusion`, whose text the
-commands print after a run.
+A run is executed by sites, processes that each control one robot arm. A record is the stored
+result of one period of a site's control loop. `conclude` does the work of `trilat report`. The
+check computes the control loops again from the received data in the log, and compares the
+results with the records, bit for bit. The result is a `Conclusion`, whose text the commands
+print after a run.
 
 Invariant:
     - Every claim rests on a new execution of the log, made for this conclusion.

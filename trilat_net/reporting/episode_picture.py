@@ -1,10 +1,11 @@
 """Draws pictures of an episode of a task, as arrays of pixels for a film.
 
 An episode is one attempt of a learned program at the task, see `trilat_net.studies`. A picture
-has a panel per site with its arm. One of the panels also shows the goal of the task.
+has a panel per site, the process that controls one arm, and the panel shows the pose of the
+arm. One of the panels also shows the goal of the task.
 
 Invariant:
-    - A picture depends only on the poses, the goal and the title.
+    - A picture depends only on the poses of the arms, the goal of the task and the title.
     - All pictures of an episode have the same size and the same axis limits, so that everything
       that moves in the film is an arm or a body.
 """

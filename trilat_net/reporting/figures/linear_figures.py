@@ -1,5 +1,8 @@
 """Draws figures of computed results, which need no recorded run.
 
+A linear model describes small motions of the coupled arms around a pose of rest. A site is a
+process that controls one arm, and an operator is the person or program that moves it.
+
 - `draw_port_impedance`, `draw_port_passivity`: a linear model of the coupled arms as seen by
   the operators who hold them. A port is the place at which an operator and an arm exchange
   force and velocity.
@@ -9,8 +12,8 @@
 - `draw_arm_gains`: largest stable gain of an arm over the delay of the links.
 
 Invariant:
-    - A line of a port has the colour of the operator's site. The line is solid while the other
-      site is free, and dashed while it is clamped.
+    - A line of a port has the colour of the operator's site. The line is solid if the arm of
+      the other operator can move freely, and dashed if that arm is clamped.
     - Bands of frequency in which a criterion fails are shaded.
 """
 

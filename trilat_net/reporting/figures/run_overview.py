@@ -1,7 +1,9 @@
 """Draws an overview of one run, or compares several runs, in four panels over time.
 
 The panels show the largest tracking error, the largest joint speed, the largest torque and the
-age of the oldest sample in use. A sample is a state that a site received from a peer.
+age of the oldest sample in use. A site is a process that controls one arm. A sample is the
+state of another arm that a site received over the network, and its age is the time since it was
+sent.
 
 Invariant:
     - In the figure of one run, each line is a site.
