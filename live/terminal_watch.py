@@ -1,5 +1,6 @@
 """Shows a running session until it ends, in a terminal or on a web page.
 
+A session is a run in which several processes ("sites") each control one robot arm.
 `watch_session` connects to the session and updates a display. The display is a table in the
 terminal (`trilat watch`), or a page (`trilat watch --page`). If standard input is a terminal, a
 key stops every arm.

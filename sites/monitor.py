@@ -1,5 +1,7 @@
 """Shows a running session in a terminal, with one row per site.
 
+A site is a process that controls one robot arm, and exchanges its state with the other sites.
+
 The commands `trilat demo` and `trilat watch` use this module. In a terminal, the rows form a
 table that is refreshed four times a second. If the output is a file or a pipe, the same rows
 are printed as lines every two seconds.

@@ -1,8 +1,8 @@
 """Requests real-time settings from the operating system, such as priority and locked memory.
 
-The settings reduce the time by which the ticks of a control loop are late: binding to a
-processor, precise sleeping (timer slack), memory that is not swapped to disk, real-time
-scheduling, and no garbage collection.
+A tick is one period of the control loop of an arm, and must start at a given time. The settings
+reduce the time by which ticks are late: binding to a processor, precise sleeping (timer slack),
+memory that is not swapped to disk, real-time scheduling, and no garbage collection.
 
 Invariant:
     - If the operating system refuses a setting, the site continues without it.

@@ -1,7 +1,8 @@
 """Stores the recent messages of a site, and sends them again to recorders that missed them.
 
-Messages may be lost on the network. A recorder notices gaps in their numbers, and queries the
-site for the missing ones.
+A site is a process that runs one arm, and publishes its state in every period of the control
+loop. A recorder is a process that writes these messages to the log. Messages may be lost on the
+network. The recorder notices gaps in their numbers, and queries the site for the missing ones.
 
 Invariant (L6):
     - The memory is bounded and allocated at the start. It holds at most a minute of every

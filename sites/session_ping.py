@@ -1,5 +1,7 @@
 """Measures the network of a running session, and the delays of ROS 2 topics.
 
+A session is a run in which processes ("sites") each control one arm. Its members are the sites
+and the recorders, which write the log. A ping is a message to which a member replies at once.
 `ping_session` sends pings to all members of a session, and reports round trip times and the
 offsets of their clocks. It also reports the delays of the links between the sites, which the
 receiving sites measure themselves. `ping_topic` measures the delays of the messages on a ROS 2

@@ -5,7 +5,7 @@ file, a TOML text, its tables, or a `Scenario`. A log is the record of a run. It
 of an MCAP file, or a `Log`. Functions that need a network are in the package `sites`.
 
 Invariant:
-    - These functions only convert arguments, and call the packages that do the work.
+    - These functions only convert their arguments, and call the packages that do the work.
 """
 
 from collections.abc import Mapping, Sequence

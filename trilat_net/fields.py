@@ -1,8 +1,9 @@
 """Base class, number types and checks of the tables that a scenario consists of.
 
-A scenario is a TOML file that describes an experiment. Each of its tables becomes an object of
-a subclass of `Frozen`. Annotations such as `Positive` limit the range of a number. Annotations
-such as `Joints` say how many numbers a vector has, for example one per joint of the arm.
+A scenario is a TOML file that describes an experiment with several robot arms. Each of its
+tables becomes an object of a subclass of `Frozen`. Annotations such as `Positive` limit the
+range of a number. Annotations such as `Joints` say how many numbers a vector has, for example
+one per joint of the arm.
 
 Invariant:
     - An error names the path of the key as the author of the scenario wrote it. For an unknown

@@ -1,5 +1,8 @@
 """Controls this process: garbage collection, signals, priority, and worker processes.
 
+A worker process computes one part of a large task, such as one of many runs, at the same time
+as other workers.
+
 Invariant:
     - Garbage collection pauses only around code that creates many objects without reference
       cycles, such as records and lists of numbers. Collecting them would cost time and free

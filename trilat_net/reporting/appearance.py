@@ -1,12 +1,13 @@
 """Defines the colours of the sites, and the widths, type sizes and resolutions of figures.
 
-A site is a process that controls one arm. It has the same colour in every figure and on every
+A site is a process that controls one robot arm. The masters are the arms that people move, and
+the slave is the arm that follows them. A site has the same colour in every figure and on every
 page. The first three colours are the "high contrast" set of Paul Tol's notes on colour: people
 with colour blindness can distinguish them, and they differ in lightness, also in grey print.
 
 Invariant:
-    - Type in print is 8 pt throughout.
-    - The third colour is the slave's, for any number of masters.
+    - Text in printed figures is 8 pt high throughout.
+    - The slave always has the third colour, for any number of masters.
 """
 
 from collections.abc import Sequence

@@ -1,14 +1,16 @@
 """Composes the text of a linear analysis, as the command `trilat linear` prints it.
 
 A linear analysis linearises the coupled arms at a pose of rest, and computes whether small
-motions decay. The text has the equilibrium, the delays, a table of the rightmost roots of the
-characteristic equation, the verdict, the largest stable delay, the ports at which operators
-hold the arms, and the values of scenario keys at which stability changes.
+motions decay. Operators are the people or programs that move the arms, and the key of a
+scenario is a value such as a gain or a delay. The text has the equilibrium, the delays, a table
+of the rightmost roots of the characteristic equation, the verdict, the largest stable delay,
+the ports at which operators hold the arms, and the values of scenario keys at which stability
+changes.
 
 Invariant:
     - Every number has its unit.
-    - Roots that are zero by the structure of the system are counted, not listed, because they
-      say nothing about stability.
+    - Roots that are zero by the structure of the system, whatever its parameters are, are
+      counted and not listed, because they say nothing about stability.
 """
 
 import math

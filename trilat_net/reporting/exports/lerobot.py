@@ -6,12 +6,13 @@ user, the dominance factors of the users (the weights with which the slave follo
 whether a person intervened in place of the program.
 
 Invariant:
-    - A frame has the newest record of every site at or before its time. Nothing is
-      interpolated.
-    - A frame is left out if such a record is older than the longer of two periods: that of the
-      site and that of the frames. Then its episode ends, and the next one begins after the gap.
-    - Numbers are float32.
-    - An orientation is six numbers, which never jump (see `trilat_net.log.orientations`).
+    - A frame has the newest record of every site at or before its time. A record is the stored
+      result of one period of the control loop of the arm. Nothing is interpolated.
+    - A frame is left out if such a record is older than the period of the site's control loop
+      and also older than the period of the frames. Then its episode ends, and the next one
+      begins after the gap.
+    - Numbers are float32. An orientation is six numbers, which never jump (see
+      `trilat_net.log.orientations`).
     - With the setting `actions`, actions have the names and units of `action_features` of the
       plugin `lerobot_robot_trilat`, so that a trained program can command the plugin. A test
       compares the two.

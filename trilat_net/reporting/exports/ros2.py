@@ -4,7 +4,8 @@ A bag can be played with `ros2 bag play`, or read by tools for ROS. Its messages
 the live bridge to ROS 2 would have published during the run.
 
 Invariant:
-    - A bag has every record once, with its numbers and times. Nothing is decimated.
+    - A bag has every record, the stored result of one tick (period) of an arm's control loop,
+      exactly once, with its numbers and times. Nothing is decimated.
     - The names and types of the topics are those of the live bridge
       (`trilat_net.log.ros2.published`).
     - The stamp of a header is the nominal time of its tick. The publish time of a message is

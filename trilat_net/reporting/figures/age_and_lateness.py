@@ -1,12 +1,14 @@
 """Draws figures of communication and timing: ages and delays of samples, and timing of loops.
 
-A sample is the state that a site publishes in one tick of its control loop. A link is the
-directed connection between two sites. The delay of a sample is the time that it needs on its
-link. The age is the time since the sample that a receiver uses in a tick was sent: it grows
-until a newer sample arrives. The lateness is the time by which a tick started after it was due.
+A site is a process that controls one arm, and a tick is one period of its control loop. A
+sample is the state of the arm that the site publishes in a tick. A link is the directed
+connection between two sites. The delay of a sample is the time that it needs on its link. The
+age is the time since the sample that a receiver uses in a tick was sent: it grows until a newer
+sample arrives. The lateness is the time by which a tick started after it was due.
 
 Invariant:
-    - A link that follows a measured trace has no line of a stated delay.
+    - If the delays of a link follow a measured series, the figure has no line for the delay
+      that the scenario states.
     - A run whose links all have one constant delay has no figure of distributions, because
       these would be vertical lines.
     - A run in virtual time reads no clock. The figure of its loops gives this reason instead of

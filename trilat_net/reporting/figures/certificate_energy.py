@@ -2,10 +2,12 @@
 
 There are two figures:
 
-- `draw_functional` draws V, the energy function of the stability proof, with its contributions
-  from the sites, its parts, the dissipated energy, the work done on the loop, and the residual,
-  which is the part of V that these do not explain.
-- `draw_observed_energy` draws the energies that control laws declare to prove their passivity.
+- `draw_functional` draws V, the energy function of the stability proof. It also draws the parts
+  of V, the contributions of the sites (the processes that control the arms), the dissipated
+  energy, the work done on the loop, and the residual, which is the part of V that these do not
+  explain.
+- `draw_observed_energy` draws the energies that control laws declare to prove their passivity,
+  the property that they never supply more energy than they have received.
 
 Invariant:
     - Times for which V is unknown, because records are missing, are shaded.

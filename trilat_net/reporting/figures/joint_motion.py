@@ -1,10 +1,11 @@
 """Draws the signals of the arms: torques, angles, errors, estimates, paths and contact forces.
 
 The sites of a run are processes that each control one arm. An operator is the person or program
-that moves an arm. A dominance factor is the weight with which an arm follows a peer, another
-site: it follows from the scenario and from the recorded changes, Eq. (6) and (7) of the paper.
-Wall forces are computed from the walls of the scenario and the recorded states, with the
-equations of `analysis.torque_sources`. Settling times are those of `analysis.site_signals`.
+that moves an arm. A dominance factor is the weight with which an arm follows the arm of another
+site. It is computed from the scenario and the recorded changes with Eq. (6) and (7) of the
+paper. Wall forces are computed from the walls of the scenario and the recorded states, with the
+equations of `analysis.torque_sources`. The settling time, after which an error stays small, is
+computed by `analysis.site_signals`.
 
 Each function with the decorator `draws` is one figure.
 
