@@ -1,8 +1,9 @@
 """Composes the messages with which the pages of a running session are drawn, as JSON objects.
 
-A page first receives the constants of the session, such as the shapes of the arms. Then it
-receives about 30 frames a second. A frame has the present state of each arm and link, and the
-new points of the plots.
+A session is a run in which several processes ("sites") each control one robot arm. A record is
+the result of one tick, a period of a site's control loop. A page first receives the constants
+of the session, such as the shapes of the arms. Then it receives about 30 frames a second. A
+frame has the present state of each arm and link, and the new points of the plots.
 
 Invariant:
     - A frame is computed from the records since the previous frame. It describes the whole
@@ -12,8 +13,9 @@ Invariant:
     - Forces are those that act on the arm, in N. The forces of people and of the control law
       follow from their torque: torque = J^T force, with the Jacobian J of the end effector.
       Near a singular pose the force is the smallest one that explains the torque.
-    - The frame for the user of a site contains the pose of each peer at one tick only: the tick
-      of the sample in use, or of the delayed picture (`SessionView.find_peer_ticks`).
+    - The frame for the user of a site contains the pose of each peer, another site, at one tick
+      only: the tick of the sample in use, or of the delayed picture
+      (`SessionView.find_peer_ticks`).
 """
 
 import math

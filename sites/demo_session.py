@@ -1,8 +1,9 @@
 """Runs a whole session on one machine, with a process per site and a recorder.
 
-A site is a process that runs one arm and its control loop. The recorder is a process that
-writes the log of the session. `run_demo` runs such a session for the command `trilat demo`, and
-`run` does so for Python programs.
+A session is a run in which several robot arms are coupled over a network. A site is a process
+that runs one arm and its control loop. The recorder is a process that writes the log of the
+session. `run_demo` runs such a session for the command `trilat demo`, and `run` does so for
+Python programs.
 
 All processes are copies (forks) of one process, the starter, which has imported all modules and
 compiled the control code. A copy starts in a tenth of the time that a Python interpreter takes.

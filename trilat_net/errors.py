@@ -6,9 +6,9 @@ operator of another machine, the owner of a file, or the developers of this prog
 Invariant:
     - An error contains its data and one sentence that names the problem, its location and the
       remedy. The command line prints that sentence and nothing else.
-    - `exit_code` is the exit code of a command that ends with the error.
-    - Messages are written for the command line, and name its options. Outside of a command,
-      the same messages name the arguments of the Python functions instead.
+    - Each class has an `exit_code`, with which a command ends after this error.
+    - Messages are written for the command line, and name its options. Outside of a command, the
+      same messages name the arguments of the Python functions instead.
     - Each text that counts things uses `count_nouns`, as in "1 record" and "2 records"
       (`tests/test_wording.py`).
 """

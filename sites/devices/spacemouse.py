@@ -1,8 +1,9 @@
 """Reads a SpaceMouse of 3Dconnexion on Linux, from its hidraw file.
 
-The cap of a SpaceMouse can only be deflected from its rest position. The deflection is
-interpreted as a velocity, which is integrated to a position. If no report has arrived for
-`STILL_NS`, the cap is at rest, because a deflected cap reports continuously.
+A SpaceMouse is an input device whose cap is pushed and turned by hand. The cap can only be
+deflected from its rest position. The deflection is interpreted as a velocity, which is
+integrated to a position. If no report has arrived for `STILL_NS`, the cap is at rest, because a
+deflected cap reports continuously.
 """
 
 import os

@@ -1,8 +1,9 @@
 """Checks that host names in endpoints can be resolved, before a connection is opened.
 
-Zenoh would try to connect to a misspelt host name for ever, without an error. The check queries
-the name service for each host name, and opens no connection. Endpoints without a host name,
-such as numeric addresses and socket files, need no check.
+An endpoint is a network address of a process, such as tcp/host:10241. Zenoh, the library that
+transports the messages, would try to connect to a misspelt host name for ever, without an
+error. The check queries the name service for each host name, and opens no connection. Endpoints
+without a host name, such as numeric addresses and socket files, need no check.
 """
 
 import ipaddress

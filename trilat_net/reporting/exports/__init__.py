@@ -1,7 +1,8 @@
 """Defines the formats to which logs are exported, one module per format.
 
-The name of a module is the name of its format. A module has a constant `FORMAT` of the type
-`export.ExportFormat`. Adding a module to this folder adds a format to `trilat export`.
+A log is the MCAP file with the results of a run. The name of a module is the name of its
+format. A module has a constant `FORMAT` of the type `export.ExportFormat`. Adding a module to
+this folder adds a format to `trilat export`.
 """
 
 import pkgutil

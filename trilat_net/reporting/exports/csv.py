@@ -1,8 +1,9 @@
 """Exports a log as a folder of CSV files, a file per table.
 
-A file has a line of column names and then a line per row. Numbers are written with as many
-digits as Python needs to read them back unchanged. A missing value is an empty field. Two more
-files describe the columns and contain the scenario.
+A table contains, for instance, the records of one arm, with a row per period of its control
+loop. A file has a line of column names and then a line per row. Numbers are written with as
+many digits as Python needs to read them back unchanged. A missing value is an empty field. Two
+more files describe the columns and contain the scenario.
 """
 
 import csv

@@ -1,7 +1,8 @@
 """Exports a log as a folder of Parquet files, a file per table.
 
-Parquet is a compressed column format that pandas, polars and DuckDB read. Two more files in the
-folder describe the columns and contain the scenario.
+A table contains, for instance, the records of one arm, with a row per period of its control
+loop. Parquet is a compressed column format that pandas, polars and DuckDB read. Two more files
+in the folder describe the columns and contain the scenario.
 """
 
 import io

@@ -8,7 +8,7 @@ draw the same poses, which `find_pose` computes.
 
 Invariant:
     - The positions of the joints are those of the simulation kernel's forward kinematics.
-    - The reference pose of each arm, which its controller aims at, is dashed.
+    - The reference pose of each arm, which its control law aims at, is drawn with dashed lines.
 """
 
 from collections.abc import Iterable, Sequence

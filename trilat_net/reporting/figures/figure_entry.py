@@ -1,6 +1,7 @@
 """Registers the functions that draw figures of a log, each under a name.
 
-A module of this folder adds a figure by decorating a function:
+A log is the MCAP file with the results of a run. A module of this folder adds a figure by
+decorating a function:
 
     @draws("positions", "actual and desired angles (Fig. 4)", in_report=True)
     def draw_positions(log, form): ...

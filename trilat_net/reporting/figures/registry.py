@@ -2,8 +2,9 @@
 
     trilat_net.figure(log, "settling").savefig("settling.pdf")
 
-The modules of this folder register their figures with the decorator `figure_entry.draws`. This
-module imports all of them, so that `FIGURES` is complete.
+A log is the MCAP file with the results of a run. The modules of this folder register their
+figures with the decorator `figure_entry.draws`. This module imports all of them, so that
+`FIGURES` is complete.
 
 Invariant:
     - A figure depends only on a log and a figure size.
