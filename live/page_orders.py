@@ -4,21 +4,20 @@ A session is a run in which several processes ("sites") each control one robot a
 shown in a browser. Its user may be an experimenter, a user who holds one arm, or a watcher. The
 page's server reads each message with `read_page_message`, and checks with `Role.may` that the
 user has the right to send it. Then `PageHands` moves the arms that a page holds, and
-`OrderDesk` sends other orders to the sites and receives their replies.
+`OrderDesk` sends other orders to the sites and receives their replies. The sites decide whether
+they accept an order.
 
 Invariant:
     - A valid message has one of the types below, finite numbers in range, and names of the
       session. Messages of a kind may not arrive more often than its rate allows. Any other
       message is counted and dropped.
-    - The sites decide whether they accept an order.
     - Of several orders for the same link, or for the dominance factors (the weights with which
       an arm follows its peers) of the same site, only the newest one waits to be sent.
     - Only one query at a time waits for the reply of a site. The query that stops the arm of
       the site is an exception, and is sent at once.
     - A token grants a role and, to a user, a site. The rest of a link may lower the role, but
-      never raise it.
-    - Every link has a token, also on this machine, because other users of the machine can
-      connect there too.
+      never raise it. Every link has a token, also on this machine, because other users of the
+      machine can connect there too.
     - Every role may stop the arms.
 """
 

@@ -1,9 +1,10 @@
 """Decides how a process connects to the network of a session, and runs the router process.
 
-A `Connection` consists of the endpoints at which a process listens and to which it connects,
-its mode, and optionally the keys that prove its identity. Opening it returns the bus through
-which messages are sent. `resolve_member_connection` derives the connection from the command
-line and a user's Zenoh file.
+A session is a run in which several processes ("sites") each control one robot arm. A
+`Connection` consists of the endpoints at which a process listens and to which it connects, its
+mode, and optionally the keys that prove its identity. Opening it returns the bus through which
+messages are sent. `resolve_member_connection` derives the connection from the command line and
+a user's Zenoh file.
 
 Each site of a session has a default endpoint on this machine: a port that follows from the name
 of the session and the index of the site. Processes that are started in separate terminals

@@ -1,8 +1,8 @@
 """Keeps the time of a running site: when ticks are due, and how far peers' clocks are off.
 
-A site executes one tick per period of its control loop. Tick k is due k * 10^9 // rate_hz ns
-after the epoch, the common start time of the session. Sites on one machine wake up one after
-another within the period (`find_turn_ns`).
+A site is a process that controls one arm. It executes one tick per period of its control loop.
+Tick k is due k * 10^9 // rate_hz ns after the epoch, the common start time of the session.
+Sites on one machine wake up one after another within the period (`find_turn_ns`).
 
 Each site measures the link from each of its peers, with four time stamps:
 
@@ -13,13 +13,13 @@ Each site measures the link from each of its peers, with four time stamps:
 
 A sample is the state that a site publishes in each tick. It carries t3 as its sending time, and
 t2 as an "echo": the confirmation that a sample of the other site has arrived, with the time of
-its arrival. No message can arrive before it was sent.
-Therefore the offset of the peer's clock (peer minus local) is at most t2 - t1 and at least
-t3 - t4. `offset` computes an estimate from the tightest of these limits.
+its arrival. No message can arrive before it was sent. Therefore the offset of the peer's clock
+(peer minus local) is at most t2 - t1 and at least t3 - t4. `offset` computes an estimate from
+the tightest of these limits.
 
 Invariant:
-    - Rule L1: ticks are due on the leader's clock, to the nanosecond. The leader is the first
-      site of the scenario.
+    - Ticks are due on the leader's clock, to the nanosecond (law L1 of docs/design.md). The
+      leader is the first site of the scenario.
     - A site on another machine follows the leader's clock by running its own schedule slightly
       faster or slower, by at most SLEW_LIMIT, and never by a step, so that no tick is skipped
       or repeated. If the leader disconnects, the site continues with the last estimate.

@@ -1,9 +1,10 @@
 """Encodes messages, and decodes and checks what arrives or what a log contains.
 
-A payload is a MessagePack map with the field names as keys. The classes in `messages` and
-`requests` define the fields. The records and samples that a site publishes in every tick are
-encoded directly from the output of the simulation kernel, which is faster than through a
-message object.
+A payload, the bytes of one message, is a map in the format MessagePack with the field names as
+keys. The classes in `messages` and `requests` define the fields. A site, the process that
+controls one arm, publishes a record (for the log) and a sample (for the other sites) in every
+tick of its control loop. These are encoded directly from the output of the simulation kernel,
+which is faster than through a message object.
 
 Invariant:
     - The decoder does not trust its input, because any program on the network can send

@@ -1,7 +1,8 @@
 """Renders the records of a site as HTML, as Jupyter notebooks display them.
 
-A record is the stored result of one tick of the site's control loop. The HTML has a heading and
-a table that summarises each quantity over the run.
+A site is a process that controls one arm. A record is the stored result of one tick of the
+site's control loop. The HTML has a heading and a table that summarises each quantity over the
+run.
 
 Invariant:
     - The table has only quantities that the records of this site contain.
