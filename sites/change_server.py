@@ -1,9 +1,10 @@
 """Replies to requests to change something while a site runs.
 
-During a run, users can change the network links, change the weights with which a site follows
-its peers, end the run early, stop or enable an arm, and mark a moment in the log. They send
-these requests to the site that runs the arm. Before each tick of its control loop, the site
-checks the requests that have arrived, and replies to each of them.
+A site is a process that controls one robot arm. During a run, users can change the network
+links, change the weights with which a site follows its peers, end the run early, stop or enable
+an arm, and mark a moment in the log. They send these requests to the site that runs the arm.
+Before each tick of its control loop, the site checks the requests that have arrived, and
+replies to each of them.
 
 Invariant:
     - Every request gets a reply: it is accepted, or refused with a reason. An accepted change
@@ -13,8 +14,8 @@ Invariant:
       some decisions are made in advance. For example, the delay of a sample that has been sent
       cannot change any more.
     - An order to stop an arm is executed at once. The orders "enable" and "reset" are never
-      executed in the same tick as another order, so that they cannot undo a stop. They wait
-      for the next tick, and the requests behind them wait as well.
+      executed in the same tick as another order, so that they cannot undo a stop. They wait for
+      the next tick, and the requests behind them wait as well.
     - A change of weights is spread over at least `MIN_RAMP_S`, whatever the request states, so
       that the reference of the arm does not jump. The log contains the actual duration.
 """

@@ -1,9 +1,10 @@
 """Moves an arm with a haptic input device, and renders the force of the arm on the device.
 
-The operator presses a button of the device, the clutch, and moves the device. The target of the
-arm then moves by the same distance, rotated and scaled by the settings of the scenario. While
-the clutch is not pressed, the operator can bring the device back to its middle position,
-and the target stays where it is. The reaction force of the arm is rendered on the device.
+The operator, the person who moves the arm, presses a button of the device, the clutch, and
+moves the device. The target of the arm then moves by the same distance, rotated and scaled by
+the settings of the scenario. While the clutch is not pressed, the operator can bring the device
+back to its middle position, and the target stays where it is. The reaction force of the arm is
+rendered on the device.
 
 Invariant:
     - The target moves only by changes of the device's position while the clutch is pressed.

@@ -1,9 +1,10 @@
 """Exchanges messages with ROS 2 programs over Zenoh, without an installation of ROS.
 
-ROS 2 programs that use the middleware rmw_zenoh exchange their messages over Zenoh. `Ros2Graph`
-opens a Zenoh session of its own, as a client of ROS's router (rmw_zenohd) or of another Zenoh
-router, and follows the same wire format. ROS programs then see a node with topics and services,
-as if it was written with a ROS library.
+Zenoh is a library that transports messages over a network. ROS 2 programs that use the
+middleware rmw_zenoh exchange their messages over Zenoh. `Ros2Graph` opens a Zenoh session of
+its own, as a client of ROS's router (rmw_zenohd) or of another Zenoh router, and follows the
+same wire format. ROS programs then see a node with topics and services, as if it was written
+with a ROS library.
 
 The wire format has three elements:
 

@@ -1,7 +1,8 @@
 """Composes the Zenoh configuration of a member, and checks the Zenoh file of a user.
 
-A member is a process that takes part in a session. Its Zenoh settings differ from Zenoh's
-defaults in three points that matter for a control loop at 1 kHz:
+Zenoh is the library that transports the messages. A member is a process that takes part in a
+session. Its Zenoh settings differ from Zenoh's defaults in three points that matter for a
+control loop at 1 kHz:
 
 - The transmission queue holds 16 batches instead of 2. A loop that was late sends the messages
   of several ticks in one burst.

@@ -1,9 +1,10 @@
 """Computes the data of the interactive charts on the page of a report.
 
 A report is a web page about a recorded run. Scripts in the page draw its charts. For this they
-need the signals of the run, such as joint angles and torques. A log has a value per tick of
-1 ms, which is far too much for a page. `ChartBuilder` therefore decimates each signal: it
-divides the ticks into buckets, and keeps the least and the largest value of each bucket.
+need the signals of the run, such as joint angles and torques. A log, the file with the results
+of the run, has a value per tick (period of the control loop) of 1 ms, which is far too much for
+a page. `ChartBuilder` therefore decimates each signal: it divides the ticks into buckets, and
+keeps the least and the largest value of each bucket.
 
 The result consists of tables of columns, and of charts whose lines refer to these columns by
 index. `page_data` defines the types of the data.

@@ -1,5 +1,7 @@
 """Represents the text of results as blocks, which become terminal output, plain text or HTML.
 
+A result is what a command has computed, such as the measured numbers of a run.
+
 A block is a line, a line behind a mark (`MarkedText`) or a table (`TextTable`). The results of
 `studies` return their blocks from a method `blocks`. Results of other packages must not depend
 on this package. For these, `_COMPOSERS` names the function in this folder that composes their

@@ -1,7 +1,8 @@
 """Composes the text that commands print about a run, a session and this machine.
 
-Each `compose_...` function turns the result of one command into blocks, which are lines, marked
-lines and tables that `terminal_output` prints:
+A run is executed by processes that each control one robot arm, and a session is a run that
+takes place live over a network. Each `compose_...` function turns the result of one command
+into blocks, which are lines, marked lines and tables that `terminal_output` prints:
 
 - results about a run: its summary, metrics, log checks, recovery and rerun;
 - measurements of a running session: `compose_ping`, `compose_topic_delays`;
