@@ -104,7 +104,7 @@ def unused_methods() -> set[str]:
                     references.add(name)
                 case ast.Constant(value=str(name)):
                     references.add(name)
-                case ast.ClassDef() if path.is_relative_to(ROOT / "tests") is False:
+                case ast.ClassDef() if not path.is_relative_to(ROOT / "tests"):
                     methods |= {
                         (node.name, method.name)
                         for method in node.body

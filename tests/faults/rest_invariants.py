@@ -152,6 +152,19 @@ def find_rises(session: FaultSession) -> Iterator[tuple[str, tuple[float, float]
         )
 
 
+def read_next_w(rest: Rest) -> np.ndarray:
+    """Returns w of the tick after each record, which is in the record's memory, shape (K, n), N m."""
+    joints = len(rest.states[0].q)
+    first = 2 * (joints + 1) + PEERS
+    return np.array([state.mem[first : first + joints] for state in rest.states])
+
+
+def _or_tick_before(marks: np.ndarray) -> np.ndarray:
+    """Returns True for each tick but the first that is marked itself, or whose predecessor is."""
+    either: np.ndarray = marks[1:] | marks[:-1]
+    return either
+
+
 def find_limited_law(rest: Rest) -> np.ndarray:
     """True for every tick in which, or in the tick before which, the law's own torque is at its limit.
 
@@ -163,27 +176,20 @@ def find_limited_law(rest: Rest) -> np.ndarray:
     q, qd, q_des, qd_des, tau = (
         rest.rows(key)[1:] for key in ("q", "qd", "q_des", "qd_des", "tau")
     )
-    first = 2 * (len(q[0]) + 1) + PEERS
-    w = np.array([state.mem[first : first + len(q[0])] for state in rest.states[:-1]])
+    w = read_next_w(rest)[:-1]
     slip = qd - qd_des + np.asarray(gains.Lambda) * (q - q_des)
     law = tau - w + np.asarray(still.damping) * slip
     most = np.asarray(rest.setup.tau_limit_nm) * (1.0 - RESIDUAL)
-    found = (np.abs(law) >= most).any(axis=1)
-    either: np.ndarray = found[1:] | found[:-1]
-    return either
+    return _or_tick_before((np.abs(law) >= most).any(axis=1))
 
 
 def find_given_up(rest: Rest) -> np.ndarray:
     """True for every tick whose w may lose more than its rule of rest says, because the arm still brakes."""
-    joints = len(rest.states[0].q)
-    first = 2 * (joints + 1) + PEERS
-    w = np.array([state.mem[first : first + joints] for state in rest.states])
+    w = read_next_w(rest)
     with_motion = (w[:-1] * rest.rows("qd")[1:] > 0.0).any(axis=1)
     braking = np.arange(1, len(w)) <= LEAST_STOP_S * rest.setup.rate_hz + 1
     braking |= (rest.rows("qd_des")[1:] != 0.0).any(axis=1)
-    found = with_motion & braking
-    either: np.ndarray = found[1:] | found[:-1]
-    return either
+    return _or_tick_before(with_motion & braking)
 
 
 def compute_storage(scenario: Scenario, rest: Rest) -> tuple[np.ndarray, np.ndarray]:
@@ -197,8 +203,7 @@ def compute_storage(scenario: Scenario, rest: Rest) -> tuple[np.ndarray, np.ndar
     q, qd, q_des, qd_des, theta_hat = (
         rest.rows(key)[1:] for key in ("q", "qd", "q_des", "qd_des", "theta_hat")
     )
-    first = 2 * (len(q[0]) + 1) + PEERS
-    w = np.array([state.mem[first : first + len(q[0])] for state in rest.states[:-1]])
+    w = read_next_w(rest)[:-1]
     e, off = q - q_des, theta_hat - theta
     r = qd + np.asarray(gains.Lambda) * e
     kinetic = (r * _multiply_inertia(theta, q, r)).sum(axis=1)

@@ -220,7 +220,7 @@ def test_who_orders_is_kept_until_an_event_says_it() -> None:
     assert other.text not in asked.changes.sources
 
 
-def test_a_mark_does_not_claim_the_change_of_its_tick() -> None:
+def test_a_mark_does_not_claim_a_change() -> None:
     asked = Asked()
     for order in (
         {"link": "m1->s", "to": {"loss": 0.5}, "source": "m1"},
