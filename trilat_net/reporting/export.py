@@ -206,6 +206,31 @@ def store_tables(
     return json.dumps(facts, indent=2, ensure_ascii=False) + "\n"
 
 
+def write_table_files(
+    log: Log,
+    folder: Path,
+    written: Written,
+    suffix: str,
+    write_table: Callable[[Table, Path], None],
+) -> None:
+    """Writes every table of a log as a file, their description and the scenario into a folder.
+
+    Args:
+        log: Log of the run that is exported.
+        folder: Existing folder of the files.
+        written: Function that is called with the number of records of each table.
+        suffix: Suffix of the files, for example ".csv".
+        write_table: Function that writes a table to a file.
+    """
+    description = store_tables(
+        log,
+        written,
+        lambda table: f"{table.label}{suffix}",
+        lambda table, file_name: write_table(table, folder / file_name),
+    )
+    describe_folder(log, folder, description)
+
+
 def _describe_table(table: Table) -> JsonObject:
     """Returns the meaning of a table's rows, and unit, meaning and source of its columns."""
     columns = {}

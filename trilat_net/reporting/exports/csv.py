@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ...log.data_tables import Table
 from ...log.log_reader import Log
-from ..export import ExportFormat, Written, describe_folder, store_tables
+from ..export import ExportFormat, Written, write_table_files
 
 _ROWS_AT_ONCE = 4096
 """Number of rows that are converted to text together, which limits the memory."""
@@ -25,13 +25,7 @@ def _write(log: Log, folder: Path, written: Written) -> None:
         folder: Existing folder of the files.
         written: Function that is called with the number of records written since its last call.
     """
-    description = store_tables(
-        log,
-        written,
-        lambda table: f"{table.label}.csv",
-        lambda table, file_name: _write_table(table, folder / file_name),
-    )
-    describe_folder(log, folder, description)
+    write_table_files(log, folder, written, ".csv", _write_table)
 
 
 def _write_table(table: Table, path: Path) -> None:

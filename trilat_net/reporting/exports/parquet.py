@@ -10,7 +10,7 @@ from pathlib import Path
 
 from ...log.data_tables import Table, to_data_frame
 from ...log.log_reader import Log
-from ..export import ExportFormat, Written, describe_folder, store_tables
+from ..export import ExportFormat, Written, write_table_files
 
 
 def _write(log: Log, folder: Path, written: Written) -> None:
@@ -21,13 +21,7 @@ def _write(log: Log, folder: Path, written: Written) -> None:
         folder: Existing folder of the files.
         written: Function that is called with the number of records written since its last call.
     """
-    description = store_tables(
-        log,
-        written,
-        lambda table: f"{table.label}.parquet",
-        lambda table, file_name: _write_table(table, folder / file_name),
-    )
-    describe_folder(log, folder, description)
+    write_table_files(log, folder, written, ".parquet", _write_table)
 
 
 def _write_table(table: Table, path: Path) -> None:
