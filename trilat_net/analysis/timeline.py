@@ -132,12 +132,12 @@ def list_changes(log: Log) -> list[AppliedChange]:
                     sentence = describe_event(event.kind, event.text, event.command)
                 applied.append(AppliedChange(change, site, tick, sentence))
     end_s = recorded_end_s(log)
-    shown = []
+    visible_entries = []
     for entry in applied:
         is_short_skip = 0 < entry.change.ticks <= HELD_OVERRUN_TICKS
         if entry.change.at_s < end_s and not is_short_skip:
-            shown.append(entry)
-    return sorted(shown, key=lambda entry: entry.change.at_s)
+            visible_entries.append(entry)
+    return sorted(visible_entries, key=lambda entry: entry.change.at_s)
 
 
 def list_stated_models(

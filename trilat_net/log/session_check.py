@@ -101,7 +101,7 @@ class LogCheckResult(CheckReport):
                 "check": finding.check,
                 "passed": finding.passed,
                 "text": finding.text,
-                "places": [place._asdict() for place in finding.places],
+                "places": [position._asdict() for position in finding.places],
                 "wrong": finding.wrong,
             }
             for finding in self.findings

@@ -466,13 +466,13 @@ class ExperimentAnalysis(Result):
     def _describe_missing_answers(self) -> str:
         """Returns the sentence about missing answers. Empty if no answer is missing."""
         missing = sum(answers.missing for answers in self.missing_answers)
-        asked = sum(answers.asked for answers in self.missing_answers)
+        question_count = sum(answers.asked for answers in self.missing_answers)
         unscored = sum(answers.unscored for answers in self.missing_answers)
         if not missing:
             return ""
         plural = "questionnaire has" if unscored == 1 else "questionnaires have"
         return (
-            f"{missing} of {count_nouns(asked, 'answer is', 'answers are')} missing; "
+            f"{missing} of {count_nouns(question_count, 'answer is', 'answers are')} missing; "
             f"{unscored} {plural} no score for that reason"
         )
 

@@ -159,12 +159,12 @@ def tabulate_front(
             the first and the last one.
     """
     count = len(search.front)
-    shown = {round(n) for n in np.linspace(0, count - 1, min(most, count))}
+    row_indices = {round(n) for n in np.linspace(0, count - 1, min(most, count))}
     overall_front = tuned.list_overall_front(search)
     knobs = search.space.knobs
     rows = []
     for n, index in enumerate(search.front):
-        if n not in shown:
+        if n not in row_indices:
             continue
         mark = "*" if index in overall_front else ""
         gains = [f"{search.tried[index][knob.name]:g}" for knob in knobs]
