@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trilat_net.log import accounting
-from trilat_net.log.accounting import Account, StartGap
+from trilat_net.log.accounting import Account, RangeSet, StartGap
 
 streams = st.lists(st.integers(0, 60), max_size=80)
 
@@ -186,3 +186,17 @@ def test_what_others_heard_of_a_killed_start_is_missing(
     gap.begin_next_start(10, 0)  # said twice, it counts once
     assert (account.gaps, account.missing, account.unpublished) == ([[5, 6]], 2, 3)
     assert account.expected == account.received + account.missing == 10
+
+
+@given(first=st.integers(-5, 5), length=st.integers(1, 10), data=st.data())
+def test_removed_numbers_leave_the_rest_of_their_range(
+    first: int, length: int, data: st.DataObject
+) -> None:
+    numbers = range(first, first + length)
+    low = data.draw(st.sampled_from(numbers))
+    high = data.draw(st.sampled_from(range(low, numbers.stop)))
+    ranges = RangeSet(10)
+    ranges.insert(numbers[0], numbers[-1])
+    assert ranges.remove(low, high)
+    kept = [n for low_kept, high_kept in ranges for n in range(low_kept, high_kept + 1)]
+    assert kept == [n for n in numbers if not low <= n <= high]

@@ -210,7 +210,7 @@ def test_topics_are_called_as_a_file_says(tmp_path: Path) -> None:
     [
         ("joint_state = 'a'", "no topic 'joint_state'.*joint_states"),
         ("joint_states = 'a b'", "joint_states 'a b' is no name of ROS 2"),
-        ("joint_states = 1", "joint_states '1' is no name of ROS 2"),
+        ("joint_states = true", "joint_states must be a text in quotes, not True"),
         ("joint_states", "is no TOML"),
         ("joint_states = 'a'\nreference = 'a'", "two topics have one name"),
         ("robot_commands = '/commands'", "one that begins with / is for one site"),

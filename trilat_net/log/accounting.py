@@ -92,7 +92,7 @@ class RangeSet:
         if containing is None:
             return False
 
-        last_removed = last or number
+        last_removed = number if last is None else last
         before = (containing[0], number - 1)
         after = (last_removed + 1, containing[1])
         remaining = [part for part in (before, after) if part[0] <= part[1]]

@@ -792,7 +792,7 @@ def _name_key(resolved: TomlTable, path: str) -> str:
     The first one that is refused at the same path is named.
 
     Args:
-        resolved: Tables that msgspec refused. The dictionary is left with a single entry.
+        resolved: Tables that msgspec refused. They are changed during the search, and restored.
         path: Path from the message of msgspec.
     """
     before, placeholder, after = path.partition("[...]")
@@ -800,11 +800,15 @@ def _name_key(resolved: TomlTable, path: str) -> str:
         return path
     *parent_keys, last_key = before.split(".")
     parent = functools.reduce(operator.getitem, parent_keys, resolved)
-    for key, entry in parent[last_key].items():
-        parent[last_key] = {key: entry}
-        try:
-            msgspec.convert(resolved, Scenario)
-        except msgspec.ValidationError as error:
-            if str(error).endswith(f"`$.{path}`"):
-                return f"{before}.{key}{after}"
+    entries = parent[last_key]
+    try:
+        for key, entry in entries.items():
+            parent[last_key] = {key: entry}
+            try:
+                msgspec.convert(resolved, Scenario)
+            except msgspec.ValidationError as error:
+                if str(error).endswith(f"`$.{path}`"):
+                    return f"{before}.{key}{after}"
+    finally:
+        parent[last_key] = entries
     return before

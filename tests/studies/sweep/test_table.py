@@ -196,6 +196,7 @@ def test_what_holds_no_results_is_refused(tmp_path: Path) -> None:
         (lambda text: text.replace("verdict", "verdicts", 1), "'verdict' is missing"),
         (lambda text: text[:-60], "cannot be read"),
         (lambda text: text.replace("0,", "zero,", 1), "cannot be read"),
+        (lambda text: text.replace("false", "yes", 1), "'yes' is neither true nor false"),
         (lambda text: text[: text.rindex("[")], "cannot be read"),
         (lambda _: "PAR1 nothing PAR1\n\0", "holds no results"),
     ],

@@ -194,7 +194,9 @@ def _check_names(source: str, names: Mapping[str, object]) -> None:
         if topic not in TOPICS:
             suggestion = suggest_nearest(topic, list(TOPICS))
             raise UsageError(f"{source}: no topic {topic!r}{suggestion}")
-        check_ros_name(str(name), f"{source}: {topic}")
+        if not isinstance(name, str):
+            raise UsageError(f"{source}: {topic} must be a text in quotes, not {name!r}")
+        check_ros_name(name, f"{source}: {topic}")
 
 
 def _check_unique_names(source: str, table: TopicTable) -> None:

@@ -276,12 +276,14 @@ def _parse_cell(text: str, kind: type) -> Any:
 
     Raises:
         ValueError: The text is not a number although the column contains numbers.
-        KeyError: The text is neither "true" nor "false" although the column contains bools.
+            It is neither "true" nor "false" although the column contains bools.
     """
     if kind is str:
         return text
     if kind is bool:
-        return {"true": True, "false": False}[text]
+        if text not in ("true", "false"):
+            raise ValueError(f"{text!r} is neither true nor false")
+        return text == "true"
     return kind(text) if text else None
 
 

@@ -153,7 +153,7 @@ def _format_fact(key: str, facts: Mapping[str, Any]) -> str:
         ]
         return ", ".join(versions)
 
-    if key == "seeds" and isinstance(value, list):
+    if key == "seeds" and isinstance(value, list) and value:
         first = value[0]
         last = value[-1]
         is_range = value == list(range(first, last + 1))
