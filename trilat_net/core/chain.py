@@ -1,34 +1,37 @@
 """Computes the kinematics and dynamics of a serial chain of revolute and prismatic joints.
 
-Symbols: q, qd and qdd are positions, velocities and accelerations of the n joints; M(q) is the
-inertia matrix, C the Coriolis matrix, G the gravity torque and tau the joint torque; theta are
-the inertial parameters. The chain starts at the base. The link's frame is the frame of the
-joint that moves the link, and the joint's axis is constant in this frame.
+Symbols: q, qd and qdd are the positions, velocities and accelerations of the n joints. M(q) is
+the inertia matrix, C the Coriolis matrix, G the gravity torque and tau the joint torque. The
+chain starts at the base. The frame of a link moves with the link, and the axis of the joint
+that moves the link is constant in this frame.
 
-Each link has ten inertial parameters about the origin of its own frame,
+Each link has ten inertial parameters about the origin of its own frame:
 
     pi = (m, m c, Ixx, Ixy, Iyy, Ixz, Iyz, Izz)
 
-with the mass m, the centre of mass c and the moments of inertia. All dynamics are linear in
-them; theta lists the parameters of one link after the other, shape (10 n,).
+Here m is the mass, c the centre of mass, and Ixx to Izz are the moments of inertia. The vector
+theta, shape (10 n,), lists the parameters of all links. All dynamics are linear in theta.
 
-A spatial vector combines a linear and an angular part, the linear part first, at the frame's
-origin. With the transformation X from the previous link p to link i, the joint's axis S as a
-spatial vector, the spatial inertia I of the link, and the products x of two velocities and x*
-of a velocity and a force, the Newton-Euler recursion computes for each link
+A spatial vector combines a linear part and an angular part at the origin of a frame. The
+Newton-Euler recursion goes from the base to the tip. It computes for link i, whose previous
+link is p:
 
     V_i = X V_p + S qd      W_i = X W_p + S v      A_i = X A_p + S a + V_i x (S v)
     f_i = I A_i + 1/2 (V_i x* I W_i + W_i x* I V_i - I (V_i x W_i))      tau_i = S' f_i
 
-V is the velocity of the link, W its velocity for the reference velocities v of the joints, A
-its acceleration for the reference accelerations a, and f the spatial force. The result is tau =
-M a + C v + G with two separate velocities qd and v, as the regressor of the paper's Eq. (12)
-requires. The symmetric product of V and W corresponds to the Christoffel symbols, so that dM/dt
-- 2 C is skew, Eq. (4).
+- X transforms spatial vectors from the frame of link p to the frame of link i. S is the axis of
+  the joint as a spatial vector, and I the spatial inertia of the link. The product x is for two
+  velocities, and x* for a velocity and a force.
+- V is the velocity of the link. W is the velocity that the link would have if the joints moved
+  at the reference velocities v of a control law. A is its acceleration for the reference
+  accelerations a, and f is the spatial force on the link.
 
-The adaptive law needs Y' r, Eq. (15), where Y is the regressor and r = qd - v. It is the
-gradient of r' tau with respect to pi. With s = V - W it is computed link by link without a
-regressor.
+The result is tau = M a + C v + G, in which C depends on qd. The product of V and W is
+symmetric. It corresponds to the Christoffel symbols, so that dM/dt - 2 C is skew-symmetric.
+
+The adaptive control law needs the product Y' r. Y is the regressor, the matrix for which
+Y theta = tau, and r = qd - v is the filtered error. The product is the gradient of r' tau with
+respect to theta. It is computed link by link with the vector V - W, without the matrix Y.
 
 Source: R. Featherstone, "Rigid Body Dynamics Algorithms" (2008), for spatial vectors,
 Newton-Euler and composite bodies; G. Niemeyer and J.-J. Slotine, "Performance in adaptive
@@ -36,7 +39,8 @@ manipulator control", Int. J. Robotics Research 10 (1991), for the recursion of 
 law.
 
 Invariant:
-    - Functions of the kernel allocate nothing. They write into the rows of the joints.
+    - Compiled functions allocate no memory. They write their results into the array that holds
+      the data of the joints, one row per joint (see `chain_dtype`).
     - Each sum has a fixed order, so that results are the same on every machine.
 """
 
@@ -548,15 +552,16 @@ def _add_products(factor: float, x: Spatial, y: Spatial, first: int, gradient: A
 
 @leaf
 def parameter_gradient(chain: RowArray, gradient: Array) -> None:
-    """Computes Y' r, the vector that drives the estimate of the parameters, Eq. (15).
+    """Computes Y' r, the vector that drives the parameter estimate of the adaptive control law.
 
     Y is the regressor, the matrix for which Y theta is the torque of the links in
-    `inverse_dynamics`, and r = qd - v is the filtered error. `propagate_motion` must have been
-    called for the same motion.
+    `inverse_dynamics`, where theta are their inertial parameters. The filtered error r = qd - v is
+    the difference between the velocities qd and the reference velocities v of the joints.
+    `propagate_motion` must have been called for the same qd and v.
 
     Args:
-        chain: Rows of the joints.
-        gradient: Written: Y' r, ten numbers per link, shape (10 n,).
+        chain: Data of the n joints, one row per joint.
+        gradient: Receives Y' r, ten numbers per link, shape (10 n,).
     """
     for i in range(chain.shape[0]):
         row: Row = chain[i]
@@ -818,15 +823,18 @@ def find_acceleration(
 
 @leaf
 def place_end_effector(chain: RowArray, tip: Vector) -> Three:
-    """Computes the pose of the end effector, its Jacobian and the links' orientations.
+    """Computes the pose of the end effector, its Jacobian and the orientations of the links.
 
-    All results are in the axes of the base. The Jacobian and the orientations are written into
-    the rows of the joints: the columns of the Jacobian J_lin (m/rad or 1) and J_ang (1 or 0),
-    and for each link its orientation R_base, the position p_base of its joint, and the axis
-    axis_base of its joint.
+    All results are in the axes of the base. Except for the position of the end effector, they are
+    written into the data of the joints:
+
+    - `J_lin` and `J_ang`: the column of the Jacobian for this joint, which gives the linear and the
+      angular velocity of the end effector per velocity of the joint.
+    - `R_base`: the orientation of the link that the joint moves.
+    - `p_base` and `axis_base`: the position, in m, and the axis of the joint.
 
     Args:
-        chain: Rows of the joints, after `place_joints`; written.
+        chain: Data of the joints, one row per joint. `place_joints` must have been called before.
         tip: Position of the end effector in the last link's frame, m, shape (3,).
 
     Returns:

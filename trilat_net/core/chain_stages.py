@@ -34,12 +34,13 @@ _ADAPTIVE = int(Law.ADAPTIVE)
 def place_chain(s: Row, chain: RowArray) -> None:
     """Updates the frames of the joints and, in task space, the pose of the end effector.
 
-    The other functions of this module use the results, so it is called after each change of the
-    joint positions.
+    The other functions of this module use the results. Therefore this function must be called
+    after each change of the joint positions.
 
     Args:
-        s: Row of the site, with its settings and its state; written in task space.
-        chain: Rows of the joints; written.
+        s: State of the site (the process that runs the arm). If the site works in task space, the
+            pose of the end effector is written into it.
+        chain: Data of the joints, one row per joint; the frames are written into it.
     """
     place_joints(chain, s.q)
     if s.task:
@@ -48,15 +49,16 @@ def place_chain(s: Row, chain: RowArray) -> None:
 
 @leaf
 def update_errors(s: Row, chain: RowArray) -> None:
-    """Computes the errors of a chain, and the reference motion that its control law needs.
+    """Computes the tracking errors of a chain, and the reference motion of its control law.
 
-    These are the errors e and ed, the filtered error r, and the reference velocity v and
-    acceleration a. For the adaptive law Y' r is computed as well, the product of the regressor
-    and the filtered error, which drives the estimate of the parameters, Eq. (15).
+    These are the errors e of the position and ed of the velocity, the filtered error r, and the
+    reference velocity v and acceleration a. For the adaptive law, the product Y' r is computed as
+    well. It drives the estimate of the dynamic parameters; Y is the regressor of the arm's
+    dynamics.
 
     Args:
-        s: Row of the site, with its settings and its state; written.
-        chain: Rows of the joints, after `place_chain`.
+        s: State of the site (the process that runs the arm); the results are written into it.
+        chain: Data of the joints, one row per joint. `place_chain` must have been called before.
     """
     if s.task:
         update_task_errors(s)
@@ -80,12 +82,17 @@ def _update_joint_errors(s: Row, joints: int) -> None:
 
 @leaf
 def advance_estimate(s: Row, gain_s: float, Yr: Vector) -> None:
-    """Advances the estimate of the arm's parameters by a step of Eq. (15), within its box.
+    """Integrates the adaptive law's estimate of the dynamic parameters over a time step.
+
+        theta_hat <- theta_hat - gain_s Gamma Y' r, limited to lower and upper bounds
+
+    Here theta_hat is the estimate of the parameters, such as masses. Gamma is the diagonal gain of
+    the adaptation, Y the regressor of the arm's dynamics, and r the filtered tracking error.
 
     Args:
-        s: Row of the site, with its settings and its state.
+        s: State of the site (the process that runs the arm), which contains theta_hat and Gamma.
         gain_s: Duration of the step, s.
-        Yr: Y' r, shape (P,).
+        Yr: The product Y' r, shape (P,) for P parameters.
     """
     for p in range(s.parameters):
         step = gain_s * s.Gamma[p] * Yr[p]
@@ -95,14 +102,15 @@ def advance_estimate(s: Row, gain_s: float, Yr: Vector) -> None:
 
 @leaf
 def update_torque(s: Row, chain: RowArray) -> None:
-    """Computes the torque of the site's control law, within its limits.
+    """Computes the motor torque of a built-in control law, limited to the range of the motors.
 
-    The law is the adaptive law, Eq. (13), with its robust term, or a law of known gravity
-    (`control.damped_torque`).
+    The law is either the adaptive law or a law that compensates a known gravity torque
+    (`control.damped_torque`). The adaptive law includes its robust term, a bounded torque against
+    disturbances.
 
     Args:
-        s: Row of the site, in which the torque is written.
-        chain: Rows of the joints, after `place_chain`.
+        s: State of the site (the process that runs the arm); the torque is written into it.
+        chain: Data of the joints, one row per joint. `place_chain` must have been called before.
     """
     if s.law == _ADAPTIVE:
         inverse_dynamics(chain=chain, theta=s.theta_hat, v=s.v, a=s.a, torque=s.tau)
@@ -154,13 +162,13 @@ def put_gravity(s: Row, chain: RowArray, theta: Array, torque: Array) -> None:
 
 @leaf
 def put_gravity_torque(s: Row, chain: RowArray, q: Array, torque: Array) -> None:
-    """Computes the gravity torque G(q) of the true parameters of the arm.
+    """Computes the gravity torque of an arm with its true dynamic parameters.
 
     Args:
-        s: Row of the site, with its settings and its state.
-        chain: Rows of the joints.
-        q: Joint angles, shape (n,), rad.
-        torque: Written: the torque, shape (n,), N m.
+        s: Settings of the site (the process that runs the arm), with the parameters.
+        chain: Data of the n joints, one row per joint; their frames are updated.
+        q: Joint positions, shape (n,), rad or m.
+        torque: Receives the gravity torque, shape (n,), N m.
     """
     place_joints(chain, q)
     put_gravity(s, chain, s.theta, torque)
@@ -168,14 +176,15 @@ def put_gravity_torque(s: Row, chain: RowArray, q: Array, torque: Array) -> None
 
 @leaf
 def update_model(s: Row, chain: RowArray) -> None:
-    """Computes the model of a chain for a user's law, after `place_joints`.
+    """Computes the model of a chain of joints that a control law written by a user may read.
 
-    The model consists of the gravity torque G. If the law asks for them, it also contains the
-    inertia matrix M and the bias torque C qd + G with friction, less the torque of the stops.
+    The model consists of the gravity torque G. If the law asks for more, the model also contains
+    the inertia matrix M and the bias torque. The bias torque is C qd + G plus friction, minus the
+    torque of the joint stops, where C is the Coriolis matrix and qd are the joint velocities.
 
     Args:
-        s: Row of the site; written.
-        chain: Rows of the joints.
+        s: State of the site (the process that runs the arm); the model is written into it.
+        chain: Data of the joints, one row per joint. `place_joints` must have been called before.
     """
     put_gravity(s, chain, s.known, s.G)
     if s.needs_model != 0:
@@ -195,17 +204,20 @@ def put_source_torque(
     sampled: int,
     torque: Array,
 ) -> None:
-    """Computes the torque of operators and environments ON the arm, the held part or the rest.
+    """Computes the torque with which some of the operators and environments act on the arm.
+
+    A sampled operator or environment is evaluated once per period of the control loop, and its
+    torque is constant until the next period. All others act continuously.
 
     Args:
-        t_s: Time since the epoch, the common start of the session, s.
-        s: Row of the site, with its settings and its state.
-        chain: Rows of the joints.
-        state: q and qd of the arm, shape (2 n,).
-        actors: Rows of operators and environments.
-        table: Their numbers, for example recorded torques.
-        sampled: 1: only those whose torque is held over a tick; 0: only the others.
-        torque: Written: the torque, shape (n,), N m.
+        t_s: Time since the start of the session, s.
+        s: Settings of the site (the process that runs the arm).
+        chain: Data of the n joints, one row per joint; their frames are updated.
+        state: Joint positions, followed by joint velocities, shape (2 n,).
+        actors: Operators and environments, one row for each.
+        table: Numbers of all operators and environments, for example recorded torques.
+        sampled: 1 for the torque of the sampled operators and environments, 0 for all others.
+        torque: Receives the torque on the arm, shape (n,), N m.
     """
     place_joints(chain, state)
     qd = state[chain.shape[0] :]
@@ -226,17 +238,17 @@ def put_source_torque(
 def update_external_torque(
     t_s: float, s: Row, chain: RowArray, actors: TorqueSourceRows, table: TorqueTable
 ) -> None:
-    """Computes the torque that operators and environments exert in a tick.
+    """Computes the torque that operators and environments exert on the arm at the present time.
 
-    The whole torque, the part of it that is held over the tick, and the force of the walls are
-    written into the row of the site.
+    The state of the site receives the whole torque, the part that stays constant until the next
+    period of the control loop, and the largest force of a wall.
 
     Args:
-        t_s: Time since the epoch, the common start of the session, s.
-        s: Row of the site; written.
-        chain: Rows of the joints, after `place_chain`.
-        actors: Rows of operators and environments.
-        table: Their numbers, for example recorded torques.
+        t_s: Time since the start of the session, s.
+        s: State of the site (the process that runs the arm); written.
+        chain: Data of the joints, one row per joint; their frames are updated.
+        actors: Operators and environments, one row for each.
+        table: Numbers of all operators and environments, for example recorded torques.
     """
     place_joints(chain, s.q)
     held_n = put_torque_on_chain(
@@ -335,21 +347,22 @@ def advance_arm(
     actors: TorqueSourceRows,
     table: TorqueTable,
 ) -> bool:
-    """Simulates the motion of the arm in one period (Runge-Kutta method of fourth order).
+    """Simulates the motion of the arm over one period of the control loop.
 
-    The torque `s.u` is held over the period. The joint positions q and velocities qd at its end
-    are written into the row of the site.
+    The motor torque is constant over the period. The method is the classical Runge-Kutta method of
+    fourth order. The joint positions and velocities at the end of the period are written into the
+    state of the site.
 
     Args:
-        t_s: Time at the beginning of the period, s since the epoch.
+        t_s: Time at the beginning of the period, in s since the start of the session.
         h_s: The period, s.
-        s: Row of the site; written.
-        chain: Rows of the joints.
-        actors: Rows of operators and environments.
-        table: Their numbers, for example recorded torques.
+        s: State of the site (the process that runs the arm), with the motor torque `u`; written.
+        chain: Data of the joints, one row per joint.
+        actors: Operators and environments, one row for each.
+        table: Numbers of all operators and environments, for example recorded torques.
 
     Returns:
-        False if the result is not finite. Then q and qd are unchanged.
+        True if the result is finite. Otherwise False, and positions and velocities are unchanged.
     """
     n = chain.shape[0]
     for i in range(n):

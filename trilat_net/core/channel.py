@@ -158,18 +158,19 @@ def _due_ns(
 def schedule_deliveries(
     sample: int, link: LinkRow, models: RowArray, dues: IntArray, points: Points
 ) -> None:
-    """Computes the due times of all samples up to `sample` that have none yet.
+    """Computes at which times a simulated link delivers its samples, up to a given sample.
 
-    A due time is the time at which the simulated link delivers the sample. The last model of
-    the link whose first stamp is not after the stamp of a sample applies to the sample.
+    A link connects one site (the process that runs one arm) to another. A sample is the state that
+    the sender sends in one period of its control loop. The model of the link's delay and loss may
+    change at planned times. Each sample follows the model in force when the sample was sent.
 
     Args:
-        sample: Index of the newest sample to schedule.
-        link: Row of the link; changed.
-        models: Models of the link's delay and loss, see `LinkArrays`.
-        dues: Written: the due times, which replace those of the oldest samples, see
-            `LinkArrays`.
-        points: Delay traces and outages of the site.
+        sample: Index of the last sample to compute. Earlier samples are not computed twice.
+        link: State of the link; changed.
+        models: Models of the link's delay and loss, in the order in which they come into force.
+        dues: Receives the delivery times in ns since the start of the session, or LOST. It is a
+            ring: sample m is stored at m modulo its length.
+        points: Delay traces and outages of all links of the receiver.
     """
     kept = dues.shape[0]
     while link.scheduled < sample:

@@ -198,7 +198,11 @@ def _compile_law(torque: Callable[..., Any], form: _Form) -> Any:
     compute = numba.njit(**_CHECKED)(torque)
 
     def call(law: Any, site: Any, links: Any, received: Any, sent: Any) -> None:
-        """Builds the law's input from views of the rows, and calls the law's `torque`."""
+        """Collects the input of the control law from the site's arrays, and calls `torque` of the law.
+
+        Nothing is copied: the law reads and writes the arrays themselves. The arrays belong to a site,
+        the process that runs one arm.
+        """
         s = site[0]
         # Conditional expressions: Numba removes the branch whose type does not apply.
         from_peers = () if received_dtype is None else received.reshape(-1).view(received_dtype)
@@ -424,17 +428,20 @@ class CompiledLaw:
         )
 
     def compute(self, k: int, t_ns: int) -> list[float]:
-        """Computes the torque of one tick (stage 6), see `law_stage`.
+        """Computes the torque of one control period by a call of the compiled law.
+
+        The torque and the vectors that the law sends to other sites are written into the arrays of this
+        site (the process that runs the arm).
 
         Args:
-            k: The tick.
-            t_ns: Nominal time of the tick, ns since the epoch, the common start of the session.
+            k: Number of the control period.
+            t_ns: Nominal time of the period, ns since the start of the session.
 
         Returns:
-            The memory of the law after the tick, which the record contains.
+            The numbers that the law remembers for the next period.
 
         Raises:
-            LawFailed: The law failed.
+            LawFailed: The law raised an exception, or returned an invalid result.
         """
         a = self._arrays
         assert a.channel is not None
@@ -464,13 +471,13 @@ class CompiledLaw:
         self.row[: self._remembered] = memory
 
     def find_failure(self, error: Exception) -> LawFailed | None:
-        """Returns the failure of the law that an error reports.
+        """Describes how the user's control law failed, if an exception came from the law.
 
         Args:
-            error: An exception that a tick raised.
+            error: An exception that was raised while the torque of a control period was computed.
 
         Returns:
-            The failure. None if the error does not come from the law.
+            An exception that names the law and the reason. None if the error has another origin.
         """
         s: Row = self._arrays.site[0]
         if not s.asked:
@@ -492,13 +499,19 @@ class CompiledLaw:
 def plug_law(
     law: Any, setup: SiteSetup, arrays: SiteArrays, sent: Array
 ) -> PlainLaw | CompiledLaw:
-    """Returns a law at its site, ready to compute torques, compiled if it is marked for it.
+    """Connects a user's control law to the arrays of a site, so that the law can compute torques.
+
+    A site is the process that runs one arm. The law is compiled if its class is marked for
+    compilation; otherwise it runs as plain Python.
 
     Args:
         law: An instance of the law's class.
         setup: Setup of the site.
-        arrays: Arrays of the site.
-        sent: Sent vectors in the site's record, see `LawChannel`.
+        arrays: Arrays of the site, which the law reads and writes.
+        sent: Array for the numbers that the law sends to other sites, see `LawChannel`.
+
+    Returns:
+        The law, ready for use.
 
     Raises:
         ScenarioError: The law is to be compiled, and Numba cannot compile it.

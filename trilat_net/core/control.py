@@ -1,22 +1,25 @@
-"""Computes the torques of built-in control laws: the adaptive law, and laws of known gravity.
+"""Computes the joint torques of the built-in control laws for the planar two-link arm.
 
-The functions are part of the kernel, the compiled code that computes a tick (one period of the
-control loop). They are for the planar two-link arm; `chain_stages` has the same laws for chains
-of joints. Gains are diagonal matrices, written as vectors with one number per joint (N m s/rad;
-the convergence rate Lambda in 1/s) or per dynamic parameter. Angles are in rad, speeds in
-rad/s, torques in N m.
+There are two kinds of law. The adaptive law estimates the dynamic parameters of its arm, such
+as masses, with the regressor of the arm. The regressor is the matrix whose product with the
+parameters is the torque of the arm's dynamics. The other laws know the gravity torque of the
+arm and compensate it. They add damping (P+d), damping and a derivative term (PD+d), or the
+force that a remote arm feels. `chain_stages` has the same laws for chains of joints.
 
-The adaptive law estimates the dynamic parameters of its arm, such as masses. Its regressor is
-the matrix whose product with the parameters is the torque of the arm's dynamics.
+Gains are diagonal matrices, written as vectors with one number per joint (N m s/rad; the
+convergence rate Lambda in 1/s) or per dynamic parameter. Angles are in rad, speeds in rad/s,
+torques in N m.
 
 Invariant:
-    - The errors and the regressor of a tick do not depend on the estimate of the same tick.
-      Therefore the second-order update of the estimate needs no equation to be solved.
+    - The errors and the regressor are computed before the estimate is updated, and do not
+      depend on the new estimate. Therefore the second-order update of the estimate needs no
+      equation to be solved.
 
-Source: Eq. (9)-(13), (15) of the paper; P+d and PD+d after Nuno, Basanez, Ortega and Spong,
-"Position Tracking for Non-linear Teleoperators with Variable Time Delay", Int. J. Robotics
-Research 28 (2009); direct force reflection after Lawrence, "Stability and transparency in
-bilateral teleoperation", IEEE Trans. Robotics and Automation 9 (1993).
+Source: Eq. (9)-(13) and (15) of the paper on which this project is based (docs/references.md); P+d
+and PD+d after Nuno, Basanez, Ortega and Spong, "Position Tracking for Non-linear Teleoperators
+with Variable Time Delay", Int. J. Robotics Research 28 (2009); direct force reflection after
+Lawrence, "Stability and transparency in bilateral teleoperation", IEEE Trans. Robotics and
+Automation 9 (1993).
 """
 
 from math import sqrt
@@ -60,12 +63,15 @@ def control_errors(
 
 @leaf
 def regressor_transpose_times(Y: tuple[Five, Five], r: Vector) -> Five:
-    """Returns the product Y' r, which drives the estimate of the parameters in Eq. (15).
+    """Computes the product Y' r, which drives the parameter estimate of the adaptive control law.
 
     Args:
-        Y: Regressor of Eq. (12), two rows of five numbers: Y theta is a torque of the arm with
-            the parameters theta.
-        r: Filtered error, shape (2,), rad/s.
+        Y: Regressor of the planar arm, two rows of five numbers. Y theta is the joint torque of an
+            arm with the dynamic parameters theta.
+        r: Filtered tracking error, shape (2,), rad/s.
+
+    Returns:
+        Five numbers, one for each parameter.
     """
     first, second = Y
     r_1 = r[0]

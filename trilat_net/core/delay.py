@@ -1,16 +1,16 @@
 """Computes by how much a simulated network delays each sample.
 
-A link is the directed connection between two sites, the processes that run one arm each. A
-sample is the state that a site sends in one tick (period of its control loop), and its stamp is
-the number of this tick. A delay model is a distribution of delays, a function of time, or a
-recorded trace.
+Two sites, the processes that run one arm each, are connected by a link in each direction. In
+each period of its control loop, a site sends a sample with the state of its arm. The periods
+are numbered, and this number is the index of the sample. The stamp of the sample is the time at
+which it was sent. A delay model is a distribution of delays, a function of time, or a recorded
+trace.
 
-Invariant (L4):
-
-- A delay depends only on the key of the link (the seed of its random numbers), on the sample's
-  index and on its stamp. It is rounded to whole microseconds.
-- Only the model AR1, with correlated delays, depends on the previous sample as well. It
-  advances by the index of the samples, not in the order in which they arrive.
+Invariant:
+    - A delay depends only on the seed of the link and on the index and the stamp of the sample.
+      Therefore a run can be repeated exactly. Delays are rounded to whole microseconds.
+    - Only the model AR1, with correlated delays, also depends on the previous sample. It
+      processes the samples in the order in which they were sent, not in which they arrive.
 """
 
 import math
@@ -175,13 +175,18 @@ def _longest_us(model: LinkModel, trace: Points | None) -> float:
 
 
 def max_delay_us(models: Sequence[LinkModel], traces: Sequence[Points | None]) -> int:
-    """Returns an upper bound of the delays on a link, us, the play-out buffer included.
+    """Computes an upper bound of the delays on a link.
 
-    It determines for how many waiting samples a link needs room.
+    The bound decides for how many delayed samples the receiver reserves memory. It includes the
+    play-out buffer, a minimum delay that the receiver adds to reduce jitter.
 
     Args:
-        models: Models that apply to the link, one after another.
-        traces: Per model the points of its trace, a table of delays by time, or None.
+        models: The delay models that apply to the link, one after another.
+        traces: For each model its recorded trace, a table of delays over time. None for a model
+            without a trace.
+
+    Returns:
+        The bound, us.
     """
     bounds_us = []
     for model, trace in zip(models, traces, strict=True):
@@ -304,14 +309,14 @@ def trace_delay_us(stamp_ns: int, model: Row, points: Points) -> int:
 
 @leaf
 def draw_pair(now: Row, index: int, attempt: int) -> tuple[float, float]:
-    """Returns two uniform random numbers for a user's compiled function of delays.
+    """Returns two uniform random numbers for a delay model that a user wrote.
 
-    Calls with the same arguments return the same numbers, in each process.
+    Equal arguments give equal numbers, in every process. Therefore a run can be repeated exactly.
 
     Args:
-        now: Input of that function.
-        index: Index of the draw, usually the sample.
-        attempt: Attempt of a method that rejects draws, from 0.
+        now: The argument that the user's function received, with the seed of the link.
+        index: Index of the draw. Usually it is the index of the sample whose delay is computed.
+        attempt: Counts the draws for one index from 0, for methods that reject some draws.
     """
     return uniforms(np.uint64(now.key), index, DELAY, attempt)
 
@@ -320,17 +325,20 @@ def draw_pair(now: Row, index: int, attempt: int) -> tuple[float, float]:
 def custom_delay_us(
     key: DrawKey, sample: int, stamp_ns: int, model: Row, points: Points
 ) -> float:
-    """Returns the delay that a user's compiled function gives a sample, us, not rounded.
+    """Computes the delay of a sample by the compiled function of a user's delay model.
 
-    The delay is at most `location`. The function of the model receives its own numbers, which
-    are stored in the site's table of points, two in each row.
+    The delay is limited to the maximum that the user's model declares.
 
     Args:
-        key: Key of the link, from which all its random numbers follow.
+        key: Seed of all random numbers of the link.
         sample: Index of the sample.
-        stamp_ns: Stamp of the sample, the time at which it was sent, ns since the epoch.
-        model: The model, in which the function finds its input and writes the delay.
-        points: The site's table of points.
+        stamp_ns: Time at which the sample was sent, ns since the start of the session.
+        model: The delay model. The function finds its input in it and writes the delay into it.
+            The field `location` is the maximum delay, us.
+        points: Table with the parameters of all models. Each row holds two of them.
+
+    Returns:
+        The delay in us, not rounded.
     """
     model.key = np.int64(key)
     model.sample = sample

@@ -1,23 +1,24 @@
-"""Computes with dominance factors, the weights with which arms follow each other.
+"""Computes the weights with which arms follow each other, and from them the reference of an arm.
 
-A site is a process that runs one arm. Site i follows site j with the dominance factor alpha_ij,
-also called its share. The reference of site i, the position that its control law aims at, is
-the sum of alpha_ij q_j over its peers j, where q_j is the position of arm j, Eq. (6). In the
-stability proof, Upsilon = I - alpha is the matrix of the coupling, with the identity I, and
-beta are the weights of the sites in V, the energy function of the proof.
+A site is a process that runs one arm. Site i follows site j with the weight alpha_ij, which is
+called dominance factor or share. The reference of site i, the position that its control law
+aims at, is the sum of alpha_ij q_j, where q_j is the position of arm j.
+
+In the stability proof, the matrix Upsilon = I - alpha describes the coupling, with the identity
+I. The energy function of the proof weights site i with the number beta_i.
 
 Invariant:
+    - Each row of the matrix alpha sums to 1, and its diagonal is zero.
+    - beta is the LEFT null vector of Upsilon.
+    - Factors change along ramps. Every row sums to 1 during a ramp too. The factors at a time
+      depend only on this time and the ramps.
+    - If samples from another site stay away, the reference stops. It later returns smoothly
+      from the held pose along the polynomial 3 x^2 - 2 x^3, with x from 0 to 1.
 
-- Each row of the matrix alpha sums to 1, Eq. (7), and its diagonal is zero.
-- beta is the LEFT null vector of Upsilon.
-- Factors change along ramps. Every row sums to 1 during a ramp too, and the factors at a time
-  depend on this time and the ramps alone.
-- If a peer is stale (its samples stay away), the reference stops. It later returns from the
-  held pose to the peers along the smooth polynomial 3 x^2 - 2 x^3, with x from 0 to 1.
-
-Source: Eq. (6), (7), (20) of the paper. The paper uses beta = (1, 1, 1). This is the right null
-vector of Upsilon, and a left null vector only if the columns sum to 1 as well. The left null
-vector of an irreducible matrix is its Perron vector, positive and unique up to its length.
+Source: Eq. (6), (7), (20) of the paper on which this project is based (docs/references.md). The
+paper uses beta = (1, 1, 1). This is the right null vector of Upsilon, and a left null vector
+only if the columns sum to 1 as well. The left null vector of an irreducible matrix is its
+Perron vector, which is positive and unique up to its length.
 """
 
 import numpy as np
@@ -233,13 +234,15 @@ def apply_ramps(t_ns: int, count: int, ramps: Array, links: RowArray) -> None:
 
 
 def fold_ramps(t_ns: int, count: int, ramps: Array) -> int:
-    """Removes the changes of the dominance factors that are over, to make room for new ones.
+    """Removes old changes of the dominance factors from a table, to make room for new changes.
 
-    The last ramp that has started stays, after a row 0 with the factors at its start. From time
-    t on `apply_ramps` therefore writes the same bits as before.
+    The dominance factors are the weights with which an arm follows the other arms. Each change is a
+    ramp in time. The last ramp that has started is kept, because it may still be in progress. Its
+    start values are stored in row 0. Therefore `apply_ramps` computes exactly the same factors as
+    before for all times from `t_ns` on.
 
     Args:
-        t_ns: The time t, ns since the epoch, the common start of the session.
+        t_ns: Present time, ns since the start of the session.
         count: Number of filled rows of `ramps`.
         ramps: Ramps, as in `apply_ramps`; changed in place.
 
@@ -298,17 +301,22 @@ def any_peer_stale(t_ns: int, age_ns: int, links: RowArray) -> bool:
 
 @leaf
 def update_stale_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
-    """Changes the mode and the reference of a site when a peer falls silent or returns.
+    """Stops the reference of a site when a peer falls silent, and resumes when the peer returns.
 
-    A peer is stale if its last sample is too old. In HOLD the reference is that of the previous
-    tick, in BRAKE the pose of the arm. In RETURN it is q_held + s (q_des - q_held), where
-    q_held is the reference before the return, s = 3 x^2 - 2 x^3, and x is the part of
-    `return_ns` that has passed.
+    A site is the process that runs one arm, and the reference is the position that its arm
+    follows. A peer, a site that it follows, is silent if its last sample is too old. In mode HOLD
+    the reference stays where it was, and in BRAKE it is the present pose of the arm. In RETURN the
+    reference moves smoothly back to the position q_des that the peers ask for:
+
+        reference = q_held + s (q_des - q_held),    s = 3 x^2 - 2 x^3
+
+    Here q_held is the reference before the return, and x the elapsed part of the time `return_ns`,
+    from 0 to 1.
 
     Args:
-        t_ns: Time, ns since the epoch, the common start of the session.
-        site: Row of the site, with the peers' reference; changed.
-        links: Rows of the site's links.
+        t_ns: Time, ns since the start of the session.
+        site: State of the site, whose reference is q_des; changed.
+        links: States of the site's links, one row per peer.
     """
     if site.on_stale == _USE or site.mode == _DIVERGED:
         return

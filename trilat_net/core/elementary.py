@@ -28,10 +28,11 @@ LARGEST_RAD = 2.0**30
 
 @leaf
 def sincos(x: float) -> tuple[float, float]:
-    """Returns the sine and the cosine of an angle in rad, to one unit in the last place of 1.
+    """Computes the sine and the cosine of an angle in rad, with equal bits on every machine.
 
-    Both are NaN if the angle is not finite or beyond `LARGEST_RAD`. Beyond 1e5 rad the error of
-    the reduction is as large as the rounding of the angle itself.
+    The absolute error is at most 2^-52. For angles beyond 1e5 rad, the rounding of the angle itself
+    causes an error of similar size. Both results are NaN if the angle is not finite or is beyond
+    `LARGEST_RAD`.
     """
     if not abs(x) <= LARGEST_RAD:
         return math.nan, math.nan
