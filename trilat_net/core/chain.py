@@ -29,8 +29,8 @@ link is p:
 The result is tau = M a + C v + G, in which C depends on qd. The product of V and W is
 symmetric. It corresponds to the Christoffel symbols, so that dM/dt - 2 C is skew-symmetric.
 
-The adaptive control law needs the product Y' r. Y is the regressor, the matrix for which
-Y theta = tau, and r = qd - v is the filtered error. The product is the gradient of r' tau with
+The adaptive control law needs the product Y' r. Y is the regressor, the matrix for which Y
+theta = tau, and r = qd - v is the filtered error. The product is the gradient of r' tau with
 respect to theta. It is computed link by link with the vector V - W, without the matrix Y.
 
 Source: R. Featherstone, "Rigid Body Dynamics Algorithms" (2008), for spatial vectors,
@@ -552,11 +552,11 @@ def _add_products(factor: float, x: Spatial, y: Spatial, first: int, gradient: A
 
 @leaf
 def parameter_gradient(chain: RowArray, gradient: Array) -> None:
-    """Computes Y' r, the vector that drives the parameter estimate of the adaptive control law.
+    """Computes Y' r, which drives the parameter estimate of the adaptive control law.
 
     Y is the regressor, the matrix for which Y theta is the torque of the links in
-    `inverse_dynamics`, where theta are their inertial parameters. The filtered error r = qd - v is
-    the difference between the velocities qd and the reference velocities v of the joints.
+    `inverse_dynamics`, where theta are their inertial parameters. The filtered error r = qd - v
+    is the difference between the velocities qd and the reference velocities v of the joints.
     `propagate_motion` must have been called for the same qd and v.
 
     Args:
@@ -825,16 +825,17 @@ def find_acceleration(
 def place_end_effector(chain: RowArray, tip: Vector) -> Three:
     """Computes the pose of the end effector, its Jacobian and the orientations of the links.
 
-    All results are in the axes of the base. Except for the position of the end effector, they are
-    written into the data of the joints:
+    All results are in the axes of the base. Except for the position of the end effector, they
+    are written into the data of the joints:
 
-    - `J_lin` and `J_ang`: the column of the Jacobian for this joint, which gives the linear and the
-      angular velocity of the end effector per velocity of the joint.
+    - `J_lin` and `J_ang`: the column of the Jacobian for this joint, which gives the linear and
+      the angular velocity of the end effector per velocity of the joint.
     - `R_base`: the orientation of the link that the joint moves.
     - `p_base` and `axis_base`: the position, in m, and the axis of the joint.
 
     Args:
-        chain: Data of the joints, one row per joint. `place_joints` must have been called before.
+        chain: Data of the joints, one row per joint. `place_joints` must have been called
+            before.
         tip: Position of the end effector in the last link's frame, m, shape (3,).
 
     Returns:

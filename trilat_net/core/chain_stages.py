@@ -38,8 +38,8 @@ def place_chain(s: Row, chain: RowArray) -> None:
     after each change of the joint positions.
 
     Args:
-        s: State of the site (the process that runs the arm). If the site works in task space, the
-            pose of the end effector is written into it.
+        s: State of the site (the process that runs the arm). If the site works in task space,
+            the pose of the end effector is written into it.
         chain: Data of the joints, one row per joint; the frames are written into it.
     """
     place_joints(chain, s.q)
@@ -52,13 +52,14 @@ def update_errors(s: Row, chain: RowArray) -> None:
     """Computes the tracking errors of a chain, and the reference motion of its control law.
 
     These are the errors e of the position and ed of the velocity, the filtered error r, and the
-    reference velocity v and acceleration a. For the adaptive law, the product Y' r is computed as
-    well. It drives the estimate of the dynamic parameters; Y is the regressor of the arm's
+    reference velocity v and acceleration a. For the adaptive law, the product Y' r is computed
+    as well. It drives the estimate of the dynamic parameters; Y is the regressor of the arm's
     dynamics.
 
     Args:
         s: State of the site (the process that runs the arm); the results are written into it.
-        chain: Data of the joints, one row per joint. `place_chain` must have been called before.
+        chain: Data of the joints, one row per joint. `place_chain` must have been called
+            before.
     """
     if s.task:
         update_task_errors(s)
@@ -86,11 +87,12 @@ def advance_estimate(s: Row, gain_s: float, Yr: Vector) -> None:
 
         theta_hat <- theta_hat - gain_s Gamma Y' r, limited to lower and upper bounds
 
-    Here theta_hat is the estimate of the parameters, such as masses. Gamma is the diagonal gain of
-    the adaptation, Y the regressor of the arm's dynamics, and r the filtered tracking error.
+    Here theta_hat is the estimate of the parameters, such as masses. Gamma is the diagonal gain
+    of the adaptation, Y the regressor of the arm's dynamics, and r the filtered tracking error.
 
     Args:
-        s: State of the site (the process that runs the arm), which contains theta_hat and Gamma.
+        s: State of the site (the process that runs the arm), which contains theta_hat and
+            Gamma.
         gain_s: Duration of the step, s.
         Yr: The product Y' r, shape (P,) for P parameters.
     """
@@ -105,12 +107,13 @@ def update_torque(s: Row, chain: RowArray) -> None:
     """Computes the motor torque of a built-in control law, limited to the range of the motors.
 
     The law is either the adaptive law or a law that compensates a known gravity torque
-    (`control.damped_torque`). The adaptive law includes its robust term, a bounded torque against
-    disturbances.
+    (`control.damped_torque`). The adaptive law includes its robust term, a bounded torque
+    against disturbances.
 
     Args:
         s: State of the site (the process that runs the arm); the torque is written into it.
-        chain: Data of the joints, one row per joint. `place_chain` must have been called before.
+        chain: Data of the joints, one row per joint. `place_chain` must have been called
+            before.
     """
     if s.law == _ADAPTIVE:
         inverse_dynamics(chain=chain, theta=s.theta_hat, v=s.v, a=s.a, torque=s.tau)
@@ -178,13 +181,15 @@ def put_gravity_torque(s: Row, chain: RowArray, q: Array, torque: Array) -> None
 def update_model(s: Row, chain: RowArray) -> None:
     """Computes the model of a chain of joints that a control law written by a user may read.
 
-    The model consists of the gravity torque G. If the law asks for more, the model also contains
-    the inertia matrix M and the bias torque. The bias torque is C qd + G plus friction, minus the
-    torque of the joint stops, where C is the Coriolis matrix and qd are the joint velocities.
+    The model consists of the gravity torque G. If the law asks for more, the model also
+    contains the inertia matrix M and the bias torque. The bias torque is C qd + G plus
+    friction, minus the torque of the joint stops, where C is the Coriolis matrix and qd are the
+    joint velocities.
 
     Args:
         s: State of the site (the process that runs the arm); the model is written into it.
-        chain: Data of the joints, one row per joint. `place_joints` must have been called before.
+        chain: Data of the joints, one row per joint. `place_joints` must have been called
+            before.
     """
     put_gravity(s, chain, s.known, s.G)
     if s.needs_model != 0:
@@ -238,7 +243,7 @@ def put_source_torque(
 def update_external_torque(
     t_s: float, s: Row, chain: RowArray, actors: TorqueSourceRows, table: TorqueTable
 ) -> None:
-    """Computes the torque that operators and environments exert on the arm at the present time.
+    """Computes the torque that operators and environments exert on the arm now.
 
     The state of the site receives the whole torque, the part that stays constant until the next
     period of the control loop, and the largest force of a wall.
@@ -349,20 +354,22 @@ def advance_arm(
 ) -> bool:
     """Simulates the motion of the arm over one period of the control loop.
 
-    The motor torque is constant over the period. The method is the classical Runge-Kutta method of
-    fourth order. The joint positions and velocities at the end of the period are written into the
-    state of the site.
+    The motor torque is constant over the period. The method is the classical Runge-Kutta method
+    of fourth order. The joint positions and velocities at the end of the period are written
+    into the state of the site.
 
     Args:
         t_s: Time at the beginning of the period, in s since the start of the session.
         h_s: The period, s.
-        s: State of the site (the process that runs the arm), with the motor torque `u`; written.
+        s: State of the site (the process that runs the arm), with the motor torque `u`;
+            written.
         chain: Data of the joints, one row per joint.
         actors: Operators and environments, one row for each.
         table: Numbers of all operators and environments, for example recorded torques.
 
     Returns:
-        True if the result is finite. Otherwise False, and positions and velocities are unchanged.
+        True if the result is finite. Otherwise False, and positions and velocities are
+        unchanged.
     """
     n = chain.shape[0]
     for i in range(n):

@@ -160,9 +160,10 @@ def schedule_deliveries(
 ) -> None:
     """Computes at which times a simulated link delivers its samples, up to a given sample.
 
-    A link connects one site (the process that runs one arm) to another. A sample is the state that
-    the sender sends in one period of its control loop. The model of the link's delay and loss may
-    change at planned times. Each sample follows the model in force when the sample was sent.
+    A link connects one site (the process that runs one arm) to another. A sample is the state
+    that the sender sends in one period of its control loop. The model of the link's delay and
+    loss may change at planned times. Each sample follows the model in force when the sample was
+    sent.
 
     Args:
         sample: Index of the last sample to compute. Earlier samples are not computed twice.

@@ -198,10 +198,10 @@ def _compile_law(torque: Callable[..., Any], form: _Form) -> Any:
     compute = numba.njit(**_CHECKED)(torque)
 
     def call(law: Any, site: Any, links: Any, received: Any, sent: Any) -> None:
-        """Collects the input of the control law from the site's arrays, and calls `torque` of the law.
+        """Collects the input of the control law, and calls the law's method `torque`.
 
-        Nothing is copied: the law reads and writes the arrays themselves. The arrays belong to a site,
-        the process that runs one arm.
+        Nothing is copied: the law reads and writes the arrays of its site, the process that
+        runs one arm.
         """
         s = site[0]
         # Conditional expressions: Numba removes the branch whose type does not apply.
@@ -430,8 +430,8 @@ class CompiledLaw:
     def compute(self, k: int, t_ns: int) -> list[float]:
         """Computes the torque of one control period by a call of the compiled law.
 
-        The torque and the vectors that the law sends to other sites are written into the arrays of this
-        site (the process that runs the arm).
+        The torque and the vectors that the law sends to other sites are written into the arrays
+        of this site (the process that runs the arm).
 
         Args:
             k: Number of the control period.
@@ -474,10 +474,12 @@ class CompiledLaw:
         """Describes how the user's control law failed, if an exception came from the law.
 
         Args:
-            error: An exception that was raised while the torque of a control period was computed.
+            error: An exception that was raised while the torque of a control period was
+                computed.
 
         Returns:
-            An exception that names the law and the reason. None if the error has another origin.
+            An exception that names the law and the reason. None if the error has another
+            origin.
         """
         s: Row = self._arrays.site[0]
         if not s.asked:
@@ -499,7 +501,7 @@ class CompiledLaw:
 def plug_law(
     law: Any, setup: SiteSetup, arrays: SiteArrays, sent: Array
 ) -> PlainLaw | CompiledLaw:
-    """Connects a user's control law to the arrays of a site, so that the law can compute torques.
+    """Connects a user's control law to a site, so that the law can compute torques.
 
     A site is the process that runs one arm. The law is compiled if its class is marked for
     compilation; otherwise it runs as plain Python.

@@ -311,7 +311,8 @@ def trace_delay_us(stamp_ns: int, model: Row, points: Points) -> int:
 def draw_pair(now: Row, index: int, attempt: int) -> tuple[float, float]:
     """Returns two uniform random numbers for a delay model that a user wrote.
 
-    Equal arguments give equal numbers, in every process. Therefore a run can be repeated exactly.
+    Equal arguments give equal numbers, in every process. Therefore a run can be repeated
+    exactly.
 
     Args:
         now: The argument that the user's function received, with the seed of the link.

@@ -1,4 +1,4 @@
-"""Computes the weights with which arms follow each other, and from them the reference of an arm.
+"""Computes the weights with which arms follow each other, and the reference of an arm.
 
 A site is a process that runs one arm. Site i follows site j with the weight alpha_ij, which is
 called dominance factor or share. The reference of site i, the position that its control law
@@ -236,10 +236,10 @@ def apply_ramps(t_ns: int, count: int, ramps: Array, links: RowArray) -> None:
 def fold_ramps(t_ns: int, count: int, ramps: Array) -> int:
     """Removes old changes of the dominance factors from a table, to make room for new changes.
 
-    The dominance factors are the weights with which an arm follows the other arms. Each change is a
-    ramp in time. The last ramp that has started is kept, because it may still be in progress. Its
-    start values are stored in row 0. Therefore `apply_ramps` computes exactly the same factors as
-    before for all times from `t_ns` on.
+    The dominance factors are the weights with which an arm follows the other arms. Each change
+    is a ramp in time. The last ramp that has started is kept, because it may still be in
+    progress. Its start values are stored in row 0. Therefore `apply_ramps` computes exactly the
+    same factors as before for all times from `t_ns` on.
 
     Args:
         t_ns: Present time, ns since the start of the session.
@@ -301,17 +301,17 @@ def any_peer_stale(t_ns: int, age_ns: int, links: RowArray) -> bool:
 
 @leaf
 def update_stale_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
-    """Stops the reference of a site when a peer falls silent, and resumes when the peer returns.
+    """Stops the reference of a site while a peer is silent, and resumes it afterwards.
 
     A site is the process that runs one arm, and the reference is the position that its arm
-    follows. A peer, a site that it follows, is silent if its last sample is too old. In mode HOLD
-    the reference stays where it was, and in BRAKE it is the present pose of the arm. In RETURN the
-    reference moves smoothly back to the position q_des that the peers ask for:
+    follows. A peer, a site that it follows, is silent if its last sample is too old. In mode
+    HOLD the reference stays where it was, and in BRAKE it is the present pose of the arm. In
+    RETURN the reference moves smoothly back to the position q_des that the peers ask for:
 
         reference = q_held + s (q_des - q_held),    s = 3 x^2 - 2 x^3
 
-    Here q_held is the reference before the return, and x the elapsed part of the time `return_ns`,
-    from 0 to 1.
+    Here q_held is the reference before the return, and x the elapsed part of the time
+    `return_ns`, from 0 to 1.
 
     Args:
         t_ns: Time, ns since the start of the session.

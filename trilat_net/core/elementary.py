@@ -30,9 +30,9 @@ LARGEST_RAD = 2.0**30
 def sincos(x: float) -> tuple[float, float]:
     """Computes the sine and the cosine of an angle in rad, with equal bits on every machine.
 
-    The absolute error is at most 2^-52. For angles beyond 1e5 rad, the rounding of the angle itself
-    causes an error of similar size. Both results are NaN if the angle is not finite or is beyond
-    `LARGEST_RAD`.
+    The absolute error is at most 2^-52. For angles beyond 1e5 rad, the rounding of the angle
+    itself causes an error of similar size. Both results are NaN if the angle is not finite or
+    is beyond `LARGEST_RAD`.
     """
     if not abs(x) <= LARGEST_RAD:
         return math.nan, math.nan
