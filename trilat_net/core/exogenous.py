@@ -1,15 +1,18 @@
 """Computes the torques by which operators and environments act on an arm.
 
-An operator is a person or program that moves the arm; an environment is, for example, a wall.
-In the code both are called actors, and their torque is the exogenous torque. A scenario, the
-file that describes an experiment, states the torque ON the arm. The paper's tau_x, which Eq.
-(8) subtracts, is the negative of this torque.
+An operator is a person or a program that moves the arm. An environment is, for example, a wall
+that the arm touches. Both are called actors in the code, because their torque is computed in
+the same way.
+
+Sign: This module computes the torque ON the arm. Records and the equations of the control laws
+use tau_x, the negative of this torque. The total torque of the joints is tau - tau_x, where tau
+is the torque of the motors.
 
 Invariant:
     - The torque depends on time and on the state of the arm. Therefore it is computed anew at
-      each evaluation of the integrator, several times per tick (period of the control loop).
-    - A source that is marked `sampled` is evaluated once per tick and then held, as in a
-      digital haptic device that renders a wall.
+      each evaluation of the integrator, several times per period of the control loop.
+    - An actor that is marked `sampled` is evaluated once per period, and its torque is then
+      constant. A digital haptic device renders a wall in this way.
 """
 
 import math
@@ -119,10 +122,11 @@ _NUMBERS = ("a", "b", "K", "B")
 
 @cache
 def torque_source_dtype(width: int) -> np.dtype[np.void]:
-    """Returns the NumPy data type of the row that stores an operator or an environment.
+    """Returns the NumPy data type that stores the parameters of an operator or an environment.
 
-    A user's function, at the address `call`, reads the fields t_s, coordinates, at and speed,
-    and writes effort.
+    If the operator or environment is a function that a user wrote, `call` is its address. The
+    function reads its input from the fields `t_s`, `coordinates`, `at` and `speed`, and writes
+    the force or torque into `effort`.
 
     Args:
         width: Largest length of the vectors of all operators and environments.
@@ -162,10 +166,12 @@ def torque_source_rows(
     Args:
         actors: Operators and environments.
         joints: Number of joints of the arm.
-        axes: Number of axes of its space.
+        axes: Number of Cartesian axes: 2 for the planar arm, 3 for a chain of joints.
 
     Returns:
-        A row per operator or environment, and one table that joins the tables of all of them.
+        An array with one row per operator or environment, and a table. The table contains
+        recorded torques and other lists of numbers. A row states which rows of the table belong
+        to it.
     """
     width = 1 + joints
     rows = np.zeros(len(actors), torque_source_dtype(max(joints, axes)))
@@ -520,18 +526,19 @@ def _end_effector_torque(
 def source_torque(
     t_s: float, q: Vector, qd: Vector, lengths: Vector, actor: Row, table: TorqueTable
 ) -> SourceTorque:
-    """Returns the torque with which one operator or environment acts on the planar arm.
+    """Computes the torque with which a single operator or environment acts on the planar arm.
 
     Args:
-        t_s: Time since the epoch, the common start of the session, s.
+        t_s: Time since the start of the session, s.
         q: Joint angles, rad.
         qd: Joint velocities, rad/s.
         lengths: Lengths of the two links, m.
-        actor: Row of the operator or environment.
-        table: Tables of all operators and environments.
+        actor: Parameters of the operator or environment.
+        table: Recorded torques and other numbers of all operators and environments.
 
     Returns:
-        The torque ON the arm, N m, and the force of the wall if the actor is one, N.
+        The torques on the two joints, N m, and the force of the wall, N. The force is 0 if the
+        environment is not a wall.
     """
     if not actor.start_s <= t_s < actor.end_s:
         return 0.0, 0.0, 0.0
@@ -563,18 +570,23 @@ def torque_on_arm(
     table: TorqueTable,
     sampled: int,
 ) -> SourceTorque:
-    """Returns the torque with which operators and environments act on the planar arm.
+    """Computes the torque with which operators and environments act on the planar arm.
 
-    This torque ON the arm is -tau_x of Eq. (8).
+    A sampled operator or environment is evaluated once per period of the control loop, and its
+    torque is constant until the next period. One call computes the torque of either the sampled
+    actors or all others.
 
     Args:
-        t_s: Time since the epoch, the common start of the session, s.
+        t_s: Time since the start of the session, s.
         q: Joint angles, rad.
         qd: Joint velocities, rad/s.
         lengths: Lengths of the two links, m.
-        actors: Rows of operators and environments.
-        table: Their tables.
-        sampled: 1: only those whose torque is held over a tick; 0: only the others.
+        actors: Operators and environments, one row for each.
+        table: Recorded torques and other numbers of all actors.
+        sampled: 1 for the torque of the sampled actors, 0 for all others.
+
+    Returns:
+        The torques on the two joints, N m, and the largest force of a wall, N.
     """
     total_0 = 0.0
     total_1 = 0.0
@@ -733,21 +745,24 @@ def put_torque_on_chain(
 ) -> float:
     """Computes the torque with which operators and environments act on a chain of joints.
 
-    `place_joints` must have been called for the same positions.
+    A sampled operator or environment is evaluated once per period of the control loop, and its
+    torque is constant until the next period. One call computes the torque of either the sampled
+    actors or all others.
 
     Args:
-        t_s: Time since the epoch, the common start of the session, s.
+        t_s: Time since the start of the session, s.
         q: Joint positions, shape (n,), rad or m.
         qd: Joint velocities, shape (n,), rad/s or m/s.
         tip: Position of the end effector in the last link's frame, m.
-        chain: Rows of the joints.
-        actors: Rows of operators and environments.
-        table: Their tables.
-        sampled: 1: only those whose torque is held over a tick; 0: only the others.
-        torque: Written: the torque ON the arm, shape (n,), N m.
+        chain: Data of the n joints, one row per joint. `place_joints` must have been called for
+            the same positions.
+        actors: Operators and environments, one row for each.
+        table: Recorded torques and other numbers of all actors.
+        sampled: 1 for the torque of the sampled actors, 0 for all others.
+        torque: Receives the torque on the arm, shape (n,), N m.
 
     Returns:
-        The largest force of a wall, N.
+        The largest force of a wall, N. 0 if no wall is touched.
     """
     n = chain.shape[0]
     for i in range(n):

@@ -1,12 +1,13 @@
 """Computes a fingerprint of the platform's arithmetic, to tell where runs repeat exactly.
 
-Simulations are reproducible to the last bit only on platforms whose arithmetic is equal. The
-fingerprint is a hash of the results of a fixed computation: many sines and cosines, and a short
-run of two simulated arms that are connected by links with random delays.
+Simulations are reproducible to the last bit only on platforms with equal arithmetic. The
+fingerprint is a hash of the results of a fixed computation. This computation consists of many
+sines and cosines, and of a short simulation of two arms that follow each other over a network
+with random delays.
 
-Invariant (L5):
-    - The verification of a log requires equal bits only if the log was written on a platform
-      with the same fingerprint.
+A log of a run contains the fingerprint of the platform that wrote it. When a log is verified,
+the run is computed again. The results must be equal to the last bit only if the fingerprint of
+the present platform is the same.
 """
 
 import hashlib

@@ -37,13 +37,16 @@ PROGRESS_DTYPE = row_dtype("progress", {})
 
 
 class RecentRecords(NamedTuple):
-    """Last records of a site, kept as a ring while a peer may still need them.
+    """Latest records of a site, kept as long as another site may still need them.
 
-    The records of all sites have one more axis in front.
+    A site is the process that runs one arm. A record contains the numbers that a site computes
+    in one period of its control loop. The arrays are ring buffers. If they are for several
+    sites, they have an additional first axis for the site.
 
     Attributes:
-        t_ns: Nominal times of the records, ns since the epoch, shape (a power of two,).
-        rows: Floats of the records, see `Layout.columns`, one row per record.
+        t_ns: Times of the records, in ns since the start of the session. The length is a power
+            of two.
+        rows: Floating-point numbers of the records, one row per record, see `Layout.columns`.
     """
 
     t_ns: IntArray
@@ -52,10 +55,12 @@ class RecentRecords(NamedTuple):
 
 @cache
 def sums_dtype(joints: int) -> np.dtype[np.void]:
-    """Returns the NumPy data type of the sums over all records of a site, see `SumsRow`.
+    """Returns the NumPy data type of the sums from which the metrics of a run are computed.
+
+    `SumsRow` lists the sums, for example of squared errors and squared torques.
 
     Args:
-        joints: Number of joints of the arm, the length of the sums' vectors.
+        joints: Number of joints of the arm.
     """
     return row_dtype("sums", {"joints": joints})
 
@@ -86,16 +91,21 @@ def _first_sent(s: SiteRow) -> int:
 
 
 class ReplayedInputs(NamedTuple):
-    """The arrivals and the live hands of a recorded run, which a fused run repeats.
+    """Inputs of a recorded run, which a simulation of all N sites repeats.
+
+    A site is a process that runs one arm. Each site has P peers, the other sites, whose samples
+    (states) it receives. A tick is one period of the control loop of a site.
 
     Attributes:
-        first: Index into `samples` of the first arrival, by site, peer and tick, shape (N, P,
-            K + 1). With K = 0 each sample arrives at the first tick after its stamp.
-        samples: The stamps of the samples, in the order of their arrival.
-        hands: The action of the live hand by site and tick: grip, target, and target plus rate,
-            shape (N, K, 1 + 2 size). Without actions all hands are free.
-        hand_indices: Per site the index of the live hand among the torque sources, shape (N,);
-            -1: no live hand.
+        first: Index into `samples` of the first arrival, by site, peer and tick, shape (N, P, K
+            + 1) for K ticks. If K is 0, each sample arrives at the first tick after it was
+            sent.
+        samples: The ticks in which the peers sent the samples, in the order of arrival.
+        hands: What the person or program that moves the arm does, by site and tick, shape (N,
+            K, 1 + 2 m). The numbers are the firmness of the grip from 0 to 1, the m coordinates
+            of the target, and the target one second later. If K is 0, nobody holds the arms.
+        hand_indices: For each site the index of this person or program among its operators and
+            environments, shape (N,). -1 if there is none.
     """
 
     first: IntArray
@@ -384,13 +394,16 @@ def _update_sums(
 
 
 class LawArrays(NamedTuple):
-    """Compiled control laws that users wrote, for all sites of a fused run.
+    """Compiled control laws that users wrote, for all N sites of a simulation.
+
+    A site is a process that runs one arm.
 
     Attributes:
         addresses: Address of the machine code of each site's law, shape (N,), see
-            `CompiledLaw`; 0: the kernel computes the law.
-        rows: Numbers of each law, shape (N, most).
-        sent: Numbers that each law sends, shape (N, most).
+            `CompiledLaw`. 0 if the law of the site is built in.
+        rows: Gains and memory of each law, one row per site, filled up to equal length.
+        sent: Numbers that each law sends to other sites, one row per site, filled up to equal
+            length.
     """
 
     addresses: IntArray
@@ -461,19 +474,21 @@ def sense_site(
     arrays: SiteArrays,
     chain: RowArray | None,
 ) -> None:
-    """Computes the part of a site's next tick before its control law (stages 1 to 5).
+    """Computes the part of a site's next control period that comes before its control law.
 
-    The peers' records arrive as in the recorded run, or without delay if there is no recorded
-    run. The remaining arguments are those of `run_until`.
+    A site is a process that runs one arm. This part accepts the samples (states) of its peers,
+    the other sites, and computes the reference, the errors and the parameter estimate. The
+    samples arrive as in the recorded run. Without a recorded run they arrive without delay.
 
     Args:
         i: Index of the site.
-        progress: Progress of the sites.
-        next_samples: Next sample of each peer to accept, shape (N, P).
-        sent: Last records of the sites.
-        feed: Inputs of a recorded run.
+        progress: State of the simulation, one row per site, see `ProgressRow`.
+        next_samples: Number of the next sample to accept, for each of N sites and P peers,
+            shape (N, P).
+        sent: Latest records of the sites, from which the samples are taken.
+        feed: Inputs of the recorded run.
         arrays: Arrays of all sites.
-        chain: Rows of the site's chain, or None for the planar arm.
+        chain: Data of the joints, one row per joint. None for the planar two-link arm.
     """
     site_progress: ProgressRow = progress[i]
     k = site_progress.tick
@@ -541,21 +556,24 @@ def finish_site(
     chain: RowArray | None,
     laws: LawArrays | None,
 ) -> int:
-    """Completes a site's next tick (stages 6 to 8), and adds its record to peaks and sums.
+    """Completes the control period of a site, whose first part `sense_site` computed.
+
+    The control law computes the torque, and the arm moves to the next period. The results of
+    the period are added to statistics of the run.
 
     Args:
-        i: Index of the site.
-        settled_rad: Errors below this are settled, rad.
-        progress: Progress of the sites.
-        sent: Last records of the sites; the new record is written.
-        peaks: Peaks of the sites, see `run_until`.
-        sums: Sums of the sites.
-        arrays: Arrays of all sites.
-        chain: Rows of the site's chain, or None for the planar arm.
-        laws: The users' compiled laws, or None.
+        i: Index of the site, the process that runs one arm.
+        settled_rad: Position error below which the arm counts as settled, rad.
+        progress: State of the simulation, one row per site, see `ProgressRow`.
+        sent: Latest records of the sites; the new record is written.
+        peaks: Largest errors and speeds so far, see `run_until`; updated.
+        sums: Sums over the records, see `SumsRow`; updated.
+        arrays: Arrays of all sites; updated.
+        chain: Data of the joints, one row per joint. None for the planar two-link arm.
+        laws: Compiled control laws that users wrote. None if there are none.
 
     Returns:
-        The mode of the site.
+        The mode of the site, a member of `Mode`.
     """
     site_progress: ProgressRow = progress[i]
     k = site_progress.tick

@@ -1,22 +1,24 @@
 # mypy: disallow-untyped-calls=False, disable-error-code="no-any-return"
-"""Compiles functions of the core with Numba, and stores their machine code.
+"""Compiles numerical functions with Numba, and stores their machine code on disk.
 
-A leaf is a function of numbers and arrays that is compiled; the decorator `leaf` marks it.
+The decorator `leaf` marks a function of numbers and arrays that is to be compiled. A marked
+function is called a leaf.
 
-Machine code is kept in the user's cache directory, in a folder named after a hash of all
-sources of the core. (Numba alone notices a change of the file that holds a leaf, but not of the
-leaves that this leaf calls.) A wheel contains such a folder, with code for the generic
-processor of its platform. This code is used if the user's folder has no code for the present
-processor.
+Where the code is stored:
+    - The machine code is in the user's cache directory, in a folder named after a hash of all
+      source files of this package. Numba alone notices a change of the file that holds a
+      function, but not of the functions that it calls.
+    - A binary wheel contains the same kind of folder, with code for any processor of its
+      platform. This code is used if the cache directory has no code for the present processor.
 
-A leaf that another leaf calls is an inner leaf. It is kept as unoptimised LLVM code, which is
-optimised as a part of the leaf that Python calls.
+A leaf that is called from Python is stored as machine code. A leaf that is called by another
+leaf is called an inner leaf. It is stored as LLVM code before optimisation, because it is
+optimised together with its caller.
 
 Invariant:
-
-- A leaf is compiled without reordering (no fastmath), so that compiled and plain Python runs
-  give the same bits.
-- The compilation and the caches of other code in the process are not affected.
+    - Floating-point operations are not reordered (no fastmath). Therefore compiled functions
+      and plain Python give the same bits.
+    - The compilation and the caches of other code in the process are not affected.
 """
 
 import hashlib
@@ -92,10 +94,11 @@ _ships = _SHIPPED.is_dir()
 
 
 def is_core_cached() -> bool:
-    """Returns True if the core need not be compiled, because its machine code is stored.
+    """Returns True if the simulation can start at once, because its machine code is stored on disk.
 
-    The code must be of this version of the core. The whole tick is compiled last, so the
-    presence of its code is sufficient.
+    The stored code must be of the present version of the sources. Only the code of
+    `kernel.site_tick` is looked for. It is compiled last, so the other functions exist if it
+    does.
     """
     folders = [_CACHE, _SHIPPED if _ships else None]
     for folder in folders:
@@ -130,7 +133,14 @@ class _CompilingNotice(event.Listener):
         self._restorers: list[Callable[[], None]] = []
 
     def on_start(self, event_data: Any) -> None:
-        """Reports the first compilation of a function of the core."""
+        """Reports the first compilation of a function of this package, because it takes long.
+
+        Numba calls this method at the start of each compilation. Until the end of the
+        compilation, signals such as Ctrl-C end the process at once.
+
+        Args:
+            event_data: Numba's description of the compilation.
+        """
         self._restorers.append(end_process_at_signals())
         module = event_data.data["dispatcher"].py_func.__module__
         if not self.is_reported and module.startswith(__package__):
@@ -206,10 +216,17 @@ class _LeafCacheImpl(CompileResultCacheImpl):
     _locator_classes = cast(Any, [_LeafLocator])
 
     def rebuild(self, context: Any, kept: Any) -> Any:
-        """Returns the compiled leaf of a stored tuple, as `CompileResult._reduce` wrote it.
+        """Converts the content of a cache file to a compiled function.
 
-        Machine code is loaded by Numba. For an inner leaf, Numba's objects are built here
-        around the LLVM code.
+        Numba itself loads machine code. For LLVM code, which only other compiled functions
+        call, this method creates Numba's objects.
+
+        Args:
+            context: Numba's description of the target processor.
+            kept: Content of the file, as `CompileResult._reduce` wrote it.
+
+        Returns:
+            Numba's description of the compiled function.
         """
         name, kind, code = kept[0]
         if kind != _INNER:
@@ -246,7 +263,12 @@ class _CompressedFiles(IndexDataCacheFile):
     """
 
     def save(self, key: Any, code: Any) -> None:
-        """Writes compiled code for a key, and adds the file to the index."""
+        """Writes compiled code to a file, and adds the file to the index of the cache.
+
+        Args:
+            key: Types of the arguments and the processor, for which the code was compiled.
+            code: The compiled code, as Numba serialises it.
+        """
         names = self._load_index()
         first, _, last = self._data_name(0).rpartition(".0.")
         digest = hashlib.sha256(repr(key).encode()).hexdigest()[:8]
@@ -287,10 +309,18 @@ class _LeafCache(FunctionCache):
         self._inner = files(str(folder), f"{base}-within", stamp)
 
     def load_overload(self, signature: Any, context: Any) -> Any:
-        """Returns the stored code for a signature, or None if there is none.
+        """Loads the machine code of the function for given types of arguments.
 
-        The user's folder is read first, then the wheel. Numba's method would first prepare the
-        compiler, which takes far longer than loading.
+        The user's cache directory is searched first. The code in the installed wheel comes
+        second. In contrast to the method of Numba, this method does not prepare the compiler,
+        which would take far longer than loading.
+
+        Args:
+            signature: Types of the arguments.
+            context: Numba's description of the target processor.
+
+        Returns:
+            Numba's description of the compiled function. None if there is no stored code.
         """
         with self._guard_against_spurious_io_errors():
             result = self._load_overload(signature, context)
@@ -308,13 +338,29 @@ class _LeafCache(FunctionCache):
             super()._save_overload(signature, result)
 
     def load_inner(self, argument_types: Any, context: Any) -> Any:
-        """Returns the kept inner leaf for these types of arguments, or None."""
+        """Loads the LLVM code of a function from the cache, for a call by another compiled function.
+
+        Args:
+            argument_types: Numba's types of the arguments.
+            context: Numba's description of the target processor.
+
+        Returns:
+            Numba's description of the compiled function. None if the cache has no code for
+            these types.
+        """
         key = self._index_key(argument_types, context.codegen())
         kept = self._inner.load(key)
         return None if kept is None else self._impl.rebuild(context, kept)
 
     def save_inner(self, argument_types: Any, result: Any) -> None:
-        """Stores a compiled inner leaf, if the user's folder can be written."""
+        """Stores the LLVM code of a function, which only other compiled functions can call.
+
+        Nothing is stored if there is no cache directory in which files can be written.
+
+        Args:
+            argument_types: Numba's types of the arguments.
+            result: Numba's description of the compiled function.
+        """
         if _CACHE is not None:
             self._impl.locator.ensure_cache_path()
             key = self._index_key(argument_types, result.codegen)
@@ -369,7 +415,17 @@ class _LeafCompiler(Compiler):
     depth = 0
 
     def compile_extra(self, function: Any) -> Any:
-        """Compiles a function, as an inner leaf while another leaf is being compiled."""
+        """Compiles a Python function to machine code that Python can call, or to LLVM code.
+
+        LLVM code is produced while the compilation of another function is in progress, because
+        the new function is then a part of this other function. Numba calls this method.
+
+        Args:
+            function: The Python function.
+
+        Returns:
+            Numba's description of the compiled function.
+        """
         state = self.state
         is_inner = _LeafCompiler.depth > 0
         state.library = _LeafLibrary(state.targetctx.codegen(), function.__qualname__)
@@ -403,13 +459,28 @@ class _Leaf(CPUDispatcher):
     _compiler: Any
 
     def get_call_template(self, arguments: Any, keywords: Any) -> Any:
-        """Returns the call for these types; a constant counts by its type, not its value."""
+        """Returns Numba's typing information for a call of the function with the given arguments.
+
+        A constant argument is treated like any other value of its type. Otherwise Numba would
+        compile the function again for each constant. Numba calls this method.
+
+        Args:
+            arguments: Types of the positional arguments.
+            keywords: Types of the keyword arguments, by name.
+        """
         plain_arguments = tuple(map(types.unliteral, arguments))
         plain_keywords = {name: types.unliteral(kind) for name, kind in keywords.items()}
         return super().get_call_template(plain_arguments, plain_keywords)
 
     def add_overload(self, result: Any) -> None:
-        """Adds a compiled form; an inner leaf is not registered for calls from Python."""
+        """Registers a compiled form of the function, for the types of its arguments.
+
+        Machine code is registered for calls from Python. LLVM code, which only other compiled
+        functions can call, is not. Numba calls this method.
+
+        Args:
+            result: Numba's description of the compiled form.
+        """
         if getattr(result.library, "is_inner", False):
             argument_types = tuple(result.signature.args)
             self.overloads[argument_types] = result
@@ -417,10 +488,18 @@ class _Leaf(CPUDispatcher):
             super().add_overload(result)
 
     def compile(self, signature: Any) -> Any:
-        """Returns the entry point for arguments of these types, compiled or loaded.
+        """Loads or compiles the function for given types of arguments.
 
-        While another leaf is compiled, the result is an inner leaf; otherwise it is machine
-        code that Python can call.
+        If Python calls the function, machine code is produced. If another function that is
+        being compiled calls it, LLVM code is produced, which is then optimised together with
+        its caller.
+
+        Args:
+            signature: Types of the arguments, in a form that Numba accepts.
+
+        Returns:
+            The compiled function. For LLVM code, an object that stands for it in Numba's
+            tables.
         """
         with global_compiler_lock:
             argument_types, return_type = normalize_signature(signature)
@@ -441,14 +520,15 @@ class _Leaf(CPUDispatcher):
 
 
 def bind_leaf(function: Callable[P, R], *arguments: P.args, **_: P.kwargs) -> Callable[P, R]:
-    """Returns a compiled function that no longer checks the types of its arguments.
+    """Compiles a function now, and returns a version that does not check the types of its arguments.
 
-    Leaving out the check saves time in each tick. The function is compiled for the types of
-    the given arguments, and must be called with arguments of these types.
+    The version saves the time of the check in each call. It must only be called with arguments
+    of the same types as those given here. If Numba is disabled, the function itself is
+    returned.
 
     Args:
-        function: The function, which `leaf` decorates.
-        *arguments: Arguments of the types with which the result is called.
+        function: A function with the decorator `leaf`.
+        *arguments: Examples of the arguments.
     """
     if _config.DISABLE_JIT:
         return function
@@ -458,10 +538,12 @@ def bind_leaf(function: Callable[P, R], *arguments: P.args, **_: P.kwargs) -> Ca
 
 
 def leaf(function: Callable[P, R]) -> Callable[P, R]:
-    """Compiles a function of numbers and arrays (decorator).
+    """Marks a function of numbers and arrays, so that Numba compiles it at its first call (decorator).
 
-    For readers and mypy the type of the function is unchanged. If Numba is disabled, the
-    function itself is returned.
+    In contrast to `numba.njit`, the compiled code is stored on disk and found again until a
+    source file of this package changes, and the function must not allocate arrays. The type of
+    the function is unchanged for readers and type checkers. If Numba is disabled, the function
+    itself is returned.
     """
     if _config.DISABLE_JIT:
         return function

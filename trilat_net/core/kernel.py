@@ -1,18 +1,24 @@
-"""Computes one tick of one site, as compiled code: its eight stages in order.
+"""Computes one period of the control loop of an arm, as compiled code.
 
-A site is a process that runs one arm and its control loop; a tick is one period of the loop.
-The stages, which README.md describes, are 1 accept, 2 release, 3 reference, 4 errors, 5
-estimate, 6 torque, 7 emit and 8 advance. The state of a site is a row of numbers, `SiteRow`,
-which the stages read and write. For an arm that is a chain of joints, `chain` contains the rows
-of its joints; for the planar two-link arm it is None.
+The process that runs one arm is called a site, and one period of its control loop a tick. A
+tick has eight stages, in this order:
+
+1. accept: store the samples (states) that arrived from other sites. 2. release: take the newest
+sample of each site whose simulated delay has passed. 3. reference: compute the position that
+the arm shall follow. 4. errors: compute the tracking errors. 5. estimate: update the estimate
+of the arm's dynamic parameters. 6. torque: compute the torque of the control law. 7. emit:
+write the record, which contains the results of the tick. 8. advance: simulate the arm until the
+next tick.
+
+The state of a site is a row of numbers, `SiteRow`, which the stages read and write. For an arm
+that is a chain of joints, `chain` contains the data of its joints. For the planar two-link arm
+it is None.
 
 Invariant:
-
-- One call computes a whole tick, and each stage is a leaf (a compiled function) that the fused
-  run, the simulation of several sites in one call, uses as well.
-- The arm advances by one period with the classical Runge-Kutta method of fourth order. Each of
-  its four evaluations evaluates operators and environments anew.
-- The control torque and the torque of sampled sources are constant over the period.
+    - Live sites and simulations of several sites call the same functions for the stages.
+    - Stage 8 integrates with the classical Runge-Kutta method of fourth order. The torque of
+      the motors is constant during the tick. The torques of operators and environments are
+      computed anew in each of the four evaluations, unless they are marked as sampled.
 """
 
 from math import isfinite
@@ -120,13 +126,15 @@ def _update_estimate(k: int, s: SiteRow, chain: RowArray | None) -> None:
 
 @leaf
 def torque_stage(site: RowArray, chain: RowArray | None) -> None:
-    """Computes the torque of a control law that is built into the kernel (stage 6 of a tick).
+    """Computes the torque of a control law that is built in.
 
-    For a user's law this function does nothing: `law_stage` computes its torque.
+    If the control law was written by a user, this function does nothing. `law_stage` computes
+    the torque of compiled user laws.
 
     Args:
-        site: Row of the site, in which the torque is written.
-        chain: Rows of the joints of a chain, or None for the planar arm.
+        site: State of the site (the process that runs the arm), shape (1,). The torque is
+            written into it.
+        chain: Data of the joints, one row per joint. None for the planar two-link arm.
     """
     s: SiteRow = site[0]
     if s.law == _USER:
@@ -325,17 +333,18 @@ def _advance(
 
 @leaf
 def channel_of(channel: ChannelArrays | None, peer: int) -> ChannelArrays | None:
-    """Returns the arrays of the numbers that the control law of one peer sends.
+    """Selects the arrays for the numbers that the control law of one peer sends.
 
-    The numbers accompany the motion in each sample of the peer.
+    A peer is another site (process that runs one arm). Some control laws send numbers in
+    addition to the motion of the arm, for example energies.
 
     Args:
-        channel: Arrays of all peers, or of all sites of stacked arrays; None if the law of this
-            site reads no such numbers.
-        peer: Index of the peer or the site.
+        channel: Arrays of all peers of a site, or of all sites of a simulation. None if the
+            control law of this site reads no such numbers.
+        peer: Index of the peer, or of the site.
 
     Returns:
-        Views of the peer's arrays. None if `channel` is None.
+        Views of the arrays of the peer or the site. None if `channel` is None.
     """
     if channel is None:
         return None
@@ -362,31 +371,35 @@ def link_arrays(arrays: SiteArrays, peer: int) -> LinkArrays:
 
 @leaf
 def find_release(peer: int, tick: int, arrays: SiteArrays) -> int:
-    """Returns the tick of the site in which a peer's sample comes into use.
+    """Finds the period of the site's control loop in which a sample of a peer is used first.
+
+    A site is the process that runs one arm, and a peer is another site. A sample is the state
+    that the peer sends in one period of its own control loop.
 
     Args:
         peer: Index of the peer.
-        tick: Stamp of the sample, a tick of the peer.
+        tick: Number of the period in which the peer sent the sample.
         arrays: Arrays of the site.
 
     Returns:
-        The tick. LOST in the cases that `link.release_tick` names.
+        The number of the period if the sample arrives in time. LOST if the link loses the
+        sample, or if the sample is too old.
     """
     return release_tick(tick, arrays.site[0].rate_hz, link_arrays(arrays, peer))
 
 
 @leaf
 def accept_stage(k: int, count: int, arrays: SiteArrays, buffers: TickBuffers) -> None:
-    """Stores the samples that arrived until they are used (stage 1 of a tick).
+    """Stores the samples that arrived, until their simulated delay has passed.
 
-    Each link has a calendar, a ring of pages in which samples wait until their delay has
-    passed.
+    A sample is the state that another arm sends in one period of its control loop. Samples wait
+    in ring buffers, which are called calendars.
 
     Args:
-        k: The tick.
-        count: Number of arrivals in the buffers.
-        arrays: Arrays of the site; written.
-        buffers: Arrivals of the tick.
+        k: Number of the present control period.
+        count: Number of samples that arrived since the previous period.
+        arrays: Arrays of the site (the process that runs the arm); written.
+        buffers: Contains the samples.
     """
     rate_hz = arrays.site[0].rate_hz
     for n in range(count):
@@ -414,22 +427,21 @@ def reference_stages(
     table: TorqueTable,
     chain: RowArray | None,
 ) -> None:
-    """Computes reference, errors and estimate from the samples in use (stages 3 to 5).
+    """Computes the reference, the tracking errors and the parameter estimate of a control period.
 
-    Then the external torque of operators and environments is computed. The arguments are
-    fields of `SiteArrays`; the fused run, which computes all sites in one call, has them for
-    each site of its stack.
+    These are stages 3 to 5 of a tick. They use the newest samples (states) of the other arms
+    whose delay has passed. At last, the external torque of operators and environments is
+    computed.
 
     Args:
-        k: The tick.
-        t_ns: Nominal time of the tick, ns since the epoch, the common start of the session.
-        site: Row of the site; written.
-        links: Rows of its links.
-        ramps: Changes of the dominance factors, the weights with which the site follows its
-            peers.
-        actors: Rows of operators and environments.
-        table: Numbers of operators and environments.
-        chain: Rows of the joints of a chain, or None for the planar arm.
+        k: Number of the tick, a period of the control loop.
+        t_ns: Nominal time of the tick, ns since the start of the session.
+        site: State of the site (the process that runs the arm), shape (1,); written.
+        links: States of the links from the other sites, one row per link.
+        ramps: Planned changes of the weights with which the arm follows the other arms.
+        actors: Operators and environments, one row for each.
+        table: Numbers of all operators and environments.
+        chain: Data of the joints, one row per joint. None for the planar two-link arm.
     """
     s: SiteRow = site[0]
     # 3 reference
@@ -496,19 +508,21 @@ def act_stages(
     chain: RowArray | None,
     record: Array,
 ) -> None:
-    """Computes the part of a tick that follows the control law (stages 6 to 8).
+    """Computes the part of a control period that follows the control law.
 
-    A joint beyond its limit of speed gives the site the final mode DIVERGED here, unless the
-    site is under the rule `glide`, by which such a fault brings the arm to rest.
+    The torque is limited, the record is written, and the arm moves to the next period (stages 6
+    to 8). If a joint is faster than its limit, the site ends in the mode DIVERGED. Under the
+    rule `glide` the arm comes to rest instead, see `session_life`.
 
     Args:
-        k: The tick.
-        t_ns: Nominal time of the tick, ns since the epoch, the common start of the session.
-        site: Row of the site, with the torque of the law; written.
-        actors: Rows of operators and environments.
-        table: Numbers of operators and environments.
-        chain: Rows of the joints of a chain, or None for the planar arm.
-        record: Written: the floating-point numbers of the tick's record.
+        k: Number of the tick, a period of the control loop.
+        t_ns: Nominal time of the tick, ns since the start of the session.
+        site: State of the site (the process that runs the arm), shape (1,), with the torque of
+            the law; written.
+        actors: Operators and environments, one row for each.
+        table: Numbers of all operators and environments.
+        chain: Data of the joints, one row per joint. None for the planar two-link arm.
+        record: Receives the floating-point numbers of the record, the results of the tick.
     """
     s: SiteRow = site[0]
     _guard_torque(k, t_ns, s, chain)
@@ -543,12 +557,17 @@ def site_tick(
     sent: Array,
     record: Array,
 ) -> None:
-    """Computes one whole tick of a site, for a law that is built into the kernel.
+    """Computes one whole tick of a site, with a control law that is built in.
 
-    Tick k is at the time t_ns, ns since the epoch, the common start of the session. The other
-    arguments are the fields of `SiteArrays` and `TickBuffers`, of which the first `count` rows
-    of `arrivals` are valid. Passing the two tuples from Python
-    instead would cost more than a microsecond.
+    A site is the process that runs one arm, and a tick is one period of its control loop. The
+    arguments that are not listed here are the fields of `SiteArrays` and `TickBuffers`. They
+    are passed one by one, because passing the two tuples from Python takes a microsecond
+    longer.
+
+    Args:
+        k: Number of the tick.
+        t_ns: Nominal time of the tick, ns since the start of the session.
+        count: Number of samples in `arrivals`. The further rows of `arrivals` are ignored.
     """
     arrays = SiteArrays(
         site=site,
@@ -579,14 +598,15 @@ def site_tick(
 
 @leaf
 def resume_stages(k: int, arrays: SiteArrays) -> None:
-    """Recomputes the numbers that tick k + 1 needs and that no record contains.
+    """Completes the state of a site that was restored from its records, so that the run can continue.
 
-    The state of the site after tick k was restored from records before. The numbers follow
-    from it by stages 4 and 8 of tick k.
+    A site is the process that runs one arm. Some numbers that tick k + 1 (the next period of
+    the control loop) needs are not in the records. They are computed here from the restored
+    state: the tracking errors, the external torques, and the state of the arm at tick k + 1.
 
     Args:
         k: The last tick that was recorded.
-        arrays: Arrays of the site, with the restored state; written.
+        arrays: Arrays of the site, with the restored state; changed.
     """
     s: SiteRow = arrays.site[0]
     t_ns = tick_ns(k, s.rate_hz)
