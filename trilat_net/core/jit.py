@@ -94,7 +94,7 @@ _ships = _SHIPPED.is_dir()
 
 
 def is_core_cached() -> bool:
-    """Returns True if the simulation can start at once, because its machine code is stored on disk.
+    """Returns True if the simulation can start at once, because its code is compiled.
 
     The stored code must be of the present version of the sources. Only the code of
     `kernel.site_tick` is looked for. It is compiled last, so the other functions exist if it
@@ -338,7 +338,7 @@ class _LeafCache(FunctionCache):
             super()._save_overload(signature, result)
 
     def load_inner(self, argument_types: Any, context: Any) -> Any:
-        """Loads the LLVM code of a function from the cache, for a call by another compiled function.
+        """Loads the LLVM code of a function that another compiled function calls.
 
         Args:
             argument_types: Numba's types of the arguments.
@@ -459,7 +459,7 @@ class _Leaf(CPUDispatcher):
     _compiler: Any
 
     def get_call_template(self, arguments: Any, keywords: Any) -> Any:
-        """Returns Numba's typing information for a call of the function with the given arguments.
+        """Returns Numba's typing information for a call with given types of arguments.
 
         A constant argument is treated like any other value of its type. Otherwise Numba would
         compile the function again for each constant. Numba calls this method.
@@ -520,11 +520,10 @@ class _Leaf(CPUDispatcher):
 
 
 def bind_leaf(function: Callable[P, R], *arguments: P.args, **_: P.kwargs) -> Callable[P, R]:
-    """Compiles a function now, and returns a version that does not check the types of its arguments.
+    """Compiles a function now, into a form that does not check the types of its arguments.
 
-    The version saves the time of the check in each call. It must only be called with arguments
-    of the same types as those given here. If Numba is disabled, the function itself is
-    returned.
+    This form saves the time of the check in each call. It must only be called with arguments of
+    the same types as those given here. If Numba is disabled, the function itself is returned.
 
     Args:
         function: A function with the decorator `leaf`.
@@ -538,7 +537,7 @@ def bind_leaf(function: Callable[P, R], *arguments: P.args, **_: P.kwargs) -> Ca
 
 
 def leaf(function: Callable[P, R]) -> Callable[P, R]:
-    """Marks a function of numbers and arrays, so that Numba compiles it at its first call (decorator).
+    """Marks a numerical function to be compiled by Numba at its first call (decorator).
 
     In contrast to `numba.njit`, the compiled code is stored on disk and found again until a
     source file of this package changes, and the function must not allocate arrays. The type of

@@ -427,7 +427,7 @@ def reference_stages(
     table: TorqueTable,
     chain: RowArray | None,
 ) -> None:
-    """Computes the reference, the tracking errors and the parameter estimate of a control period.
+    """Computes reference, tracking errors and parameter estimate of a control period.
 
     These are stages 3 to 5 of a tick. They use the newest samples (states) of the other arms
     whose delay has passed. At last, the external torque of operators and environments is
@@ -560,14 +560,11 @@ def site_tick(
     """Computes one whole tick of a site, with a control law that is built in.
 
     A site is the process that runs one arm, and a tick is one period of its control loop. The
-    arguments that are not listed here are the fields of `SiteArrays` and `TickBuffers`. They
-    are passed one by one, because passing the two tuples from Python takes a microsecond
-    longer.
+    number of the tick is k, and its nominal time t_ns is in ns since the start of the session.
+    Only the first `count` rows of `arrivals` are read; they are the samples that arrived.
 
-    Args:
-        k: Number of the tick.
-        t_ns: Nominal time of the tick, ns since the start of the session.
-        count: Number of samples in `arrivals`. The further rows of `arrivals` are ignored.
+    All other arguments are the fields of `SiteArrays` and `TickBuffers`. They are passed one by
+    one, because passing the two tuples from Python takes a microsecond longer.
     """
     arrays = SiteArrays(
         site=site,
@@ -598,7 +595,7 @@ def site_tick(
 
 @leaf
 def resume_stages(k: int, arrays: SiteArrays) -> None:
-    """Completes the state of a site that was restored from its records, so that the run can continue.
+    """Completes the state of a site that was restored from records, to continue the run.
 
     A site is the process that runs one arm. Some numbers that tick k + 1 (the next period of
     the control loop) needs are not in the records. They are computed here from the restored
