@@ -1,17 +1,20 @@
-"""Implements the paper's adaptive law, which learns the arm's parameters: Eq. (13) and (15).
+"""Implements the adaptive control law, which learns the parameters of the arm's dynamics.
 
-The law needs no known model of the arm. While it controls the arm, it estimates the dynamic
-parameters theta, which are combinations of masses, lengths and inertias. Its symbols are
+The law is that of Eq. (13) and (15) of the paper on which this project is based, "Adaptive
+Control of Dual User Teleoperation with Time Delay and Dynamic Uncertainty". It needs no model
+of the arm. While it controls the arm, it estimates the dynamic parameters theta, which are
+combinations of masses, lengths and inertias:
 
-    q, qd    positions and velocities of the joints
-    e        synchronisation error: q less the reference, the weighted position of the peers
-    Lambda   gain: rate at which the error decays
-    r        filtered error, qd + Lambda e
-    Y        regressor: the matrix for which Y theta is the torque of the arm's dynamics
+    torque = Y theta_hat - Kp r - Kd ed
+    rate of theta_hat = -Gamma Y' r
 
-The simulation kernel, the compiled code of a tick, computes this law
-(`core.control.adaptive_torque` and `update_estimate`). `Adaptive.compute_torque` and
-`Adaptive.advance_estimate` state the same law in plain Python, and
+where q and qd are positions and velocities of the joints, e is the position minus its reference
+(the weighted mean position of the other arms), ed its derivative, r = qd + Lambda e the
+filtered error, theta_hat the estimate, and Y the matrix for which Y theta is the torque of the
+arm's dynamics. Lambda, Kp, Kd and Gamma are gains; a prime denotes the transpose.
+
+The compiled control loop computes this law (`core.control.adaptive_torque` and
+`update_estimate`). `Adaptive` states the same law in plain Python, and
 `tests/control_laws/test_plain_torques.py` checks that both give the same numbers.
 """
 
@@ -104,10 +107,11 @@ class Adaptive(ControlLaw):
         return theta_hat - gain_s * np.array(self.Gamma) * Yr
 
     def gains(self, theta: Array) -> Gains:  # noqa: ARG002 - as the other laws
-        """Returns the gains with which the kernel computes the law.
+        """Converts the gains of this law to the record that the compiled control loop reads.
 
         Args:
-            theta: Parameters of the arm, which this law does not use.
+            theta: True parameters of the arm. This law does not use them, because it learns
+                them.
         """
         return Gains(
             law=Law.ADAPTIVE,
@@ -119,9 +123,12 @@ class Adaptive(ControlLaw):
         )
 
     def exchanges_positions(self) -> bool:
-        """Returns True if the law does not learn (Gamma = 0): it is a spring between poses.
+        """Returns True if the adaptation gain Gamma is zero, so that the law learns nothing.
 
-        Such a law needs reversible dominance factors, see `LawSettings.exchanges_positions`.
+        Without learning, the law acts like springs and dampers between the positions of the
+        arms. Stability conditions of laws of this kind need reversible dominance factors. The
+        dominance factor alpha_ij is the weight with which site i follows site j. The factors
+        are reversible if positive weights D_i exist with D_i alpha_ij = D_j alpha_ji.
         """
         return not any(self.Gamma)
 

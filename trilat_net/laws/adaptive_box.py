@@ -24,17 +24,19 @@ from .interface import TuningSite
 
 
 class AdaptiveBox(Adaptive):
-    """The paper's law with each estimate kept within its bounds.
+    """Adaptive law that keeps the estimate of each parameter of the arm between two bounds.
 
-    If the box contains the true parameters, also on its edge, V' <= 0 still holds, where V is
-    the energy function of the stability proof. An estimate that learns gravity acts like a
-    spring that ties the arms to a pose; if the true parameters lie strictly inside the box, the
-    box removes this effect.
+    The law is `Adaptive` with a projection of the estimates. If the true parameters lie within
+    the bounds, or on them, the projection preserves the stability proof: the energy function V
+    of the proof still never increases (V' <= 0).
+
+    Without bounds, an estimate that learns gravity acts like a spring that pulls the arms back
+    to a pose. If the true parameters lie strictly between the bounds, this effect disappears.
 
     Source: Ioannou and Sun, "Robust Adaptive Control" (1996), 4.4, for the projection.
 
     Attributes:
-        Lambda, Kp, Kd, Gamma, theta_hat0: As of `Adaptive`.
+        Lambda, Kp, Kd, Gamma, theta_hat0: Gains and first estimate, as in `Adaptive`.
         theta_low: Lower bound of each estimate.
         theta_high: Upper bound of each estimate.
     """
@@ -61,10 +63,11 @@ class AdaptiveBox(Adaptive):
         return np.minimum(above_low, self.theta_high)
 
     def gains(self, theta: Array) -> Gains:
-        """Returns the gains with which the kernel computes the law, the bounds included.
+        """Converts gains and bounds to the record that the compiled control loop reads.
 
         Args:
-            theta: Parameters of the arm, which this law does not use.
+            theta: True parameters of the arm. This law does not use them, because it learns
+                them.
         """
         gains = Adaptive.gains(self, theta)
         return gains._replace(low=self.theta_low, high=self.theta_high)
@@ -93,11 +96,15 @@ class AdaptiveBox(Adaptive):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the [control] table of a site: the gains, the first estimate and its box.
+        """Returns the settings of this law for one site, after its gains were tuned.
+
+        The settings form the table [control] of a scenario, the description of an experiment.
+        They contain the tuned gains, the estimate of the arm's parameters with which the law
+        starts, and the bounds within which the estimate must stay.
 
         Args:
-            gains: The tuned gains by name.
-            site: The site whose table is written.
+            gains: Tuned gains by name.
+            site: Facts about the site for which the table is written.
         """
         control = Adaptive.write_control(gains, site)
         low, high = site.box

@@ -1,34 +1,35 @@
-"""Implements the paper's law for end-effector positions, with unknown masses and link lengths.
+"""Controls end-effector positions of planar arms with unknown masses and link lengths.
 
-The position x of the end effector and its velocity are measured. The Jacobian J is computed
-from estimated link lengths l_hat, J_hat = J + J~. With the dominance factors alpha_ij, the
-weights with which site i follows its peers j, and the delay T, let
+The law learns the dynamic parameters theta of an arm and the two lengths l of its links. It
+measures the position x and the velocity xd of the end effector.
 
-    e = x - sum_j alpha_ij x_j(t - T),    v = -J_hat^-1 Lambda e,    a = v',    r = qd - v
+Equations:
 
-where e is the error, v the reference velocity of the joints, a its derivative and r the
-filtered error. With the regressor Y, for which Y theta is the torque of the arm's dynamics, the
-law and its estimates are
+    e   = x - sum_j alpha_ij x_j(t - T)     ed: derivative of e
+    v   = -inv(J_hat) Lambda e              a: derivative of v
+    r   = qd - v
+    tau = Y theta_hat - Kp r - J_hat^T Kd ed
+    rate of theta_hat = -Gamma Y^T r
+    rate of l_hat     = Gamma_l Y_k^T Kd ed
 
-    tau        = Y(q, qd, v, a) theta_hat - Kp r - J_hat' Kd ed
-    theta_hat' = -Gamma Y' r
-    l_hat'     = Gamma_l Y_k' Kd ed,    where Y_k l_hat = J_hat qd
+Symbols:
+    - x_j: position of peer j (another arm); alpha_ij: weight with which this arm follows it; T:
+      delay of the connection.
+    - q, qd: joint angles and velocities; tau: joint torques.
+    - e: position error; v: reference velocity of the joints; r: filtered error.
+    - theta_hat, l_hat: estimates of theta and l; J_hat: Jacobian computed from l_hat.
+    - Y: matrix with Y theta = torque of the arm's dynamics for qd, v and a.
+    - Y_k: matrix with Y_k l_hat = J_hat qd.
+    - Lambda, Kp, Kd, Gamma, Gamma_l: gains.
 
-Here tau is the torque of the joints, theta_hat the estimate of the dynamic parameters theta
-(such as masses), ed the derivative of e, and Y_k the matrix of the kinematics. Lambda, Kp, Kd,
-Gamma and Gamma_l are gains. A prime at a matrix means its transpose, and at a vector its
-derivative.
-
-Stability: J_hat r = x' + Y_k (l_hat - l) + Lambda e. The wrong lengths add a term to
--r' J_hat' Kd ed. The derivative of 1/2 (l_hat - l)' Gamma_l^-1 (l_hat - l) cancels this term,
-so the derivative of V, the energy function of the stability proof, is the same as with known
-lengths (docs/laws.md). The adaptive Jacobian is due to C. C.
-Cheah, C. Liu and J.-J. E. Slotine, Int. J. Robotics Research 25 (2006).
+The stability proof is that of the law `adaptive`: the adaptation of l_hat cancels the term that
+wrong lengths add (docs/laws.md). Source of the adaptive Jacobian: Cheah, Liu and Slotine, Int.
+J. Robotics Research 25 (2006).
 
 Invariant:
-    - Both estimates advance by the trapezoid rule, like the estimate of the adaptive law.
-    - The estimated lengths stay in their box, an interval per length. The projection into the
-      box can only lower the additional term of V further.
+    - Both estimates are integrated by the trapezoid rule, like the estimate of `adaptive`.
+    - The estimated lengths stay between their bounds. The limitation to the bounds does not
+      impair the stability proof.
 """
 
 from collections.abc import Mapping
@@ -178,10 +179,13 @@ class AdaptiveKinematics(ControlLaw):
     known_facts: ClassVar = "gravity, as its first estimate, and no length"
 
     def begin(self, facts: LawContext) -> None:
-        """Creates the memory of the law for a site: its two estimates and their rates.
+        """Prepares the law of a site before a run: creates its estimates and their last rates.
 
-        The estimates of the lengths and of theta, the parameters of the arm's dynamics, start
-        at the first estimates of the settings.
+        The law estimates the lengths of the two links and the dynamic parameters of the arm.
+        Both estimates start at the values that the settings state.
+
+        Args:
+            facts: Facts about the site that are known before the run.
         """
         self.theta_hat = list(self.theta_hat0)
         self.lengths_m = list(self.lengths0_m)
@@ -192,14 +196,23 @@ class AdaptiveKinematics(ControlLaw):
         self.g_m_s2 = facts.g_m_s2
 
     def torque(self, now: LawInput) -> None:
-        """Computes torque and estimates in one tick, and sends the end effector's motion.
+        """Computes the joint torques of one control period, and updates the estimates.
 
-        The steps are: measure the end effector; compute the error e and its derivative; advance
-        the estimate of the lengths; compute v, a and r; compute the torque and advance
-        theta_hat. All symbols are defined at the top of this module.
+        The law estimates the lengths of the links and the dynamic parameters of the arm. The
+        steps are:
+
+        1. Measure the position and velocity of the end effector, and send them to the other
+           sites.
+        2. Compute the error from the weighted mean position of the other end effectors.
+        3. Update the estimate of the link lengths.
+        4. Compute the reference velocity of the joints and the filtered error.
+        5. Compute the torque, and update the estimate of the dynamic parameters.
+
+        The module docstring gives the equations.
 
         Args:
-            now: Inputs and outputs of the law in this tick.
+            now: Inputs and outputs of the law in this period. The torque is written into
+                `now.tau`.
         """
         q = (now.q[0], now.q[1])
         qd = (now.qd[0], now.qd[1])
@@ -274,14 +287,18 @@ class AdaptiveKinematics(ControlLaw):
             now.tau[1] += second[p] * estimate
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns the stability condition of this law at a site of a scenario.
+        """Evaluates whether this control law is known to be stable in a scenario.
 
-        The delays must be constant, the elbows must stay bent, and the true lengths must lie
-        within the law's bounds. The condition stays undecided, because only the run shows
-        whether the elbows stay bent.
+        The stability proof requires that all delays are constant, that the elbow of each arm
+        stays bent, and that the true lengths of the links lie between the bounds `least_m` and
+        `most_m`.
 
         Args:
-            situation: The site, its peers and the delays between them.
+            situation: The site, its peers (the other sites) and the delays between them.
+
+        Returns:
+            The condition as a text. It is never decided (`holds` is None), because only a run
+            shows whether the elbows stay bent.
         """
         if np.isnan(situation.longest_s):
             return StabilityCondition(
@@ -296,12 +313,14 @@ class AdaptiveKinematics(ControlLaw):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the [control] table of a site: tuned gains and the first estimate.
+        """Returns the settings of this law for one site, after its gains were tuned.
 
-        The lengths are learnt, starting from the law's default.
+        The settings form the table [control] of a scenario, the description of an experiment.
+        They contain the tuned gains and the first estimate of the arm's dynamic parameters. The
+        first estimate of the link lengths keeps its default value.
 
         Args:
-            gains: The tuned gains by name.
-            site: The site whose table is written.
+            gains: Tuned gains by name.
+            site: Facts about the site for which the table is written.
         """
         return {**gains, "theta_hat0": site.estimate}

@@ -54,20 +54,24 @@ class AdaptiveRobust(AdaptiveBox):
         ed: Array,
         joint_friction: Array | float = 0.0,
     ) -> Array:
-        """Returns the torque of each joint before the torque limits, N m.
+        """Computes the torque of each joint before the torque limits, N m.
 
             tau = Y theta_hat - Kp r - Kd ed - (1 - friction) f(v) - rho r / sqrt(r^2 + width^2)
 
-        The last term is the robust term, which opposes disturbances up to rho.
+        Kp and Kd are damping gains in N m s/rad, and `friction` is the fraction of the friction
+        f(v) that the law compensates. The last term is the robust term. It opposes disturbances
+        of at most rho (N m) and is smooth for errors below `width` (rad/s).
 
         Args:
-            Y: Regressor of Eq. (12), shape (n, P). Multiplied by parameters, it gives a torque.
+            Y: Regressor of the arm's dynamics, shape (n, P), for n joints and P parameters.
+                Multiplied by the parameters, it gives a torque.
             theta_hat: Estimate of the parameters, shape (P,).
-            r: Filtered error qd + Lambda e, Eq. (10), shape (n,), rad/s.
-            ed: Derivative of the error, shape (n,), rad/s.
-            joint_friction: f(v), friction of a chain's joints at the reference velocity, shape
-                (n,), N m. Y theta_hat of a chain contains f(v) in full. The planar arm has no
-                friction.
+            r: Filtered error qd + Lambda e, shape (n,), rad/s. Here qd is the joint velocity, e
+                the position error and Lambda a gain in 1/s.
+            ed: Derivative of the position error, shape (n,), rad/s.
+            joint_friction: Friction torque f(v) at the reference velocity v, shape (n,), N m.
+                For an arm from a URDF file, Y theta_hat contains it in full. The planar arm has
+                no friction.
         """
         rho = np.array(self.rho_nm)
         width = np.array(self.width_rad_s)
@@ -78,23 +82,31 @@ class AdaptiveRobust(AdaptiveBox):
         return torque
 
     def gains(self, theta: Array) -> Gains:
-        """Returns the gains with which the kernel computes the law, the robust term included.
+        """Converts the gains of this law to the record that the compiled control loop reads.
+
+        The record contains the gains and bounds of `AdaptiveBox`, and the settings of the
+        robust term and of the friction.
 
         Args:
-            theta: Parameters of the arm, which this law does not use.
+            theta: True parameters of the arm. This law does not use them, because it learns
+                them.
         """
         box = AdaptiveBox.gains(self, theta)
         return box._replace(rho=self.rho_nm, width=self.width_rad_s, friction=(self.friction,))
 
     def condition(self, situation: LawSituation) -> StabilityCondition:
-        """Returns the stability condition of this law at a site of a scenario.
+        """Evaluates which bound of the errors is proved for this law in a scenario.
 
-        The condition states a bound on this site's part of the mean power, in W, that the
-        energy function of the stability proof dissipates. It is weaker than convergence of the
-        errors.
+        The proof uses an energy function of all sites. The bound is a power in W: the part of
+        the energy that this site dissipates per time does not exceed it on average. This is a
+        weaker statement than convergence of the errors to zero.
 
         Args:
-            situation: The site, its peers and the delays between them.
+            situation: The site, its peers (the other sites) and the delays between them.
+
+        Returns:
+            The bound as a text. It holds if all delays are constant, and is undecided
+            otherwise.
         """
         pairs = zip(self.rho_nm, self.width_rad_s, strict=True)
         joint_bounds = [rho * width for rho, width in pairs]
@@ -110,10 +122,16 @@ class AdaptiveRobust(AdaptiveBox):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the [control] table of a site for tuned gains.
+        """Returns the settings of this law for one site, after its gains were tuned.
 
-        Near r = 0 the robust term acts like a damping of rho / width. The width is chosen so
-        that this damping is a tenth of Kp.
+        The settings form the table [control] of a scenario, the description of an experiment.
+        The robust term -rho r / sqrt(r^2 + width^2) of this law acts like a damping rho / width
+        while the filtered error r is small, where rho (N m) is the largest disturbance. This
+        function chooses the width (rad/s) so that this damping is a tenth of the gain Kp.
+
+        Args:
+            gains: Tuned gains by name, with rho as `rho_nm`.
+            site: Facts about the site for which the table is written.
         """
         width_rad_s = 10.0 * gains["rho_nm"] / gains["Kp"]
         return {**AdaptiveBox.write_control(gains, site), "width_rad_s": width_rad_s}

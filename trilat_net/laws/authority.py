@@ -34,7 +34,10 @@ from .interface import DAMPING, STIFFNESS, ControlLaw, TuningSite
 
 @compiled
 class Authority(ControlLaw):
-    """Two users share the authority over a slave and feel each other, not the environment.
+    """Lets two users at master arms share the authority over one slave arm.
+
+    Each user feels the motion of the other user, but not the force of the environment on the
+    slave. A spring couples each arm to the arms of the users, and a damper brakes it.
 
     Source: Nudehi, Mukherjee and Ghodoussi, "A shared-control approach to haptic interface
     design for minimally invasive telesurgical training", IEEE T-CST, 2005.
@@ -42,8 +45,8 @@ class Authority(ControlLaw):
     Attributes:
         K: Stiffness per joint, N m/rad.
         d: Damping of the arm's velocity, per joint, N m s/rad.
-        leads: True for a user, false for the slave.
-        gravity: Factor of the true gravity that the law compensates; 1 is exact.
+        leads: True if the other arms follow this arm. This is so for a user, not for the slave.
+        gravity: Ratio of the compensated gravity torque to the true gravity torque. 1 is exact.
     """
 
     K: PositiveJoints = (10.0,)
@@ -56,13 +59,15 @@ class Authority(ControlLaw):
     needs_theta: ClassVar = True
 
     def torque(self, now: LawInput) -> None:
-        """Computes the torque of one tick, and tells the peers whether this site leads.
+        """Computes the torque of the arm in one period of the control loop.
 
-        The springs pull the arm only towards the sites that lead. The torque is written into
-        `now.tau`.
+        Springs pull the arm towards the arms of the users. Each site, the process that runs one
+        arm, sends the flag `leads`, which is 1 for a user and 0 for the slave. A spring acts
+        only towards sites whose flag is 1.
 
         Args:
-            now: Inputs and outputs of the law in this tick.
+            now: Inputs and outputs of the law in this period. The torque is written into
+                `now.tau`.
         """
         now.to_all.leads[0] = 1.0 if self.leads else 0.0
         for i in range(now.joints):
@@ -77,22 +82,26 @@ class Authority(ControlLaw):
             now.tau[i] = tau
 
     def linear_gains(self, theta: Array) -> Gains | None:
-        """Returns gains of the kernel's law of known gravity that describe the damping alone.
+        """Returns the damping of this law for the linear analysis.
 
-        The kernel's law is the built-in law tau = G(q) - K e - d qd - Kd ed + k_f felt. The
-        springs of this law are described by `linear_form`.
+        The gains are those of the built-in law tau = G - d qd, where G is the gravity torque, d
+        the damping in N m s/rad and qd the joint velocity. `linear_form` adds the springs.
 
         Args:
-            theta: Parameters of the arm, shape (P,).
+            theta: Parameters of the arm's dynamics, such as masses, shape (P,), where P is
+                their number.
         """
         known = (theta * self.gravity).tolist()
         return Gains(Law.KNOWN, d=self.d, known=known)
 
     def linear_form(self, situation: LinearSituation) -> LinearForm | None:
-        """Returns the springs towards the users for small motions, for the linear analysis.
+        """Returns the springs of this law as blocks of the linear analysis.
+
+        The linear analysis considers small motions around a pose at rest. Each spring pulls the
+        arm of this site towards the arm of a user, so the torque depends on both positions.
 
         Args:
-            situation: The site, its peers and their laws.
+            situation: The site, its peers (the other sites) and their laws.
         """
         form = LinearForm(len(situation.inertia))
         for j in situation.peers:
@@ -105,16 +114,18 @@ class Authority(ControlLaw):
         return form
 
     def explain_idle_shares(self, situation: LawSituation) -> str:
-        """Explains to the user which dominance factors of a site have no effect.
+        """Explains to the user which dominance factors of a user's arm have no effect.
 
-        A user does not feel the sites that do not lead, whatever dominance factor (the weight
-        with which the site follows a peer) the scenario gives them.
+        A dominance factor is the weight with which an arm follows another arm. With this law,
+        the arms of the users follow only each other. The weight that a scenario gives to the
+        slave is not used.
 
         Args:
             situation: The site, and the laws of all sites.
 
         Returns:
-            A sentence. Empty for the slave, and if all sites lead.
+            A sentence for the user. Empty if the site is the slave, whose factors all have an
+            effect, or if no site is a slave.
         """
         idle = []
         for name, law in zip(situation.names, situation.laws, strict=True):
@@ -125,14 +136,14 @@ class Authority(ControlLaw):
         return f"users feel only sites that lead, not {', '.join(idle)}"
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns the stability condition of this law at a site of a scenario.
+        """Evaluates for which gains and delays this law is stable at one site of a scenario.
 
-        For a user it is the condition of P+d, a spring with damping, among the users. The slave
-        follows the users but influences nobody. It closes no loop, so that it is stable for
-        every delay.
+        For the arm of a user, the loop is a spring with a damper between the two users, whose
+        known condition is used. The slave follows the users, but nobody follows the slave. It
+        closes no loop and is stable for every delay.
 
         Args:
-            situation: The site, its peers and the delays between them.
+            situation: The site, its peers (the other sites) and the delays between them.
         """
         users = [n for n, law in enumerate(situation.laws) if getattr(law, "leads", False)]
         if situation.site not in users:
@@ -142,10 +153,15 @@ class Authority(ControlLaw):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the [control] table of a site for tuned gains; master sites lead.
+        """Returns the settings of this law for one site, after its gains were tuned.
+
+        The settings form the table [control] of a scenario, the description of an experiment. A
+        site is the process that runs one arm. At the masters, which are the arms of the two
+        users, `leads` is set to true, so that the other arms follow them. At the slave it is
+        false.
 
         Args:
-            gains: The tuned gains by name.
-            site: The site whose table is written.
+            gains: Tuned gains by name.
+            site: Facts about the site for which the table is written.
         """
         return {**gains, "leads": site.role == "master", "gravity": site.gravity}

@@ -1,17 +1,18 @@
-"""Defines what a control law states about itself: its stability condition and its linear form.
+"""Defines how a control law states its stability condition and its linear form.
 
-The stability condition of a law tells the user for which gains and delays the law is stable.
-The commands `trilat scenario check` and `trilat linear` print it. The linear form of a law
-describes the law for small motions around a pose at rest. The linear analysis combines the
-linear forms of all sites (the processes that run one arm each) to one linear system with
-delays.
+The stability condition tells the user for which gains and delays the law is stable. The
+commands `trilat scenario check` and `trilat linear` print it.
+
+The linear form describes the law for small motions around a pose at rest. The linear analysis
+combines the linear forms of all sites (the processes that run one arm each) into one linear
+system with delays. A linear form is a matrix of blocks. Each block says how one quantity, for
+example the torque, depends on another, for example the position.
 
 Invariant:
-    - A law states both once, as methods of its `Settings`, the record of its gains.
+    - Each law defines both as methods of its `Settings`, the record of its gains.
     - The text of a condition says whether the condition is only sufficient, and who proved it.
-    - A linear form consists of blocks of a matrix. It is needed for laws that have states or
-      send more than the motion of the arm. The spring and dampers that a law has in common with
-      the simple laws of known gravity (`linear_gains`) are not among these blocks.
+    - A spring and dampers of the usual form are not blocks: the method `linear_gains` returns
+      their gains. Blocks describe the remaining terms, for example internal states of a law.
 """
 
 from collections.abc import Sequence
@@ -68,12 +69,13 @@ class LawSituation(NamedTuple):
         return float(np.max(self.delay_s[self.alpha > 0.0], initial=0.0))
 
     def restrict(self, sites: Sequence[int]) -> "LawSituation":
-        """Returns the situation of the same site as if only some of the sites existed.
+        """Returns the facts about the session as if only some of the sites took part.
 
-        A law that follows only some of its peers evaluates its condition for these alone.
+        A law that follows only some of the other sites evaluates its stability condition for
+        these sites alone.
 
         Args:
-            sites: Indices of the sites that remain, including this site.
+            sites: Indices of the sites that remain. The site of these facts must be among them.
         """
         part = np.ix_(sites, sites)
         return self._replace(

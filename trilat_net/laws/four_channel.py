@@ -1,17 +1,18 @@
-"""Implements the four-channel law, which exchanges positions and forces in both directions.
+"""Implements the four-channel law: positions and forces go in both directions.
 
-Each arm is pulled towards the positions of its peers, and also gets the external torques that
-act on their arms. The quantities q_des, qd_des, qdd_des and felt are the peers' position,
-velocity, acceleration and external torque. They are weighted by the dominance factors, the
-weights with which a site follows its peers. The torque by which an operator or environment acts
-ON the site's own arm is tau_h.
+Each arm is pulled towards the positions of the other arms, its peers. It also receives the
+torques that operators and environments exert on the peers' arms. Both are averaged with the
+dominance factors, the weights with which an arm follows its peers. The averages are q_des
+(position), qd_des (velocity), qdd_des (acceleration) and `felt` (torque). The torque that an
+operator or environment exerts on the arm itself is tau_h.
 
-Lawrence, who introduced the law for two sites, calls its force gains C2 and C6 at the master,
-and C3 and C5 at the slave. A gain of zero removes a channel.
+Four gains weight the torques: `force_peer` and `force_own`, each at the master and at the
+slave. A gain of zero removes a channel. Lawrence, who introduced the law for two sites, uses
+the symbols C2 and C6 for them at the master, and C3 and C5 at the slave.
 
 Invariant:
-    - The acceleration that a site sends is computed, not measured: it follows from the model of
-      the arm and the torques of the tick.
+    - The acceleration that a site sends is computed, not measured. It follows from the model of
+      the arm and the torques of the current period of the control loop.
 """
 
 from typing import Any, ClassVar
@@ -112,9 +113,13 @@ class FourChannel(ControlLaw):
     needs_theta: ClassVar = True
 
     def begin(self, facts: LawContext) -> None:
-        """Creates the work space with which the law solves the arm's equation of motion.
+        """Prepares the law before a run: stores the torque limits and creates a work space.
 
-        The law needs it, and the torque limits, to predict the acceleration that it sends.
+        If the law sends the acceleration of its arm, it computes the acceleration from the
+        equation of motion. This computation needs the limits and the work space.
+
+        Args:
+            facts: Facts about the site that are known before the run.
         """
         self.needs_model = self.acceleration > 0.0
         self.limit = (np.zeros(facts.joints) + facts.tau_limit_nm).tolist()
@@ -122,12 +127,19 @@ class FourChannel(ControlLaw):
         self.rows = [0.0] * (facts.joints * (facts.joints + 1))
 
     def torque(self, now: LawInput) -> None:
-        """Computes the torque of one tick, and sends the acceleration that it causes.
+        """Computes the torque of the arm in one period of the control loop.
 
-        The equation is that of the class. Nothing is sent if the factor `acceleration` is zero.
+            tau = G + K (q_des - q) + B (qd_des - qd) + acceleration M qdd_des
+                  + force_peer felt + force_own tau_h
+
+        `FourChannel` explains the gains, and the module docstring explains the other symbols. G
+        is the gravity torque and M the inertia matrix. If the gain `acceleration` is not zero,
+        the method also sends the acceleration that the torque causes to the peers (the other
+        arms).
 
         Args:
-            now: Inputs and outputs of the law in this tick.
+            now: Inputs and outputs of the law in this period. The torque is written into
+                `now.tau`.
         """
         n = now.joints
         for i in range(n):
@@ -152,12 +164,16 @@ class FourChannel(ControlLaw):
             send_acceleration(self, now)
 
     def linear_gains(self, theta: Array) -> Gains | None:
-        """Returns the kernel's law of known gravity without the terms in qdd_des and tau_h.
+        """Returns the gains of spring, damper and felt torque for the linear analysis.
 
-        These terms are described by `linear_form`.
+        The gains are those of the built-in law tau = G - K e - Kd ed + k_f felt. Here G is the
+        gravity torque, e the position error, ed its derivative and `felt` the torque on the
+        arms of the peers. K, Kd and k_f are the gains `K`, `B` and `force_peer` of this law.
+        `linear_form` adds the remaining terms.
 
         Args:
-            theta: Parameters of the arm, shape (P,).
+            theta: Parameters of the arm's dynamics, such as masses, shape (P,), where P is
+                their number.
         """
         known = (theta * self.gravity).tolist()
         return Gains(
@@ -170,16 +186,16 @@ class FourChannel(ControlLaw):
         )
 
     def linear_form(self, situation: LinearSituation) -> LinearForm | None:
-        """Returns the terms in qdd_des and tau_h for small motions, for the linear analysis.
+        """Returns two terms for the linear analysis that `linear_gains` cannot express.
 
-        These are the acceleration of the peers and the torque on the arm itself, which
-        `linear_gains` does not describe.
+        The terms are the acceleration of the peers (the other arms), which is fed forward, and
+        the torque that the operator or environment exerts on the arm itself.
 
         Args:
-            situation: The site and its arm.
+            situation: The site, its arm, and the weights with which it follows its peers.
 
         Returns:
-            The linear form. None if both gains are zero.
+            Both terms. None if the gains `acceleration` and `force_own` are zero.
         """
         if not self.acceleration and not any(self.force_own):
             return None
@@ -192,10 +208,12 @@ class FourChannel(ControlLaw):
         return form
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:  # noqa: ARG002
-        """Returns the stability condition of this law, as far as it is known without the arms.
+        """Evaluates the stability of this law as far as the gains alone decide it.
 
-        With acceleration = 1 the condition is not met. In all other cases it is undecided here:
-        Llewellyn's condition, which the command `trilat ports` evaluates, decides them.
+        If the feedforward gain `acceleration` is 1, high frequencies are undamped, and the
+        condition is not met. In all other cases it is undecided (`holds` is None), because it
+        depends on the arms. The command `trilat ports` then evaluates Llewellyn's criterion for
+        absolute stability.
         """
         if self.acceleration >= 1.0:
             return StabilityCondition(False, _NEUTRAL)

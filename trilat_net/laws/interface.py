@@ -47,15 +47,19 @@ INERTIA = (0.1, 10.0, "kg m^2")
 
 
 class TuningSite(NamedTuple):
-    """Facts about a site that a law receives when its gains are tuned for that site.
+    """Facts about a site, the process that runs one arm, for which gains are tuned.
+
+    The method `write_control` of a law receives them.
 
     Attributes:
-        role: "master" or "slave".
-        gravity: Factor of the true gravity that the law compensates; 1 is exact.
-        estimate: First estimate of the arm's parameters theta, shape (P,). It contains this
-            factor of gravity and no inertia.
+        role: "master" for an arm that an operator moves, "slave" for an arm that follows.
+        gravity: Ratio of the gravity torque that the law compensates to the true gravity
+            torque. 1 is exact.
+        estimate: First estimate of the arm's dynamic parameters theta, shape (P,), where P is
+            their number. Its gravity terms are the true ones times `gravity`, and its inertia
+            terms are zero.
         box: Lower and upper bounds around the estimate, shape (P,) each.
-        longest_ms: Half of the longest mean round trip, ms.
+        longest_ms: Half of the longest mean round trip between two sites, ms.
     """
 
     role: str
@@ -66,10 +70,11 @@ class TuningSite(NamedTuple):
 
 
 class LawSettings(Frozen, frozen=True):
-    """Gains of a law as a scenario stores them, and the properties that follow from the gains.
+    """Gains of a control law as a scenario stores them, and properties that follow from them.
 
-    Each law has a subclass, which is derived from the class of the law. A law may override each
-    of these methods.
+    A scenario is the description of an experiment. Every law has a subclass with its own gains,
+    which is derived automatically from the class of the law. Methods that the class of the law
+    defines replace the methods here.
     """
 
     kind: ClassVar[Any] = None
@@ -87,18 +92,19 @@ class LawSettings(Frozen, frozen=True):
 
     @property
     def plugged(self) -> bool:
-        """True if the class of the law computes the torque, false if the kernel computes it.
+        """True if the class of the law computes the torque.
 
-        The kernel is the compiled code of a tick. It contains some of the laws.
+        Otherwise the simulation kernel, the compiled code of the control loop, contains the
+        law.
         """
         return hasattr(self.kind, "torque")
 
     @property
     def books_energy(self) -> bool:
-        """True if the law balances energy between the sites.
+        """True if the law balances the energies that the sites exchange.
 
-        Then all sites must have this law, because each end accounts for what the other end
-        sends.
+        Then all sites must use this law: each site adds up the energy that it sends, and the
+        receiving site subtracts what it uses.
         """
         return self.plugged and issubclass(self.kind, EnergyLaw)
 
@@ -119,10 +125,10 @@ class LawSettings(Frozen, frozen=True):
         """
 
     def find_problem(self, rates_hz: Mapping[str, int]) -> KeyProblem | None:  # noqa: ARG002
-        """Returns the setting of the law that does not suit the tick rates of the sites.
+        """Finds a setting of the law that does not suit the tick rates of the sites.
 
         Args:
-            rates_hz: Tick rate of each site, by name.
+            rates_hz: Rate of the control loop of each site, in Hz, by name of the site.
 
         Returns:
             The key of the setting and the problem. None if all settings are suitable.
@@ -130,21 +136,30 @@ class LawSettings(Frozen, frozen=True):
         return None
 
     def gains(self, theta: Array) -> Gains:  # noqa: ARG002 - as the laws of the kernel
-        """Returns the gains with which the simulation kernel computes the law.
+        """Converts the gains of the law to the record that the simulation kernel reads.
+
+        The simulation kernel is the compiled code of the control loop. The default record
+        (`Law.USER`) tells the kernel that the class of the law computes the torque.
 
         Args:
-            theta: Parameters of the arm's dynamics, shape (P,).
+            theta: Parameters of the arm's dynamics, such as masses and inertias, shape (P,),
+                where P is their number.
+
+        Returns:
+            The record, which names the formula of the torque and contains its gains.
         """
         return Gains(Law.USER)
 
     def linear_gains(self, theta: Array) -> Gains | None:
-        """Returns the gains of a law of the kernel that has the same small motions as this law.
+        """Returns the gains of a built-in law that has the same linear part as this law.
 
-        The linear analysis uses them. If `linear_form` returns blocks, they are added to these
-        small motions.
+        For the linear analysis, which considers small motions around a pose at rest, the
+        built-in law takes the place of this law. Terms that it does not have are added by
+        `linear_form`.
 
         Args:
-            theta: Parameters of the arm's dynamics, shape (P,).
+            theta: Parameters of the arm's dynamics, such as masses and inertias, shape (P,),
+                where P is their number.
 
         Returns:
             The gains. None if the law cannot be linearised.
@@ -154,13 +169,17 @@ class LawSettings(Frozen, frozen=True):
         return self.gains(theta)
 
     def linear_form(self, situation: LinearSituation) -> LinearForm | None:  # noqa: ARG002
-        """Returns the part of the law's small motions that `linear_gains` does not describe.
+        """Returns the terms of the linearised law that `linear_gains` cannot express.
+
+        The linear analysis describes the law for small motions around a pose at rest. It adds
+        these terms, which are blocks of a matrix, to the spring and the dampers from
+        `linear_gains`.
 
         Args:
-            situation: The site and its arm.
+            situation: The site, its arm, and the weights with which it follows the other sites.
 
         Returns:
-            The linear form. None if `linear_gains` describes the law completely.
+            The terms. None if `linear_gains` describes the law completely.
         """
         return None
 
@@ -172,37 +191,42 @@ class LawSettings(Frozen, frozen=True):
         return ""
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:  # noqa: ARG002
-        """Returns the stability condition of the law at a site, evaluated for a scenario.
+        """Evaluates under which gains and delays this control law is stable in a scenario.
 
         Args:
-            situation: The site, its peers and the delays between them.
+            situation: The site, its peers (the other sites), their laws and the delays between
+                them.
 
         Returns:
-            The condition. None if no condition is known for the law.
+            The condition, and whether the scenario satisfies it. None if no condition is known
+            for this law.
         """
         return None
 
     def exchanges_positions(self) -> bool:
-        """Returns True if the law is a spring between poses, with exactly known gravity.
+        """Returns True if the law acts like passive springs between the positions of the arms.
 
-        Such a law needs reversible dominance factors: positive weights D_i must exist with
-        D_i alpha_ij = D_j alpha_ji.
+        This requires that the law compensates gravity exactly. Stability conditions of laws of
+        this kind need reversible dominance factors. The dominance factor alpha_ij is the weight
+        with which site i follows site j. The factors are reversible if positive weights D_i
+        exist with D_i alpha_ij = D_j alpha_ji for all pairs of sites.
         """
         return False
 
     def resolve_shares(self, names: Sequence[str], alpha: Array) -> Any:  # noqa: ARG002
-        """Completes the settings that follow from the dominance factors of the scenario.
+        """Computes settings of the law that depend on the dominance factors of the scenario.
 
-        A dominance factor is the weight with which a site follows a peer. Most laws have no
-        such settings and are returned unchanged.
+        A dominance factor is the weight with which a site, the process that runs one arm,
+        follows another site. An example is the impedance of the connection between two sites in
+        the law `wave`. Most laws have no settings of this kind and are returned unchanged.
 
         Args:
-            names: Names of the sites.
-            alpha: Dominance matrix at the start, shape (N, N): row i contains the weights with
+            names: Names of the N sites.
+            alpha: Dominance factors at the start, shape (N, N): row i contains the weights with
                 which site i follows the other sites.
 
         Returns:
-            The law with these settings.
+            The law with the computed settings.
         """
         return self
 
@@ -225,17 +249,24 @@ class LawSettings(Frozen, frozen=True):
         return convert_sends(getattr(self.kind, "sends", {}), self.kind.__name__, "control")
 
     def build_factory(self, sites: int, scheme: str) -> UserLawFactory | None:
-        """Returns a function that creates the law at a site. None if the kernel computes it.
+        """Returns a function that creates the law for one site before a run.
 
         Args:
             sites: Number of sites in the scenario.
-            scheme: The scenario's integration scheme, "second_order" or "digital".
+            scheme: Integration scheme of the scenario, "second_order" or "digital".
+
+        Returns:
+            The function. None if the simulation kernel, the compiled code of the control loop,
+            contains the law, because no instance is needed then.
         """
         if not self.plugged:
             return None
 
         def make_law(context: LawContext) -> UserLaw:
-            """Returns an instance of the law, after checking that its class suits the site."""
+            """Creates the control law of one site, if its class can be used there.
+
+            Otherwise, the check of the class raises an error.
+            """
             check_law_class(
                 kind=self.kind, code=self.tag, context=context, sites=sites, scheme=scheme
             )
@@ -252,17 +283,19 @@ def format_class_name(tag: str) -> str:
 
 
 class ControlLaw:
-    """Base class of the built-in control laws.
+    """Base class of the built-in control laws, which compute the torque of an arm.
 
-    A law may also define the methods of `LawSettings`, which its `Settings` then have. Python
-    runs `__init_subclass__` for each law and derives the `Settings` there.
+    A law may also define the methods of `LawSettings`. When Python creates the class of a law,
+    it derives a second class, `Settings`, which has the gains and these methods.
+    docs/own-controller.md describes the other class variables of a law.
 
     Attributes:
-        Settings: Class that stores the gains in a scenario.
-        sends, remembers, schemes, sites, needs_theta, needs_model: See docs/own-controller.md.
-        tune: Ranges of the gains that are tuned, by name.
-        known_facts: Sentence for the user: which of the facts that every law receives this law
-            uses.
+        Settings: Class that stores the gains of the law in a scenario, the description of an
+            experiment.
+        remembers: Names of the instance attributes that keep the state of the law between
+            ticks.
+        tune: Range of each gain that is tuned, by name.
+        known_facts: Sentence for the user. It states which facts about the arm the law needs.
     """
 
     Settings: ClassVar[type[LawSettings]] = LawSettings
@@ -321,11 +354,15 @@ class ControlLaw:
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the [control] table of a scenario for this law, after its gains were tuned.
+        """Returns the settings of the law for one site, after its gains were tuned.
+
+        The settings form the table [control] of a scenario, the description of an experiment.
+        Besides the tuned gains, the table contains settings that follow from the facts about
+        the site.
 
         Args:
-            gains: The tuned gains by name.
-            site: The site whose table is written.
+            gains: Tuned gains by name.
+            site: Facts about the site for which the table is written.
         """
         if "gravity" in cls.Settings.__struct_fields__:
             return {**gains, "gravity": site.gravity}
@@ -333,11 +370,12 @@ class ControlLaw:
 
 
 class EnergyLaw(ControlLaw):
-    """Base class of the laws that balance energy between the sites.
+    """Base class of the laws that balance energy between the sites, the processes of the arms.
 
-    The energy that one end of a coupling sends is accounted for at the other end, so all sites
-    must have the same law. These laws are computed with the scheme `digital`, in which a torque
-    is held during a period, because only then is the work of a torque known exactly.
+    One site counts the energy that it sends, and the other site counts the energy that it uses.
+    Therefore all sites must use the same law. These laws require the integration scheme
+    `digital`, which holds each torque constant for one period of the control loop. Only then is
+    the work of a torque known exactly: it is the torque times the motion of the joint.
     """
 
     gravity: NotNegative = 1.0
