@@ -124,8 +124,7 @@ class Authority(ControlLaw):
             situation: The site, and the laws of all sites.
 
         Returns:
-            A sentence for the user. Empty if the site is the slave, whose factors all have an
-            effect, or if no site is a slave.
+            A sentence for the user. Empty if the site is the slave, or if all sites are users.
         """
         idle = []
         for name, law in zip(situation.names, situation.laws, strict=True):

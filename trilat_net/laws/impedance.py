@@ -61,21 +61,27 @@ class Impedance(ControlLaw):
     needs_model: ClassVar = True
 
     def begin(self, facts: LawContext) -> None:
-        """Creates the memory of the law: the start pose and the acceleration of the impedance.
+        """Prepares the law before a run: creates its start pose and its desired acceleration.
 
-        The first tick sets the start pose.
+        The first control period stores the measured pose as the start pose.
+
+        Args:
+            facts: Facts about the site that are known before the run.
         """
         self.start = [0.0] * facts.joints
         self.qdd = [0.0] * facts.joints
 
     def torque(self, now: LawInput) -> None:
-        """Computes the torque of one tick; the slave also sends the torque on its arm.
+        """Computes the torque of the arm in one period of the control loop.
 
-        The first loop computes the acceleration of the impedance, the second the torque that
-        gives the arm this acceleration.
+        The method first computes the acceleration that a mass M on a spring K and a damper B
+        would have under the forces on the arm. It then computes the torque that gives the arm
+        this acceleration. At the slave, it also sends the measured torque of the environment to
+        the masters.
 
         Args:
-            now: Inputs and outputs of the law in this tick.
+            now: Inputs and outputs of the law in this period. The torque is written into
+                `now.tau`.
         """
         follows = 1.0 if self.follows else 0.0
         for i in range(now.joints):
@@ -102,24 +108,27 @@ class Impedance(ControlLaw):
             now.tau[i] = tau
 
     def linear_gains(self, theta: Array) -> Gains | None:
-        """Returns gains of the kernel's law of known gravity that are all zero.
+        """Returns gains for the linear analysis that only compensate gravity.
 
-        The kernel's law then only compensates gravity. The impedance itself is described by
-        `linear_form`.
+        The linear analysis considers small motions around a pose at rest. `linear_form` adds
+        the spring, the damper and the forces of this law.
 
         Args:
-            theta: Parameters of the arm, shape (P,).
+            theta: Parameters of the arm's dynamics, such as masses, shape (P,), where P is
+                their number.
         """
         return Gains(Law.KNOWN, known=theta.tolist())
 
     def linear_form(self, situation: LinearSituation) -> LinearForm | None:
-        """Returns the impedance for small motions, for the linear analysis.
+        """Returns the spring, the damper and the forces of this law for the linear analysis.
 
-        The gains are scaled by M(q) M^-1, the inertia matrix of the arm times the inverse
-        inertia of the impedance. The form of the slave also contains the force that it sends.
+        The linear analysis considers small motions around a pose at rest. The law gives the
+        arm, whose inertia matrix is A, the apparent inertia M. Therefore all its terms are
+        multiplied by A inv(M). At the slave, the result also contains the force that it sends
+        to the masters.
 
         Args:
-            situation: The site and its arm.
+            situation: The site, its arm, and the weights with which it follows the other sites.
         """
         n = len(situation.inertia)
         form = LinearForm(n)
@@ -150,13 +159,14 @@ class Impedance(ControlLaw):
         return "" if self.follows else "follows = false stays at its start pose"
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns the stability condition of the session at a site.
+        """Evaluates whether the loop between the masters and the slave is stable.
 
-        Its text states the stiffest wall for which the small-gain theorem proves stability, see
-        `find_stiffest_wall`.
+        The result states the stiffest wall at the slave for which the small-gain theorem proves
+        stability for any delays (see `find_stiffest_wall`). The condition is not met if there
+        is not exactly one slave, if a site uses another law, or if a damping is zero.
 
         Args:
-            situation: The sites and their laws.
+            situation: All sites, their laws, and the weights with which they follow each other.
         """
         laws = situation.laws
         followers = [n for n, law in enumerate(laws) if getattr(law, "follows", False)]
@@ -178,11 +188,15 @@ class Impedance(ControlLaw):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the [control] table of a site for tuned gains; the slave follows.
+        """Returns the settings of this law for one site, after its gains were tuned.
+
+        The settings form the table [control] of a scenario, the description of an experiment.
+        The setting `follows` is true for the slave, which follows the masters, and false for a
+        master, which stays at its start pose.
 
         Args:
-            gains: The tuned gains by name.
-            site: The site whose table is written.
+            gains: Tuned gains by name.
+            site: Facts about the site for which the table is written.
         """
         return {**gains, "follows": site.role == "slave"}
 

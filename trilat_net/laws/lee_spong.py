@@ -59,13 +59,16 @@ class LeeSpong(ControlLaw):
         return tuple(damping)
 
     def compute_torque(self, G: Array, e: Array, ed: Array, qd: Array) -> Array:
-        """Returns the torque of each joint before the torque limits, N m.
+        """Computes the torque of each joint before the torque limits, N m.
 
-            tau = G(q) - K e - (K T_max + P_e) qd - Kd ed
+            tau = G - K e - (K T_max + P_e) qd - Kd ed
+
+        K is the stiffness of the spring (N m/rad), T_max half of the longest round trip between
+        the sites (s), P_e additional damping and Kd the damping of the error (both N m s/rad).
 
         Args:
-            G: Torque of the known gravity, shape (n,), N m.
-            e: Position error q - q_des, Eq. (9), shape (n,), rad.
+            G: Torque that compensates gravity, shape (n,) for n joints, N m.
+            e: Position error: position minus reference, shape (n,), rad.
             ed: Derivative of the error, shape (n,), rad/s.
             qd: Joint velocities, shape (n,), rad/s.
         """
@@ -76,36 +79,41 @@ class LeeSpong(ControlLaw):
         return G - spring - damper - error_damper
 
     def gains(self, theta: Array) -> Gains:
-        """Returns the gains with which the simulation kernel computes the law.
+        """Converts the gains of this law to the record that the compiled control loop reads.
 
-        The kernel computes it as PD+d, tau = G - K e - d qd - Kd ed, with d from `damping`.
+        The record contains the stiffness, the two dampings, and the parameters from which the
+        gravity torque is computed. The damping of the arm is the property `damping`.
 
         Args:
-            theta: Parameters of the arm, shape (P,).
+            theta: Parameters of the arm's dynamics, such as masses, shape (P,), where P is
+                their number.
         """
         known = (theta * self.gravity).tolist()
         return Gains(Law.KNOWN, K=self.K, Kd=self.Kd, d=self.damping, known=known)
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns the stability condition of this law at a site of a scenario.
+        """Evaluates for which gains and delays this law is stable at one site of a scenario.
 
-        It is the condition of P+d, a spring with damping, on the stiffness K and the damping d.
+        The condition is that of a spring with a damper. It bounds the damping from below by the
+        stiffness times the delay.
 
         Args:
-            situation: The site, its peers and the delays between them.
+            situation: The site, its peers (the other sites) and the delays between them.
         """
         return judge_position_exchange(situation, "K", "damping")
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the [control] table of a site for tuned gains.
+        """Returns the settings of this law for one site, after its gains were tuned.
 
-        T_max is half of the longest mean round trip. For delays that vary, the bound is not
-        proved.
+        The settings form the table [control] of a scenario, the description of an experiment.
+        The largest delay T_max, from which the law computes its damping, is set to half of the
+        longest mean round trip between two sites. If delays vary, some are larger, and
+        stability is not proved.
 
         Args:
-            gains: The tuned gains by name.
-            site: The site whose table is written.
+            gains: Tuned gains by name.
+            site: Facts about the site for which the table is written.
         """
         return {
             "K": gains["K"],

@@ -57,17 +57,24 @@ class PD(ControlLaw):
         return G - spring - damper
 
     def gains(self, theta: Array) -> Gains:
-        """Returns the gains with which the kernel computes the law.
+        """Converts the gains of this law to the record that the compiled control loop reads.
+
+        The record contains the stiffness, the damping, and the parameters from which the
+        gravity torque is computed.
 
         Args:
-            theta: Parameters of the arm, shape (P,).
+            theta: Parameters of the arm's dynamics, such as masses, shape (P,), where P is
+                their number.
         """
         known = (theta * self.gravity).tolist()
         return Gains(Law.KNOWN, K=self.K, d=self.d, known=known)
 
     def exchanges_positions(self) -> bool:
-        """Returns True if gravity is compensated exactly: the law is a spring between poses.
+        """Returns True if the law compensates gravity exactly.
 
-        Such a law needs reversible dominance factors, see `LawSettings.exchanges_positions`.
+        The law then acts like springs and dampers between the positions of the arms. Stability
+        conditions of laws of this kind need reversible dominance factors. The dominance factor
+        alpha_ij is the weight with which site i follows site j. The factors are reversible if
+        positive weights D_i exist with D_i alpha_ij = D_j alpha_ji.
         """
         return self.gravity == 1.0

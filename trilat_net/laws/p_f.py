@@ -54,15 +54,19 @@ class PF(ControlLaw):
     }
 
     def compute_torque(self, G: Array, e: Array, qd: Array, felt: Array) -> Array:
-        """Returns the torque of each joint before the torque limits, N m.
+        """Computes the torque of each joint before the torque limits, N m.
 
-            tau = G(q) - K e - d qd + k_f felt
+            tau = G - K e - d qd + k_f felt
+
+        K is the stiffness (N m/rad), d the damping (N m s/rad) and k_f the dimensionless gain
+        of the reflected force.
 
         Args:
-            G: Torque of the known gravity, shape (n,), N m.
-            e: Position error q - q_des, Eq. (9), shape (n,), rad.
+            G: Torque that compensates gravity, shape (n,) for n joints, N m.
+            e: Position error: position minus reference, shape (n,), rad.
             qd: Joint velocities, shape (n,), rad/s.
-            felt: Torque on the peers' arms as received, weighted by dominance, shape (n,), N m.
+            felt: Torque of operator and environment on the other arm, as received, shape (n,),
+                N m. It is multiplied by the weight with which this arm follows the other arm.
         """
         spring = np.array(self.K) * e
         damper = np.array(self.d) * qd
@@ -70,21 +74,26 @@ class PF(ControlLaw):
         return G - spring - damper + reflected
 
     def gains(self, theta: Array) -> Gains:
-        """Returns the gains with which the kernel computes the law.
+        """Converts the gains of this law to the record that the compiled control loop reads.
+
+        The record contains the stiffness, the damping, the gain of the reflected force, and the
+        parameters from which the gravity torque is computed.
 
         Args:
-            theta: Parameters of the arm, shape (P,).
+            theta: Parameters of the arm's dynamics, such as masses, shape (P,), where P is
+                their number.
         """
         known = (theta * self.gravity).tolist()
         return Gains(Law.KNOWN, K=self.K, d=self.d, k_f=self.k_f, known=known)
 
     def check(self, path: str, sites: int) -> None:
-        """Refuses a scenario with more or fewer than two sites.
+        """Refuses a scenario that has more or fewer than two sites.
 
-        With several peers it would be ambiguous whose contact the master feels.
+        A site is the process that runs one arm. With several other arms, it would be ambiguous
+        which contact force the master reflects to its user.
 
         Args:
-            path: Path of the law's table in the scenario, for errors.
+            path: Path of the law's settings in the scenario file, for error messages.
             sites: Number of sites in the scenario.
 
         Raises:
@@ -113,7 +122,10 @@ class PF(ControlLaw):
 
     @classmethod
     def explain_misfit(cls, roles: Sequence[str]) -> str:
-        """Explains to the user why the law cannot be used for the sites of a scenario.
+        """Explains to the user why force reflection cannot be used for the sites of a scenario.
+
+        This law needs exactly one master, the arm that a person moves, and one slave, the arm
+        that follows.
 
         Args:
             roles: Role of each site, "master" or "slave".

@@ -42,13 +42,16 @@ class PdD(ControlLaw):
     tune: ClassVar = {"K": STIFFNESS, "Kd": ERROR_DAMPING, "d": DAMPING}
 
     def compute_torque(self, G: Array, e: Array, ed: Array, qd: Array) -> Array:
-        """Returns the torque of each joint before the torque limits, N m.
+        """Computes the torque of each joint before the torque limits, N m.
 
-            tau = G(q) - K e - d qd - Kd ed
+            tau = G - K e - d qd - Kd ed
+
+        K is the stiffness (N m/rad), d the damping of the arm and Kd the damping of the error
+        (both N m s/rad).
 
         Args:
-            G: Torque of the known gravity, shape (n,), N m.
-            e: Position error q - q_des, Eq. (9), shape (n,), rad.
+            G: Torque that compensates gravity, shape (n,) for n joints, N m.
+            e: Position error: position minus reference, shape (n,), rad.
             ed: Derivative of the error, shape (n,), rad/s.
             qd: Joint velocities, shape (n,), rad/s.
         """
@@ -59,17 +62,24 @@ class PdD(ControlLaw):
         return G - spring - damper - error_damper
 
     def gains(self, theta: Array) -> Gains:
-        """Returns the gains with which the kernel computes the law.
+        """Converts the gains of this law to the record that the compiled control loop reads.
+
+        The record contains the stiffness, the two dampings, and the parameters from which the
+        gravity torque is computed.
 
         Args:
-            theta: Parameters of the arm, shape (P,).
+            theta: Parameters of the arm's dynamics, such as masses, shape (P,), where P is
+                their number.
         """
         known = (theta * self.gravity).tolist()
         return Gains(Law.KNOWN, K=self.K, Kd=self.Kd, d=self.d, known=known)
 
     def exchanges_positions(self) -> bool:
-        """Returns True if gravity is compensated exactly: the law is a spring between poses.
+        """Returns True if the law compensates gravity exactly.
 
-        Such a law needs reversible dominance factors, see `LawSettings.exchanges_positions`.
+        The law then acts like springs and dampers between the positions of the arms. Stability
+        conditions of laws of this kind need reversible dominance factors. The dominance factor
+        alpha_ij is the weight with which site i follows site j. The factors are reversible if
+        positive weights D_i exist with D_i alpha_ij = D_j alpha_ji.
         """
         return self.gravity == 1.0

@@ -72,24 +72,31 @@ class SaturatedPd(ControlLaw):
             now.tau[i] = tau
 
     def linear_gains(self, theta: Array) -> Gains | None:
-        """Returns the gains of P+d, to which this law is equal for small errors.
+        """Returns the gains of an unsaturated spring and a damper, for the linear analysis.
 
-        The linear analysis uses them.
+        For small position errors the spring does not saturate, so this law equals tau = G - K e
+        - d qd. Here G is the gravity torque, K the stiffness, e the position error, d the
+        damping and qd the joint velocity.
 
         Args:
-            theta: Parameters of the arm, shape (P,).
+            theta: Parameters of the arm's dynamics, such as masses, shape (P,), where P is
+                their number.
         """
         known = (theta * self.gravity).tolist()
         return Gains(Law.KNOWN, K=self.K, d=self.d, known=known)
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns the condition of P+d, and the speed up to which torques stay within limits.
+        """Evaluates the stability of this law, and whether its torques stay within limits.
 
-        The condition of P+d applies because the slope of the saturated spring is nowhere above
-        K. The torque limits must leave room for gravity and the largest pull.
+        The spring of this law is nowhere stiffer than a linear spring with the gain K.
+        Therefore the condition of a linear spring with a damper applies.
+
+        If the gravity torque of the arm is known, the torque limit of each joint must be above
+        the sum of the gravity torque and the largest spring torque P. The text then states up
+        to which joint speed the damper does not exceed the rest.
 
         Args:
-            situation: The site, its peers, its torque limits and the delays.
+            situation: The site, its peers (the other sites), its torque limits and the delays.
         """
         condition = judge_position_exchange(situation, "K", "d")
         if not situation.gravity_nm:

@@ -69,15 +69,16 @@ def build_channel(
 
 
 def check_sends(channel: LawChannel, joints: int, path: str) -> None:
-    """Refuses unsuitable names of vectors, and more numbers than a sample or record can hold.
+    """Checks the names and the total length of the vectors that a control law sends.
 
     Args:
-        channel: All vectors that the law sends.
-        joints: Number of the site's joints.
-        path: Path of the law's table, for errors.
+        channel: All vectors that the law sends to other sites.
+        joints: Number of joints of the site's arm.
+        path: Path of the law's settings in the scenario file, for error messages.
 
     Raises:
-        ScenarioError: A name or a count is refused; the error has the path of the key.
+        ScenarioError: A name is not allowed, or the vectors have more numbers than a message or
+            a log entry can hold.
     """
     sends_path = f"{path}.sends"
     for vector in channel.vectors:
@@ -178,12 +179,18 @@ def read_sends(source: bytes, file: Path, code: str, path: str) -> SentVectorSpe
 
 
 def convert_sends(sends: Any, code: str, path: str) -> SentVectorSpecs:
-    """Returns the declaration of a law's class, converted to `SentVectorSpec`.
+    """Converts the class variable `sends` of a control law to checked specifications.
+
+    The variable `sends` declares the vectors that the law sends to the other sites, each with
+    its name, unit and length.
 
     Args:
-        sends: The value of the class attribute `sends`.
-        code: The law's name, for errors.
-        path: The path of the key, for errors.
+        sends: Value of the class variable.
+        code: Name of the law, for error messages.
+        path: Path of the key in the scenario, for error messages.
+
+    Returns:
+        A specification for each vector, by its name.
 
     Raises:
         ScenarioError: The value does not describe vectors.

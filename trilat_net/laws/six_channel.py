@@ -1,9 +1,12 @@
-"""Implements the four-channel law of two users and a slave, with a single dominance factor a.
+"""Implements a control law in which two users share one slave arm by a single factor a.
 
-A dominance factor is the weight with which a site, a process that runs one arm, follows a peer.
-The dominance matrix of a scenario (the file that describes an experiment) contains these
-weights, one row per site. The torque is computed as in `FourChannel`. In addition, this law
-requires that all weights in the matrix follow from the one factor a.
+The factor a is the authority of user 1, and 1 - a that of user 2. It determines the dominance
+factors, the weights with which each arm follows the other two: `complementary_shares` gives
+them all.
+
+The torque is the one of the four-channel law, which exchanges positions and forces
+(`FourChannel`). This law adds the check that the weights in a scenario, the description of an
+experiment, follow from one factor a.
 """
 
 from typing import ClassVar
@@ -16,11 +19,12 @@ from .four_channel import FourChannel
 
 
 class SixChannel(FourChannel):
-    """The four-channel law of two users and a slave whose dominance is one factor a.
+    """Four-channel law of two users and one slave whose authority is one factor a.
 
-    The sites are user 1, user 2 and the slave, in this order. User 1 follows the slave with
-    weight a and user 2 with 1 - a. User 2 follows the slave with 1 - a and user 1 with a. The
-    slave follows user 1 with a and user 2 with 1 - a.
+    The arms exchange positions and forces as in `FourChannel`. The sites, the processes that
+    run one arm each, are user 1, user 2 and the slave, in this order. The slave follows user 1
+    with the weight a and user 2 with 1 - a. User 1 follows the slave with the weight a and user
+    2 with 1 - a. User 2 follows the slave with the weight 1 - a and user 1 with a.
 
     Source: Khademian and Hashtrudi-Zaad, IEEE/ASME T-Mech 17, 2012.
     """
@@ -28,14 +32,15 @@ class SixChannel(FourChannel):
     sites: ClassVar = 3
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns the stability condition of the four-channel law for these sites.
+        """Evaluates the stability condition of the four-channel law for two users and a slave.
 
-        Its text starts with the dominance factor a of user 1, and with the weights with which
-        the torques of the operators are in balance at rest. If the dominance matrix does not
-        follow from one factor a, the condition is not met.
+        The condition is not met if the dominance factors, the weights with which the arms
+        follow each other, do not all follow from one factor a (see `complementary_shares`).
+        Otherwise its text states the factor a and the weights with which the torques of the
+        operators balance at rest.
 
         Args:
-            situation: The sites and their dominance matrix.
+            situation: The three sites and the dominance factors.
         """
         a = float(situation.alpha[2, 0])
         if not np.allclose(situation.alpha, complementary_shares(a)):
@@ -50,16 +55,18 @@ class SixChannel(FourChannel):
 
 
 def complementary_shares(a: float) -> Array:
-    """Returns the dominance matrix of user 1, user 2 and the slave for the factor a.
+    """Computes all dominance factors of two users and a slave from the single factor a.
 
-    Row i contains the weights with which site i follows the other sites; the class `SixChannel`
-    lists them.
+    A dominance factor is the weight with which an arm follows another arm. The slave follows
+    user 1 with the weight a and user 2 with 1 - a. User 1 follows user 2 with 1 - a and the
+    slave with a. User 2 follows user 1 with a and the slave with 1 - a.
 
     Args:
-        a: Weight of user 1, from 0 to 1.
+        a: Authority of user 1, from 0 to 1. User 2 has 1 - a.
 
     Returns:
-        The matrix, shape (3, 3).
+        Matrix of shape (3, 3). Row i contains the weights with which arm i follows the others,
+        in the order user 1, user 2, slave.
     """
     user_1 = (0.0, 1.0 - a, a)
     user_2 = (a, 0.0, 1.0 - a)
@@ -68,16 +75,17 @@ def complementary_shares(a: float) -> Array:
 
 
 def complementary_weights(a: float) -> tuple[float, float, float]:
-    """Returns the weights with which the operators' torques are in balance at rest.
+    """Computes the weights beta with which the operators' torques add up to zero at rest.
 
-    With the weights beta of the sites, sum beta_i tau_h,i = 0, where tau_h,i is the torque of
-    the operator at site i.
+    While all arms rest, sum_i beta_i tau_i = 0, where tau_i is the torque of the operator or
+    environment on arm i, in N m. The weights hold for the dominance factors that
+    `complementary_shares` returns.
 
     Args:
-        a: Weight of user 1, from 0 to 1.
+        a: Authority of user 1, from 0 to 1.
 
     Returns:
-        The weights of user 1, user 2 and the slave.
+        The weights of user 1, user 2 and the slave, dimensionless.
     """
     user_1 = 1.0 - (1.0 - a) ** 2
     user_2 = 1.0 - a**2

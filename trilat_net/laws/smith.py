@@ -35,7 +35,11 @@ from .interface import DAMPING, INERTIA, STIFFNESS, ControlLaw, TuningSite
 
 @compiled
 class Smith(ControlLaw):
-    """P+d of a master and a slave with a Smith predictor of the slave at the master.
+    """Couples a master and a slave by springs, with a Smith predictor against the delay.
+
+    A spring and a damper pull each arm towards the other. The master does not wait for the
+    delayed position of the slave: it uses a model of the slave, and corrects the model with the
+    delayed deviation from the true motion. The equations are at the top of this module.
 
     Source: Smith, "Closer control of loops with dead time", Chemical Engineering Progress 53,
     1957 (cited from memory).
@@ -46,7 +50,7 @@ class Smith(ControlLaw):
         inertia: Inertia of the slave's model, per joint, kg m^2. K, d and inertia are the same
             at both sites.
         predicts: True for the master.
-        gravity: Factor of the true gravity that the law compensates; 1 is exact.
+        gravity: Ratio of the compensated gravity torque to the true gravity torque. 1 is exact.
     """
 
     K: PositiveJoints = (10.0,)
@@ -62,21 +66,27 @@ class Smith(ControlLaw):
     needs_theta: ClassVar = True
 
     def begin(self, facts: LawContext) -> None:
-        """Creates the state of the slave's model: its position x and its velocity xd.
+        """Prepares the law before a run: creates the state of the slave's model.
 
-        The model starts in tick 0.
+        The state is the position x and the velocity xd. The model predicts the motion of the
+        slave without delay. The first control period sets its position.
+
+        Args:
+            facts: Facts about the site that are known before the run.
         """
         self.x = [0.0] * facts.joints
         self.xd = [0.0] * facts.joints
 
     def torque(self, now: LawInput) -> None:
-        """Computes the torque of one tick, and advances the model of the slave by this tick.
+        """Computes the torque of one control period, and advances the model of the slave.
 
-        The torque is written into `now.tau`. The vector w, defined at the top of this module,
-        is sent to the peer.
+        Master and slave run the same model of the slave's motion. The slave sends the
+        difference w between its position and the position of the model. The master is pulled
+        towards the position of its model plus the received w.
 
         Args:
-            now: Inputs and outputs of the law in this tick.
+            now: Inputs and outputs of the law in this period. The torque is written into
+                `now.tau`.
         """
         h = now.h_s
         for i in range(now.joints):
@@ -106,25 +116,30 @@ class Smith(ControlLaw):
             self.xd[i] += h * acceleration
 
     def linear_gains(self, theta: Array) -> Gains | None:
-        """Returns the gains of the part of the law that does not depend on the model.
+        """Returns the gains of this law's spring and damper for the linear analysis.
 
-        This is known gravity with the damping d, and at the slave also with the spring K. The
-        rest is described by `linear_form`.
+        The linear analysis considers small motions around a pose at rest. At the slave, the
+        gains contain the spring K and the damping d. At the master they contain only d, because
+        its spring acts on the model of the slave, which `linear_form` adds.
 
         Args:
-            theta: Parameters of the arm, shape (P,).
+            theta: Parameters of the arm's dynamics, such as masses, shape (P,), where P is
+                their number.
         """
         K = (0.0,) if self.predicts else self.K
         known = (theta * self.gravity).tolist()
         return Gains(Law.KNOWN, K=K, d=self.d, known=known)
 
     def linear_form(self, situation: LinearSituation) -> LinearForm | None:
-        """Returns the small motions of the model, and its part of the torque or of w.
+        """Returns the model of the slave and its effect on the law, for the linear analysis.
 
-        The model is driven by the position of the master, which the slave receives.
+        The linear analysis considers small motions around a pose at rest. The model is a mass
+        on a spring and a damper that the master's position moves; its states are the position x
+        and the velocity xd. At the master, the torque depends on x. At the slave, the
+        difference between its position and x is sent to the master.
 
         Args:
-            situation: The site and its arm.
+            situation: The site, its arm and its only peer.
         """
         (peer,) = situation.peers
         K = np.array(self.K)
@@ -146,10 +161,12 @@ class Smith(ControlLaw):
         return form
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns the condition under which the predictor removes the delay from the loop.
+        """Evaluates whether the predictor removes the delay from the control loop.
 
-        One site must predict, and both must have the same K, d and inertia. Then the condition
-        is undecided, because the model knows no contact.
+        Exactly one site must predict, and K, d and inertia must be equal at both sites.
+        Otherwise the condition is not met. If both requirements are met, the condition is
+        undecided (`holds` is None): the loop is stable while the slave moves freely, but the
+        model does not include contacts.
 
         Args:
             situation: The two sites and their laws.
@@ -171,10 +188,14 @@ class Smith(ControlLaw):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the [control] table of a site for tuned gains; the master predicts.
+        """Returns the settings of this law for one site, after its gains were tuned.
+
+        The settings form the table [control] of a scenario, the description of an experiment.
+        The setting `predicts` is true for the master, which predicts the motion of the slave
+        with a model, and false for the slave.
 
         Args:
-            gains: The tuned gains by name.
-            site: The site whose table is written.
+            gains: Tuned gains by name.
+            site: Facts about the site for which the table is written.
         """
         return {**gains, "predicts": site.role == "master", "gravity": site.gravity}

@@ -1,16 +1,18 @@
-"""Implements adaptive synchronisation of outputs, including its known weakness under gravity.
+"""Implements adaptive synchronisation of outputs, a control law with a flaw under gravity.
 
-Each site, a process that runs one arm, compares its output r = qd + Lambda q with the outputs
-of its peers. Here q and qd are the positions and velocities of the joints, and Lambda is a
-gain. While it controls the arm, the law learns the dynamic parameters of the arm, such as
-masses.
+The law makes the outputs r = qd + Lambda q of all arms equal, where q and qd are the positions
+and velocities of the joints, and Lambda is a gain. While it controls an arm, it learns the
+dynamic parameters of the arm, such as masses.
 
-The output contains the pose itself instead of the difference between two poses. Under gravity
-every equilibrium satisfies Y_G' r = 0, where Y_G, the regressor of gravity, is the matrix whose
-product with the parameters is the gravity torque. Therefore all arms end at q = 0.
+The flaw: an arm can rest only if the learning rests, too. This requires Y_G' r = 0, where Y_G
+is the matrix whose product with the parameters is the gravity torque, and Y_G' its transpose.
+At rest, r is Lambda q. Therefore under gravity all arms end at q = 0, wherever their users want
+to hold them. Laws that compare positions, such as `adaptive`, do not have this flaw, because
+their r contains the position error instead of q.
 
 Invariant:
-    - The estimate of the parameters advances by the trapezoid rule, as in the adaptive law.
+    - The estimate of the parameters is integrated by the trapezoid rule, as in the law
+      `adaptive`.
 """
 
 from collections.abc import Mapping
@@ -30,20 +32,26 @@ from .interface import ADAPTATION, CONVERGENCE, DAMPING, ControlLaw, TuningSite
 
 @compiled
 class Sync(ControlLaw):
-    """Adaptive synchronisation of r = qd + Lambda q: under gravity all arms end at q = 0.
+    """Synchronises the outputs r = qd + Lambda q of all arms, and learns the arm's parameters.
 
-        tau = Y(q, qd, -Lambda q, -Lambda qd) theta_hat + K (sum_j alpha_ij r_j - r)
-        theta_hat' = -Gamma Y' r
+        tau = Y theta_hat + K (sum_j alpha_ij r_j - r)
+        rate of theta_hat = -Gamma Y' r
 
-    The law is for planar arms.
+    q and qd are the positions and velocities of the joints, r_j the output of arm j as
+    received, and alpha_ij the weight with which arm i follows arm j. theta_hat is the estimate
+    of the arm's dynamic parameters. The matrix Y(q, qd, -Lambda q, -Lambda qd) is the
+    regressor: times the parameters, it gives the torque of the arm's dynamics. Y' is its
+    transpose.
+
+    Weakness: under gravity all arms end at q = 0. The law is for planar arms.
 
     Source: Chopra, Spong and Lozano, "Synchronization of bilateral teleoperators with time
-    delay", Automatica 44, 2008; the defect is described in Nuno, Ortega and Basanez, Automatica
-    46, 2010.
+    delay", Automatica 44, 2008; the weakness is described by Nuno, Ortega and Basanez,
+    Automatica 46, 2010.
 
     Attributes:
-        Lambda: Weight of the pose in r, per joint, 1/s.
-        K: Gain towards the peers' outputs, per joint, N m s/rad.
+        Lambda: Weight of the position in r, per joint, 1/s.
+        K: Gain towards the outputs of the other arms, per joint, N m s/rad.
         Gamma: Adaptation gain per parameter.
         theta_hat0: First estimate of theta, Eq. (24).
     """
@@ -59,10 +67,14 @@ class Sync(ControlLaw):
     known_facts: ClassVar = "gravity, as its first estimate"
 
     def begin(self, facts: LawContext) -> None:
-        """Creates the memory of the law: the estimate of the parameters and its last rate.
+        """Prepares the law before a run: creates the estimate of the parameters.
 
-        The rate is Y' r of the tick before, the product of the regressor and the filtered
-        error.
+        The estimate of the arm's dynamic parameters starts at the setting `theta_hat0`. Its
+        rate in the previous control period is kept, because the estimate is integrated by the
+        trapezoid rule.
+
+        Args:
+            facts: Facts about the site that are known before the run.
         """
         self.theta_hat = list(self.theta_hat0)
         self.Yr = [0.0] * len(self.theta_hat)
@@ -100,12 +112,16 @@ class Sync(ControlLaw):
             now.tau[1] += second[p] * estimate
 
     def linear_gains(self, theta: Array) -> Gains | None:  # noqa: ARG002
-        """Returns gains for the linear analysis: those of the adaptive law of the kernel.
+        """Returns gains with which the linear analysis treats this law as the adaptive law.
 
-        The filtered error is r = qd + Lambda q here, instead of qd + Lambda e.
+        Both laws use the same formula, but with different outputs: r = qd + Lambda q here, and
+        r = qd + Lambda e in the adaptive law. Here q and qd are position and velocity of a
+        joint, e is the position error, and Lambda a gain in 1/s. The flag `absolute` selects
+        the first form.
 
         Args:
-            theta: Parameters of the arm, which this law does not use.
+            theta: Parameters of the arm's dynamics. This law does not use them, because it
+                learns them.
         """
         return Gains(
             law=Law.ADAPTIVE,
@@ -117,12 +133,14 @@ class Sync(ControlLaw):
         )
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns the stability condition of this law: the delays must be constant.
+        """Evaluates whether this law is known to be stable in a scenario.
 
-        Its text also names the pose at which all arms end under gravity.
+        The stability proof requires that all delays are constant. If a delay varies, the
+        condition is undecided (`holds` is None). If all are constant, the text also warns that
+        under gravity the arms end at the joint angles q = 0.
 
         Args:
-            situation: The site, its peers and the delays between them.
+            situation: The site, its peers (the other sites) and the delays between them.
         """
         if np.isnan(situation.longest_s):
             text = "proved for constant delays, and a delay here varies"
@@ -135,13 +153,15 @@ class Sync(ControlLaw):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the [control] table of a site for tuned gains.
+        """Returns the settings of this law for one site, after its gains were tuned.
 
-        The tuned gain is called Kp, as in the other adaptive laws, and is this law's K.
+        The settings form the table [control] of a scenario, the description of an experiment.
+        The tuning uses one name, `Kp`, for the damping gains of all adaptive laws. In the
+        settings of this law the gain is called `K`.
 
         Args:
-            gains: The tuned gains by name.
-            site: The site whose table is written.
+            gains: Tuned gains by name.
+            site: Facts about the site for which the table is written.
         """
         return {
             "Lambda": gains["Lambda"],

@@ -1,16 +1,18 @@
-"""Couples arms by springs whose work is paid for by a tank of energy at each arm.
+"""Couples arms by springs that may spend only the energy that is in a tank.
 
-A site, the process that runs one arm, has a controller of two layers. The transparency layer is
-a spring and dampers, which couple the arm to its peers, the arms that it follows. The passivity
-layer below it keeps a tank, an account of the energy that the site may spend, and reduces the
-torque of the transparency layer so that it spends no more.
+Delays can make a spring between two arms active, which means that it produces energy. Therefore
+each site, the process that runs one arm, keeps an account of the energy that its controller may
+spend: the tank. The controller has two layers. The transparency layer computes the torque of a
+spring and dampers that couple the arm to the other arms, its peers. The passivity layer reduces
+this torque so that its work does not exceed the energy in the tank.
 
 Invariant:
-    - The tank is filled by the work that the arm does on its controller, and by packets of
-      energy from the peers. It is emptied by the work of the torque on the arm, which is the
-      torque tau times the change of the position q in a tick (period of the control loop).
-    - While the tank is empty, the transparency layer has no torque.
-    - Packets are sent as cumulative sums, so no energy is lost with a lost message.
+    - The tank is filled by the work that the arm does on its controller, and by energy that the
+      peers send. It is emptied by the work of the controller on the arm. The work is the torque
+      times the motion of the joint in a period of the control loop.
+    - While the tank is empty, the torque of the transparency layer is zero.
+    - A message states the sum of all energy sent so far. Therefore no energy is lost with a
+      lost message.
 """
 
 from typing import Any, ClassVar
@@ -27,26 +29,28 @@ from .interface import ERROR_DAMPING, STIFFNESS, EnergyLaw
 
 @compiled
 class Tanks(EnergyLaw):
-    """Springs to the reference, whose work is paid for by one tank of energy per site.
+    """Couples arms by springs whose work is limited by one energy tank per arm.
 
-    Tanks are passive for any dominance factors (the weights with which a site follows its
-    peers) and any delays.
+    A tank is the amount of energy that the controller of an arm may still spend. The law is
+    passive for any delays and for any dominance factors, the weights with which an arm follows
+    its peers (the other arms).
 
     Source: Franken, Stramigioli, Misra, Secchi and Macchelli, IEEE Transactions on Robotics 27
     (4), 2011.
 
     Attributes:
-        K: Stiffness of the transparency layer per joint, N m/rad.
-        Kd: Its damping of the error's velocity per joint, N m s/rad.
-        d: Its damping of the arm's velocity per joint, N m s/rad.
+        K: Stiffness of the spring to the reference, per joint, N m/rad.
+        Kd: Damping of the error's velocity, per joint, N m s/rad.
+        d: Damping of the arm's velocity, per joint, N m s/rad.
         level_J: Level to which a tank is refilled, J.
         fill_nm_s_rad_J: Damping of the arm per energy that the tank lacks, N m s/rad/J. It
             refills the tank from the motion of the arm.
         packet_1_s: Rate at which a tank is emptied towards the peers, 1/s.
-        by_shares: True: the peers' packets are weighted by this site's dominance factors;
-            false: They are equal.
+        by_shares: If True, the energy for the peers is divided by the dominance factors of this
+            arm. If False, every peer gets the same part.
         acceleration_rad_s2: Largest acceleration a of a joint for which the tank reserves
-            energy: in the coming period h the joint moves by up to qd h + a h^2 / 2.
+            energy: in the coming period h the joint moves by up to qd h + a h^2 / 2, where qd
+            is its velocity.
     """
 
     K: PositiveJoints = (100.0,)
@@ -69,10 +73,13 @@ class Tanks(EnergyLaw):
     """False leaves the transparency layer without a tank, for comparison."""
 
     def begin(self, facts: LawContext) -> None:
-        """Creates the memory of the law at a site, and the constants that its ticks need.
+        """Prepares the law before a run: creates its state and its constants.
 
-        These are the sums of the energy received from each peer, the gravity torque, and the
-        rates per tick.
+        The state consists of the sum of the energy received from each peer (another arm), and
+        the gravity torque of the previous control period.
+
+        Args:
+            facts: Facts about the site that are known before the run.
         """
         self.guarded = bool(self.guarded)
         self.packet = float(self.packet_1_s) / facts.rate_hz
@@ -137,13 +144,14 @@ class Tanks(EnergyLaw):
             now.tau[i] = carried + affordable * now.tau[i] - damping * now.qd[i]
 
     def energies(self, seen: LawRecords) -> LawEnergies:
-        """Returns the energies that show whether the law was passive in a run.
+        """Computes the energies that show whether the law was passive in a run.
 
-        A line is the connection to a peer. Energy is put into it by the packets sent, and taken
-        out by the packets received. The tank itself dissipates nothing.
+        Each arm has an energy tank, the amount of energy that its controller may still spend.
+        The result contains the energy in the tank, the energy sent to each peer (another arm),
+        the energy received from each peer, and the energy that the arm gave to the controller.
 
         Args:
-            seen: Records of the site in the run.
+            seen: Records of the site in the run, one per control period.
         """
         gave = [peer.sent["E"] for peer in seen.peers]
         E_seen = seen.memory["E_seen"]
@@ -164,10 +172,15 @@ class Tanks(EnergyLaw):
         return "the energy in the tank switches its torque on and off"
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns the stability condition: no tank may send more energy per tick than it has.
+        """Evaluates whether the energy tanks keep the session passive.
 
-        If this holds, the session is passive, provided that operators and environments are
-        passive.
+        A tank is the amount of energy that the controller of an arm may still spend. In each
+        control period, it sends a fixed part of its content to the other arms. The condition is
+        met if this part is at most 1. Then the session is passive, provided that operators and
+        environments are passive.
+
+        Args:
+            situation: The site, with the rate of its control loop.
         """
         part_per_tick = self.packet_1_s / situation.rate_hz
         if part_per_tick > 1.0:
