@@ -136,18 +136,21 @@ class AlignedRecords(NamedTuple):
 
     @property
     def nominal_s(self) -> Array:
-        """Nominal time of every row, rounded down to whole nanoseconds, shape (K,), in s.
+        """Planned time of the tick in every row, rounded down to whole nanoseconds.
 
-        The simulation kernel compares these times with the start and end of an external torque.
+        The shape is (K,), in s. The simulation compares these times with the start and end of
+        an external torque.
         """
         time_ns = self._ticks * NS_PER_S // self.rate_hz
         return time_ns.astype(np.float64) * 1e-9
 
     @property
     def e(self) -> Array:
-        """The synchronisation error: the shared coordinates minus their reference, Eq. (9).
+        """The synchronisation error of the site, which is its position minus its reference.
 
-        Its shape is (K, n), in rad, or in task space (K, m).
+        The reference is the position that the site follows. If sites follow each other joint by
+        joint, the error has the shape (K, n) for n joints, in rad. In task space, where they
+        follow with their end effectors, it has the shape (K, m) for m coordinates.
         """
         if self.x.size:
             return compute_task_errors(self.x, self.q_des, self.axes)
@@ -155,22 +158,31 @@ class AlignedRecords(NamedTuple):
 
     @property
     def ed(self) -> Array:
-        """The derivative of the synchronisation error: shared velocities minus their reference.
+        """The derivative of the synchronisation error, which is the velocity error of the site.
 
-        Its shape is (K, n), in rad/s, or in task space (K, m).
+        It is the velocity of the site minus the velocity of its reference, which is the motion
+        that it follows. If sites follow each other joint by joint, the shape is (K, n) for n
+        joints, in rad/s. In task space, where they follow with their end effectors, it is (K,
+        m) for m coordinates.
         """
         return self.shared_rate - self.qd_des
 
     @property
     def known_periods(self) -> Bools:
-        """Marks the tick periods that have a record at both ends, shape (K - 1,)."""
+        """Marks the tick periods whose first and last tick both have a record.
+
+        The shape is (K - 1,), because K ticks bound K - 1 periods.
+        """
         return self.known[:-1] & self.known[1:]
 
     def known_at_end(self, length_s: float) -> Bools:
-        """Marks the rows of the last seconds that have a record, shape (K,).
+        """Marks the rows in the last seconds of the run that are recorded, not interpolated.
 
         Args:
-            length_s: Length of the interval at the end, in s.
+            length_s: Length of the interval at the end of the records, in s.
+
+        Returns:
+            True for each row that is in the interval and has a record, shape (K,).
         """
         t_s = self.t_s
         start_s = t_s[-1] - length_s
@@ -203,16 +215,17 @@ def hold_torque(tau: Array, limit_nm: Array | float, *, digital: bool) -> Array:
 def align_records(log: Log, *, common: bool = False) -> dict[str, AlignedRecords]:
     """Arranges the records of all sites with one row per tick, so that they can be compared.
 
-    Sites without records are left out. So is a record with the mode "diverged", which says that
-    the arm exceeded its limits: it may contain zeros in place of numbers that are not finite.
+    A site is the process that runs one arm. Ticks without a record are interpolated. A last
+    record with the mode "diverged" is left out, because it may contain zeros in place of
+    numbers that are not finite.
 
     Args:
         log: The log of the run.
         common: True to end all sites where the first site ends, as sums over all sites require.
 
     Returns:
-        The records by name of the site, in scenario order. With `common` the result is empty if
-        any site has fewer than two ticks.
+        The records by name of the site, in scenario order. Sites without records are missing.
+        With `common` the result is empty if any site has fewer than two ticks.
     """
     rows_by_site: dict[str, Ints] = {}
     for site in log.sites:
@@ -248,14 +261,19 @@ def align_records(log: Log, *, common: bool = False) -> dict[str, AlignedRecords
 
 
 def find_unlimited_rows(limits: Limits, qd_des: Array) -> Bools:
-    """Finds the rows in which every coordinate of a reference is slower than its limit.
+    """Marks the records in which no speed limit restricts the motion that the arm follows.
+
+    The motion that an arm follows is called its reference. Its velocity is limited in each of
+    the n coordinates.
 
     Args:
-        limits: Limits of the site.
-        qd_des: Velocities of the reference, shape (K, n) or (n,).
+        limits: Limits of the arm's site, with the largest velocity of the reference.
+        qd_des: Velocity of the reference in rad/s, shape (K, n) for K records or (n,) for a
+            single record.
 
     Returns:
-        True for such rows, shape (K,) or ().
+        True for each record in which every coordinate is slower than its limit, shape (K,) or
+        ().
     """
     is_slower = np.abs(qd_des) < limits.motion.qd_des_limit
     return np.asarray(is_slower.all(axis=-1))
@@ -348,13 +366,17 @@ def _fill_tick_grid(
 
 
 class PeerMotion(NamedTuple):
-    """Motion of a peer at K times: of its joints, or in task space of its end effector.
+    """Motion of another site (a peer) at K times, computed from its records.
+
+    Joint by joint, the motion has n coordinates, in rad. In task space it has the m coordinates
+    of the end effector, in m. Units below are for joints.
 
     Attributes:
-        q: Shared coordinates, shape (K, n), in rad. In task space (K, m), in m.
-        qd: Their derivatives, shape (K, n), in rad/s. In task space (K, m), in m/s.
-        squares: Integral of qd squared since row 0, per coordinate, shape (K, n), in rad^2/s.
-        known: True if the motion follows from records, shape (K,).
+        q: Positions, shape (K, n) or (K, m), in rad.
+        qd: Velocities, with the same shape, in rad/s.
+        squares: Integral over time of the squared velocity, from the peer's first record on,
+            with the same shape, in rad^2/s.
+        known: True at each time at which no interpolated record was needed, shape (K,).
     """
 
     q: Array
@@ -453,9 +475,10 @@ class DelayedPeer(NamedTuple):
 
     @property
     def known(self) -> Bools:
-        """Marks the periods in which the delayed motion rests on records only.
+        """Marks the tick periods in which no interpolated record determines the peer's motion.
 
-        Its shape is (K - 1,).
+        Both the present and the delayed motion of the peer are then known from its records. The
+        shape is (K - 1,), because K ticks bound K - 1 periods.
         """
         now = self.now.known
         delayed = self.delayed.known
@@ -491,15 +514,17 @@ def view_delayed_peer(records: AlignedRecords, past: PeerTrajectory) -> DelayedP
 
 
 def find_latest_rows(records: AlignedRecords, t_s: Array) -> tuple[Ints, Bools]:
-    """Finds the rows of a site's latest ticks at some times.
+    """Finds the last tick of a site at or before each of some times.
 
     Args:
-        records: Records of the site.
-        t_s: Times, shape (K,), in s.
+        records: Records of the site, with one row per tick.
+        t_s: Times since the start of the session, shape (K,), in s.
 
     Returns:
-        The rows, shape (K,).
-        True for each of these ticks that is recorded, shape (K,).
+        For each time, the row of that tick in `records`, shape (K,). If the time is outside the
+        records, it is the nearest row.
+        For each time, True if that tick was recorded, and False if its row is interpolated or
+        outside the records, shape (K,).
     """
     tick = np.floor(t_s * records.rate_hz + 1e-6).astype(np.int64)
     row = tick - records.first

@@ -1,26 +1,21 @@
 """Computes inertia, torque, energy and end effector of an arm, for many records at once.
 
-There are two kinds of arms: the planar arm of the paper with two joints, and chains of any
-number of joints. `PlanarArmRows` and `ChainArmRows` have the same methods, in which the rows of
-the arguments are the records.
+A record is the state of an arm in one period of its control loop. There are two kinds of arms:
+the planar arm with two joints, and chains of any number of joints. `PlanarArmRows` and
+`ChainArmRows` have the same methods. Row k of their arguments and results belongs to record k.
 
 A chain has ten inertial parameters per link, but its torques depend only on some linear
-combinations of them, the base parameters. Adaptive laws move estimates along these combinations
-only, so errors of estimates are stated in them. The combinations follow from the geometry: the
-regressors (the matrices that yield the torques when multiplied by the parameters) of many
-random states are stacked, and a QR decomposition goes through their columns. A column that
-depends linearly on the columns before it adds no combination. Its parameter becomes part of the
-combinations of these columns.
+combinations of them, the base parameters. Estimation errors are stated in these. They are found
+with a QR decomposition: M. Gautier, "Numerical calculation of the base inertial parameters of
+robots", J. Robotic Systems 8 (1991).
 
-Sources: M. Gautier, "Numerical calculation of the base inertial parameters of robots", J.
-Robotic Systems 8 (1991), for the QR decomposition; P. M. Wensing, S. Kim, J.-J. Slotine,
-"Linear matrix inequalities for physically consistent inertial parameter identification", IEEE
-Robotics and Automation Letters 3 (2018), for the pseudo-inertia.
+Whether a rigid body can have the parameters of a link is checked by its pseudo-inertia: P. M.
+Wensing, S. Kim, J.-J. Slotine, "Linear matrix inequalities for physically consistent inertial
+parameter identification", IEEE Robotics and Automation Letters 3 (2018).
 
 Invariant:
-    - The planar arm is written from Section IV and Eq. (12) of the paper, independently of the
-      simulation kernel that executed the run.
-    - A chain is computed by the compiled functions of the kernel, which the tests compare with
+    - The planar arm is computed independently of the simulation that executed the run.
+    - A chain is computed by the simulation's own functions, which the tests compare with
       Pinocchio.
 """
 
@@ -297,10 +292,7 @@ class PlanarArmRows(NamedTuple):
 
     @property
     def task(self) -> None:
-        """The task that the end effector follows, which does not exist for this arm.
-
-        It is always None: the planar arm follows other arms joint by joint.
-        """
+        """Always None, because this arm follows joint by joint, not with its end effector."""
         return
 
     @property
@@ -312,10 +304,12 @@ class PlanarArmRows(NamedTuple):
         return np.arange(5) >= 3
 
     def place(self, q: Array) -> PlacedArm:
-        """Returns the arm in all K poses, for computations with one column per pose.
+        """Returns an object that computes the dynamics of the arm in K poses.
+
+        Its arrays have the poses on their last axis.
 
         Args:
-            q: Joint angles, shape (K, 2), in rad.
+            q: Joint angles of the K poses, shape (K, 2), in rad.
         """
         return PlacedArm(self.g, self.lengths_m, q.T)
 
@@ -349,16 +343,17 @@ class PlanarArmRows(NamedTuple):
         v: Array,
         a: Array,
     ) -> Array:
-        """Returns the torque with which a law compensates the dynamics that it estimates.
+        """Returns the torque with which an adaptive law compensates the estimated dynamics.
 
-        It is Y(q, qd, v, a) theta_hat, with the regressor Y of Eq. (12).
+        The torque is Y theta_hat. Y is the regressor, the matrix that yields the torque of a
+        motion when it is multiplied by the dynamic parameters.
 
         Args:
-            theta_hat: Estimates of the arm's dynamic parameters, shape (K, 5).
+            theta_hat: Estimates of the arm's five dynamic parameters in K poses, shape (K, 5).
             q: Joint angles, shape (K, 2), in rad.
             qd: Joint velocities, shape (K, 2), in rad/s.
-            v: Reference velocities, shape (K, 2), in rad/s.
-            a: Reference accelerations, shape (K, 2), in rad/s^2.
+            v: Velocities that the joints should have, shape (K, 2), in rad/s.
+            a: Accelerations that the joints should have, shape (K, 2), in rad/s^2.
 
         Returns:
             Torque, shape (K, 2), in N m.
@@ -377,17 +372,18 @@ class PlanarArmRows(NamedTuple):
     ) -> Array:
         """Returns Y'r, the direction in which the adaptive law changes the parameter estimates.
 
-        Y' is the transposed regressor of Eq. (12), and r = qd - v the filtered error.
+        Y is the regressor: the torque that a motion requires is Y times the dynamic parameters.
+        Y' is its transpose, and r = qd - v the velocity error.
 
         Args:
-            q: Joint angles, shape (K, 2), in rad.
+            q: Joint angles in K poses, shape (K, 2), in rad.
             qd: Joint velocities, shape (K, 2), in rad/s.
-            v: Reference velocities, shape (K, 2), in rad/s.
-            a: Reference accelerations, shape (K, 2), in rad/s^2.
-            r: Filtered errors, shape (K, 2), in rad/s.
+            v: Velocities that the joints should have, shape (K, 2), in rad/s.
+            a: Accelerations that the joints should have, shape (K, 2), in rad/s^2.
+            r: Velocity errors qd - v, shape (K, 2), in rad/s.
 
         Returns:
-            Gradient, shape (K, 5).
+            Gradient Y'r with respect to the five parameters, shape (K, 5).
         """
         arm = self.place(q)
         Y = arm.regressor_matrix(qd.T, v.T, a.T)
@@ -428,7 +424,17 @@ class PlanarArmRows(NamedTuple):
         return np.zeros_like(speed)
 
     def stop_torque(self, q: Array, qd: Array) -> Array:  # noqa: ARG002 - as of a chain
-        """Returns zeros, shape (K, 2): the joints of this arm have no stops."""
+        """Returns zeros, because the joints of this arm have no mechanical stops.
+
+        The method exists so that this arm can be used in place of a chain.
+
+        Args:
+            q: Joint angles in K poses, shape (K, 2), in rad.
+            qd: Joint velocities, shape (K, 2), in rad/s.
+
+        Returns:
+            Torque of the stops, shape (K, 2), in N m.
+        """
         return np.zeros_like(q)
 
     def place_end_effector(self, q: Array, qd: Array) -> EndEffectorRows:
@@ -590,7 +596,10 @@ class ChainArmRows(NamedTuple):
 
     @property
     def task(self) -> TaskSetup | None:
-        """The task that the end effector follows. None if the arm follows joint by joint."""
+        """The coordinates of the end effector with which the arm follows other arms.
+
+        None if the arm follows other arms joint by joint.
+        """
         return self.chain.task
 
     @property
@@ -704,17 +713,18 @@ class ChainArmRows(NamedTuple):
     ) -> Array:
         """Returns Y'r, the direction in which the adaptive law changes the parameter estimates.
 
-        Y' is the transposed regressor of Eq. (12), and r = qd - v the filtered error.
+        Y is the regressor: the torque that a motion requires is Y times the dynamic parameters.
+        Y' is its transpose, and r = qd - v the velocity error. The chain has n joints.
 
         Args:
-            q: Joint angles, shape (K, n), in rad.
+            q: Joint angles in K poses, shape (K, n), in rad.
             qd: Joint velocities, shape (K, n), in rad/s.
-            v: Reference velocities, shape (K, n), in rad/s.
-            a: Reference accelerations, shape (K, n), in rad/s^2.
-            r: Filtered errors, shape (K, n), in rad/s.
+            v: Velocities that the joints should have, shape (K, n), in rad/s.
+            a: Accelerations that the joints should have, shape (K, n), in rad/s^2.
+            r: Velocity errors qd - v, shape (K, n), in rad/s.
 
         Returns:
-            Gradient, shape (K, 10 n).
+            Gradient Y'r with respect to the 10 n parameters, shape (K, 10 n).
         """
         gradient = np.zeros((len(q), len(self.theta)))
         _put_gradients(
@@ -775,13 +785,14 @@ class ChainArmRows(NamedTuple):
         return energy
 
     def friction(self, speed: Array) -> Array:
-        """Returns the torque of the joints' friction, which opposes a motion, in N m.
+        """Returns the torque that the joints need to overcome their friction.
 
         Args:
-            speed: Joint velocities, shape (K, n), in rad/s.
+            speed: Joint velocities at K times, shape (K, n) for n joints, in rad/s.
 
         Returns:
-            Torque, shape (K, n), with the sign of the velocity.
+            Torque, shape (K, n), in N m. It has the sign of the velocity. The friction itself
+            acts with the opposite sign.
         """
         viscous = self._column("viscous") * speed
         # a smooth sign of the speed
@@ -859,15 +870,18 @@ class ChainArmRows(NamedTuple):
         return rate.transpose(0, 2, 1)
 
     def hanging_angle(self, q: Array) -> float:
-        """Returns how far the chain is from hanging down, as the angle of a pendulum, in rad.
+        """Returns how far the chain is from hanging straight down, as an angle in rad.
 
-        The pendulum has the same position between its least and its largest potential energy.
-        Both extremes of the chain's energy are searched joint by joint from this pose on,
-        without regard to mechanical stops. A chain without weight never hangs: its angle is
-        infinite.
+        The angle compares the chain's potential energy E with the lowest and highest energy
+        that it can have: cos(angle) = 1 - 2 (E - lowest) / (highest - lowest). So 0 means
+        hanging down, and pi means upright. The extremes are searched from this pose on, one
+        joint after the other. Mechanical stops are ignored.
 
         Args:
-            q: Joint angles of one pose, shape (n,), in rad.
+            q: Joint angles of one pose, shape (n,) for n joints, in rad.
+
+        Returns:
+            The angle. Infinite if gravity has no effect on the chain.
         """
         lowest_j = self._find_extreme_energy(q, 1.0)
         highest_j = self._find_extreme_energy(q, -1.0)
@@ -1078,14 +1092,16 @@ def _find_chain_base(chain: ChainSetup, learnt: tuple[bool, ...]) -> BaseParamet
 
 
 def find_base_parameters(arm: ArmRows, learnt: NDArray[np.bool_]) -> BaseParameters:
-    """Finds the combinations of the learnt parameters that torques determine.
+    """Finds which combinations of an arm's dynamic parameters can be learnt from its torques.
 
-    The five parameters of the planar arm are base parameters already, so that each is a
-    combination of its own.
+    Torques do not determine every parameter of a chain by itself, but only some linear
+    combinations of them, the base parameters. For the planar arm, each of its five parameters
+    is a base parameter.
 
     Args:
-        arm: The arm.
-        learnt: True for each parameter that the control law learns, shape (P,).
+        arm: The arm, with P dynamic parameters.
+        learnt: True for each parameter that the control law learns, shape (P,). The other
+            parameters are in no combination.
     """
     if isinstance(arm, ChainArmRows):
         return _find_chain_base(arm.chain, tuple(learnt.tolist()))

@@ -25,14 +25,17 @@ class BodyTurns:
         self._signs: dict[int, QuaternionSigns] = {}
 
     def align(self, bodies: Sequence[float]) -> Array:
-        """Returns the poses of a frame, with each quaternion near that of the frame before.
+        """Returns the poses of all bodies at one time, with quaternions that do not jump.
+
+        The sign of each quaternion is chosen so that it is near the body's quaternion in the
+        previous call.
 
         Args:
-            bodies: Pose of each of the b bodies: position x, y, z in m, and unit quaternion w,
-                x, y, z.
+            bodies: Seven numbers for each of the b bodies: position x, y, z in m, and unit
+                quaternion w, x, y, z.
 
         Returns:
-            The poses, shape (7 b,), in which the signs of some quaternions are reversed.
+            The same numbers, in which the signs of some quaternions are reversed, shape (7 b,).
         """
         pose_length = POSITION + len(QUATERNION_AXES)
         numbers = np.array(bodies, dtype=np.float64)

@@ -88,10 +88,11 @@ class SiteEnergy:
 
     @cached_property
     def residual(self) -> Array:
-        """The part of the change of V_i that no known energy explains, shape (K,), in J.
+        """The change of the site's energy V_i that no energy flow explains, shape (K,), in J.
 
-        It is V_i - V_i(0) + dissipation + transfer - work, summed over the judged periods up to
-        each record. It includes the work of sampling.
+        It is V_i - V_i(0) + dissipation + transfer - work, with the attributes of this class.
+        Only changes in judged periods are summed. It still contains the work that arises
+        because the control law is executed in ticks, see `unexplained`.
         """
         dissipated = [kind.total for kind in self.dissipation.values()]
         worked = [source.total for source in self.work.values()]
@@ -102,7 +103,12 @@ class SiteEnergy:
 
     @cached_property
     def unexplained(self) -> Array:
-        """The residual less the work that arises from execution in ticks, shape (K,), in J."""
+        """The change of the site's energy that remains unexplained, shape (K,), in J.
+
+        It is `residual` minus the work that arises because the continuous control law is
+        executed only once per tick. It is 0 up to numerical errors if the records obey the
+        model of the site.
+        """
         sampling = _accumulate(self.sampling.total, self.judged)
         return self.residual - sampling
 
@@ -136,10 +142,10 @@ class SiteEnergy:
 
     @property
     def begin_s(self) -> float:
-        """Time of the first tick at which V_i can be computed from records, in s.
+        """Time of the first tick at which the energy V_i of the site can be computed, in s.
 
-        V_i depends on the motion of the peers since the oldest sample in use. If there is no
-        such tick, the time is infinite.
+        V_i depends on the motion of the other sites since they sent the states that are in use.
+        If this motion is not recorded at any tick, the time is infinite.
         """
         known = []
         for view in self.followed.values():
@@ -152,12 +158,14 @@ class SiteEnergy:
 
     @cached_property
     def uncertainty(self) -> float:
-        """Bound of the error of the energies because of motion within the tick periods, in J.
+        """Estimated numerical error of the site's energies, in J.
 
-        The error of the trapezoid rule is estimated by the sum of the second differences of the
-        total power. The error of sampling and operators is estimated by the products of the
-        changes of r and of a torque: if these products add up, the period is long for the
-        gains. With too few periods for second differences, the whole energy is uncertain.
+        Energies are integrated from records at the ticks, so that motion between the ticks
+        causes errors. The error of the trapezoid rule is estimated from the curvature of the
+        total power. The error of torques that are constant between ticks is estimated from the
+        changes of these torques, times the changes of the filtered error r = qd - v. Here qd is
+        the joint velocity and v the reference velocity. With fewer than `MIN_PERIODS` judged
+        periods, the whole energy counts as uncertain.
         """
         dissipated = [self.transfer, *self.dissipation.values()]
         worked = list(self.work.values())
@@ -201,16 +209,20 @@ def _accumulate(amounts: Array, judged: Bools | None = None) -> Array:
 
 
 def compute_site_energies(log: Log) -> dict[str, SiteEnergy]:
-    """Computes the energies of the sites of a log, all of which must have an energy function.
+    """Computes the energy of each site in the stability proof, from a log.
+
+    A site is the process that runs one arm. Every site must have an energy function.
 
     Args:
         log: The log of the run.
 
     Returns:
-        The energies, by site. Empty if there are no two ticks at which V is known.
+        The energies, by name of the site. Empty if there are no two ticks at which the energies
+        of all sites can be computed.
 
     Raises:
-        LogError: A record names a change that is not valid.
+        LogError: A recorded change of the settings, such as of a dominance factor, is not
+            valid.
     """
     records = align_records(log, common=True)
     pasts = {site: PeerTrajectory(site_records) for site, site_records in records.items()}
@@ -227,15 +239,15 @@ def derive_site_energies(
     pasts: Mapping[str, PeerTrajectory],
     dominance: Callable[[str, Array], DominanceHistory],
 ) -> dict[str, SiteEnergy]:
-    """Computes the energy functions V_i of sites, and what changes them, from some records.
+    """Computes the energy of each site in the stability proof, and all that changes it.
 
-    Every site must have an energy function.
+    A site is the process that runs one arm. Every site must have an energy function.
 
     Args:
         scenario: The description of the experiment.
         records: Records of every site, by name.
-        pasts: Motion of every site, back to the time at which the oldest sample in use was
-            sent.
+        pasts: Motion of every site over time, by name. It must reach back to the time at which
+            the oldest state that a site uses was sent.
         dominance: Function that returns the dominance factors of a site, the weights with which
             it follows its peers, at given times in s.
 
@@ -326,9 +338,10 @@ class EnergyBalance:
 
     @cached_property
     def V(self) -> Array:  # noqa: N802 - the paper's symbol
-        """The energy function of the stability proof over time, shape (T,), in J.
+        """The total energy of the arms in the stability proof over time, shape (T,), in J.
 
-        It is the weighted sum of the energy functions of the sites.
+        It is the sum of the energies of the sites, the processes that run one arm each. Every
+        site is weighted with its entry of `beta`.
         """
         return _sum(self.parts)
 
@@ -345,8 +358,10 @@ class EnergyBalance:
 
     @cached_property
     def unexplained(self) -> Array:
-        """The residual less the work of sampling and the transferred energy, shape (T,), in J.
+        """The change of the group's energy that remains unexplained, shape (T,), in J.
 
+        It is `residual` minus two known causes: the work that arises because control laws are
+        executed in ticks, and the energy transfers that the weights of the sites do not cancel.
         A large value means that the log contradicts the model, or that records are wrong.
         """
         explained = self._accumulate_judged(self.sampling - self.transfer)
@@ -354,10 +369,11 @@ class EnergyBalance:
 
     @cached_property
     def unsupplied(self) -> Array:
-        """The part of V that operators and environments did not supply, shape (T,), in J.
+        """The energy V without the work of operators and environments, shape (T,), in J.
 
-        It is V less their work, summed over the judged periods. According to the stability
-        theorem it never rises.
+        It starts at V(0). From then on, only changes in judged periods count, and the work of
+        operators, environments and the stops of joints is subtracted. If the conditions of the
+        stability theorem hold, it never rises.
         """
         rise = self._accumulate_judged(self.V - self.external_work)
         unsupplied: Array = self.V[0] + rise
@@ -388,9 +404,10 @@ class EnergyBalance:
 
     @cached_property
     def scale(self) -> float:
-        """The energy to which errors of the balance are compared, in J.
+        """The size of the energies in the balance, in J, with which its errors are compared.
 
-        It is the largest V, or the largest work if that is larger.
+        It is the largest magnitude that the total energy V, or the work of any source, reaches
+        during the run.
         """
         energies = [self.V, *self.work.values()]
         return max(float(np.abs(energy).max()) for energy in energies)
@@ -405,12 +422,15 @@ def compute_energy_balance(
 ) -> EnergyBalance:
     """Adds up the energies of several sites to the energy balance of the group.
 
+    The sites are weighted so that the energies which they transfer to each other cancel in the
+    sum.
+
     Args:
         energies: Energies of the sites in scenario order. No site may follow a site outside the
             group.
-        paper_weights: True to give all sites the same weight in V, as in the paper. The
-            energies that sites transfer to each other may then not cancel, so that the balance
-            does not close.
+        paper_weights: True to give all sites the same weight, as in the paper on which the
+            control law is based. The transferred energies may then not cancel, so that the
+            balance does not close.
     """
     times = find_common_times(energies)
     weights_by_grid = {}
@@ -447,7 +467,14 @@ def compute_energy_balance(
     all_judged = bool(judged.all())
 
     def select(kind: str) -> dict[str, Array]:
-        """Returns the running sums of a kind by name, over the judged periods."""
+        """Returns the energies of a kind over time, summed over the judged periods.
+
+        Args:
+            kind: The kind, such as "dissipation" or "work".
+
+        Returns:
+            The energies in J by name, such as "damping". Each starts with 0.
+        """
         selected = {}
         for (group, name), energy in sums.items():
             if group != kind:

@@ -1,39 +1,34 @@
-"""Evaluates the energy function of an arm in the stability proof, and all terms that change it.
+"""Evaluates the energy of an arm in the stability proof, and all terms that change it.
 
-A site is the process that runs one arm. Site i follows site j with the weight alpha_ij, its
-dominance factor. The stability proof uses the weighted sum of the energy functions V_i, in J,
-of all sites:
+A site is the process that runs one arm. Site i follows its peer j with the weight alpha_ij, its
+dominance factor. It uses samples, which are delayed states that the peer sent. The energy of
+site i in J is
 
     V_i = 1/2 ( r'M r + (theta_hat - theta)' Gamma^-1 (theta_hat - theta) + e' Lambda Kd e
                 + sum_j alpha_ij int qd_j' Kd qd_j ds )
 
-Here e is the error of the site, the difference between its joint angles and those that it
-follows, and ed is the derivative of e. The filtered error is r = qd + Lambda e, where qd are
-the joint velocities (qd_i for site i). M is the inertia matrix of the arm, theta its dynamic
-parameters such as masses, theta_hat their estimates, and Gamma, Lambda, Kp and Kd are gains.
-The integral runs over the time s, from the time at which the sample in use was sent until now.
+Here ' means transposed. The error e is the difference between the joint angles and those that
+the site follows, and ed its derivative. The filtered error is r = qd + Lambda e, with the joint
+velocities qd (qd_i for site i). M is the inertia matrix of the arm, theta its dynamic
+parameters, and theta_hat their estimates. Gamma, Lambda, Kp and Kd are gains. The integral runs
+over the time s, from the time at which the sample in use was sent until now.
 
-This is Eq. (16) of the paper with the integral that its Eq. (22) needs (docs/errata.md). If
-|x|^2 stands for x'Kd x, and T for the delay from site j, the derivative without external
-torques is
+With |x|^2 = x'Kd x and the delay T from peer j, the derivative without external torques is
 
-    V_i' = -r'Kp r - 1/2 sum_j alpha_ij |qd_i - qd_j(t - T)|^2
-           - 1/2 |qd_i|^2 + 1/2 sum_j alpha_ij |qd_j|^2
+    dV_i/dt = -r'Kp r - 1/2 sum_j alpha_ij |qd_i - qd_j(t - T)|^2
+              - 1/2 |qd_i|^2 + 1/2 sum_j alpha_ij |qd_j|^2
 
-The terms of the first line dissipate energy. The terms of the second line transfer it between
-sites, and cancel in the sum over all sites with the weights beta of the proof. If the sites
-follow in task space, e and qd_j are errors and velocities of end effectors, and r is defined by
-`following`. docs/certificate.md has the rest.
+The first line dissipates energy. The second line transfers energy between sites, and cancels in
+a suitably weighted sum over all sites. In task space, e and qd_j concern the end effectors.
+docs/certificate.md explains the derivation.
 
-Within a tick period each term is integrated by the trapezoid rule, with an error of second
-order in the period. At the end of the period a new sample comes into use, so that e jumps. The
-energy of the jump is computed exactly, and divided among the links, the changes of dominance
-factors, and the rule for silent peers.
+Each term is integrated over a tick period by the trapezoid rule. At the end of the period e
+jumps to the value of the next sample. The energy of this jump is computed exactly.
 
 Invariant:
     - The work of operators and environments is computed with r instead of qd, because the
       theorem requires that they are passive with respect to r.
-    - A site has an energy function only if its control law is the paper's, and theta is known.
+    - A site has an energy function only if it uses the adaptive law and theta is known.
 """
 
 from collections.abc import Mapping
@@ -142,16 +137,21 @@ class SiteConstants(NamedTuple):
 
     @property
     def adapts(self) -> Bools:
-        """True for each parameter that the law adapts, shape (P,)."""
+        """Marks the dynamic parameters that the control law estimates, shape (P,).
+
+        The other parameters keep the value that the scenario gives them.
+        """
         return self.Gamma > 0.0
 
 
 def derive_site_constants(scenario: Scenario, site: str) -> SiteConstants:
-    """Collects the constants of a site whose control law is the adaptive law of the paper.
+    """Collects the gains, limits and arm parameters of a site from the scenario.
+
+    The site must use the adaptive control law, and the parameters of its arm must be known.
 
     Args:
         scenario: The description of the experiment, which defines the gains.
-        site: Name of the site.
+        site: Name of the site, the process that runs one arm.
     """
     spec = scenario.sites[site]
     arm = build_arm_rows(scenario, site)
@@ -213,7 +213,8 @@ class PeriodEnds(NamedTuple):
 class SiteMotion:
     """The recorded motion of a site, and everything that acts on it, over K records.
 
-    All energies of the site are computed from this object.
+    A site is the process that runs one arm, and its peers are the sites that it follows. All
+    energies of the site are computed from this object.
 
     Attributes:
         records: Records of the site.
@@ -224,8 +225,8 @@ class SiteMotion:
         torque: External torque on the arm, by source.
         scheme: Whether the controller holds the torque of a tick until the next tick, or
             extrapolates it.
-        common: For each coordinate, 1 if all sites follow along it, else 0. Empty if all sites
-            follow along all coordinates.
+        common: 1 for each coordinate in which all sites follow others, and 0 for each other
+            coordinate. Empty if all sites follow others in all coordinates.
     """
 
     records: AlignedRecords
@@ -238,9 +239,10 @@ class SiteMotion:
 
     @cached_property
     def following(self) -> Following:
-        """The functions that turn errors of the reference into motion and torque of the joints.
+        """Functions that translate errors of the shared coordinates to the joints of the arm.
 
-        They differ between sites that follow joint by joint and with the end effector.
+        Sites that follow each other with their end effectors use other functions than sites
+        that follow joint by joint.
         """
         records = self.records
         c = self.constants
@@ -248,9 +250,11 @@ class SiteMotion:
 
     @cached_property
     def r(self) -> Array:
-        """The filtered error (sliding variable) r, shape (K, n), in rad/s.
+        """The filtered error r (sliding variable) of the site, shape (K, n), in rad/s.
 
-        It is qd + Lambda e, Eq. (10). In task space it is qd - v with the reference velocity v.
+        It is the velocity of the joints minus the reference velocity. If the site follows joint
+        by joint, it is r = qd + Lambda e, with the joint velocity qd, the synchronisation error
+        e and the gain Lambda in 1/s.
         """
         records = self.records
         v, _ = self.following.compute_reference(slice(None), records.e, records.ed)
@@ -258,9 +262,11 @@ class SiteMotion:
 
     @cached_property
     def Yr(self) -> Array:  # noqa: N802 - the paper's symbol
-        """Y'r of Eq. (15), the direction in which the law adapts its estimates, shape (K, P).
+        """The direction in which the adaptive law changes its P estimates at each of K ticks.
 
-        Y' is the transposed regressor of the arm's dynamics, and r the filtered error.
+        It is Y'r with the shape (K, P). Y is the regressor, which yields torques when
+        multiplied by the dynamic parameters, and Y' its transpose. The filtered error r is the
+        joint velocity minus the reference velocity.
         """
         records = self.records
         v, a = self.following.compute_reference(slice(None), records.e, records.ed)
@@ -274,10 +280,11 @@ class SiteMotion:
 
     @cached_property
     def mean_Yr(self) -> Array:  # noqa: N802 - the paper's symbol
-        """The value of Y'r with which the law advances its estimates over each tick period.
+        """The direction in which the law changed its P estimates in each of K - 1 tick periods.
 
-        Its shape is (K - 1, P). Y is the regressor of the arm's dynamics, and r the filtered
-        error.
+        It is Y'r, where Y is the regressor of the arm's dynamics, Y' its transpose, and r the
+        filtered error. Y'r is taken at the start of the period or averaged over its ends, as
+        the law did. The shape is (K - 1, P).
         """
         if self.scheme is Scheme.DIGITAL:
             return self.Yr[:-1]
@@ -286,13 +293,13 @@ class SiteMotion:
         return 0.5 * (Yr_left + Yr_right)
 
     def law_torque(self, rows: Ints) -> Array:
-        """Returns the torque that the control law of Eq. (13) demands, before it is limited.
+        """Returns the torque that the control law demands, before it is limited.
 
         Args:
             rows: Rows of the records at which the law is evaluated, shape (K,).
 
         Returns:
-            Torque, shape (K, n), in N m.
+            Torque, shape (K, n) for n joints, in N m.
         """
         return self.control_torque(
             rows,
@@ -308,16 +315,17 @@ class SiteMotion:
         ed: Array,
         r: Array,
     ) -> Array:
-        """Returns the torque of the control law, Eq. (13), for errors that were not recorded.
+        """Returns the torque that the control law would demand for given errors.
 
-        Pose and estimates are the recorded ones. This shows, for example, the torque just
-        before a new sample came into use.
+        Pose and parameter estimates are taken from the records. The errors may differ from the
+        recorded ones. This shows, for example, the torque just before a new sample of a peer
+        was used.
 
         Args:
-            rows: Rows whose pose and estimate are used, shape (K,).
-            e: Synchronisation errors, shape (K, n).
-            ed: Their derivatives, shape (K, n).
-            r: Filtered errors, shape (K, n).
+            rows: Rows of the records whose pose and estimates are used, shape (K,).
+            e: Synchronisation errors, shape (K, n), in rad.
+            ed: Derivatives of the synchronisation errors, shape (K, n), in rad/s.
+            r: Filtered errors, shape (K, n), in rad/s.
 
         Returns:
             Torque before it is limited, shape (K, n), in N m.
@@ -341,7 +349,10 @@ class SiteMotion:
 
     @property
     def rests(self) -> Bools:
-        """True if the arm comes to rest, so that the torque may not be that of the law."""
+        """Marks the records in which the arm comes to rest, or has just done so, shape (K,).
+
+        The recorded torque may then differ from the torque that the control law demands.
+        """
         records = self.records
         if records.rests.size:
             return records.rests
@@ -378,7 +389,10 @@ class SiteMotion:
 
     @cached_property
     def limited(self) -> Bools:
-        """Marks each torque at its limit or at the limit of its rate, shape (K, n)."""
+        """Marks each recorded torque that is at a limit of the joint, shape (K, n).
+
+        The limit is the largest torque or the largest change of the torque per tick.
+        """
         low, high = self.torque_bounds
         c = self.constants
         tau = self.records.tau
@@ -392,11 +406,13 @@ class SiteMotion:
 
     @cached_property
     def ends(self) -> PeriodEnds:
-        """The motion at both ends of all tick periods.
+        """The state of the site at the start and the end of every tick period.
 
-        While the site follows its peers, its reference moves smoothly within a period by Eq.
-        (6), as if the samples in use grew no older. Otherwise the rule for silent peers
-        decides, and the trapezoid rule is applied to the recorded velocity of the reference.
+        The reference is the motion that the site follows: the delayed motions of its peers,
+        weighted with the dominance factors. Within a period the delays are taken as constant,
+        so that the reference moves smoothly. At the end of the period it jumps to its next
+        recorded value. If samples of a peer stop arriving, the rule for silent peers determines
+        the reference instead. Then its recorded velocity is integrated by the trapezoid rule.
         """
         records = self.records
         dominance = self.dominance
@@ -455,15 +471,16 @@ class SiteMotion:
 
 
 class FunctionalParts(NamedTuple):
-    """The four parts of a site's energy function V_i, shape (K,) each, in J.
+    """The energy of a site in the stability proof, split into its four parts, in J.
 
-    They are the four terms of the equation in the module's docstring, in its order.
+    Each part has the shape (K,) for K records. Their sum is V_i in the module's docstring.
 
     Attributes:
-        kinetic: Kinetic energy of the filtered error, 1/2 r'M r.
+        kinetic: Kinetic energy that corresponds to the filtered error r, 1/2 r'M r with the
+            inertia matrix M.
         parameter: Energy of the errors of the parameter estimates.
-        position: Energy of the synchronisation error e.
-        delay: Energy of the peers' motion that is under way on the links.
+        position: Energy of the synchronisation error, which acts like a stretched spring.
+        delay: Energy of the motion of the peers that the site has not received yet.
     """
 
     kinetic: Array
@@ -478,13 +495,14 @@ class FunctionalParts(NamedTuple):
 
 
 def evaluate_functional(site: SiteMotion) -> FunctionalParts:
-    """Computes the energy function V_i of a site at each of its K records.
+    """Computes the energy of a site in the stability proof at each of its K records.
 
     Args:
         site: Motion of the site.
 
     Returns:
-        The four parts of V_i, of which the sum is V_i.
+        Four parts of the energy: of the filtered error, of the parameter estimates, of the
+        synchronisation error, and of the delay.
     """
     records = site.records
     c = site.constants
@@ -524,16 +542,16 @@ def _energy_in_transit(c: SiteConstants, view: DelayedPeer) -> Array:
 
 
 class Increment(NamedTuple):
-    """An amount of energy in each tick period, computed by the trapezoid rule, in J.
+    """An amount of energy in each of K - 1 tick periods, in J, shape (K - 1,) each.
 
-    Each attribute has the shape (K - 1,) for K records. At the end of a period, when a new
-    sample comes into use, the error e of the site jumps, so that some energies change in a
-    step.
+    The energy is the integral of a power by the trapezoid rule, plus a sudden change. At the
+    end of each period a new sample of a peer comes into use. The error of the site then jumps,
+    and some energies change with it.
 
     Attributes:
-        left: Contribution of the start of the period to the trapezoid rule.
-        right: Contribution of the end of the period, before the jump of e.
-        jump: Amount by which the energy changes at the jump.
+        left: Contribution of the power at the start of the period.
+        right: Contribution of the power at the end of the period, before the sudden change.
+        jump: The sudden change of the energy.
     """
 
     left: Array
@@ -542,7 +560,7 @@ class Increment(NamedTuple):
 
     @property
     def total(self) -> Array:
-        """The whole amount of every period, shape (K - 1,), in J."""
+        """The energy of each tick period, including its jump, shape (K - 1,), in J."""
         return self.left + self.right + self.jump
 
 
@@ -579,19 +597,24 @@ def _zero_increment(site: SiteMotion) -> Increment:
 
 
 def compute_dissipation(site: SiteMotion) -> dict[str, Increment]:
-    """Computes the energy that a site dissipates in each tick period, by kind.
+    """Computes the energy that the controller of a site dissipates in each tick period.
 
-    The module's docstring defines the symbols. The kinds are the integrals of these powers:
+    The result has these kinds of energy:
 
-    - damping: r'Kp r, and r times the robust torque;
-    - disagreement: 1/2 sum_j alpha_ij |qd_i - qd_j(t - T_ij)|^2, where T_ij is the delay from j
-      to i;
-    - friction, of joints that have any: r'(friction(qd) - friction(qd - r));
-    - open axes, if not all sites follow along all axes: the power that sites do not return to
-      each other along these axes.
+    - damping: the work of the damping and of the robust torque, which both act against the
+      filtered error r.
+    - disagreement: half the squared difference between the velocity of the site and the delayed
+      velocity of each peer, weighted with the dominance factor of the peer and the gain Kd.
+    - friction, if the joints have any: the work r'(friction(qd) - friction(qd - r)), with the
+      joint velocities qd.
+    - open axes: the energy that the site gives to others along the axes of space that not all
+      sites follow. It is missing if all sites follow along all axes.
 
     Args:
         site: Motion of the site.
+
+    Returns:
+        The energies, by kind.
     """
     records = site.records
     c = site.constants
@@ -637,15 +660,17 @@ def compute_dissipation(site: SiteMotion) -> dict[str, Increment]:
 
 
 def compute_transfer(site: SiteMotion, axes: Array) -> Increment:
-    """Computes the energy that a site gives to its followers, less the energy that it gets.
+    """Computes the energy that a site gives to the sites which follow it, minus what it gets.
 
-    It is int (1/2 |qd_i|^2 - 1/2 sum_j alpha_ij |qd_j|^2) dt, with the velocities qd of the
-    sites, |x|^2 = x'Kd x, and the dominance factors alpha_ij with which site i follows peer j.
-    In the weighted sum over all sites these energies cancel.
+    In each tick period it is the integral of 1/2 qd_i'Kd qd_i - 1/2 sum_j alpha_ij qd_j'Kd
+    qd_j. Here qd_i is the velocity of the site and qd_j of its peer j, Kd is the damping gain,
+    and alpha_ij is the dominance factor: the weight with which site i follows peer j. In the
+    weighted sum over all sites these energies cancel.
 
     Args:
         site: Motion of the site.
-        axes: Weight of each axis, 1 to include it or 0, shape (m,) or ().
+        axes: 1 for each of the m coordinates that counts, and 0 for each other one, shape (m,).
+            The shape () applies to all coordinates.
     """
     dominance = site.dominance
     c = site.constants._replace(Kd=axes * site.constants.Kd)
@@ -703,9 +728,10 @@ def compute_work(site: SiteMotion) -> dict[str, Increment]:
 
 
 def torque_work(site: SiteMotion, now: Array, held: Array) -> Increment:
-    """Computes the work int r' tau_h dt of an external torque tau_h on the arm.
+    """Computes the work of an external torque on the arm in each tick period.
 
-    r is the filtered error of the site, on which the torque does work in the proof.
+    In the stability proof, a torque does work on the filtered error r instead of the joint
+    velocity. The work is the integral of r' times the torque.
 
     Args:
         site: Motion of the site.
@@ -744,16 +770,17 @@ def link_work(site: SiteMotion, j: int) -> Increment:
 
 
 def dominance_change_work(site: SiteMotion) -> Increment:
-    """Computes the work of a change of dominance factors on V_i, along a ramp or at a step.
+    """Computes the energy that a change of dominance factors adds to the energy V_i of a site.
 
-    A dominance factor alpha_ij is the weight with which site i follows peer j. Along a ramp
-    with the rates alpha_ij', the power of this work is
+    The dominance factor alpha_ij is the weight with which site i follows its peer j. Along a
+    ramp, the power of the change is
 
-        1/2 sum_j alpha_ij' int qd_j' Kd qd_j ds + qd_i' Kd sum_j alpha_ij' q_j(t - T_ij),
+        1/2 sum_j w_j int qd_j' Kd qd_j ds + qd_i' Kd sum_j w_j q_j(t - T_ij)
 
-    with the delay T_ij and the gain Kd. The second term arises because ed, the derivative of
-    the error, and with it the damping, contains the ramp. The work of a change of the weights
-    beta of the sites in V is not included.
+    with w_j the time derivative of alpha_ij, T_ij the delay, Kd the damping gain, and q and qd
+    positions and velocities. The integral covers the last T_ij seconds. The second term arises
+    because the velocity error of the site contains w_j. A sudden change adds the energy of the
+    jump. The effect on the weights of the sites in the total energy is not included.
 
     Args:
         site: Motion of the site.
@@ -790,9 +817,11 @@ def dominance_change_work(site: SiteMotion) -> Increment:
 
 
 def stale_rule_work(site: SiteMotion) -> Increment:
-    """Computes the work of the rule for silent peers, while it replaces the reference.
+    """Computes the work on a site that is caused by missing samples of its peers.
 
-    When samples of a peer stop arriving, the rule determines the reference instead of Eq. (6).
+    When samples of a peer stop arriving, a rule of the scenario determines the reference, the
+    motion that the site follows. The result is the work of the difference from the reference
+    that the site would have had with all samples.
 
     Args:
         site: Motion of the site.
@@ -829,9 +858,9 @@ def stale_rule_work(site: SiteMotion) -> Increment:
 def torque_limit_work(site: SiteMotion) -> Increment:
     """Computes the work of the part of the torque that the control law did not demand.
 
-    It is int r' (tau - tau_law) dt, with the filtered error r, the recorded torque tau and the
-    torque tau_law of Eq. (13). They differ where a torque is limited, and while the arm comes
-    to rest.
+    It is the integral of r'(tau - tau_law) over time. Here r is the filtered error and r' its
+    transpose, tau the recorded torque, and tau_law the torque that the law demanded. The two
+    torques differ where a torque is limited, and while the arm comes to rest.
 
     Args:
         site: Motion of the site.
@@ -848,13 +877,14 @@ def torque_limit_work(site: SiteMotion) -> Increment:
 
 
 def unknown_friction_work(site: SiteMotion) -> Increment:
-    """Computes the work of the part of the friction that the law does not compensate.
+    """Computes the work of the part of the friction that the control law does not compensate.
 
-    It is -int r' friction(v) dt, with the filtered error r and the reference velocity v = qd -
-    r.
+    The power of this work is minus the filtered error r, times the uncompensated part of the
+    friction torque. The friction torque is evaluated at the reference velocity qd - r, with the
+    joint velocity qd.
 
     Args:
-        site: Motion of the site.
+        site: Recorded motion of the site.
     """
     records = site.records
     c = site.constants
@@ -872,13 +902,17 @@ def unknown_friction_work(site: SiteMotion) -> Increment:
 
 
 def singular_pose_work(site: SiteMotion) -> Increment:
-    """Computes the work that arises because motion is damped near singular poses.
+    """Computes the work that arises because motion is damped near singular poses of the arm.
 
-    In task space the inverse of the Jacobian J is damped near singular poses, where the end
-    effector cannot move in some direction. The damped inverse J+ makes J J+ differ from the
-    unit matrix. The work is int (r'M(a - v') - (J r - x' - Lambda e)'Kd ed) dt, with the
-    reference velocity v of the joints, the acceleration a that the law uses for it, and the
-    velocity x' of the end effector. Both terms are zero if J J+ = I.
+    In a singular pose the end effector cannot move in some direction. Near it, the controller
+    uses a damped inverse of the Jacobian J. The energy then changes by the integral of
+
+        r'M(a - dv/dt) - (J r - xd - Lambda e)'Kd ed
+
+    Here r is the filtered error, M the inertia matrix, v the reference velocity of the joints,
+    a the acceleration that the law uses for dv/dt, xd the velocity of the end effector, e its
+    error, ed the derivative of e, and Lambda and Kd are gains. Both terms are zero without
+    damping.
 
     Args:
         site: Motion of the site.
@@ -932,17 +966,17 @@ def _singular_pose_power(
 
 
 def measure_torque_error(site: SiteMotion) -> Array:
-    """Computes how far the recorded torques are from those of the control law, Eq. (13).
+    """Computes how much the recorded torques differ from those that the control law demands.
 
     The law is evaluated from the recorded motion, within its limits. A large error means that
     the site ran another law than the scenario states.
 
     Args:
-        site: Motion of the site.
+        site: Motion of the site, with K records.
 
     Returns:
-        The largest difference of all joints, shape (K,), in N m. It is 0 in rows without a
-        record, and while the arm comes to rest.
+        The largest difference of all joints, shape (K,), in N m. It is 0 for interpolated
+        records, and while the arm comes to rest.
     """
     records = site.records
     low, high = site.torque_bounds
@@ -956,13 +990,16 @@ def measure_torque_error(site: SiteMotion) -> Array:
 
 
 def estimate_work(site: SiteMotion) -> Increment:
-    """Computes the work of parameter estimates that do not follow the adaptive law, Eq. (15).
+    """Computes the work of parameter estimates that do not follow the adaptive law.
 
-    Such estimates are held at the limits of their permitted range, or are not adapted at all. A
-    limit only reduces the energy 1/2 (theta_hat - theta)' Gamma^-1 (theta_hat - theta), since
-    the range contains the true parameters theta. For a parameter that is not adapted, or not
-    while the arm comes to rest, no term of V_i cancels the power r' Y (theta_hat - theta),
-    where Y is the regressor and r the filtered error.
+    There are two cases:
+
+    - An estimate is held at a limit of its permitted range. If the range contains the true
+      parameter, this only reduces the energy of the estimation errors.
+    - A parameter is never adapted, or not while the arm comes to rest. Its estimation error
+      then causes a torque error, which does work: the integral of r'Y(theta_hat - theta). Here
+      r is the filtered error, Y the regressor, theta_hat the estimates and theta the true
+      parameters.
 
     Args:
         site: Motion of the site.
@@ -994,17 +1031,19 @@ def estimate_work(site: SiteMotion) -> Increment:
 
 
 def compute_sampling_work(site: SiteMotion) -> Increment:
-    """Returns the work that arises because the continuous law is executed in ticks.
+    """Returns the work that arises because the continuous control law is executed in ticks.
 
-    The work has two parts:
+    With the filtered error r, the work has two parts:
 
-    - int r' (u - tau) dt, where u is the torque that is held: the torque of the tick for the
-      scheme `digital`, or the extrapolated torque for `second_order`. tau is taken as a
-      straight line up to its value before the jump of e.
-    - The step of the estimate, compared with the trapezoid rule on Eq. (15).
+    - Torque: the integral of r'(u - tau). The torque u is constant within a period, while the
+      torque tau of the continuous law changes linearly until the end of the period.
+    - Parameter estimates: their recorded step, compared with the trapezoid rule for the
+      adaptive law.
 
-    This work is not part of the energy balance. The residual of the balance less this work is
-    the unexplained energy.
+    This work is no part of the energy balance. It explains part of the balance's residual.
+
+    Args:
+        site: Motion of the site.
     """
     records = site.records
     c = site.constants

@@ -1,19 +1,19 @@
 """Checks the energies that a control law declares against the records of a run.
 
-Some control laws prove passivity by bookkeeping: they store energy in tanks, in lines between
-sites, or in passivity observers. Such a law declares these energies for every record. This
-module computes the same energies independently, from the recorded torques and motion, and
-compares them:
+Some control laws prove passivity by counting energy: they keep energy in stores (tanks), or
+track the energy that travels between the sites, the processes that run one arm each. Such a law
+declares these energies for every tick of its control loop. This module computes the same
+energies independently, from the recorded torques and motion, and compares them:
 
-- Energy of the line from site j to site i: the energy that the law of j sent into the line,
-  less the energy that the law of i received from it.
-- Energy through the port of an arm: the sum of u_k' (q_{k+1} - q_k) over all ticks k, where u_k
-  is the torque that was held during tick k, and q_k the joint angles.
+- Energy of the connection (line) from site j to site i: the energy that the law of j sent,
+  minus the energy that the law of i received.
+- Energy that the arm gives to its law: minus the sum of u_k'(q_{k+1} - q_k) over all ticks k.
+  Here u_k is the torque during tick k, and q_k are the joint angles.
 
 Invariant:
     - A declared energy counts as evidence only if it agrees with the computed energy.
-    - The verdict is negative if the energy of a line or store is ever below zero, or if the
-      energy that a law dissipated ever decreases. It names the line, the store or the site.
+    - The verdict is negative if the energy of a line or store is ever below zero. It is also
+      negative if the total energy that a law has dissipated ever decreases.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -42,9 +42,9 @@ SAMPLING_SHARE = 1e-2
 
 
 class ObservedFinding(StrEnum):
-    """What the energies that control laws declare show about a run.
+    """Result of the check that the energies which control laws declare stay above zero.
 
-    The value of each member is the text for people.
+    The value of each member is a phrase for the user.
     """
 
     PASSIVE = "observed energy never below zero"
@@ -79,7 +79,11 @@ class EnergyCurve(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Name of the energy, such as "line m->s", "known at s of m" or "store of s"."""
+        """Short name of the energy for reports.
+
+        With sites m and s, the energy on the way from m to s is named "line m->s". The part of
+        it that s knows is "known at s of m". The energy stored at s is "store of s".
+        """
         if self.kind == "line":
             return f"line {self.peer}->{self.site}"
         if self.kind == "known":
@@ -106,13 +110,15 @@ class ObservedEnergy(NamedTuple):
     """Verdict on the energies that control laws declare, computed by `observe_energies`.
 
     Attributes:
-        finding: What the energies show.
+        finding: Whether the energies stay above zero, or why this is not judged.
         text: The verdict as a sentence.
         premises: The conditions under which the energies count as evidence, each checked.
         least: Minimum over time of every energy.
         largest_j: Largest of all energies, in J.
-        residual_j: Largest error in the energy account of a law, in J.
-        sampling_j: Largest energy that an arm received beyond what its law accounts for, in J.
+        residual_j: Largest difference between the energy that a law dissipated and the sum of
+            the other energies that it declares, in J.
+        sampling_j: Largest energy that an arm received and its law did not count, in J. It
+            arises between ticks.
         curves: Every energy over time, and the energies that the arms gave to their laws.
     """
 
@@ -126,7 +132,10 @@ class ObservedEnergy(NamedTuple):
     curves: Sequence[EnergyCurve] = ()
 
     def to_json(self) -> JsonObject:
-        """Returns the verdict as plain values, ready for JSON. The curves are left out."""
+        """Returns this verdict on the declared energies as plain values, ready for JSON.
+
+        The energies over time are left out.
+        """
         content = self._asdict()
         del content["curves"]
         content["finding"] = self.finding.name.lower()
