@@ -146,7 +146,11 @@ class Pencil(NamedTuple):
 
     @property
     def rate_matrix(self) -> Array:
-        """The matrix E, which is the coefficient of s in Delta(s), shape (n, n)."""
+        """The matrix E of the loop E x' = A x + sum_k A_k x(t - T_k), shape (n, n).
+
+        x is the state, with n entries, and T_k are the delays. E is diagonal. An entry is 1 if
+        the state has a rate of change, and 0 if an algebraic equation determines the state.
+        """
         if self.E is None:
             return np.eye(len(self.A))
         return np.diag(self.E)
@@ -184,10 +188,17 @@ class Pencil(NamedTuple):
         return float(abs(s) + undelayed + delayed)
 
     def compute_taylor_coefficient(self, power: int) -> Array:
-        """Returns a coefficient of the Taylor series of Delta(s) at s = 0, shape (n, n).
+        """Returns a coefficient of the Taylor series of the characteristic matrix at s = 0.
+
+        The characteristic matrix is Delta(s) = s E - A - sum_k A_k exp(-s T_k), with the
+        matrices E, A and A_k and the delays T_k of the loop. Its n rows and columns belong to
+        the n states.
 
         Args:
             power: Power of s to which the coefficient belongs, from 0.
+
+        Returns:
+            The coefficient, shape (n, n).
         """
         undelayed: Array | float = 0.0
         if power == 0:
@@ -202,7 +213,10 @@ class Pencil(NamedTuple):
 
     @property
     def delayed_states(self) -> NDArray[np.intp]:
-        """Indices of the states that act on the loop after a delay."""
+        """Indices of the states whose delayed values act on the loop.
+
+        An arm, for example, follows the angles that another arm had some time ago.
+        """
         effects = np.abs(self.Ad).sum(axis=(0, 1))
         return np.flatnonzero(effects)
 
@@ -216,13 +230,18 @@ states, each of which has a root at zero.
 
 
 def extract_moving_part(pencil: Pencil, names: Sequence[str]) -> MovingPart:
-    """Removes the states of a loop that are constant or act on no other state.
+    """Removes the states of a linear loop that are constant or act on no other state.
 
-    Such states do not influence the other modes, see `MovingPart`.
+    These states do not influence the other modes of the loop. Each of them only adds a
+    characteristic root at zero.
 
     Args:
-        pencil: Matrices of the loop.
+        pencil: Matrices and delays of the loop.
         names: Names of the states.
+
+    Returns:
+        The matrices of the remaining states, the names of these states, and the number of
+        removed states.
     """
     # entry (i, j): effect of state j on the rate of state i
     delayed_effects = np.abs(pencil.Ad).sum(axis=0)
@@ -273,7 +292,12 @@ class CharacteristicRoot(NamedTuple):
 
     @property
     def description(self) -> str:
-        """Names of the states that move most in this mode, grouped, as in "q2 of m1, m2, s"."""
+        """Names of the states that move most in this mode, for the user.
+
+        A state of a site (a process that runs one arm) is called "m1.q2", for example. Sites
+        with the same state are grouped: "q2 of m1, m2, s" stands for the second joint angle of
+        three sites.
+        """
         sites: dict[str, list[str]] = {}
         for state in self.states:
             site, _, name = state.partition(".")
@@ -314,7 +338,12 @@ class Spectrum(NamedTuple):
 
     @property
     def basis(self) -> str:
-        """A phrase that states the analysed span of time. Empty if all ticks are alike."""
+        """A phrase for the user that names the span of time for which the roots were computed.
+
+        If the controllers compute in ticks (periods of the control loop) that are not all
+        alike, the roots belong to a span of several ticks. The phrase is empty if the roots do
+        not belong to such a span.
+        """
         if self.span_s is None:
             return ""
         if self.deviation_per_s is None:
@@ -324,7 +353,12 @@ class Spectrum(NamedTuple):
 
     @property
     def rightmost(self) -> CharacteristicRoot | None:
-        """The rightmost root that is not zero by structure. None if there is none."""
+        """The characteristic root with the largest real part, which decides about stability.
+
+        Roots that are zero because of the structure of the loop are not considered: they exist,
+        for example, because all arms can rest in other poses too. None if there are no other
+        roots.
+        """
         return self.roots[0] if self.roots else None
 
     @property
@@ -533,12 +567,17 @@ def refine_roots(
 
 
 def find_moving_part(loop: LinearLoop) -> MovingPart:
-    """Returns the matrices of a loop without the states that are constant or act on no other.
+    """Reduces a linear loop to the states that can influence its stability.
 
-    `MovingPart` describes the result.
+    States that are constant, and states that act on no other state, are left out. Each of them
+    only adds a characteristic root at zero.
 
     Args:
-        loop: The loop.
+        loop: Linear model of the coupled arms.
+
+    Returns:
+        The matrices of the remaining states, the names of these states, and the number of
+        omitted states.
     """
     delayed_matrices = np.array([term.A for term in loop.delayed])
     # without delays, an empty array of the right shape

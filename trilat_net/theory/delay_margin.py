@@ -85,7 +85,12 @@ class DelayInterval(NamedTuple):
 
     @property
     def description(self) -> str:
-        """The ends, and the frequency at the upper end. Empty if the interval has no ends."""
+        """A phrase for the user, such as "from 2 ms up to 9.5 ms (crosses at 31 rad/s)".
+
+        It names the ends of the interval of stable delays, and the frequency at which
+        characteristic roots cross the imaginary axis at the upper end. It is empty if no roots
+        cross at either end, because then all examined delays are stable.
+        """
         if self.low is None and self.high is None:
             return ""
 
@@ -99,13 +104,17 @@ class DelayInterval(NamedTuple):
 
 
 class DelayMargin(NamedTuple):
-    """The common delays for which a loop is stable, see `find_delay_margin`.
+    """The delays for which a control loop is stable if all its links have the same delay.
+
+    As the delay grows, characteristic roots of the loop may cross the imaginary axis. The loop
+    becomes unstable if roots cross to the right, and may become stable if they return.
 
     Attributes:
-        intervals: Intervals of delays, by rising delay. Empty if the loop is unstable for every
-            delay.
-        crossings: All crossings up to `MAX_COMMON_DELAY_S`, by rising delay.
-        lossless: True if waves run along lines without losses, so that some roots are on the
+        intervals: Intervals of stable delays, by rising delay. Empty if the loop is unstable
+            for every delay.
+        crossings: All crossings of the imaginary axis for delays up to `MAX_COMMON_DELAY_S`, by
+            rising delay.
+        lossless: True if the links carry waves without losses, so that some roots are on the
             imaginary axis for every delay.
     """
 
@@ -115,7 +124,10 @@ class DelayMargin(NamedTuple):
 
     @property
     def description(self) -> str:
-        """A phrase that states the delays for which the loop is stable."""
+        """A phrase for the user that states for which common delays the control loop is stable.
+
+        Common means that all links between the arms have this same delay.
+        """
         if self.lossless:
             return (
                 "none: waves run along lines without losses, "
@@ -155,14 +167,18 @@ def set_common_delay(loop: LinearLoop, delay_s: float) -> LinearLoop:
 
 
 def find_delay_margin(loop: LinearLoop) -> DelayMargin:
-    """Finds for which delays a loop is stable, if all of its links have the same delay.
+    """Finds the stable delays of a control loop whose links all have the same delay.
 
-    The loop's own delays are ignored. The unstable roots are counted at half the delay of the
-    first crossing of the imaginary axis. From there on, every crossing changes the count by the
-    number of roots that cross.
+    The delays that the loop itself contains are replaced by this common delay. The unstable
+    characteristic roots are counted for a small delay, below the first delay at which roots
+    cross the imaginary axis. From there on, every crossing changes the count by the number of
+    roots that cross.
 
     Args:
-        loop: The loop.
+        loop: Linear model of the coupled arms.
+
+    Returns:
+        The intervals of stable delays, and the crossings that limit them.
     """
     crossings, lossless = find_axis_crossings(loop)
     if lossless:
@@ -331,19 +347,36 @@ class _FrequencySweep:
         return np.linalg.eigvals(delayed_rows).astype(np.complex128)
 
     def count_outside(self, omega: Array) -> NDArray[np.int64]:
-        """Returns the number of eigenvalues of G(j w) outside the unit circle, shape (K,).
+        """Counts the eigenvalues of the open-loop frequency response outside the unit circle.
+
+        G(j w) is the open-loop frequency response: the response of the states that act after a
+        delay to their own delayed values, without the delay itself.
 
         Args:
             omega: Frequencies w, shape (K,), in rad/s.
+
+        Returns:
+            The number of eigenvalues of G(j w) outside the unit circle, shape (K,).
         """
         moduli = np.abs(self.compute_eigenvalues(omega))
         counts: NDArray[np.int64] = (moduli > _OUTSIDE).sum(axis=1)
         return counts
 
     def find_crossings(self, low: float, high: float) -> list[AxisCrossing]:
-        """Finds all crossings between two frequencies, in rad/s, by bisection.
+        """Finds where eigenvalues of the open-loop frequency response cross the unit circle.
 
-        The number of eigenvalues outside the unit circle changes at a crossing.
+        At the frequency w of a crossing, an eigenvalue of the response G(j w) has the modulus
+        1. A delay can then put a characteristic root of the loop on the imaginary axis, at j w.
+        Crossings are located by bisection, because the number of eigenvalues outside the circle
+        changes there.
+
+        Args:
+            low: Lower end of the searched frequencies, in rad/s.
+            high: Upper end of the searched frequencies, in rad/s.
+
+        Returns:
+            The crossings of the imaginary axis by roots, for all delays that cause them. Empty
+            if the number of eigenvalues outside the circle is equal at both ends.
         """
         ends = self.count_outside(np.array([low, high]))
         if ends[0] == ends[1]:

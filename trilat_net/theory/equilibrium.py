@@ -1,11 +1,12 @@
-"""Finds equilibria of the control loop: poses in which all arms and parameter estimates rest.
+"""Finds equilibria of the coupled arms: poses in which all arms and estimates rest.
 
-An equilibrium is needed to linearise the loop. It may be the one at the end of a run, the one
-nearest to a given pose, or the one that the linear loop predicts from the start poses.
+The linear stability analysis describes small motions about an equilibrium. It may use the
+equilibrium at the end of a run, the equilibrium nearest to a given pose, or the equilibrium
+that the arms reach from their start poses according to their linear model.
 
-Equilibria are not isolated, because any pose on which the arms agree may be an equilibrium.
-Therefore every result is the equilibrium nearest to a stated pose. The simulation supplies
-starting values only.
+Any pose on which all arms agree may be an equilibrium, so that there are infinitely many.
+Therefore the equilibrium nearest to a known pose is computed. A simulated run may supply this
+pose, but the equilibrium itself is found by solving the equations.
 
 Invariant:
     - The result solves the equations to 1e-10, or a note states that it does not.
@@ -133,17 +134,20 @@ def _select_loop_states(conditions: OperatingConditions, states: Sequence[Array]
 
 @limit_blas_threads()
 def find_nearest_equilibrium(conditions: OperatingConditions, rest: Equilibrium) -> Equilibrium:
-    """Finds the equilibrium of a loop that is nearest to a given pose.
+    """Finds the pose nearest to a given pose in which all arms rest.
 
-    It is found by Gauss-Newton steps, each of which is the smallest that solves the linearised
-    equations.
+    It is found by Gauss-Newton iteration. Each step is the smallest step that solves the
+    linearised equations of the equilibrium.
 
     Args:
-        conditions: The sites, gains and delays of the loop.
-        rest: The pose, with parameter estimates.
+        conditions: The sites (processes that each run one arm), gains and delays.
+        rest: The given pose of all arms, with the estimates of their parameters.
+
+    Returns:
+        The equilibrium. Its `residual` says how well it solves the equations.
 
     Raises:
-        ScenarioError: A site in task space is in a singular pose.
+        ScenarioError: An arm that follows with its end effector is in a singular pose.
     """
     _refuse_singular_poses(conditions, rest)
     if conditions.has_forms:
@@ -340,17 +344,20 @@ def _project_on_zero_roots(loop: linear_loop.LinearLoop, deviation: Array) -> Ar
 
 
 def find_equilibrium(scenario: Scenario, pose: tuple[float, ...] | None = None) -> Equilibrium:
-    """Finds the equilibrium of a scenario at the end of a run, or at a pose.
+    """Finds a pose in which all arms of a scenario rest, near the end of a run or as given.
 
     Args:
-        scenario: The experiment.
-        pose: Shared pose of all sites: an angle per joint in rad, or in task space the pose of
-            the end effectors. Estimates are then the true parameters. None for the end of a
-            run.
+        scenario: Description of the experiment.
+        pose: Pose in which all arms rest: an angle per joint in rad, or in task space the pose
+            of the end effectors. The estimates of the arm parameters are then assumed to be
+            true. None for the equilibrium at the end of a run.
+
+    Returns:
+        The equilibrium, with remarks for the user.
 
     Raises:
-        ScenarioError: The scenario has no linear loop, or no equilibrium near the end of its
-            run.
+        ScenarioError: The scenario cannot be linearised, or has no equilibrium near the end of
+            its run.
         UsageError: The pose does not consist of as many finite numbers as expected.
     """
     conditions = derive_operating_conditions(scenario)
@@ -377,18 +384,18 @@ def predict_equilibrium(scenario: Scenario) -> Equilibrium:
 
 
 def follow_equilibrium(scenario: Scenario, rest: Equilibrium) -> Equilibrium:
-    """Finds the equilibrium of a scenario that continues the one of a similar scenario.
+    """Finds the equilibrium of a scenario that is nearest to a known equilibrium.
 
-    It is the equilibrium nearest to the given one, so that an equilibrium can be followed while
-    a key of the scenario changes. If the given equilibrium is one of this scenario too, it is
-    returned with completed estimates.
+    The known equilibrium belongs to a similar scenario, so that an equilibrium can be followed
+    while a setting, such as a gain, changes in small steps. If it is also an equilibrium of
+    this scenario, it is returned, and only missing parameter estimates are added.
 
     Args:
-        scenario: The description of the experiment.
+        scenario: Description of the experiment.
         rest: Equilibrium of the similar scenario.
 
     Raises:
-        ScenarioError: The scenario has no linear loop, or no equilibrium near `rest`.
+        ScenarioError: The scenario cannot be linearised, or has no equilibrium near `rest`.
     """
     conditions = derive_operating_conditions(scenario)
     start = rest._replace(theta_hat=_complete_estimates(conditions, rest.theta_hat))
@@ -402,17 +409,21 @@ def follow_equilibrium(scenario: Scenario, rest: Equilibrium) -> Equilibrium:
 
 
 def choose_equilibrium(scenario: Scenario) -> Equilibrium:
-    """Finds the equilibrium of a scenario by the method that suits the scenario.
+    """Finds the pose in which the arms of a scenario come to rest, by the suitable method.
 
-    If any shared pose is an equilibrium, the linear loop predicts which one is reached. This is
-    so if no site has estimates, and no operator or environment acts. Otherwise the equilibrium
-    at the end of a run is found.
+    If no control law estimates parameters, and no operator or environment acts, the arms can
+    rest in any pose on which they agree. Then a linear model of the coupled arms predicts which
+    of these poses they reach from their start poses. Otherwise a run is simulated, and the
+    equilibrium at its end is found.
 
     Args:
-        scenario: The description of the experiment.
+        scenario: Description of the experiment.
+
+    Returns:
+        The equilibrium.
 
     Raises:
-        ScenarioError: The scenario has no linear loop, or no such equilibrium.
+        ScenarioError: The scenario cannot be linearised, or no equilibrium was found.
     """
     sites = derive_operating_conditions(scenario).sites
     if any(site.gains.law is Law.ADAPTIVE or site.actors for site in sites):

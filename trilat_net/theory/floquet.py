@@ -1,33 +1,32 @@
-"""Computes the stability of the control loop as it is executed: in ticks, with delayed samples.
+"""Computes the stability of coupled arms whose controllers compute once per tick.
 
-The controllers of the sites (the processes that each run one arm) compute once per tick, while
-the arms move continuously. Tick rates and delays may differ between sites and links, but the
-whole pattern repeats after a period T. Such a periodic system is analysed by Floquet theory.
-Each site is linearised over one tick of its own rate:
+A site is a process that runs one arm. Its controller computes once per tick, while the arm
+moves continuously. In each tick the site sends a sample, its state, to the other sites. Tick
+rates and delays may differ between sites, but the whole pattern repeats after a period T. Such
+a periodic system is analysed by Floquet theory. Each site is linearised over one tick:
 
     X_i[k + 1] = P_i X_i[k] + sum_j P_ij X_j[m_ij(k)]
 
-Here X_i[k] is the state of site i at its tick k, P_i and P_ij are constant matrices, and
-m_ij(k) is the number of the sample of site j that site i uses at tick k. Over a period, these
-equations form a linear map M. Its eigenvalues mu, called multipliers, give the characteristic
-roots s = ln(mu) / T, and the loop is stable if all roots have a negative real part. The largest
-multipliers are approximated in a block Krylov space (block Arnoldi; Saad, "Numerical Methods
-for Large Eigenvalue Problems", second edition (2011), chapter 6).
+X_i[k] is the state of site i at its tick k, P_i and P_ij are constant matrices, and m_ij(k) is
+the number of the sample of site j that site i uses at tick k. Over a period, these equations
+form a linear map. Its eigenvalues mu, the multipliers, give the characteristic roots s = ln(mu)
+/ T. The loop is stable if all roots have a negative real part. The largest multipliers are
+approximated in a block Krylov space (block Arnoldi; Saad, "Numerical Methods for Large
+Eigenvalue Problems", second edition (2011), chapter 6).
 
 The integration scheme of the scenario defines how a controller updates its parameter estimates
-theta, whose rate of change is f, and which torque it applies. With the computed torque tau_k,
-the tick h, and a stored estimate eta:
+and which torque it applies. Let f_k be the rate of the estimates at tick k, tau_k the computed
+torque, and h the tick. Both schemes store a number eta with eta_{k+1} = eta_k + h f_k:
 
-- Both schemes store eta_{k+1} = eta_k + h f_k.
-- The scheme `digital` uses theta_k = eta_k and applies tau_k.
-- The scheme `second_order` uses theta_k = eta_k + h/2 f_k and applies
+- The scheme `digital` uses the estimate eta_k and applies tau_k.
+- The scheme `second_order` uses the estimate eta_k + h/2 f_k and applies
   1.5 tau_k - 0.5 tau_{k-1}.
 
-A control law that a user wrote may have a memory m. It is treated as an estimate with
-h f_k = m_k - m_{k-1}, so that eta is the law's own value.
+A control law that a user wrote may have a memory, the numbers m_k that it stores at tick k. The
+memory takes the place of eta, with the rate f_k = (m_k - m_{k-1}) / h.
 
 Invariant:
-    - Delays are never replaced by their mean. The roots are exact if delays and rates repeat
+    - Delays are never replaced by their mean. The roots are exact if delays and ticks repeat
       after T.
     - If delays are random or recorded, the roots are computed as though a span of length T
       repeated forever. The deviation of the roots between parts of the span is reported.
@@ -88,16 +87,18 @@ def discretise_zero_order_hold(A: Array, B: Array, h_s: float) -> tuple[Array, A
 
 
 class SiteTickMap(NamedTuple):
-    """Linear model of one site over a tick: X' = P X + Q w.
+    """Linear model of one site over one tick (period of its control loop): X' = P X + Q w.
 
-    X is the state of the site at a tick, X' the state at the next tick, and w the samples that
-    the site receives from its peers.
+    X contains the n states of the site at a tick, and X' the states at the next tick. w
+    contains what the site receives from the other sites.
 
     Attributes:
-        P: Matrix of the state, shape (n, n). X contains q, qd, the state eta of the estimate,
-            and, for the scheme `second_order`, the torque of the previous tick.
-        Q: Matrix of the inputs w, shape (n, inputs).
-        output: Samples for the peers as a function of X, shape (3 m, n), as in `SiteJacobian`.
+        P: Effect of the states, shape (n, n). The states are the joint angles and velocities,
+            the stored parameter estimates, and, for the scheme `second_order`, the torque of
+            the previous tick.
+        Q: Effect of the received values, shape (n, inputs).
+        output: Matrix that computes the values for the other sites from X, shape (3 m, n). They
+            are the pose, its velocity and the reflected torque, with m numbers each.
         names: Names of the states.
     """
 
@@ -108,11 +109,16 @@ class SiteTickMap(NamedTuple):
 
 
 def linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian) -> SiteTickMap:
-    """Returns one site over a tick, from the derivatives of its rates.
+    """Builds the linear model of one site over one tick, from a model in continuous time.
+
+    A site is a process that runs one arm, and a tick is one period of its control loop.
 
     Args:
         site: Setup of the site.
-        jacobian: Derivatives of its rates, see `differentiate_rates`.
+        jacobian: Linear model of the site in continuous time, from `differentiate_rates`.
+
+    Returns:
+        The matrices that map the states and inputs at one tick to the states at the next tick.
     """
     layout = jacobian.layout
     rates = jacobian.rates
@@ -134,7 +140,19 @@ def linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian) -> SiteTickMap:
     Phi, Gamma = _discretise_arm(jacobian, h_s)
 
     def compute_control(arguments: Array) -> Array:
-        """Returns the controller's part of X'; each column holds arguments of the rates."""
+        """Returns what the controller adds to the state of a site during one tick.
+
+        Its torque moves the arm, and its parameter estimates change. The torque of this tick is
+        kept for the next tick if the integration scheme needs it. All quantities are linear.
+
+        Args:
+            arguments: States and inputs of the site, in the order of `ArgumentLayout`, shape
+                (arguments, columns).
+
+        Returns:
+            The contribution to the state at the next tick, shape (n, columns), with the n
+            states of the site.
+        """
         f = rates.estimate @ arguments
         correction: Array | float = 0.0
         if uses_trapezoid:
@@ -188,12 +206,15 @@ def _discretise_arm(jacobian: SiteJacobian, h_s: float) -> tuple[Array, Array]:
 
 
 class CoupledTicks(NamedTuple):
-    """Linear model of all sites over one tick, with the effects of sites on each other.
+    """Linear model of all sites over one tick (period of their control loops).
+
+    The model has n states, which belong to the sites (processes that each run one arm).
 
     Attributes:
-        S: Block diagonal matrix of the sites' own maps from tick to tick, shape (n, n).
-        effects: Effect of the state of site j on site i, shape (n, n) each, by (i, j). Pairs
-            without an effect are missing.
+        S: Matrix that maps the states of all sites to their next tick, without the effects of
+            sites on each other, shape (n, n). It is block diagonal.
+        effects: For each pair (i, j), the effect of the states of site j on the states of site
+            i, shape (n, n). Pairs without an effect are missing.
         names: Names of the states.
         owners: Index of the site to which each state belongs, shape (n,).
         constant: Number of omitted states that are constant or have no effect.
@@ -207,13 +228,17 @@ class CoupledTicks(NamedTuple):
 
 
 def couple_ticks(conditions: OperatingConditions, rest: Equilibrium) -> CoupledTicks:
-    """Builds the linear model of all sites over a tick, with their effects on each other.
+    """Builds the linear model of all coupled sites over one tick of their control loops.
 
-    States that are constant or have no effect are left out.
+    The model contains each site by itself, and the effects of the sites on each other. States
+    that are constant, and states without an effect, are left out.
 
     Args:
-        conditions: The sites, gains and delays of the loop.
-        rest: The equilibrium about which the sites are linearised.
+        conditions: The sites (processes that each run one arm), gains and delays.
+        rest: The pose of rest about which the sites are linearised.
+
+    Returns:
+        The model, with the number of omitted states.
     """
     jacobians = differentiate_rates(conditions, rest)
     maps = []
@@ -284,17 +309,18 @@ _SAME_ROOT = 1e-6
 
 
 class SamplesInUse(NamedTuple):
-    """The samples that the sites use, tick by tick, over a span of time.
+    """Which samples of the other sites each site uses, in every tick of a span of time.
 
-    A sample is the state that a site publishes in one tick. The span begins with a tick of
-    every site.
+    A tick is one period of a site's control loop. A sample is the state that a site sends in
+    one tick. At the beginning of the span, all sites have a tick.
 
     Attributes:
         span_s: Length of the span, in s.
-        used: By (i, j) the number of the sample of site j that site i uses at each of its
-            ticks, counted from the sample at the beginning of the span.
-        period_s: Period of delays and tick rates, which divides the span, in s. None if they do
-            not repeat.
+        used: For each pair (i, j), the numbers of the samples of site j that site i uses, with
+            an entry for each tick of site i. The sample that site j sends at the beginning of
+            the span has the number 0.
+        period_s: Time after which the pattern of ticks and delays repeats, in s. The span
+            contains it a whole number of times. None if the pattern does not repeat.
     """
 
     span_s: float
@@ -356,13 +382,17 @@ def _find_period_s(links: Sequence[LinkBase], rates_hz: Sequence[int]) -> float 
 
 
 def find_samples_in_use(conditions: OperatingConditions) -> SamplesInUse:
-    """Finds which samples the sites use, until delays and tick rates repeat.
+    """Finds which samples of the other sites each site uses, in every tick of a span of time.
 
-    If delays are drawn at random, they never repeat. A span of fixed length with drawn delays
-    then takes the place of the period.
+    A sample is the state that a site sends in one tick (period of its control loop). The
+    pattern of used samples repeats after some time, and the span consists of whole repetitions.
+    Random delays never repeat. A span of fixed length with drawn delays is used for them.
 
     Args:
-        conditions: The sites, tick rates and links of the loop.
+        conditions: The sites, their tick rates, and the links between them.
+
+    Returns:
+        The used samples, and the length of the span.
     """
     rates_hz = [site.rate_hz for site in conditions.sites]
     common_hz = math.gcd(*rates_hz)
@@ -530,7 +560,17 @@ class _SpanMap:
         return np.linalg.qr(columns)[0]
 
     def build_constant_columns(self, X: Array) -> Array:
-        """Returns columns whose past states all equal X, shape (n, columns)."""
+        """Returns columns for motions in which all states have been constant.
+
+        Each column contains the states of all sites at their last ticks, as far back as they
+        are used. Here every past tick of a site has the same states.
+
+        Args:
+            X: The constant states, shape (n, columns), with the n states of all sites.
+
+        Returns:
+            The columns, shape (size, columns).
+        """
         blocks = []
         for states, rows in zip(self._states, self._rows, strict=True):
             blocks.append(np.tile(X[states], (rows, 1)))
@@ -568,18 +608,21 @@ class _SpanMap:
         divided: bool = True,
         sizes: list[Array] | None = None,
     ) -> tuple[Array, list[Array]]:
-        """Returns columns after the span, and the track of each site.
+        """Computes how small motions develop over the analysed span of time.
+
+        A column contains the states of all sites at their last ticks, as far back as they are
+        used. For computation the span is split into parts.
 
         Args:
-            V: Columns, shape (size, columns).
-            divided: True to divide out constant motions, and to scale the columns after each
-                part.
+            V: Motions at the start of the span, shape (size, columns).
+            divided: True to remove motions that stay constant, and to scale the columns after
+                each part.
             sizes: List to which the norm of each column after each part is appended.
 
         Returns:
-            The columns after the span.
-            The states of each site from the start of the span on, shape (ticks + 1, n_i,
-            columns) each.
+            The motions at the end of the span, shape (size, columns).
+            For each site i, its n_i states from the start of the span on, shape (ticks + 1,
+            n_i, columns).
         """
         columns = V.shape[1]
         tracks = self._build_tracks(V)
@@ -715,20 +758,21 @@ def compute_sampled_spectrum(
     wanted: int = 6,
     uses: SamplesInUse | None = None,
 ) -> Spectrum | None:
-    """Computes the rightmost characteristic roots of a loop that is executed in ticks.
+    """Computes the rightmost characteristic roots of coupled arms with controllers in ticks.
 
-    The states are followed over the period of delays and tick rates. The eigenvalues z of this
-    map correspond to the roots s with z = exp(s span).
+    A tick is one period of the control loop. A small motion is followed over a span of T
+    seconds, after which the pattern of delays and ticks repeats. This gives a linear map of the
+    states. Each eigenvalue z of the map corresponds to a root s with z = exp(s T).
 
     Args:
-        conditions: The sites, gains and delays of the loop.
-        rest: The equilibrium about which the loop is linearised.
+        conditions: The sites (processes that each run one arm), gains and delays.
+        rest: The pose of rest about which the loop is linearised.
         wanted: Number of roots. Fewer result if the others are too close to -infinity.
-        uses: The samples in use. None for those of the scenario's links.
+        uses: Which samples of the other sites each site uses. None to derive this from the
+            links.
 
     Returns:
-        The roots. None if a law has states or waves of its own, because such a law is
-        linearised in continuous time only.
+        The roots. None if a control law can be linearised in continuous time only.
     """
     if conditions.has_forms:
         return None

@@ -71,7 +71,7 @@ class Minima(NamedTuple):
 
     @property
     def least_hz(self) -> float:
-        """The frequency of the least value, in Hz."""
+        """The frequency at which the curve has its least value, in Hz."""
         w_rad_s = self.w_rad_s[self.values.argmin()]
         return float(w_rad_s / (2.0 * np.pi))
 
@@ -103,14 +103,16 @@ def build_frequency_grid(low_hz: float, high_hz: float, delay_s: float) -> Array
 
 
 def find_resolved_hz(low_hz: float, high_hz: float, delay_s: float) -> float:
-    """Returns the frequency up to which the grid resolves the phase of a delay, in Hz.
+    """Returns the frequency up to which a frequency grid resolves the phase of a delay, in Hz.
 
-    Up to this frequency the grid has at least four points per turn of a round trip.
+    A signal that travels over a delay T and back makes the phase turn once in every interval of
+    1 / (2 T) Hz. Up to the returned frequency, the grid of `build_frequency_grid` has at least
+    four points in each of these intervals. Above it, the points are farther apart.
 
     Args:
-        low_hz: Lower end of the band, in Hz.
-        high_hz: Upper end of the band, in Hz.
-        delay_s: The longest delay, in s.
+        low_hz: Lowest frequency of the grid, in Hz.
+        high_hz: Highest frequency of the grid, in Hz.
+        delay_s: The longest delay T, in s.
     """
     step_hz = (high_hz - low_hz) / _MAX_POINTS
     if 8.0 * step_hz * delay_s <= 1.0:
@@ -199,17 +201,18 @@ def find_minima(
     level: float = 0.0,
     tolerance: FrequencyCurve | None = None,
 ) -> Minima:
-    """Evaluates a curve over frequency, with more points near its minima.
-
-    The bands in which the curve is below a level are found as well.
+    """Evaluates a curve over frequency, and adds frequencies until its minima are resolved.
 
     Args:
-        curve: The curve, as a function of frequency.
+        curve: Function that returns the values of the curve at given frequencies.
         w_rad_s: First frequencies, rising, shape (F,), in rad/s.
-        level: The level.
-        tolerance: Rounding error of the curve, as a function of frequency. The curve must be
-            below the level by more than this error, and so must a minimum be below its
-            neighbours. None for zero.
+        level: Value of the curve below which bands of frequencies are reported.
+        tolerance: Function that returns the rounding error of the curve at given frequencies.
+            Smaller differences from the level, or between neighbouring values, are ignored.
+            None if there is no rounding error.
+
+    Returns:
+        The frequencies and values, and the bands in which the curve is below the level.
     """
 
     def find_rounding(w: Array) -> Array:

@@ -1,20 +1,19 @@
-"""Predicts whether small motions of the coupled arms die away, for a scenario or a log.
+"""Predicts whether small motions of coupled arms die away, for a scenario or a log.
 
-The control loop is linearised about an equilibrium, a pose in which all arms rest. The analysis
-contains this equilibrium, the characteristic roots of the loop (the loop is stable if all have
-a negative real part), the delay margin, and, if requested, the edges of stability and the
-haptic ports. The roots are computed for the sampled loop, whose controllers compute in ticks,
-and for its continuous approximation.
+The control loop is linearised about an equilibrium, a pose in which all arms rest. Its
+characteristic roots decide: the loop is stable if all roots have a negative real part. They are
+computed for the sampled loop, whose controllers compute once per tick (period of the control
+loop), and for its continuous approximation. The analysis also contains the delay margin and, if
+requested, the settings at the edge of stability and what operators feel.
 
-At the end of a recorded run, the roots belong to the log's last pose and parameter estimates,
-under the conditions at the log's end. If delays are random or measured, the roots are computed
-with the samples that the last quarter of the records uses. If a control law can be linearised
-in continuous time only, the mean ages of these samples replace them. The run is not executed
-again, except for its twins, repeated runs with a small push.
+For a recorded run, the equilibrium is the last pose, with the last parameter estimates. Delays
+and operators are as at the end of the run. If delays are random or measured, the sampled loop
+uses the delays that occurred in the last quarter of the run. The continuous loop uses their
+means. The recorded run is not executed again, except to see whether small pushes grow.
 
 Invariant:
-    - The verdict is based on the sampled loop, at any tick rates and delays. If a law can be
-      linearised in continuous time only, the verdict is based on the continuous loop.
+    - The verdict is based on the sampled loop, at any tick rates and delays. If a control law
+      can be linearised in continuous time only, the verdict is based on the continuous loop.
     - The verdict holds for small motions about the equilibrium only.
 """
 
@@ -96,7 +95,11 @@ class LinearAnalysis(Result):
 
     @property
     def end_effectors(self) -> tuple[Array, ...]:
-        """The pose that each site shares at the equilibrium. Empty arrays in joint space."""
+        """The pose of each end effector at the equilibrium, if end effectors follow each other.
+
+        There is an array for each site (process that runs one arm), with the pose that the site
+        sends to the other sites. The arrays are empty if joints follow each other instead.
+        """
         sites = self.conditions.sites
         if not sites[0].layout.task:
             return (np.zeros(0),) * len(sites)
@@ -104,7 +107,11 @@ class LinearAnalysis(Result):
 
     @property
     def decisive(self) -> Spectrum:
-        """The characteristic roots on which the verdict is based: sampled or continuous."""
+        """The characteristic roots on which the verdict about stability is based.
+
+        They belong to the sampled loop, whose controllers compute once per tick. If a control
+        law can be linearised in continuous time only, they belong to the continuous loop.
+        """
         return self.continuous if self.sampled is None else self.sampled
 
     @property
@@ -114,7 +121,11 @@ class LinearAnalysis(Result):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Remarks on the conditions, the equilibrium and the roots."""
+        """Remarks for the user that qualify the verdict of the linear analysis.
+
+        They concern the analysed conditions (such as delays and operators), the pose of rest
+        about which the arms are linearised, and the characteristic roots.
+        """
         notes = [*self.conditions.notes, *self.rest.notes]
         if self.sampled is not None and self.sampled.verdict != self.continuous.verdict:
             decides = "ticks and delays decide"
@@ -199,7 +210,11 @@ class LinearAnalysis(Result):
         return delays_ms
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row for each root of the continuous and of the sampled loop."""
+        """Returns a table of the characteristic roots, with a row per root.
+
+        The roots of the continuous loop come first. Then follow the roots of the sampled loop,
+        whose controllers compute once per tick, if they were computed.
+        """
         spectra = {"continuous": self.continuous, "as computed": self.sampled}
         rows: list[dict[str, Any]] = []
         for loop, spectrum in spectra.items():
@@ -242,20 +257,23 @@ def analyse_linear_loop(
     ports: bool = False,
     hands: Sequence[HandMatrices] = (),
 ) -> LinearAnalysis:
-    """Analyses the linear loop of a scenario, see `trilat_net.linear`.
+    """Predicts whether small motions of the coupled arms of a scenario die away.
+
+    The control loop is linearised about a pose in which all arms rest.
 
     Args:
-        source: A scenario, its file, or the name of a shipped scenario.
-        overrides: Changed keys of the scenario.
-        pose: Shared pose of all sites, in rad. None for the pose at the end of a run.
-        roots: Number of roots to compute.
-        over: Ranges of keys along which edges of stability are searched, such as
+        source: A scenario (description of an experiment), its file, or the name of a shipped
+            scenario.
+        overrides: Settings of the scenario that are replaced.
+        pose: Pose of rest that all arms share, in rad. None for the pose at the end of a run.
+        roots: Number of characteristic roots to compute.
+        over: Ranges of settings in which to search the values where stability changes, such as
             "control.d=0.1:3".
-        ports: True to analyse the haptic ports of the operators.
-        hands: Measured impedances of operators, any of whom may hold any master.
+        ports: True to analyse also what operators feel when they hold an arm.
+        hands: Measured impedances of operators. Any of them may hold the arm of any master.
 
     Raises:
-        ScenarioError: The scenario is not valid, or has no linear loop.
+        ScenarioError: The scenario is not valid, or cannot be linearised.
         UsageError: Another argument is not valid.
     """
     ranges = [parse_edge_range(text) for text in over]
@@ -338,17 +356,18 @@ def certify_run(
     own_laws: bool = False,
     twins: int = TWINS,
 ) -> Certificate:
-    """Issues the full stability certificate of a recorded run.
+    """Certifies whether a recorded run was stable, with all available checks.
 
-    In addition to the checks of `certify`, the run is repeated with small pushes (twins), which
-    show whether disturbances grow, and the characteristic roots at its end pose are computed.
+    In addition to the checks of `certify`, the run is repeated with small pushes, to see
+    whether disturbances grow. The characteristic roots of the coupled arms are computed at the
+    end pose.
 
     Args:
         log: The log of the run.
-        min_coverage: Least fraction of the ticks of a site that must be recorded, see
-            `certify`.
-        own_laws: True if the code of imported control laws may be executed.
-        twins: Number of twins that are executed. 0 for none.
+        min_coverage: Least fraction of the ticks (periods of the control loop) of each arm's
+            process that must be recorded.
+        own_laws: True if the code of users' control laws may be executed.
+        twins: Number of repeated runs with a push. 0 for none.
 
     Raises:
         LogError: A record cannot be read, or names a change that does not exist.

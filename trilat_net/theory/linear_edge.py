@@ -1,16 +1,19 @@
-"""Finds the values of a scenario's key at which the linear loop becomes stable or unstable.
+"""Finds the values of a setting at which coupled arms become stable or unstable.
 
-Such a value is called an edge. The key may be any number of the scenario, such as a gain or a
-delay. The growth rate of the loop is the real part of its rightmost characteristic root: the
-loop is unstable if it is positive. A scan evaluates the growth rate at some values of the key,
-and Brent's method finds its zero between two values of different sign.
+A value at which this happens is called an edge. The setting is a number of the scenario (the
+description of an experiment), such as a gain or a delay, and is named by its key. The growth
+rate of small motions is the real part of the rightmost characteristic root of the linearised
+control loop. The loop is unstable if the growth rate is positive. It is evaluated for some
+values of the setting. Between two values with different signs, Brent's method finds its zero.
 
-The sampled loop, with its ticks, is analysed for the scheme `digital` and for walls and
-operators that act once per tick. The continuous loop is analysed otherwise.
+The sampled loop, whose controllers compute once per tick, is analysed if the tick matters: if
+the integration scheme is `digital`, which holds each computed torque for a tick, or if walls or
+operators act once per tick. Otherwise the continuous loop is analysed.
 
 Invariant:
-    - The equilibrium is determined once and followed along the key, so that a scan does not
-      jump between different equilibria.
+    - The equilibrium, the pose of rest about which the arms are linearised, is determined once.
+      For every further value of the setting, the nearest equilibrium is used, so that the
+      results do not jump between different poses.
 """
 
 from collections.abc import Iterator, Sequence
@@ -80,13 +83,15 @@ def find_rightmost_root(
 
 
 def find_deepest_contact(scenario: Scenario, q: Array) -> int | None:
-    """Finds the state of a run in which an end effector is deepest in a sampled wall.
+    """Finds the state of a run in which an end effector has penetrated a wall most deeply.
 
-    A sampled wall computes its torque once per tick.
+    Only sampled walls are considered, which compute their force once per tick (period of the
+    control loop).
 
     Args:
-        scenario: The experiment.
-        q: Joint angles of all sites in K states, shape (K, N, n), in rad.
+        scenario: Description of the experiment.
+        q: Joint angles in K states of the run, for N arms with up to n joints, shape (K, N, n),
+            in rad.
 
     Returns:
         Index of the state. None if no wall is touched.
@@ -106,20 +111,22 @@ def find_deepest_contact(scenario: Scenario, q: Array) -> int | None:
 
 
 def find_contact_growth(scenario: Scenario, q: Array, theta_hat: Array) -> float:
-    """Returns the growth rate of small motions in contact with sampled walls, in 1/s.
+    """Returns the growth rate of small motions while an arm touches a wall, in 1/s.
 
-    It is the real part of the sampled loop's rightmost root, at the equilibrium nearest to the
-    state that is deepest in a wall. The mean of the states is not used: arms that chatter leave
-    the wall again and again, so that the mean may have no contact.
+    Only sampled walls are considered, which compute their force once per tick (period of the
+    control loop). The arms are linearised at the equilibrium nearest to the state of a run that
+    is deepest in a wall. The mean of the states would not do: an arm that chatters leaves the
+    wall again and again.
 
     Args:
-        scenario: The experiment.
-        q: Joint angles of all sites in K states, shape (K, N, n), in rad.
-        theta_hat: Estimates of all sites in these states, shape (K, N, P).
+        scenario: Description of the experiment.
+        q: Joint angles in K states of the run, for N arms with up to n joints, shape (K, N, n),
+            in rad.
+        theta_hat: Estimates of the arms' P parameters in these states, shape (K, N, P).
 
     Returns:
-        The growth rate. -infinity if nothing moves. NaN without contact or without a linear
-        loop.
+        The growth rate. It is -infinity if nothing moves. It is NaN if no wall is touched, or
+        if the scenario cannot be linearised.
     """
     deepest = find_deepest_contact(scenario, q)
     if deepest is None:
@@ -284,7 +291,17 @@ class _GrowthRate:
         self._root: CharacteristicRoot | None = None
 
     def evaluate(self, value: float) -> float:
-        """Returns the growth rate at a value, in 1/s. -infinity if all roots are zero."""
+        """Computes how fast small motions grow if the examined setting has a given value.
+
+        The setting is a number of the scenario, such as a gain.
+
+        Args:
+            value: Value of the setting, in its own unit.
+
+        Returns:
+            The growth rate, in 1/s, which is negative if motions decay. It is -infinity if
+            there are no moving modes.
+        """
         typed_value = round(value) if self.takes_integers else value
         scenario = load_scenario(self._scenario, {self._key: typed_value})
         conditions = derive_operating_conditions(scenario)
@@ -296,17 +313,22 @@ class _GrowthRate:
         return -np.inf if self._root is None else self._root.s.real
 
     def close_edge(self, left: _GrowthPoint, right: _GrowthPoint) -> LinearEdge:
-        """Returns the edge between two values of which exactly one is unstable.
+        """Finds where the coupled arms change between stable and unstable, between two values.
 
-        Keys with whole numbers are searched by bisection, all others by Brent's method.
+        The values belong to one setting of the scenario, such as a gain. Exactly one of them
+        gives an unstable loop. Settings with whole numbers are searched by bisection, all
+        others by Brent's method.
 
         Args:
-            left: The smaller value.
-            right: The larger value.
+            left: The smaller value, with its growth rate.
+            right: The larger value, with its growth rate.
+
+        Returns:
+            The value at which stability changes, with the frequency of the motion.
 
         Raises:
-            ScenarioError: A value in between has no linear loop.
-            ValueError: The ends, evaluated again, are both stable or both unstable.
+            ScenarioError: For a value in between, the scenario cannot be linearised.
+            ValueError: When evaluated again, both values are stable, or both are unstable.
         """
         low = left.value
         high = right.value
@@ -332,14 +354,15 @@ class _GrowthRate:
 
 
 class GrowthColumn(NamedTuple):
-    """Growth rate of small motions of a loop, over the values of a scenario's key.
+    """Growth rate of small motions of coupled arms, for several values of one setting.
 
     Attributes:
-        growth_per_s: Real part of the rightmost characteristic root at each value, in 1/s. NaN
-            if there is no linear loop, and -infinity if nothing moves.
-        edges: Values at which the loop becomes stable or unstable, by the index of the next
-            smaller value.
-        remarks: Remarks on the analysis for the user, without repetition.
+        growth_per_s: Growth rate for each value, in 1/s, which is the real part of the
+            rightmost characteristic root. It is NaN if the scenario cannot be linearised, and
+            -infinity if nothing moves.
+        edges: Values at which stability changes. The key n means that the change lies between
+            the values n and n + 1.
+        remarks: Remarks for the user on the analysis, each once.
     """
 
     growth_per_s: list[float]
@@ -352,15 +375,20 @@ def compute_growth_column(
     key: str,
     values: Sequence[float],
 ) -> GrowthColumn:
-    """Computes the growth rates of scenarios that differ in one key only.
+    """Computes how the growth of small motions depends on one setting of a scenario.
 
-    The equilibrium is followed from one scenario to the next. An edge is missing if a value
-    between its neighbours is not valid for the key.
+    For each value of the setting, the coupled arms are linearised about a pose of rest. This
+    pose is followed from one value to the next. Between two neighbouring values of which
+    exactly one gives an unstable loop, the value at which stability changes is searched.
 
     Args:
-        scenarios: The experiments, by rising value of the key.
-        key: Key of the scenarios.
-        values: Values of the key.
+        scenarios: The experiments, which differ in the setting only, by its rising value.
+        key: Name of the setting, such as "control.d".
+        values: Values of the setting, one per scenario.
+
+    Returns:
+        The growth rates, and the values at which stability changes. A value of change is
+        missing if the setting does not allow the numbers that the search needs.
     """
     rest: Equilibrium | None = None
     column = GrowthColumn([], {}, [])
@@ -394,17 +422,19 @@ def find_root_crossings(
     low: float,
     high: float,
 ) -> tuple[tuple[float, ...], str]:
-    """Finds the values of a key at which the loop becomes stable or unstable.
+    """Finds the values of one setting at which coupled arms become stable or unstable.
 
     Args:
-        scenario: The experiment. Its own value of the key determines the equilibrium.
-        key: Key of the scenario.
-        low: Lower end of the range.
-        high: Upper end of the range.
+        scenario: Description of the experiment. The pose of rest is determined with its own
+            value of the setting.
+        key: Name of the setting, such as "control.d".
+        low: Smallest value to examine.
+        high: Largest value to examine.
 
     Returns:
-        The values, rising. Empty without a linear loop.
-        A remark on the analysis. Empty if there is none.
+        The values at which stability changes, rising. If the scenario cannot be linearised,
+        there are none.
+        A remark for the user on the analysis. Empty if there is none.
     """
     try:
         rest, remark = _assume_equilibrium(scenario, None)

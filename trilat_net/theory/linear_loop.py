@@ -1,24 +1,25 @@
-"""Linearises the control loop of all arms about an equilibrium, with the delays of the network.
+"""Linearises the control loop of all arms about a pose of rest, with network delays.
 
-The result is a differential equation with delays, for small deviations from the equilibrium:
+A site is a process that runs one arm. For small deviations x from the pose of rest, the result
+is a differential equation with delays:
 
     x'(t) = A x(t) + sum_k A_k x(t - T_k) + B u(t) + sum_k B_k u(t - T_k),    y(t) = C x(t)
 
-Here x contains the deviations of all states: for each site, the process that runs one arm, its
-joint angles, its joint velocities, and the parameter estimates of its control law. The sites
-have the order of the scenario. The inputs u are the torques that operators add on the joints,
-the outputs y are the joint velocities, T_k are the delays of the links, and A, A_k, B, B_k and
-C are constant matrices.
+The state x contains, for each site, its joint angles, its joint velocities, and the parameter
+estimates of its control law. The inputs u are the torques that operators add on the joints, the
+outputs y are the joint velocities, T_k are the delays of the links, and A, A_k, B, B_k and C
+are constant matrices.
 
-An arm that is a chain of n joints has ten parameter estimates theta_hat per link. Only one
-combination of them per joint takes part in small motions, the learnt gravity torque
-z = Y_G theta_hat in N m. It changes at the rate z' = -Y_G Gamma Y' r, where Y_G is the
-regressor (the matrix that multiplies the parameters) at rest, Y the regressor of the control
-law, Gamma the adaptation gain and r the filtered error. Therefore z replaces the estimates in
-x. Each omitted combination is constant or has no effect, and adds one root at zero.
+For an arm with n joints in a chain, the control law may estimate ten parameters theta_hat per
+link. Only one combination of them per joint acts on small motions: the estimated gravity torque
+z = Y_G theta_hat, in N m. Y_G is the regressor of the gravity torque, the matrix that
+multiplies the parameters, at rest. The torque z therefore replaces the estimates in x. Its rate
+is z' = -Y_G Gamma Y' r, with the regressor Y of the control law, its adaptation gain Gamma, and
+its filtered error r = e' + Lambda e. Here e is the error of the joint angles and Lambda a gain.
+The remaining combinations are omitted. They only add roots at zero.
 
-If the sites follow in task space, where end effectors instead of joints follow each other, they
-are coupled through the poses `SiteRates.x` of their end effectors and the velocities of these.
+In task space, where end effectors instead of joints follow each other, the sites are coupled
+through the poses and velocities of their end effectors.
 """
 
 from collections.abc import Sequence
@@ -43,18 +44,19 @@ _DEPENDENT = 1e-9
 
 
 class SiteJacobian(NamedTuple):
-    """Linear model of one site: the derivatives of its rates at an equilibrium.
+    """Linear model of one site (a process that runs one arm) about a pose of rest.
 
-    Only the states that the loop keeps are included. The columns are the site's state and what
-    it receives.
+    It contains the derivatives of the site's rates of change with respect to its states and to
+    what it receives from the other sites. States that no small motion changes or shows are left
+    out.
 
     Attributes:
-        layout: Which column belongs to which quantity. Without an estimate if the law learns
-            nothing.
-        rates: The derivatives, see `differentiate_site_rates`.
-        states: Names of the states, such as "q1", "qd2", "theta4". "gravity2" is the learnt
-            gravity torque of joint 2.
-        omitted_states: Number of parameter estimates that no small motion changes or shows.
+        layout: Which column of the derivatives belongs to which quantity. There are no columns
+            for parameter estimates if the control law estimates nothing.
+        rates: The derivatives of accelerations, estimates, torques and sent values.
+        states: Names of the states, such as "q1", "qd2" and "theta4" (parameter estimate).
+            "gravity2" is the estimated gravity torque of joint 2.
+        omitted_states: Number of parameter estimates that were left out.
     """
 
     layout: site_dynamics.ArgumentLayout
@@ -64,9 +66,10 @@ class SiteJacobian(NamedTuple):
 
     @property
     def output(self) -> Array:
-        """The samples for the peers as a function of the site's states, shape (3 m, states).
+        """Matrix that computes what the site sends to the other sites from its own states.
 
-        The rows are the shared pose x, its velocity, and the reflected torque.
+        The site sends the pose that it shares, the velocity of this pose, and the external
+        torque that it reflects, with m numbers each. The matrix has the shape (3 m, states).
         """
         rates = self.rates
         samples = np.vstack([rates.x, rates.xd, rates.reflected])
@@ -74,12 +77,16 @@ class SiteJacobian(NamedTuple):
 
 
 class DelayedTerm(NamedTuple):
-    """The part of the loop that acts after one delay.
+    """Effect of all states and torques on the coupled arms after one particular delay T.
+
+    It is the term A x(t - T) + B u(t - T) in the differential equation of the loop. x contains
+    the n states, and u the m torques of operators on the joints.
 
     Attributes:
-        delay_s: The delay, in s.
-        A: Matrix of the delayed state, shape (n, n).
-        B: Matrix of the operators' delayed torque, if a law reflects it, shape (n, m).
+        delay_s: The delay T, in s.
+        A: Effect of the delayed states, shape (n, n).
+        B: Effect of the delayed torques, shape (n, m). It is zero unless a control law sends
+            external torques to other arms.
     """
 
     delay_s: float
@@ -117,25 +124,28 @@ class LinearLoop(NamedTuple):
 
     @property
     def static_matrix(self) -> Array:
-        """The rates of the states under a constant deviation: A + sum_k A_k, shape (n, n).
+        """Sum of the matrices of present and delayed states, A + sum_k A_k, shape (n, n).
 
-        A is the matrix of the present state, and A_k are the matrices of the delayed states.
+        It gives the rates of change of the n states while these states are constant, because
+        delays then have no effect.
         """
         delayed = [term.A for term in self.delayed]
         return sum(delayed, self.A)
 
 
 def gather_site_arguments(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
-    """Collects the arguments from which the rates of each site are computed at an equilibrium.
+    """Collects the states and inputs of each site when all arms are at rest.
 
+    The states are joint angles, joint velocities and parameter estimates. The inputs are what a
+    site (process that runs one arm) receives from the other sites, and the external torque.
     `ArgumentLayout` describes their order.
 
     Args:
-        conditions: The sites, gains and delays of the loop.
-        rest: The equilibrium.
+        conditions: The sites, gains and delays of the coupled arms.
+        rest: The pose of rest, with the parameter estimates.
 
     Returns:
-        A vector for each site, shape (arguments,).
+        A vector for each site, with the length that its `ArgumentLayout` states.
     """
     layouts = [site_dynamics.lay_out_arguments(site) for site in conditions.sites]
     arguments = [np.zeros(layout.arguments) for layout in layouts]
@@ -201,18 +211,20 @@ def compute_references(conditions: OperatingConditions, rest: Equilibrium) -> li
 def differentiate_references(
     conditions: OperatingConditions, rest: Equilibrium
 ) -> dict[tuple[int, int], Array]:
-    """Computes how the references of the sites depend on the poses that the sites share.
+    """Computes how the pose that a site follows depends on the poses of the other sites.
 
-    For positions the derivative is the dominance factor alpha_ij times the unit matrix. A
-    reference with an orientation depends on the site's own pose too, as (i, i).
+    A site is a process that runs one arm. For positions, the derivative is the unit matrix
+    times the dominance factor, the weight with which site i follows site j. If end effectors
+    follow each other in orientation too, the followed pose also depends on the site's own pose.
 
     Args:
-        conditions: The sites, gains and delays of the loop.
-        rest: The equilibrium.
+        conditions: The sites, gains and delays of the coupled arms.
+        rest: The pose of rest at which the derivatives are taken.
 
     Returns:
-        By (i, j), the derivative of site i's reference with respect to site j's pose, shape (m,
-        m).
+        For each pair (i, j), the derivative of the pose that site i follows with respect to the
+        pose of site j, shape (m, m), for poses of m numbers. Pairs without an effect are
+        missing.
     """
     derivatives = {}
     poses = compute_shared_poses(conditions, rest)
@@ -241,18 +253,20 @@ def compute_couplings(
     rest: Equilibrium,
     sites: list[SiteJacobian],
 ) -> dict[tuple[int, int], Array]:
-    """Computes how the output of each site acts on the inputs of the sites that receive it.
+    """Computes how what each site sends acts on the inputs of the sites that receive it.
 
-    An imported law receives each sample twice: within the sums that are weighted with the
-    dominance factors, and by itself.
+    A site (process that runs one arm) sends its pose, its velocity and its reflected torque,
+    with m numbers each. A receiver weights them with its dominance factors (weights with which
+    it follows the other arms). The control law of a user also receives them without weights.
 
     Args:
-        conditions: The sites, gains and delays of the loop.
-        rest: The equilibrium.
-        sites: Derivatives of each site's rates.
+        conditions: The sites, gains and delays of the coupled arms.
+        rest: The pose of rest about which the arms are linearised.
+        sites: Linear model of each site, without the others.
 
     Returns:
-        By (i, j), the effect of site j's output on site i's inputs, shape (inputs, 3 m).
+        For each pair (i, j), the effect of the values that site j sends on the inputs of site
+        i, shape (inputs, 3 m).
     """
     references = differentiate_references(conditions, rest)
     couplings = {}
@@ -276,15 +290,18 @@ def compute_couplings(
 
 
 def mask_loop_states(conditions: OperatingConditions) -> list[NDArray[np.bool_]]:
-    """Finds which states of each site belong to the loop.
+    """Finds which states of each site belong to the linear model of the coupled arms.
 
-    Angles and velocities always do. Parameter estimates do if the site's law learns.
+    A site is a process that runs one arm. Its joint angles and velocities always belong to the
+    model. Its parameter estimates belong to the model if its control law changes them. The same
+    holds for the memory of a user's control law.
 
     Args:
-        conditions: The sites and laws of the loop.
+        conditions: The sites and their control laws.
 
     Returns:
-        For each site, True for each state in the loop, shape (states,).
+        For each site a mask of its states (angles, velocities, estimates), shape (states,). It
+        is True for states in the model.
     """
     masks = []
     for site in conditions.sites:
@@ -301,15 +318,20 @@ def differentiate_rates(
     *,
     all_estimates: bool = False,
 ) -> list[SiteJacobian]:
-    """Builds the linear model of each site at an equilibrium, without its peers.
+    """Builds the linear model of each site about a pose of rest, without the other sites.
 
-    It consists of the derivatives of the site's rates with respect to its states and inputs.
+    A site is a process that runs one arm. The model contains the derivatives of its rates of
+    change with respect to its own states and to its inputs.
 
     Args:
-        conditions: The sites, gains and delays of the loop.
-        rest: The equilibrium.
-        all_estimates: True to keep each estimate of a chain as a state, instead of only the
-            learnt gravity torques.
+        conditions: The sites, gains and delays of the coupled arms.
+        rest: The pose of rest, with the parameter estimates.
+        all_estimates: True to keep every parameter estimate of a chain of joints as a state. By
+            default, only their combinations that act on small motions are states: the estimated
+            gravity torques of the joints.
+
+    Returns:
+        The models, in the order of the sites.
     """
     arguments = gather_site_arguments(conditions, rest)
     references = differentiate_references(conditions, rest)
@@ -424,15 +446,20 @@ def linearise_loop(
     *,
     all_estimates: bool = False,
 ) -> LinearLoop:
-    """Builds the linear model of the whole control loop at an equilibrium.
+    """Builds the linear model of the coupled arms for small motions about a pose of rest.
 
-    It contains all sites, the links between them with their delays, and the torques of
-    operators as inputs.
+    The model contains all sites (processes that each run one arm) and the links between them
+    with their delays. Its inputs are the torques of operators on the joints.
 
     Args:
-        conditions: The sites, gains and delays of the loop.
-        rest: The equilibrium.
-        all_estimates: True to make each estimate of a chain a state, see `differentiate_rates`.
+        conditions: The sites, gains and delays of the coupled arms.
+        rest: The pose of rest, with the parameter estimates.
+        all_estimates: True to keep every parameter estimate of a chain of joints as a state. By
+            default, only their combinations that act on small motions are states: the estimated
+            gravity torques of the joints.
+
+    Returns:
+        The model, a linear differential equation with delays.
     """
     sites = differentiate_rates(conditions, rest, all_estimates=all_estimates)
     states = _list_blocks([site.layout.states for site in sites])
@@ -524,15 +551,20 @@ def add_law_forms(
     sites: Sequence[SiteJacobian],
     loop: LinearLoop,
 ) -> LinearLoop:
-    """Adds to a loop the states and the sent signals of control laws that have their own.
+    """Adds control laws that gains do not fully describe to a linear model of the arms.
 
-    Such a law describes them as a `LinearForm`. A sent signal, such as a wave, is an algebraic
-    state: it has no rate, and the peer receives it after the delay.
+    These laws may store numbers of their own, or send signals of their own, such as waves. They
+    state their linear equations as a `LinearForm`. A sent signal becomes a state without a rate
+    of change: an algebraic equation determines it, and the receiver reacts to its delayed
+    value.
 
     Args:
-        conditions: The sites, gains and delays of the loop.
-        sites: Derivatives of each site's rates.
-        loop: The loop without these states.
+        conditions: The sites (processes that each run one arm), gains and delays.
+        sites: Linear model of each site, without the others.
+        loop: Linear model of the coupled arms without the additional equations.
+
+    Returns:
+        The model with the additional equations and states.
     """
     inertias = []
     for site in sites:
@@ -642,7 +674,18 @@ def _add_form(
     A, B = terms[0.0]
 
     def find_delayed_matrix(j: int) -> Array:
-        """Returns the state matrix at the age of site j's samples."""
+        """Returns the matrix through which delayed states of all arms act on the loop.
+
+        The delay is the age of the samples (sent states) of site j when site i uses them. If no
+        matrix for this delay exists, one with zeros is added.
+
+        Args:
+            j: Index of the site that sends the samples.
+
+        Returns:
+            The matrix, shape (n, n), with the n states of the loop. The caller changes it in
+            place.
+        """
         delay_s = float(conditions.age_s[i, j])
         if delay_s not in terms:
             terms[delay_s] = (np.zeros_like(A), np.zeros_like(B))

@@ -1,23 +1,26 @@
 """Linearises a control law that a user wrote, by central differences.
 
-The equations of such a law are unknown, because only its code exists. For one tick of the
-control loop, the code is treated as a function of numbers:
+Only the code of the law exists, and not its equations. For one tick (period of the control
+loop), the code is treated as a function of numbers:
 
     (tau_k, m_k) = f(q, qd, m_{k-1}, q_des, qd_des, felt, peers, torque)
 
-The results are the torque tau_k that the law commands at tick k, and its memory m_k, the
-numbers that it keeps for the next tick. The arguments are the joint angles q and velocities qd,
-the desired angles q_des and velocities qd_des, the external torque `felt` that the law
-perceives, the states of the peers (the arms that it follows), and the external torque on the
-arm. Each argument is changed by a small step in both directions, and the differences of the
-results give the derivatives. In continuous time the memory changes at the rate
-m' = (m_k - m_{k-1}) / h, where h is the tick.
+The results at tick k are the torque tau_k that the law commands and its memory m_k, the numbers
+that it stores for the next tick. The arguments are:
+
+- the joint angles q and velocities qd, and the desired angles q_des and velocities qd_des,
+- `felt`, the received external torques of the other arms, weighted and summed,
+- `peers`, the states of these arms one by one,
+- `torque`, the external torque on the law's own arm.
+
+Each argument is changed by a small step in both directions, and the differences of the results
+give the derivatives. In continuous time, the memory changes at the rate m' = (m_k - m_{k-1}) /
+h, where h is the length of a tick.
 
 Invariant:
     - The law receives the same inputs as in a run. Its torque is not limited.
-    - The memory also contains the torque and the angles of the previous tick if the law uses
-      them.
-    - The analysis of the sampled loop multiplies m' by h, and thus recovers m_k exactly.
+    - If the law uses the torque or the angles of the previous tick, they belong to the memory.
+    - The analysis that treats each tick adds h m' to the memory m_{k-1}, which gives m_k.
 """
 
 from collections.abc import Sequence
@@ -47,23 +50,23 @@ _STILL = 1e-14
 
 
 class NumericLaw:
-    """A control law written by a user, as a function from numbers to numbers.
+    """A user's control law as a function that the linear analysis can differentiate.
 
-    The linear analysis differentiates this function. The law may store numbers from tick to
-    tick, its memory. The law is built once. Calling the object returns the law itself, so that
-    the object can stand in for the law's factory in a `SiteSetup`.
+    The law may store numbers from one tick (period of the control loop) to the next. These
+    numbers are its memory. The law object is built once. Calling this object returns the law
+    object, as for the function that normally builds the law of a `SiteSetup`.
 
     Args:
-        setup: Setup of the site.
+        setup: Setup of the site, the process that runs the arm.
         code: Name by which the scenario refers to the law.
-        shares: Dominance factors with which the site follows its peers.
+        shares: Dominance factors, the weights with which the site follows the other sites.
 
     Attributes:
         names: Names of the numbers in the memory, such as "error[1]".
         memory: The memory at the start of a run.
 
     Raises:
-        ScenarioError: The law sends vectors of its own, or follows with an end effector.
+        ScenarioError: The law sends vectors of its own, or makes an end effector follow.
     """
 
     def __init__(self, setup: SiteSetup, code: str, shares: Sequence[float]) -> None:
@@ -124,16 +127,17 @@ class NumericLaw:
         return self._law
 
     def complete_memory(self, memory: Array | None) -> Array:
-        """Returns all numbers that the law stores, of which some are given.
+        """Completes the memory of a control law, of which only the beginning may be known.
 
-        The given numbers overwrite the beginning of the initial memory.
+        The memory contains all numbers that the law stores from tick to tick (period of the
+        control loop). Unknown numbers are taken from the memory at the start of a run.
 
         Args:
-            memory: Known numbers: all of the memory, or at least the numbers that the law
-                itself remembers. Longer arrays are cut. None if nothing is known.
+            memory: Known numbers: the whole memory, or at least the numbers that the law itself
+                stores. Longer arrays are cut. None if nothing is known.
 
         Returns:
-            The full memory.
+            The whole memory.
         """
         full_memory: Array = self.memory.copy()
         if memory is None:
@@ -165,17 +169,21 @@ class NumericLaw:
         return x[memory]
 
     def evaluate(self, x: Numbers) -> tuple[Numbers, Numbers]:
-        """Returns the torque and the rate of the memory.
+        """Computes the torque of a control law, or its derivatives by central differences.
 
-        For a complex x, whose columns are steps of `COMPLEX_STEP` about one real argument, the
-        imaginary parts of the result are the derivatives by central differences.
+        The derivatives are requested in the same form as for functions that accept a complex
+        step: the real parts of x are the arguments, and the imaginary part of each column is a
+        small change of the arguments.
 
         Args:
-            x: Arguments, shape (arguments,), or complex of shape (arguments, columns).
+            x: Arguments of the law, real with the shape (arguments,), or complex with the shape
+                (arguments, columns).
 
         Returns:
-            The torque, shape (n, ...), in N m.
-            The rate of the memory, shape (memory, ...), in 1/s.
+            The torque of the n joints, shape (n, ...), in N m. For a complex x, the imaginary
+            part of each column is its small change.
+            The rate of change of the numbers in the law's memory, shape (memory, ...), in 1/s,
+            in the same form.
         """
         if not np.iscomplexobj(x):
             return self._evaluate_rates(x)

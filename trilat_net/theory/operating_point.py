@@ -104,13 +104,18 @@ class OperatingConditions(NamedTuple):
     links: Mapping[tuple[int, int], tuple[LinkBase, int]] = MappingProxyType({})
 
     def find_forms(self, inertia: Sequence[Array] = ()) -> list[LinearForm | None]:
-        """Returns the linear form of each site's control law.
+        """Returns the linear equations of control laws that their gains do not fully describe.
 
-        A law with states or signals of its own describes them in this form. The entry is None
-        for a law that its gains describe fully.
+        Examples are laws that store numbers, or send waves. `LinearForm` represents their
+        equations.
 
         Args:
-            inertia: Inertia matrix of each arm, shape (n, n). Empty for unit matrices.
+            inertia: Inertia matrix of each arm, shape (n, n), for n joints. Empty for unit
+                matrices.
+
+        Returns:
+            The equations for each site (process that runs one arm). None for a site whose law
+            is fully described by its gains.
         """
         forms: list[LinearForm | None] = []
         for n, law in enumerate(self.laws):
@@ -127,10 +132,11 @@ class OperatingConditions(NamedTuple):
 
     @property
     def coupled_pairs(self) -> list[tuple[int, int]]:
-        """Pairs (i, j) of sites for which site i uses the samples of site j.
+        """Pairs (i, j) of sites for which site i reacts to the states that site j sends.
 
-        Site i uses them if its dominance factor for j is not zero, or if its law is imported:
-        such a law reads the samples of every peer.
+        A site is a process that runs one arm. It reacts if its dominance factor for site j, the
+        weight with which it follows site j, is not zero. The control law of a user reads the
+        states of all other sites, so that it reacts in any case.
         """
         pairs = []
         for i, site in enumerate(self.sites):
@@ -143,9 +149,10 @@ class OperatingConditions(NamedTuple):
 
     @property
     def has_forms(self) -> bool:
-        """True if a law has states of its own or sends signals beyond the samples.
+        """True if gains alone do not describe the control law of some site.
 
-        Such a loop is linearised in continuous time only.
+        A site is a process that runs one arm. Examples are laws that store numbers, or send
+        waves. The coupled arms are then linearised in continuous time only.
         """
         return any(form is not None for form in self.find_forms())
 
@@ -156,10 +163,11 @@ class OperatingConditions(NamedTuple):
 
     @property
     def needs_sampled_loop(self) -> bool:
-        """True if only an analysis with ticks shows whether the loop is stable.
+        """True if the controllers' ticks decide about stability, so that they must be modelled.
 
-        This is so for the scheme `digital`, for walls and operators that act once per tick, and
-        for ages that vary in a known way, without random draws.
+        A tick is one period of the control loop. This is so in three cases: the integration
+        scheme `digital` is used, which holds each computed torque for a tick; a wall or an
+        operator acts once per tick; or the delays vary in a known way, and not at random.
         """
         has_random_link = any(link.random for link, _ in self.links.values())
         if self.varying and not has_random_link:
@@ -170,10 +178,16 @@ class OperatingConditions(NamedTuple):
         return any(actor.sampled for actor in actors)
 
     def evaluate_rates(self, arguments: Sequence[Array]) -> list[SiteRates]:
-        """Returns the rates of change of every site's states, see `evaluate_site_rates`.
+        """Computes how fast the states of every site change.
+
+        The states of a site (process that runs one arm) are its joint angles, its joint
+        velocities and its parameter estimates.
 
         Args:
-            arguments: Arguments of each site, in scenario order.
+            arguments: States and inputs of each site, in the order of `ArgumentLayout`.
+
+        Returns:
+            The rates of change of each site, with its torques and outputs.
         """
         pairs = zip(self.sites, arguments, strict=True)
         return [evaluate_site_rates(site, x) for site, x in pairs]
