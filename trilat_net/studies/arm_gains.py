@@ -1,22 +1,24 @@
 """Finds the largest gains with which equal arms can follow each other over a delay.
 
-Two or three equal arms follow one another over links with the given delay. Each joint has a
-stiffness K, a damping d of its own velocity, and for some control laws a damping Kd of the
-velocity of its error. All gains are determined by one number k:
+Two or three equal arms follow one another over links with a delay. Each joint has a stiffness
+K, a damping d of its velocity, and for some control laws a damping Kd of the velocity of its
+position error. One number k, in 1/s^2, determines all gains:
 
     K = k m,    d + Kd = 2 zeta sqrt(k) m,
 
-where zeta is the damping ratio and m the inertia of the joint. The inertia is the largest
-diagonal element of the inertia matrix that the joint has in some poses, or less. The edge is
-the least k at which small motions of the sampled control loop grow in one of these poses. The
-result has the damping at the edge, and the stiffness at the edge divided by a margin. Simulated
-runs then confirm the edge.
+where zeta is the damping ratio. For m, the module uses the largest inertia of the joint about
+its own axis that occurs in a set of poses.
 
-The gains keep the same margin to a second limit: a damping torque is held for a tick of the
-controller, and if it is too large, the lightest motion of the arm swings from tick to tick. If
-several joints take part in this light motion, their m is reduced.
+Two limits bound the gains, and the result keeps a margin to both:
 
-For a single joint at a wall such edges are known: J. J. Gil, A. Avello, A. Rubio and J. Florez,
+- Stability with the delay: the edge is the least k at which small motions of the sampled
+  control loop grow in one of the poses. The tuned stiffness is the stiffness at the edge
+  divided by the margin. Simulated runs check the edge.
+- Damping at the tick rate: a damping torque is constant during a control period (tick). If it
+  is too large, it reverses the velocity in every tick. This happens first in the direction in
+  which the arm has the least inertia. Where this limit requires it, m is chosen smaller.
+
+For a single joint at a wall, this edge is known: J. J. Gil, A. Avello, A. Rubio and J. Florez,
 "Stability analysis of a 1 DOF haptic interface using the Routh-Hurwitz criterion", IEEE Trans.
 Control Systems Technology 12 (2004); over delays, T. Hulin, C. Preusche and G. Hirzinger,
 "Stability boundary for haptic rendering: influence of physical damping", IROS 2006.
@@ -159,14 +161,15 @@ class ArmGains(Result):
     curve: list[tuple[float, float]]
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns the entries of `joints`, one row per joint, for a table or a CSV file."""
+        """Returns a row per joint of the arm with its inertia and tuned gains, for a CSV file."""
         return self.joints
 
     def blocks(self) -> Iterator[Block]:
-        """Yields the parts of the text that the command prints.
+        """Yields the parts of the text that the command `trilat tune` prints.
 
-        The parts are a description of the loop, a table of the joints and their gains, the edge
-        of stability, the simulated runs that check it, and the line to paste into a scenario.
+        The parts are a description of the control loop, a table of the joints and their gains,
+        the limit of stability, the simulated runs that check it, and a line with the gains. A
+        user can paste this line into a scenario, the file that describes an experiment.
         """
         yield (
             f"{self.arm}: {self.sites} equal arms, {self.law}, {self.rate_hz} Hz, "
@@ -449,25 +452,29 @@ class _GainSearch:
         return float(values[-1]), vectors[:, -1] ** 2
 
     def fix_age(self, age_s: float) -> OperatingConditions:
-        """Returns the linearised conditions of the loop with the same age for all samples.
+        """Returns the linear model of the loop with the same delay for all received data.
 
-        The age of a sample is the time from its sending until its use. A constant age stands
-        for a varying delay where the analysis needs a single number.
+        The age of a sample (a state that one arm sent to another) is the time from its sending
+        until its use. A varying delay makes the ages vary. The returned model has a constant
+        age instead, where the analysis needs a single number.
 
         Args:
-            age_s: The age, in s.
+            age_s: The age of all samples, in s.
         """
         ages_s: Array = np.where(self.conditions.age_s > 0.0, age_s, 0.0)
         return self.conditions._replace(age_s=ages_s, varying=False)
 
     def build_law(self, k: float, stiffness_divisor: float = 1.0) -> Any:
-        """Returns the control law with the gains at a point of the ray, with four digits.
+        """Returns the control law with the gains that belong to a gain parameter k.
 
-        The damping gains d and Kd have the same ratio as the default gains of the law.
+        The gains of a joint with the inertia m are the stiffness K = k m and the damping d + Kd
+        = 2 zeta sqrt(k) m, where zeta is the damping ratio of this search. The damping d of the
+        velocity and the damping Kd of the velocity error have the same ratio as the default
+        gains of the law. All gains are rounded to four digits.
 
         Args:
-            k: Parameter of the ray, in 1/s^2.
-            stiffness_divisor: Factor by which the stiffness lies below that of the ray.
+            k: The gain parameter, in 1/s^2.
+            stiffness_divisor: Number by which K is divided. The damping stays the same.
         """
         law: Any = self._scenario.controls[0]
         default_damping = {}
@@ -488,15 +495,19 @@ class _GainSearch:
     def find_root(
         self, law: Any, pose: Array, loop: OperatingConditions, *, sampled: bool = True
     ) -> CharacteristicRoot:
-        """Returns the rightmost root of the linearised loop at rest in a pose.
+        """Returns the characteristic root of the linearised loop with the largest real part.
 
-        Its real part is the rate at which small motions grow.
+        The loop is linearised about a rest in the given pose. The real part of the root is the
+        rate, in 1/s, at which small motions grow. A negative value means that they decay.
 
         Args:
             law: Control law with its gains.
-            pose: Pose of all arms, shape (n,).
-            loop: Conditions of the loop.
+            pose: Pose of all arms, shape (n,), in rad or m, for n joints.
+            loop: Linear model of the arms, their tick rates and the delays between them.
             sampled: True to analyse the sampled loop, False to analyse it in continuous time.
+
+        Returns:
+            The root. If the loop has no roots, a root with a large negative real part.
         """
         sites = tuple(site._replace(gains=law.linear_gains(site.theta)) for site in loop.sites)
         poses = np.tile(pose, (len(sites), 1))
@@ -566,10 +577,16 @@ class _GainSearch:
         return edge, worst_pose
 
     def find_edge(self) -> dict[str, Any]:
-        """Finds the k above which small motions grow, see `ArmGains.edge`.
+        """Finds the largest gains with which small motions of the arms still decay.
 
-        The pose in which this edge is lowest is determined with a constant delay. The edges
-        with varying delays and in continuous time are computed in this pose only.
+        The stiffness of each joint is K = k m, where m is the inertia of the joint. The edge of
+        stability is the least k, in 1/s^2, at which small motions grow. First, the pose with
+        the least edge is found with a constant delay. The edges with the varying delay and in
+        continuous time are then computed in this pose only.
+
+        Returns:
+            The edge values, as described for `ArmGains.edge`. The further entry `used_per_s2`
+            is the k of the tuned gains before the stiffness is divided by the margin.
         """
         constant, pose = self.find_least_edge(
             self.constant_conditions, self._poses, self._least_k
@@ -608,16 +625,18 @@ class _GainSearch:
         }
 
     def trace_edge(self, pose: Array) -> list[tuple[float, float]]:
-        """Computes the edge of the sampled loop for several delays, for a figure.
+        """Computes how the largest stable gains depend on the delay, for a figure.
 
-        The delays are geometrically spaced whole numbers of ticks, up to four times the delay
-        of the loop.
+        For each delay, the result is the least k at which small motions of the sampled control
+        loop grow, where the stiffness of each joint is k times its inertia. The delays are
+        whole numbers of control periods on a geometric scale, up to four times the delay of the
+        loop.
 
         Args:
-            pose: Pose of all arms, shape (n,).
+            pose: Pose of all arms, shape (n,), in rad or m, for n joints.
 
         Returns:
-            Pairs of a delay, in s, and k at the edge, in 1/s^2.
+            Pairs of a delay, in s, and the value of k, in 1/s^2.
         """
         longest_ticks = max(4.0 * self.age_s * self.rate_hz, 8.0)
         ages_ticks = np.round(np.geomspace(1.0, longest_ticks, _CURVE_POINTS))
@@ -632,20 +651,23 @@ class _GainSearch:
     def confirm(
         self, law: Any, share: float | None, pose: Array, push: Array
     ) -> dict[str, Any]:
-        """Checks gains by a simulation, in which motions must decay or grow as predicted.
+        """Simulates arms with given gains, to check whether small motions grow as predicted.
 
-        The first arm starts displaced from the pose of the others. The first duration is a few
-        time constants of the slowest motion. It is doubled as long as the trend of the motions
-        is undecided.
+        The first arm starts slightly displaced from the pose of the others. The run lasts a few
+        time constants of the slowest motion. As long as it is not clear whether the motions
+        grow or decay, the duration is doubled, up to a limit.
 
         Args:
             law: Control law with its gains.
-            share: Fraction of k at the edge, which the result states. None for the tuned gains.
-            pose: Pose of all arms, shape (n,).
+            share: The gains of `law` as a fraction of the largest stable gains: their parameter
+                k divided by the least k at which motions grow, where the stiffness is k times
+                the inertia. None for the tuned gains. The value is only copied into the result.
+            pose: Pose of all arms, shape (n,), in rad or m, for n joints.
             push: Displacement of the first arm, shape (n,), in rad or m.
 
         Returns:
-            The run, as in `ArmGains.runs`.
+            The run as an entry of `ArmGains.runs`, with the simulated and the predicted growth
+            rate.
         """
         predicted_per_s = self.find_root(law, pose, self.conditions).s.real
         sites = {}

@@ -92,16 +92,17 @@ class WorkerRequirements(NamedTuple):
 def explain_unfit_worker(
     required: WorkerRequirements, identity: WorkerIdentity, lacks: Sequence[str]
 ) -> str:
-    """Explains why a worker may not run items of a study.
+    """Explains why a worker of a cluster may not run items of a study.
 
-    A worker must have the same program, arithmetic and files of control laws as the process
-    that started the study. Commits need not be the same, since one commit can differ from
-    another in documentation only. They are named as a hint if the source files differ.
+    A worker must have the same source files, the same versions of packages, the same floating
+    point results, and the same files of control laws as the process that started the study.
+    Its Git commit may differ, since commits can differ in documentation only. If the source
+    files differ, the explanation also names the commits, as a hint.
 
     Args:
-        required: Requirements.
-        identity: Properties of the worker.
-        lacks: Imported laws whose file the worker does not have.
+        required: What a worker must have.
+        identity: Versions and other properties of the worker.
+        lacks: Imported control laws whose file the worker does not have.
 
     Returns:
         The end of a sentence that begins with "the worker". Empty if the worker may run items.
@@ -150,10 +151,11 @@ def check_this_worker(required: WorkerRequirements) -> None:
     """Checks that this process, a worker of a cluster, computes the same results as the study.
 
     Args:
-        required: What a worker must have.
+        required: Versions of the program and its packages, and files of control laws, that
+            every worker must have.
 
     Raises:
-        UsageError: It does not. The message names the worker and the differences.
+        UsageError: This process differs. The message names the worker and the differences.
     """
     reason = explain_unfit_worker(required, describe_worker(), find_missing_laws(required.laws))
     if reason:
@@ -171,7 +173,15 @@ def _make_probe() -> Callable[
     """
 
     def probe(laws: Sequence[tuple[str, str]]) -> tuple[WorkerIdentity, Sequence[str]]:
-        """Returns the properties of this process, and the laws that it does not have."""
+        """Describes the worker process in which it is called, and checks its control laws.
+
+        Args:
+            laws: Name of each imported control law, with the SHA-256 of its file.
+
+        Returns:
+            The versions on which the results of this process depend; and the names of the laws
+            whose file this process does not have, or has with other contents.
+        """
         try:
             from trilat_net.studies import dask_cluster
         except ImportError:
@@ -218,7 +228,7 @@ class DaskCluster:
 
     @property
     def executor(self) -> Executor:
-        """Interface of the standard library to run functions on the workers of the cluster."""
+        """Runs functions on the workers of the cluster, as a `concurrent.futures.Executor`."""
         executor: Executor = self._client.get_executor(pure=False)
         return executor
 
@@ -229,13 +239,16 @@ class DaskCluster:
         return sum(worker["nthreads"] for worker in workers.values())
 
     def require(self, laws: Sequence[ImportedCode]) -> WorkerRequirements:
-        """Determines the requirements on every worker, and checks the workers that are present.
+        """Determines what workers need for a study, and checks the workers that are present.
+
+        A worker must have the same program, arithmetic and versions of packages as this
+        process, and the files of all imported control laws.
 
         Args:
-            laws: Imported control laws that the items need.
+            laws: Imported control laws that the items of the study need.
 
         Returns:
-            The requirements.
+            The requirements, against which later workers check themselves.
 
         Raises:
             UsageError: No worker appeared within `CONNECT_S`, or a worker does not meet the

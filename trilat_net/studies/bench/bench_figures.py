@@ -56,13 +56,13 @@ The slave touched no wall, the arms did not come to rest, or a run diverged.
 
 
 def list_figures_with_values(results: BenchResults) -> list[str]:
-    """Lists the figures for which the results have at least one number.
+    """Lists the figures of a benchmark for which the results contain at least one number.
 
     Args:
-        results: The results of the suite.
+        results: The results of the benchmark, which compares control laws.
 
     Returns:
-        Names for `draw_bench`. Empty if nothing can be drawn.
+        Names of figures that `draw_bench` can draw. Empty if there are no numbers at all.
     """
     names = []
     for name in FIGURES_OF_BENCH:
@@ -216,15 +216,15 @@ def _mark_cells(axes: Axes, results: BenchResults, task: str) -> None:
 
 
 def write_bench(results: BenchResults, folder: Path, command: str) -> list[Path]:
-    """Writes the page, the tables and the figures of a suite.
+    """Writes the results of a benchmark of control laws as a page, tables and figures.
 
     Args:
-        results: The results of the suite.
-        folder: Folder of the files.
-        command: Command that produces them, which the page shows.
+        results: The results of the benchmark.
+        folder: Folder in which the files are written.
+        command: The command that produces these files. The page shows it.
 
     Returns:
-        The paths of the files.
+        The paths of the Markdown page, the CSV tables and the PNG figures.
     """
     names = list_figures_with_values(results)
     pictures = {}

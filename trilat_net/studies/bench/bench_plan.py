@@ -1,20 +1,20 @@
-"""The plan of the benchmark suite: which control law runs in which task, over which link.
+"""Plans the benchmark of control laws: which law runs in which task, over which link.
 
-The suite compares control laws. It consists of cells. A cell is one law in one task over one
-link (the delay and loss between the sites), and runs once per seed. A task and a link are sets
-of overrides of a scenario that is shipped with the program, so `trilat sim` can reproduce every
-run of the suite.
+The benchmark consists of cells. A cell is one control law in one task over one link (the delay
+and loss between the arms). It runs once per random seed. A task and a link are sets of
+overrides of a scenario that is shipped with the program, so `trilat sim` can reproduce every
+run.
 
-The gains of all laws are tuned by one procedure, `trilat bench --tune`, and are stored in a
-file. A plan depends only on the study, the part of the study that the user selected, and the
-stored gains.
+One procedure, `trilat bench --tune`, tunes the gains of all laws and stores them in a file. It
+selects the gains with the smallest error among the choices that also stay stable if all delays
+grow by the factor `TUNING_MARGIN`. A study is a named selection of tasks, laws and links.
 
 Invariant:
     - Gains are never set by hand. They come from `trilat bench --tune` only.
     - Gains carry a fingerprint of the scenario and of the source code of the law for which they
       were tuned. If the fingerprint differs today, the user is told so.
-    - A law without a candidate that stays stable with the margin gets no gains, and does not
-      run.
+    - If no tried gains of a law stay stable with longer delays, the law gets no gains and does
+      not run.
     - A selection that cannot run is refused before the first run.
 """
 
@@ -128,14 +128,14 @@ def _build_dominance(a: float) -> dict[str, dict[str, float]]:
 
 
 class BenchTask(NamedTuple):
-    """A task of the suite: what the operators do, and what the slave arm touches.
+    """A task of the benchmark: what the operators do, and what the slave arm touches.
 
     Attributes:
         about: Description of the task for the user.
-        settings: Overrides that turn the scenario of a form into the task.
+        settings: Overrides of a shipped scenario. With them, the scenario describes the task.
         users: Number of users that the task needs.
-        cut_s: Start and end of the outage of all links of the slave, in s. None if no link
-            fails.
+        cut_s: Time interval, in s, during which the slave arm has no connection to any other
+            arm. None if no connection fails.
         duration_s: Time from the start over which errors and efforts are measured, in s. A run
             lasts at least as long.
     """
@@ -240,17 +240,19 @@ The tuning also runs it without the wall, as free motion.
 
 
 class BenchStudy(NamedTuple):
-    """A named part of the suite: a selection of tasks, laws and links.
+    """A named part of the benchmark: a selection of tasks, control laws and links.
 
-    The study runs every law in every task over every link, as far as they fit.
+    The study runs every law in every task over every link, except where a law does not fit a
+    task.
 
     Attributes:
         about: Purpose of the study.
-        tasks: Names of its tasks.
-        laws: Names of its laws, by the form in which they run (a key of `BASES`).
-        links: Names of its links.
-        seeds: Number of runs of a cell whose link draws random delays or losses. Any other cell
-            runs once.
+        tasks: Names of the tasks.
+        laws: Names of the control laws. The keys name the kind of scenario in which the laws
+            run, such as "two" for two arms, and are keys of `BASES`.
+        links: Names of the links, keys of `LINKS`.
+        seeds: Number of runs of a law in a task over a link with random delays or losses. Over
+            a link without randomness, the law runs once.
     """
 
     about: str
@@ -296,15 +298,16 @@ ROUND_TRIPS = 40
 
 
 def build_settings(form: str, task: str, link: str, seed: int | None = None) -> dict[str, Any]:
-    """Returns the overrides that turn the scenario of a form into a run of the suite.
+    """Returns the scenario overrides for a run of the benchmark, apart from the control law.
 
-    A form is a kind of scenario, such as with two or three sites. The overrides set the task,
-    the link and the seed, but not the law.
+    The overrides turn one of the shipped scenarios into the requested task over the requested
+    link. They also set a duration of at least `ROUND_TRIPS` round trips of the link.
 
     Args:
-        form: Kind of scenario in which the law runs, a key of `BASES`.
-        task: A key of `TASKS`.
-        link: A key of `LINKS`.
+        form: Kind of shipped scenario, a key of `BASES`. It determines the number of arms and
+            whether gravity acts on them.
+        task: Name of the task, a key of `TASKS`.
+        link: Name of the delay and loss between the arms, a key of `LINKS`.
         seed: Seed of the run. None keeps the seed of the scenario.
     """
     bench_task = TASKS[task]
@@ -380,7 +383,11 @@ class TunedGains(msgspec.Struct, frozen=True):
 
     @property
     def key(self) -> tuple[str, str, int]:
-        """Form, law and round trip in ms, which identify the gains in their file."""
+        """Identifier of these gains in the file of all tuned gains.
+
+        It consists of the kind of scenario (`form`), the name of the control law, and the round
+        trip of the links in ms.
+        """
         return self.form, self.law, self.round_trip_ms
 
     def __str__(self) -> str:
@@ -397,11 +404,11 @@ def format_settings(settings: Settings) -> list[str]:
 
 
 def load_tuning_task(form: str, round_trip_ms: int) -> TuningScenario:
-    """Loads the scenario in which the control laws of a form are tuned.
+    """Loads the scenario in which the benchmark tunes control laws for a round trip.
 
     Args:
-        form: Kind of scenario in which the law runs, a key of `BASES`.
-        round_trip_ms: Round trip of the links, in ms.
+        form: Kind of scenario, a key of `BASES`, such as "two" for two arms.
+        round_trip_ms: Round trip of the links between the arms, in ms.
     """
     settings = build_settings(form, TUNING_TASK, f"rtt{round_trip_ms}")
     return load_tuning_scenario(BASES[form], format_settings(settings))
@@ -508,15 +515,19 @@ def tune_laws(
     progress: Progress = ignore_progress,
     budget: int = TUNING_BUDGET,
 ) -> list[TunedGains]:
-    """Tunes laws at every round trip of the suite.
+    """Tunes control laws for the benchmark, at each of several round trips of the links.
+
+    The round trips are `TUNED_ROUND_TRIPS_MS`.
 
     Args:
-        laws_by_form: Names of the laws, by form (a key of `BASES`).
+        laws_by_form: Names of the laws to tune, by the kind of scenario in which they run, such
+            as "two" for two arms. The keys are keys of `BASES`.
         jobs: Number of processes, as for `trilat_net.tune`.
-        on: Cluster that runs the candidates, as for `trilat_net.tune`.
+        on: Cluster that tries the gains, as for `trilat_net.tune`.
         progress: Function that is called with the number of finished tunings and of all
             tunings.
-        budget: Number of candidates per gain of a law.
+        budget: Number of choices of gains to try, per gain of a law. A law with three gains
+            gets three times this number.
 
     Returns:
         The gains of every law at every round trip.
@@ -579,11 +590,12 @@ def _select_gains(form: str, round_trip_ms: int, search: CandidateSearch) -> Tun
 
 
 def write_gains(tuned: Sequence[TunedGains], path: Path = GAINS_FILE) -> None:
-    """Writes gains into a file, and keeps the other gains of the file.
+    """Writes tuned gains into a file, and keeps the other gains of the file.
 
     Args:
-        tuned: The gains. They replace those of the same form, law and round trip.
-        path: The file.
+        tuned: The gains to write. They replace gains in the file that were tuned for the same
+            kind of scenario, the same control law and the same round trip.
+        path: The file, in JSON.
     """
     entries = read_gains(path)
     for gains in tuned:
@@ -625,7 +637,7 @@ class BenchCell(NamedTuple):
 
     @property
     def inputs(self) -> str:
-        """Digest of everything that determines the runs: scenario, task, link and gains.
+        """Digest of everything that determines these runs: base scenario, task, link and gains.
 
         Stored runs with another digest are out of date and are not used.
         """
@@ -638,15 +650,15 @@ class BenchCell(NamedTuple):
 
     @property
     def key(self) -> str:
-        """Name of the cell in the journal of finished runs, see `BenchRun.cell`.
+        """Name of this law, task and link in the journal of finished runs.
 
-        It contains `inputs`, so that runs with other gains are not mistaken for runs of this
-        cell.
+        The name contains the digest `inputs` of the scenario and the gains. Therefore runs with
+        other gains are not mistaken for these runs.
         """
         return f"{self.name} {self.inputs}"
 
     def build(self, seed: int) -> TuningScenario:
-        """Returns the scenario of one run of the cell, with the tuned gains of its law.
+        """Returns the scenario of one run: a law with its tuned gains in a task over a link.
 
         Args:
             seed: Seed of the run.
@@ -657,14 +669,16 @@ class BenchCell(NamedTuple):
 
 
 class BenchPlan(NamedTuple):
-    """The suite, or a part of it, ready to run.
+    """All runs of a benchmark of control laws, or of a selected part, ready to be executed.
 
     Attributes:
-        study: Name of the study.
-        cells: The cells in the order in which they run.
-        laws: All selected laws, each with its form. In tables, a law without cells has an empty
-            row.
-        without: Tunings of the selected laws that found no gains.
+        study: Name of the study, which is a selection of tasks, laws and links.
+        cells: The combinations of a task, a control law and a link that run, in the order in
+            which they run.
+        laws: Pairs of a selected law and the kind of scenario in which it runs (a key of
+            `BASES`). A law without any run still has a row in the tables, without numbers.
+        without: Tunings of selected laws that found no stable gains. These laws do not run over
+            the links for which they were tuned there.
     """
 
     study: str
@@ -674,12 +688,12 @@ class BenchPlan(NamedTuple):
 
     @property
     def tasks(self) -> list[str]:
-        """Names of the tasks of the cells, in the order of the cells, without duplicates."""
+        """Names of the tasks that run in the benchmark, each once, in running order."""
         return list(dict.fromkeys(cell.task for cell in self.cells))
 
     @property
     def links(self) -> list[str]:
-        """Names of the links of the cells, in the order of the cells, without duplicates."""
+        """Names of the links over which the benchmark runs, each once, in running order."""
         return list(dict.fromkeys(cell.link for cell in self.cells))
 
     @property
@@ -784,16 +798,19 @@ NO_GAINS = "no gains"
 
 
 def explain_no_cell(law: str, form: str, task: str) -> str:
-    """Returns the reason why a law does not run in a task, as the tables print it.
+    """Returns why the benchmark has no run of a control law in a task, as the tables print it.
 
     Args:
         law: Name of the control law.
-        form: Form in which the law runs, a key of `BASES`.
-        task: A key of `TASKS`.
+        form: Kind of scenario in which the law runs, a key of `BASES`. For example, the form
+            "three" has two users and a slave arm, and the form "two" has a single user.
+        task: Name of the task, a key of `TASKS`.
 
     Returns:
-        "-" if the task needs more users than the form has. "no handover" if the task changes
-        dominance factors, and the law cannot. `NO_GAINS` if the law fits the task.
+        - "-" if the task needs two users, and the form has a single user.
+        - "no handover" if one user hands the control over to the other in this task, and the
+          law cannot change how much each user leads.
+        - `NO_GAINS` otherwise. In this case, the tuning of the law found no stable gains.
     """
     bench_task = TASKS[task]
     if bench_task.users > 1 and form != "three":

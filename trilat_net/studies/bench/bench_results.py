@@ -1,8 +1,9 @@
-"""The results of the benchmark suite by cell, as tables, Markdown, CSV and JSON.
+"""Summarises the results of the benchmark as tables, Markdown, CSV and JSON.
 
-A cell is a control law in a task over a link, see `bench_plan`. It has one run per seed. The
-tables show, for each law, how many links it is stable over, which properties its runs have, and
-the means of the measured quantities.
+The benchmark runs control laws in tasks over links with different delays and losses. A cell is
+one law in one task over one link, and has one run per random seed. For each law, the tables
+show over how many links the law is stable, which properties its runs have, and the means of the
+measured quantities.
 
 Invariant:
     - The output depends on the runs alone. It contains no time of day, so equal results give
@@ -115,18 +116,20 @@ class BenchRun(msgspec.Struct, frozen=True):
 
     @property
     def cell(self) -> str:
-        """Name of the run's cell in the journal.
+        """Name that identifies this run in the journal of finished runs, with its seed.
 
-        It contains the digest of the gains, and the duration of a repeated run, so that such
-        runs are not mistaken for the first runs of the cell.
+        The name consists of the task, the law, the link, and a digest of the scenario and the
+        gains. If this run repeats a first run over a longer time, the name also contains the
+        duration.
         """
         return name_run(f"{self.name} {self.inputs}", self.to_s)
 
     @property
     def needs_confirmation(self) -> bool:
-        """True if a longer run could refute that this run is not stable.
+        """True if this run was judged not stable, but a longer run might be stable.
 
-        This is not so if the run diverged, or is as long as `LONGEST_S` already.
+        False if the run diverged, which means that the motion grew without bound. Also false if
+        the run already lasted for `LONGEST_S`.
         """
         diverged = self.behaviour is EndBehaviour.DIVERGED
         is_short = self.length_s < LONGEST_S
@@ -179,42 +182,52 @@ class BenchCellResult(NamedTuple):
         return self.count(Stability.STABLE)
 
     def count(self, stability: Stability) -> int:
-        """Counts the runs of the cell with a given judgement.
+        """Counts the runs with a given judgement of their stability.
 
         Args:
-            stability: The judgement, for example that a run is stable.
+            stability: The judgement to count, for example `Stability.NOT_STABLE`.
         """
         return sum(run.stability is stability for run in self.runs)
 
     @property
     def judgement(self) -> Stability:
-        """The worst judgement of the cell's runs: a cell is stable only if all runs are."""
+        """Whether the control law is stable in all runs of this task over this link.
+
+        The value is the worst judgement of the runs: not stable if a run is not stable,
+        otherwise open if a run could not be decided, otherwise stable.
+        """
         if self.count(Stability.NOT_STABLE):
             return Stability.NOT_STABLE
         return Stability.OPEN if self.count(Stability.OPEN) else Stability.STABLE
 
     @property
     def masked(self) -> bool:
-        """True if the slave should touch a wall, but did not in at least one run.
+        """True if the slave arm should touch a wall, but did not touch it in at least one run.
 
-        The numbers of such a cell are not shown, see `BenchRun.masked`.
+        The numbers of these runs are not shown, because they do not describe the task.
         """
         return any(run.masked for run in self.runs)
 
     @property
     def is_passive(self) -> bool:
-        """True if no run returned more energy to the operators than they had put in.
+        """True if the control law never generated energy in these runs.
 
-        False if a run diverged.
+        This means that at no time the arms had returned more energy to the operators and the
+        other surroundings than they had received from them. False if a run diverged, which
+        means that the motion grew without bound.
         """
         return self.energy_j is not None and self.energy_j >= PASSIVE_J
 
     @property
     def energy_j(self) -> float | None:
-        """Least energy, in J, that the arms had received from outside at any time of any run.
+        """Lowest net energy that the environment had put into the arms at any time, in J.
 
-        A negative value means that a law generated energy, see `BenchRun.energy_j`. None if a
-        run diverged.
+        The environment is the operators, the friction and the wall. The value is the minimum
+        over time and over all runs of this law in this task over this link. It is negative if
+        the arms gave back more energy than they had received, so the control law generated
+        energy.
+
+        None if a run diverged.
         """
         values = [run.energy_j for run in self.runs if run.energy_j is not None]
         return min(values) if len(values) == len(self.runs) else None
@@ -230,14 +243,15 @@ class BenchCellResult(NamedTuple):
         return wilson_interval(self.stable, len(self.runs))
 
     def compute_mean(self, quantity: str) -> float | MeanInterval | None:
-        """Computes the mean of a quantity over the seeds.
+        """Computes the mean of a measured quantity over the runs, which differ in their seeds.
 
         Args:
-            quantity: A key of `QUANTITIES`.
+            quantity: Name of the quantity, a key of `QUANTITIES`.
 
         Returns:
-            The mean, with its 95 % confidence interval if there are at least `LEAST_SEEDS`
-            runs. None if the cell is masked, or if a run lacks the quantity.
+            The mean. With at least `LEAST_SEEDS` runs, it has a 95 % confidence interval. None
+            if a run lacks the quantity, or if the slave should touch a wall but missed it in a
+            run.
         """
         values = [getattr(run, quantity) for run in self.runs]
         if None in values or self.masked:
@@ -268,10 +282,12 @@ class BenchResults(Result):
         self.runs = [run for result in self.places for run in result.runs]
 
     def blocks(self) -> Iterator[Block]:
-        """Yields the parts of the printed text.
+        """Yields the parts of the text that describes the results of the benchmark.
 
-        These are a description, the verdicts, the properties of each task, each quantity of
-        each task, and the effects of delay and loss in the study "round-trips".
+        The parts are a description of the study, and a table that counts the stable runs of
+        each control law. Then each task has a table of the properties of its runs, and a table
+        for each measured quantity, such as the error. In the study "round-trips", a last table
+        has the effects of delay and loss.
         """
         yield from describe_bench(self)
         yield ""
@@ -287,7 +303,10 @@ class BenchResults(Result):
             yield tabulate_round_trips(self)
 
     def headline(self) -> str:
-        """Returns a sentence with the name of the study and the numbers of cells and runs."""
+        """Returns a sentence with the study's name and its numbers of cells and runs.
+
+        A cell is a control law in a task over a link.
+        """
         cells = count_nouns(len(self.places), "cell")
         runs = count_nouns(len(self.runs), "run")
         return f"{self.plan.study}: {cells}, {runs}"
@@ -305,12 +324,12 @@ class BenchResults(Result):
         return list(map(_build_row, self.places))
 
     def select(self, task: str, law: str = "", link: str = "") -> Iterator[BenchCellResult]:
-        """Yields the results of the cells of a task.
+        """Yields the results of a task: one for each control law and link that ran in it.
 
         Args:
-            task: Name of the task, a key of `TASKS`.
-            law: The law of the cells. Empty selects all laws.
-            link: The link of the cells. Empty selects all links.
+            task: Name of the task, such as "contact".
+            law: Name of the control law to select. Empty selects all laws.
+            link: Name of the link to select. Empty selects all links.
         """
         for result in self.places:
             cell = result.cell
@@ -384,13 +403,14 @@ UNSTABLE_MARK = "!"
 
 
 def list_quantities(results: BenchResults) -> list[tuple[str, str]]:
-    """Lists the tables that are printed: one for each task and measured quantity.
+    """Lists which measured quantities are printed for which task.
 
     Args:
-        results: Results of the suite or of a part of it.
+        results: Results of the benchmark or of a part of it.
 
     Returns:
-        Pairs of a task that ran and a key of `QUANTITIES`.
+        Pairs of the name of a task that ran and the name of a quantity, a key of `QUANTITIES`.
+        Each pair is printed as a table.
     """
     tasks = results.plan.tasks
     pairs = [(task, quantity) for quantity in _QUANTITIES_OF_ALL for task in tasks]
@@ -400,11 +420,12 @@ def list_quantities(results: BenchResults) -> list[tuple[str, str]]:
 
 
 def name_law(law: str, form: str) -> str:
-    """Returns the name of a law for tables, with a note if it runs with two sites.
+    """Returns the name of a control law for tables, with a note if only two arms take part.
 
     Args:
         law: Name of the control law.
-        form: Form of the suite in which the law runs, a key of `BASES`.
+        form: Kind of scenario in which the law runs, a key of `BASES`. The form "three" has two
+            users and a slave arm. All other forms have two arms.
     """
     return law if form == "three" else f"{law} (two sites)"
 
@@ -521,17 +542,16 @@ def _format_least_energy(law_results: Sequence[BenchCellResult]) -> str:
 
 
 def tabulate_quantity(results: BenchResults, task: str, quantity: str) -> TextTable:
-    """Returns a table of the means of a quantity: a row per law, a column per link.
+    """Returns a table of the mean of a quantity: a row per control law, a column per link.
 
-    The means are over the seeds of a cell.
-
-    Entries of cells that are open or not stable have a mark. A law that cannot run in the task
-    has no row.
+    The mean is over the runs of the law with different random seeds. An entry has a mark if not
+    all of its runs are stable. A law that cannot run in the task has no row. If there are many
+    links, only some of them have a column.
 
     Args:
-        results: Results of the suite or of a part of it.
-        task: A task that ran.
-        quantity: A key of `QUANTITIES`.
+        results: Results of the benchmark or of a part of it.
+        task: Name of a task that ran.
+        quantity: Name of the quantity, a key of `QUANTITIES`.
     """
     links = results.plan.links
     if len(links) > len(_PRINTED_LINKS):
@@ -576,13 +596,13 @@ def _describe_result(result: BenchCellResult, quantity: str) -> str:
 def tabulate_round_trips(results: BenchResults) -> TextTable:
     """Returns a table of how the error of each law grows with delay and with losses.
 
-    A row is a task and a law. The columns have the error at the shortest round trip, the ratio
-    of the errors at the longest and the shortest round trip, and the ratio of the errors with
-    and without losses. The published study that this part of the suite repeats reports these
-    effects.
+    A row is a task and a control law. Its columns are the error at the shortest round trip,
+    the error at the longest round trip divided by the error at the shortest, and the error
+    with losses divided by the error without losses. The published study that the study
+    "round-trips" repeats reports the same effects.
 
     Args:
-        results: Results of the suite or of a part of it.
+        results: Results of the benchmark or of a part of it.
     """
     rows = []
     for task in results.plan.tasks:

@@ -64,12 +64,13 @@ TIME_CONSTANTS = 6.0
 
 
 class BenchRunItem(NamedTuple):
-    """One run of the suite as an item for a worker process. It can be pickled.
+    """One run of the benchmark, as it is sent to a worker process. It can be pickled.
 
     Attributes:
-        cell: The cell of the suite.
+        cell: The task, control law and link of the run, with the tuned gains.
         seed: Seed of the run.
-        to_s: Duration in s of a repeated run that is longer. 0 for a first run.
+        to_s: Duration in s, if the run repeats a first run over a longer time to check that it
+            is not stable. 0 for a first run.
     """
 
     cell: BenchCell
@@ -109,7 +110,7 @@ class _JudgedRun(NamedTuple):
 
 
 def run_bench_task(item: BenchRunItem) -> BenchRun:
-    """Simulates a run, judges whether it is stable, and measures its numbers.
+    """Simulates a run of the benchmark, judges its stability, and measures its performance.
 
     The function needs nothing but its argument, so that any worker process can call it.
 
@@ -117,7 +118,8 @@ def run_bench_task(item: BenchRunItem) -> BenchRun:
         item: The run to execute.
 
     Returns:
-        The run with its judgement and numbers, ready for the journal.
+        The finished run, ready for the journal. It has the judgement of its stability and
+        measured numbers such as error and effort. A run that diverged has no such numbers.
     """
     cell = item.cell
     scenario = cell.build(item.seed).scenario
@@ -298,15 +300,22 @@ def _compute_hand_torque(scenario: Scenario, name: str, record: RecordBatch) -> 
 
 
 def find_least_energy(records: dict[str, RecordBatch]) -> float:
-    """Computes the smallest energy that the arms had received from outside, in J.
+    """Computes the minimum over time of the net energy that the arms received from outside.
 
-    The energy received until t is the integral of sum_i -tau_x_i' qd_i from 0 to t, where
-    tau_x_i is the recorded exogenous torque of arm i, computed with the trapezoidal rule. All
-    arms start at rest. If network and controllers are passive, they cannot return more energy
-    than they received, so the energy never falls below 0.
+    The net energy that the arms received until time t is the integral of
+    -sum_i tau_x_i' qd_i from the start to t. Here tau_x_i is the recorded torque from outside
+    on arm i, in N m, with the sign of the record, and qd_i its joint velocity, in rad/s. The
+    integral is computed with the trapezoidal rule and is 0 at the start.
+
+    All arms start at rest. If network and controllers are passive, the arms cannot return more
+    energy than they received, so the minimum is 0 apart from numerical errors. A negative
+    result shows that energy was generated.
 
     Args:
-        records: All records of the run, by site.
+        records: All records of the run, by the name of the arm.
+
+    Returns:
+        The minimum, in J. At most 0.
     """
     power = sum(-np.sum(record.tau_x * record.qd, axis=1) for record in records.values())
     h_s = 1e-9 * np.diff(records[SLAVE].t_ns[:2])[0]
@@ -413,15 +422,17 @@ BenchFolder = StudyFolder[BenchPlan, BenchRun]
 
 
 def prepare_bench_folder(plan: BenchPlan, path: Path | None = None) -> BenchFolder:
-    """Makes the folder of a suite, or opens an existing folder with its finished runs.
+    """Creates the folder of a benchmark, or opens an existing folder with finished runs.
 
     Args:
-        plan: Plan of the suite.
-        path: The folder. None uses `runs/bench-STUDY`.
+        plan: Plan of the benchmark.
+        path: The folder. None uses the folder `bench-` in `runs`, followed by the name of the
+            study.
 
     Raises:
-        UsageError: The folder has other content, or runs of another version of the program or
-            of another arithmetic, or cannot be made.
+        UsageError: The folder cannot be made, or has other content. The same error is raised
+            if its runs come from another version of the program, or from a machine that
+            computes with other rounding, because these results must not be mixed.
     """
     if path is None:
         path = Path("runs") / f"bench-{plan.study}"
@@ -475,14 +486,15 @@ def run_bench(
     *,
     confirm: bool = False,
 ) -> BenchResults:
-    """Executes the runs of a suite that are not finished yet.
+    """Executes the runs of a benchmark that are not finished yet.
 
     Args:
-        folder: Folder of the suite. Its journal has the finished runs.
+        folder: Folder of the benchmark. Its journal contains the finished runs.
         jobs: Number of processes, as for `trilat_net.bench`.
         on: Cluster that executes the runs, as for `trilat_net.bench`.
         progress: Function that is called with the number of finished runs and of all runs.
-        confirm: True to repeat the runs that are not stable over `LONGEST_S`.
+        confirm: True to repeat runs that were judged not stable, with the longer duration
+            `LONGEST_S`, because a longer run may show that they are stable.
 
     Returns:
         The results of all runs.
