@@ -161,7 +161,7 @@ class ArmGains(Result):
     curve: list[tuple[float, float]]
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row per joint of the arm with its inertia and tuned gains, for a CSV file."""
+        """Returns a row per joint of the arm: its inertia and tuned gains, for a CSV file."""
         return self.joints
 
     def blocks(self) -> Iterator[Block]:
@@ -467,9 +467,9 @@ class _GainSearch:
     def build_law(self, k: float, stiffness_divisor: float = 1.0) -> Any:
         """Returns the control law with the gains that belong to a gain parameter k.
 
-        The gains of a joint with the inertia m are the stiffness K = k m and the damping d + Kd
-        = 2 zeta sqrt(k) m, where zeta is the damping ratio of this search. The damping d of the
-        velocity and the damping Kd of the velocity error have the same ratio as the default
+        A joint with the inertia m gets the stiffness K = k m and the damping d + Kd =
+        2 zeta sqrt(k) m, where zeta is the damping ratio of this search. The damping d of
+        the velocity and the damping Kd of the velocity error have the same ratio as the default
         gains of the law. All gains are rounded to four digits.
 
         Args:
