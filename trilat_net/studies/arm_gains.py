@@ -467,10 +467,14 @@ class _GainSearch:
     def build_law(self, k: float, stiffness_divisor: float = 1.0) -> Any:
         """Returns the control law with the gains that belong to a gain parameter k.
 
-        A joint with the inertia m gets the stiffness K = k m and the damping d + Kd =
-        2 zeta sqrt(k) m, where zeta is the damping ratio of this search. The damping d of
-        the velocity and the damping Kd of the velocity error have the same ratio as the default
-        gains of the law. All gains are rounded to four digits.
+        A joint with the inertia m gets the following gains, where K is the stiffness, d the
+        damping of the velocity, Kd the damping of the velocity error, and zeta the damping
+        ratio:
+
+            K = k m,    d + Kd = 2 zeta sqrt(k) m
+
+        The ratio of d and Kd is the same as in the default gains of the law. All gains are
+        rounded to four digits.
 
         Args:
             k: The gain parameter, in 1/s^2.

@@ -205,14 +205,18 @@ class ReachTask:
         self._last_s = scene.t_s
 
     def judge(self, scene: Scene) -> Judgement:
-        """Computes the reward of a step, and whether the end effector stayed long enough.
+        """Computes the reward of a step, and checks whether the reaching task is done.
+
+        The reward is the negative distance from the end effector to the goal, in m, times the
+        duration of the step, in s. A reward of 1 is added when the task is done. The task is
+        done when the end effector has stayed within the tolerance around the goal for the
+        required time.
 
         Args:
-            scene: State after the step.
+            scene: State of the arms after the step.
 
         Returns:
-            The judgement. It ends the episode once the end effector has stayed at the goal for
-            `stay_s`.
+            The reward, and whether the task is done. If it is done, the episode ends.
         """
         from_goal_m = scene.end_effector_m[self._site] - self.goal
         distance_m = float(np.linalg.norm(from_goal_m))
@@ -227,11 +231,11 @@ class ReachTask:
 
 
 class ActedHand(HandPlayer):
-    """Simulated operator that moves the user's arm as the actions of an episode say.
+    """Simulated operator that moves the user's arm with the actions of a policy.
 
     Args:
-        hand_site: Site and settings of the operator.
-        actions: Action of each step. The environment appends to this list.
+        hand_site: The arm that the operator holds, and the settings of the operator.
+        actions: Action of each step of the episode. The environment appends to this list.
     """
 
     def __init__(self, hand_site: HandSite, actions: list[Array]) -> None:
@@ -239,14 +243,14 @@ class ActedHand(HandPlayer):
         self._actions = actions
 
     def request_action(self, k: int, arrays: SiteArrays) -> None:  # noqa: ARG002 - already observed
-        """Passes the action of the current step on, as the decision of the operator.
+        """Applies the policy's action for the current step as the decision of the operator.
 
-        The simulation calls this in the ticks in which an operator decides. The policy has
-        already observed the state, so that the state in the second argument is not needed.
+        The simulation calls this method whenever the operator has to decide.
 
         Args:
-            k: Tick of the decision, from 0.
-            arrays: State of the site, which is not used.
+            k: Period of the control loop in which the decision is due, from 0.
+            arrays: State of the arm. It is not used, because the policy has observed it
+                already.
         """
         action = self._actions[k // self.hand.period_ticks]
         self.hand.accept_decision(k, action.tolist())

@@ -119,7 +119,11 @@ class HandImpedance(Result):
     responses: tuple[SineResponse, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """Converts the result to plain values, as `trilat linear --operators` reads them."""
+        """Converts the identified hand to plain values for a JSON file.
+
+        The values are the matrices, their intervals and the measured responses. The command
+        `trilat linear --operators` reads the file.
+        """
         return {
             "site": self.site,
             "segments": self.segments,
@@ -135,13 +139,15 @@ class HandImpedance(Result):
         }
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a table of the responses, one row of plain values per frequency."""
+        """Returns a table of the hand's motion and force, one row per shaking frequency."""
         return [response._asdict() for response in self.responses]
 
     def to_hand(self) -> dict[str, Any]:
-        """Returns settings of a simulated operator that resembles the hand most.
+        """Returns settings of the simulated operator that is most similar to this hand.
 
-        This operator of a scenario is a spring and a damper along each axis. It has no mass.
+        This operator consists of a spring and a damper along each axis, and has no mass. The
+        settings are the entries of its table in a scenario, the file that describes an
+        experiment.
         """
         return {
             "kind": "tip_spring",
@@ -152,8 +158,9 @@ class HandImpedance(Result):
     def blocks(self) -> Iterator[Block]:
         """Yields the parts of the text that `trilat identify hand` prints.
 
-        They are the matrices with their intervals, the responses at the frequencies of the
-        sines, and the most similar operator of a scenario.
+        The parts are the mass, damping and stiffness matrices with their confidence intervals,
+        a table of the motion and force at each frequency of the shaking, and the settings of
+        the most similar simulated operator.
         """
         segments = count_nouns(self.segments, "segment")
         yield f"hand at {self.site}: {segments} of {self.segment_s:g} s, intervals of 95 %"
@@ -196,18 +203,22 @@ def _round_diagonal(matrix: Array) -> list[float]:
 def identify_hand(log: Log | str | Path, site: str = "m1") -> HandImpedance:
     """Identifies mass, damping and stiffness of the hand that holds an arm.
 
-    The command is `trilat identify hand`.
+    While the person holds the arm, a simulated operator must shake the arms with a sum of sines
+    (kind `multisine`). The command is `trilat identify hand`.
 
     >>> hand = tn.identify_hand("run.mcap", "m1")  # doctest: +SKIP
     >>> hand.K.diagonal(), hand.halves["K"].diagonal()  # doctest: +SKIP
 
     Args:
         log: Log of the run, or its path.
-        site: Site of the arm that the hand holds.
+        site: Name of the arm that the hand holds.
+
+    Returns:
+        The matrices M, B and K. `halves` contains half the widths of their 95 % intervals.
 
     Raises:
-        UsageError: There is no such site, no sine acts, the run is too short, or the motion
-            does not distinguish the axes.
+        UsageError: The run has no such arm or no sines, the run is too short, or the motion
+            along some axes is too similar to separate them.
     """
     log = log if isinstance(log, Log) else open_log(log)
     scenario = log.scenario
@@ -508,7 +519,17 @@ def _fit_impedance(force: Complex, motions: Complex, segments: NDArray[np.int64]
     smallest_deviation = 1e-6 * np.abs(mean_force).max()  # avoids a division by zero
 
     def compute_weighted_residuals(impedance: Array) -> Array:
-        """Returns the residual of each frequency, divided by its standard deviation."""
+        """Computes how far the measured force is from the force of the hand model.
+
+        At each frequency, the difference is averaged over the segments of the run and divided
+        by its standard deviation.
+
+        Args:
+            impedance: Rows of M, B and K for this axis, shape (3 n,), for n axes.
+
+        Returns:
+            The real parts and then the imaginary parts, shape (2 F,), for F frequencies.
+        """
         residuals = force - motions @ impedance
         deviation = np.maximum(residuals.std(axis=0), smallest_deviation)
         mean_residual = mean_force - mean_motion @ impedance
@@ -521,13 +542,13 @@ def _fit_impedance(force: Complex, motions: Complex, segments: NDArray[np.int64]
 
 
 def read_hands(files: Sequence[str | Path]) -> list[HandMatrices]:
-    """Reads identified hands from JSON files, which `trilat identify hand --json` wrote.
+    """Reads the mass, damping and stiffness of hands from files.
 
     Args:
-        files: Paths of the files.
+        files: Paths of JSON files that `trilat identify hand --json` wrote.
 
     Returns:
-        The matrices of each hand, in the order of the files.
+        The mass, damping and stiffness matrices of each hand, in the order of the files.
 
     Raises:
         UsageError: A file does not contain a hand.

@@ -55,7 +55,8 @@ class LogComparison(Result):
     def blocks(self) -> Iterator[Block]:
         """Yields the parts of the text that `trilat compare` prints.
 
-        They are the differences of the scenarios, the table of metrics, and the remarks.
+        The parts are the differences of the experiments, a table of the metrics, notes on how
+        each run ended, and reasons for missing values.
         """
         names = {log.scenario.name for log in self.logs}
         if len(names) > 1:

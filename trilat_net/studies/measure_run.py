@@ -175,7 +175,7 @@ def run_in_batches(
     diverged_at_s: float | None = None
 
     def flush(name: str) -> None:
-        """Passes the pending records of a site on."""
+        """Passes the collected records of a site to its receiver, and clears them."""
         records = pending[name]
         if not records:
             return
@@ -302,12 +302,12 @@ class WindowStats:
         self._hits = 0
 
     def add(self, rows: RecordBatch) -> None:
-        """Updates the statistics with the next records of the site.
+        """Updates the statistics of an interval of time with the next records of the arm.
 
-        Records outside of the window are ignored.
+        Records outside of the interval are ignored.
 
         Args:
-            rows: The records, which must follow those of the previous call.
+            rows: The records, at least one. They must follow the records of the previous call.
         """
         self._last_ns = int(rows.t_ns[-1])
         inside = rows.between(self._from_ns, self._to_ns)
@@ -358,14 +358,15 @@ class WindowStats:
         self._force_peak = max(self._force_peak, float(force.max()))
 
     def compute_ranges(self) -> dict[str, Range]:
-        """Returns the range of each quantity within the window.
+        """Returns the smallest and the largest value of each quantity in this interval of time.
 
-        Joint angles have a smallest and a largest value. All other quantities, such as a mean
-        or a peak, have a single value.
+        A scenario can limit quantities in intervals of the run, which it calls windows of its
+        table [expect]. Joint angles have a smallest and a largest value. All other quantities,
+        such as a mean or a peak, have a single value, which is both.
 
         Returns:
-            The ranges, by the keys of a window of [expect]. Empty if the records end before
-            the window does.
+            The ranges, by the keys of the table [expect]. Empty if the records end before the
+            interval does.
         """
         ends_early = self._last_ns < self._to_ns - self._period_ns
         if not self._records or ends_early:
@@ -442,10 +443,11 @@ class SiteStats:
         self._tail: list[RecordBatch] = []
 
     def add(self, rows: RecordBatch) -> None:
-        """Updates all statistics with the next records of the site.
+        """Updates the largest errors, torques, sample ages and all other statistics of the arm.
 
         Args:
-            rows: The records, which must follow those of the previous call.
+            rows: The next records of the arm. They must follow the records of the previous
+                call.
         """
         if not len(rows.t_ns):
             return
@@ -521,18 +523,19 @@ class SiteStats:
         return ages
 
     def end(self, end_ns: int) -> RecordBatch:
-        """Returns the records of the last second before a time, which show how the run ended.
+        """Returns the records of the last second of the run.
 
         Args:
-            end_ns: The time, in ns. It must not lie before the last record.
+            end_ns: Time of the run's last record, in ns. If the records of this arm end earlier
+                than others, fewer records are returned.
         """
         return join_batches(self._tail).since(end_ns - _END_NS)
 
     @property
     def buckets(self) -> Array:
-        """Compact summary of the site's records, from which the end of the run is judged.
+        """Summary of the arm's motion, from which the end of the run is judged.
 
-        See `RecordBatch.reduce`.
+        A row has the extreme values of a short interval of time, see `RecordBatch.reduce`.
         """
         return self._buckets[: self.last_ns // _BUCKET_NS + 1]
 
@@ -650,7 +653,14 @@ def compute_run_metrics(
     sites_by_window = zip(*windows_by_site, strict=True)
 
     def find_largest(name: str) -> float | None:
-        """Returns the largest value of an attribute over the sites with records."""
+        """Returns the largest value of a statistic over all arms.
+
+        Args:
+            name: Name of the statistic, an attribute of `SiteStats`.
+
+        Returns:
+            The largest value. None if no arm has recorded anything.
+        """
         values = [getattr(stats, name) for stats in with_records.values()]
         return max(values, default=None)
 
@@ -846,17 +856,18 @@ class ExpectationResult(msgspec.Struct, frozen=True):
 
 
 def evaluate_expectations(expect: Expect, metrics: RunMetrics) -> list[ExpectationResult]:
-    """Compares the metrics of a run with the expectations of its scenario.
+    """Compares the metrics of a run with the expectations that its scenario states.
 
-    A run that diverged, that is, left the limits of an arm, has an outcome `stable` even if the
-    scenario does not contain this key, see `Expect`.
+    If the run diverged, which means that an arm left its limits, the expectation `stable` is
+    always reported, even if the scenario does not state it.
 
     Args:
-        expect: Expectations of the scenario.
+        expect: Expectations of the scenario, for example the largest permitted error.
         metrics: Metrics of the run.
 
     Returns:
-        The outcome of each expectation, in the order of the keys of `Expect`.
+        For each expectation, whether the run met it, and the measured value. The results are in
+        the order of the attributes of `Expect`.
     """
     outcomes = list(_evaluate_stability(expect, metrics))
     for key in _LIMITS:

@@ -85,10 +85,13 @@ _VERSIONS = ("version_trilat-net", "version_numba", "version_numpy")
 
 
 def describe_program() -> tuple[str, dict[str, str]]:
-    """Returns what the results of this program depend on, apart from the plan of a study.
+    """Returns the properties of this program and machine on which numerical results depend.
+
+    Results of a study are mixed only if these properties are the same.
 
     Returns:
-        The fingerprint of the arithmetic, and the versions of the computing packages.
+        A fingerprint of how the machine rounds floating point numbers; and the versions of the
+        program and of the packages that compute the results.
     """
     provenance = collect_provenance()
     return compute_fingerprint(), {name: provenance[name] for name in _VERSIONS}
@@ -128,7 +131,10 @@ class JournalEntry(Protocol):
 
     @property
     def cell(self) -> Hashable:
-        """Part of the study to which the run belongs, such as the number of a grid point."""
+        """Identifier of the part of the study to which the run belongs.
+
+        For example, the number of a grid point in a sweep over parameters.
+        """
 
     @property
     def seed(self) -> int:

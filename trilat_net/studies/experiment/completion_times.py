@@ -145,12 +145,20 @@ def find_unit_medians(
 def summarise_times(
     rows: Sequence[Row], limit_s: float, *, unit: str = "participant"
 ) -> list[CompletionTime]:
-    """Returns the completion time of each condition, in the order of the rows.
+    """Returns the median completion time, and its interval, under each condition.
+
+    The median is first taken over the trials of each participant (or pair), and then over the
+    participants. It is None if it was not reached, because too many trials were not completed.
 
     Args:
-        rows: Trials, as for `find_unit_medians`.
+        rows: Trials as mappings with the keys `condition`, `completion_s`, `succeeded`, and the
+            key that `unit` names, as in `trials.csv`.
         limit_s: Time limit of a trial, in s.
-        unit: "participant" or "pair", which is sampled independently.
+        unit: "participant" if participants are independent of each other. "pair" if the two
+            members of a pair did the trials together, and only pairs are independent.
+
+    Returns:
+        A summary per condition, in the order in which the conditions first occur.
     """
     summaries: list[CompletionTime] = []
     for condition, medians_by_unit in find_unit_medians(rows, unit).items():

@@ -273,12 +273,17 @@ class ExperimentAnalysis(Result):
             )
 
     def of(self, measure: str) -> Sequence[Row]:
-        """Returns the rows of the table that contains a measure.
+        """Returns the table rows in which a measure of the experiment can be found.
 
-        This is the table of trials, of units (participants or pairs), or of questionnaires.
+        Depending on the measure, a row is a trial, a participant or pair, or a completed
+        questionnaire.
 
         Args:
-            measure: Name of the measure.
+            measure: Name of the measure, such as "completion_s".
+
+        Returns:
+            The rows, as mappings from column names to values. Empty if no questionnaire has the
+            measure.
         """
         rows_by_kind = {
             "throughput": self.throughput_rows,
@@ -538,10 +543,10 @@ class ExperimentAnalysis(Result):
         return figures
 
     def compose_page(self, figures: Sequence[str]) -> str:
-        """Composes the Markdown page that reports the analysis.
+        """Composes the Markdown page that reports the results of the experiment.
 
         Args:
-            figures: Names of the PNG files beside the page.
+            figures: Names of the PNG files beside the page, without the suffix.
 
         Returns:
             The text of the page.
@@ -559,10 +564,14 @@ class ExperimentAnalysis(Result):
         return "\n\n".join(parts) + "\n"
 
     def fit_models(self) -> Iterator[MixedModel]:
-        """Fits mixed models of the forces of users within pairs, one after the other.
+        """Fits mixed models to the mean and the peak force of users who act in pairs.
 
-        A mixed model accounts for the fact that users of the same pair are not independent.
-        There are models only if the package statsmodels is installed.
+        A mixed model accounts for the fact that the two users of a pair are not independent.
+
+        Yields:
+            One model for each of the two measures, as soon as it is fitted. There are none if
+            participants act alone, if there are too few pairs, or if the package statsmodels is
+            not installed.
         """
         pairs = {row[self.unit] for row in self.rows}
         if self.unit == "participant" or len(pairs) < 2 or find_spec("statsmodels") is None:
@@ -590,7 +599,12 @@ class ExperimentAnalysis(Result):
         return [test._asdict() for test in chain.from_iterable(self.comparisons.values())]
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the analysis, which `trilat experiment analyse --json` prints."""
+        """Returns all results of the experiment as plain values.
+
+        These are the means of the conditions, their comparisons, completion times, missing
+        answers, fitted models and the methods paragraph. `trilat experiment analyse --json`
+        prints them.
+        """
         models = {model.measure: model._asdict() for model in self.models}
         for model in models.values():
             model["effects"] = [effect._asdict() for effect in model["effects"]]
@@ -610,9 +624,10 @@ class ExperimentAnalysis(Result):
     def blocks(self) -> Iterator[Block]:
         """Yields the parts of the text that `trilat experiment analyse` prints.
 
-        They are the completion of trials, the measures and their comparisons, missing numbers,
-        and the methods paragraph. With a single participant or pair there are no comparisons,
-        and one table has all measures.
+        The parts are a summary of completed trials, the means and comparisons of the measures,
+        the fitted models, the number of missing questionnaire answers, the reasons why a
+        measure has no number, and the methods paragraph. With a single participant or pair
+        there are no comparisons, and one table has all measures.
         """
         yield from self._write_time_blocks()
         units = {row[self.unit] for row in self.rows}
@@ -816,7 +831,11 @@ class PowerOfExperiment(Result):
             )
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the numbers, which `trilat experiment power --json` prints."""
+        """Returns plain values for `trilat experiment power --json`.
+
+        These are the effect size, the participants needed for each statistical power, and the
+        power that the planned number of participants gives, both computed and simulated.
+        """
         simulated = None if self.simulated is None else self.simulated._asdict()
         least = [
             {"power": wanted, "participants": number} for wanted, number in self.least.items()
@@ -832,8 +851,9 @@ class PowerOfExperiment(Result):
     def blocks(self) -> Iterator[Block]:
         """Yields the parts of the text that `trilat experiment power` prints.
 
-        A table has the number of participants for each power. With a planned number of
-        participants, a second part has the power that it gives.
+        A table shows how many participants are needed for each statistical power, which is the
+        probability of finding a true effect. If a number of participants is planned, a sentence
+        follows with the power that this number gives.
         """
         yield (
             "paired comparison of two conditions, two-sided, alpha 0.05, "

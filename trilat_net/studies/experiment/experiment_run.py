@@ -44,20 +44,22 @@ LOGS = "logs"
 
 
 class Note(msgspec.Struct, frozen=True):
-    """Event of an experiment with people, other than a finished trial.
+    """An event of an experiment with people that is not a finished trial.
 
-    Such events are consents, answers to a questionnaire, and aborted trials. They are stored in
-    a journal of their own.
+    The event is a consent, the answers to a questionnaire, or an aborted trial. Events are
+    stored in a journal of their own.
 
     Attributes:
-        cell: Unique key of the event: a step and a participant, or an aborted trial.
+        cell: Unique key of the event. It names the step of the experiment and the participant,
+            or the aborted trial.
         kind: "consent", "questionnaire" or "aborted".
-        who: Pseudonym of the participant. For a trial, those of all participants.
+        who: Pseudonym of the participant. If a trial was aborted, the pseudonyms of all its
+            participants.
         number: Number of the trial to which the event belongs.
         unix_s: Time on the machine's clock, in s.
         text: Name of a questionnaire, or the reason why a trial was aborted.
         answers: Answers by item. None for a missing answer.
-        seed: Always 0. The journal expects a seed.
+        seed: Always 0. The field exists because journal entries of other studies have a seed.
     """
 
     cell: str
@@ -108,15 +110,16 @@ class Experiment(Result):
     def open_trials(self, *, people: bool | None = None) -> RunJournal[TrialEntry]:
         """Opens the journal with the results of the finished trials.
 
-        People and synthetic participants (models of people) must not be mixed in one
-        experiment, so that a caller who continues it states which it uses.
+        An experiment must not mix trials of people with trials of synthetic participants, which
+        are models of people. Therefore a caller who wants to add trials declares their kind
+        here.
 
         Args:
-            people: True if people continue the experiment, False if synthetic participants do.
+            people: True to add trials of people, False to add trials of synthetic participants.
                 None to read only.
 
         Raises:
-            UsageError: The finished trials are of the other kind of participants.
+            UsageError: The finished trials are of the other kind.
         """
         if people is not None:
             entries = self.read_entries().values()
@@ -133,7 +136,11 @@ class Experiment(Result):
         )
 
     def open_notes(self) -> RunJournal[Note]:
-        """Opens the journal of consents, answers to questionnaires and aborted trials."""
+        """Opens the journal file of all events of the experiment that are not finished trials.
+
+        The events are consents, answers to questionnaires, and aborted trials. Use the returned
+        journal in a `with` statement to read events or to append new events.
+        """
         return RunJournal(self.folder / NOTES_FILE, self.plan.digest, Note, self._remedy)
 
     def read_entries(self) -> dict[int, TrialEntry]:
@@ -142,8 +149,9 @@ class Experiment(Result):
             return {entry.cell: entry for entry in journal.done.values()}
 
     def read_notes(self) -> list[Note]:
-        """Returns the consents, answers and aborted trials, in the order of their time.
+        """Returns what people did besides finished trials, in the order of time.
 
+        Each entry is a consent, the answers to a questionnaire, or a trial that was aborted.
         Empty if nothing has been noted yet.
         """
         if not (self.folder / NOTES_FILE).exists():
@@ -203,12 +211,20 @@ class Experiment(Result):
     def run(
         self, jobs: int | None = None, show: Progress = ignore_progress, on: Workers = None
     ) -> "Experiment":
-        """Runs the remaining trials with synthetic participants, and writes the tables.
+        """Runs the remaining trials of the experiment with simulated people.
+
+        A simulated person, or synthetic participant, is a model that moves the arms like a
+        person. The trials run in virtual time. Trials that are in the journal already are not
+        repeated. In the end, the tables of the experiment are written.
 
         Args:
-            jobs: Number of processes. None for one per core.
+            jobs: Number of processes. None uses one process per core.
             show: Function that is called with the numbers of finished and of all trials.
-            on: Address of a Dask scheduler, or an executor that runs the trials.
+            on: Address of a Dask scheduler, or an executor that runs the trials. None uses
+                processes on this machine.
+
+        Returns:
+            This experiment.
         """
         logs = make_subfolder(self.folder / LOGS)
         plan = self.plan
@@ -435,13 +451,22 @@ def new_experiment(file: str | Path, *, pair: bool = False, force: bool = False)
 
 
 def check_experiment(file: str | Path) -> ExperimentPlan:
-    """Returns the plan of a protocol, as `trilat experiment check` does.
+    """Checks the protocol of an experiment with people, and plans all of its trials.
+
+    The command is `trilat experiment check`.
 
     >>> len(tn.check_experiment(tn.new_experiment("reaching.toml")).trials)
     240
 
+    Args:
+        file: Path of the protocol, a TOML file with the conditions, the task, and the numbers
+            of participants and trials.
+
+    Returns:
+        The plan, which lists every trial in its order.
+
     Raises:
-        UsageError: the protocol cannot be carried out; the error lists all problems.
+        UsageError: The protocol cannot be carried out. The error lists all problems.
     """
     return plan_experiment(read_protocol(file), Path(file).parent)
 

@@ -90,7 +90,11 @@ class Training(Frozen, frozen=True):
     rest_s: Annotated[float, Meta(ge=0.0, le=1e6)] = 600.0
 
     def describe(self) -> str:
-        """Describes the training in a sentence for the methods section of a paper."""
+        """Describes how the authority over the slave moved from the expert to the learner.
+
+        Returns:
+            A sentence for the methods section of a paper.
+        """
         courses: list[str] = []
         for condition, (first, last) in self.lead.items():
             courses.append(f"{first:g} to {last:g} ({condition})")
@@ -162,18 +166,21 @@ class Protocol(Frozen, frozen=True):
     def list_phases(
         self, condition: str, random: np.random.Generator
     ) -> list[tuple[str, float | None]]:
-        """Lists the phase and the lead of each trial of a block, without practice trials.
+        """Lists the phase and the authority of each trial of a block, without practice trials.
 
-        A phase is a part of a training or a staircase, see `PlannedTrial`. The lead is the
-        first user's part of the authority that two users have over the slave.
+        A block contains all trials of a participant under one condition. In an experiment with
+        a training, the phases are "before", "training", "after" and "retention". In an
+        experiment with a staircase, trials come in pairs, and one of the two phases of a pair
+        is the standard trial.
 
         Args:
-            condition: Condition of the block.
+            condition: Name of the condition of the block.
             random: Generator that draws the order within the pairs of a staircase.
 
         Returns:
-            Pairs of the phase, which is empty outside of a training or staircase, and the lead.
-            A lead of None keeps the scenario's dominance factors.
+            For each trial, the phase and the first user's part of the authority over the slave
+            arm, from 0 to 1. The phase is empty without training and staircase. A part of None
+            keeps the authority that the scenario defines.
         """
         phases: list[tuple[str, float | None]] = []
         if self.staircase is not None:
@@ -194,9 +201,10 @@ class Protocol(Frozen, frozen=True):
 
     @property
     def forms(self) -> list[Questionnaire]:
-        """Forms that participants fill in.
+        """Forms that participants fill in during the experiment.
 
-        These are the questionnaires, and the choices after the pairs of a staircase.
+        These are the questionnaires. In an experiment that measures a perception threshold, the
+        question that follows each pair of trials is a form too.
         """
         forms = list(self.questionnaires)
         if self.staircase:
@@ -348,17 +356,20 @@ class ExperimentPlan(Result):
                         yield Step("questionnaire", planned, find_form(form))
 
     def judge_choices(self, planned: PlannedTrial, choices: Choices) -> list[bool]:
-        """Judges the choices that participants have made in the staircase of a block.
+        """Judges which answers of the participants in a perception test were right.
 
-        After each pair of trials the participant says in which one the difference was larger.
-        The right answer is the comparison trial.
+        In each pair of trials, a quantity such as the delay has its standard value in one
+        trial, and a larger value in the comparison trial. After the pair, the participants
+        choose one of the two trials. The choice of the comparison trial is right.
 
         Args:
-            planned: Any trial of the block.
-            choices: Choices of the participants.
+            planned: Any trial of the block, which contains all trials of the participants under
+                one condition.
+            choices: The choices 1 (first trial) or 2 (second trial), by the number of the
+                second trial of the pair.
 
         Returns:
-            For each choice in the block, True if it is right.
+            For each choice in the block, in the order of the trials, True if it is right.
         """
         block_start = planned.number - planned.trial
         block_end = block_start + self.trials[-1].trial

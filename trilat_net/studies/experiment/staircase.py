@@ -31,16 +31,21 @@ SKIPPED_REVERSALS = 2
 
 
 class Staircase(Frozen, frozen=True):
-    """A key of the scenario that is adapted to the perception of each participant.
+    """Settings of a perception test that finds the smallest difference a participant notices.
+
+    Trials come in pairs. A scenario key, such as the delay, has its standard value in one trial
+    of a pair, and a larger value in the other. The participant says in which trial the value
+    was larger. The difference of the two values decreases after right answers, and increases
+    after wrong answers.
 
     Attributes:
-        key: The key of the scenario.
+        key: The scenario key that is varied.
         start: First difference, which is also the largest, in the key's unit.
-        standard: Value of the key in the standard trial.
+        standard: Value of the key in the standard trial, in the key's unit.
         factor: Factor by which the difference changes.
         down: Number of right answers in a row after which the difference decreases.
-        asks: Question after each pair.
-        deviation: Standard deviation of a synthetic participant's perception, in the key's
+        asks: Question that participants answer after each pair.
+        deviation: Standard deviation of the perception of a simulated participant, in the key's
             unit. None stands for a quarter of `start`.
     """
 
@@ -54,7 +59,11 @@ class Staircase(Frozen, frozen=True):
 
     @property
     def measure(self) -> str:
-        """Name of the threshold with its unit, such as threshold_delay_ms for link.delay_ms."""
+        """Name of the measured perception threshold, with its unit.
+
+        It is "threshold_" and the last part of the scenario key that is varied. For example,
+        the key `link.delay_ms` gives threshold_delay_ms.
+        """
         parts = [part for part in self.key.split(".") if not part.isdigit()]
         return f"threshold_{parts[-1]}"
 
@@ -95,16 +104,18 @@ class Staircase(Frozen, frozen=True):
         return directions
 
     def list_differences(self, right: Sequence[bool]) -> list[float]:
-        """Lists the differences between the two trials of each pair, including the next pair.
+        """Lists the differences that a participant has compared, and the next difference.
 
-        The difference decreases after `down` right answers in a row, and increases after a
-        wrong answer.
+        In each pair of trials, a scenario key has its standard value in one trial, and a value
+        that is larger by the difference in the other. The difference decreases after `down`
+        right answers in a row, and increases after a wrong answer, up to its start value.
 
         Args:
-            right: For each earlier answer, True if it was right.
+            right: For each answered pair in order, True if the answer was right.
 
         Returns:
-            The differences in the key's unit, one more than answers.
+            The differences in the key's unit, one for each answered pair and one for the next
+            pair.
         """
         differences = [self.start]
         for direction in self._list_directions(right):
@@ -161,7 +172,7 @@ class Staircase(Frozen, frozen=True):
         return comparison if difference + error > 0.0 else standard
 
     def describe(self) -> str:
-        """Describes the procedure in a sentence for the methods section of a paper."""
+        """Describes in a sentence how the perception threshold was measured, for a paper."""
         right_percent = 100.0 * 0.5 ** (1.0 / self.down)
         return (
             f"{self.key} was adapted in a two-interval forced choice against "

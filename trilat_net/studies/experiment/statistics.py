@@ -123,18 +123,19 @@ def read_number(value: Any, measure: str, row: Row) -> float:
 
 
 class ConditionMean(NamedTuple):
-    """Mean and spread of a measure under one condition, over units.
+    """Mean and spread of a measure under one condition, over participants or pairs.
 
-    Deviation and intervals are None for fewer than two units.
+    A unit is what was sampled independently: a participant, or a pair whose members take part
+    together. The standard deviation and the intervals are None for fewer than two units.
 
     Args:
         condition: Name of the condition.
         number: Number of units with at least one trial.
         mean: Mean of the means of the units.
         deviation: Standard deviation of the means of the units.
-        interval: 95 % interval of the mean by Student's t.
-        bootstrap: 95 % interval of the mean by the bias-corrected and accelerated bootstrap
-            (BCa).
+        interval: 95 % confidence interval of the mean by Student's t.
+        bootstrap: 95 % confidence interval of the mean by the bias-corrected and accelerated
+            bootstrap (BCa).
         missing: Number of trials, or questionnaires, without a number. They are not averaged.
     """
 
@@ -150,15 +151,20 @@ class ConditionMean(NamedTuple):
 def summarise_conditions(
     rows: Sequence[Row], measure: str, *, unit: str = "participant", seed: int = 0
 ) -> list[ConditionMean]:
-    """Returns mean, spread and intervals of each condition that has a number.
+    """Returns the mean of a measure under each condition, with its spread and intervals.
 
-    The conditions are in the order of the rows.
+    The trials of each participant (or pair) are averaged first. Conditions in which no trial
+    has a number are left out.
 
     Args:
-        rows: Trials, as for `average_trials`.
-        measure: Name of the measure.
-        unit: "participant" or "pair", which is sampled independently.
-        seed: Seed of the bootstrap.
+        rows: Trials as mappings from column names to values, as for `average_trials`.
+        measure: Name of the measure, which is a column.
+        unit: "participant" if participants are independent of each other. "pair" if the two
+            members of a pair did the trials together, and only pairs are independent.
+        seed: Seed of the bootstrap, a confidence interval that uses random samples.
+
+    Returns:
+        A summary per condition, in the order in which the conditions first occur.
     """
     means = average_trials(rows, measure, unit)
     rows_without_value = [row for row in rows if row.get(measure) in (None, "")]

@@ -45,10 +45,11 @@ class TrialTask(Frozen, frozen=True, tag_field="kind"):
     needs_wall: ClassVar[bool] = False
 
     def render_instructions(self, slave: str) -> str:
-        """Returns the text that tells participants what to do.
+        """Returns the text that tells participants of the experiment what to do in this task.
 
         Args:
-            slave: Name of the slave in the text.
+            slave: Name of the slave arm, which the participants move, as it appears in the
+                text.
         """
         return self.instructions.format(slave=slave, task=self)
 
@@ -246,13 +247,21 @@ class ReachTrial(TrialTask, frozen=True, tag="reach"):
 
     @property
     def needs_pair(self) -> bool:
-        """True if one user hands the slave over to the other, which takes two users."""
+        """True if the task needs two users.
+
+        This is so if the first user hands the control of the slave arm over to the second user
+        during the trial.
+        """
         return self.handover_s is not None
 
     def render_instructions(self, slave: str) -> str:
-        """Returns the text that tells participants what to do.
+        """Returns the text that tells the participants what to do in a reaching trial.
 
-        It includes the limits of the corridor and the handover, if the task has them.
+        The text says how far they may leave the straight path to the target, and when the other
+        user takes over, if the task has these rules.
+
+        Args:
+            slave: Name of the slave arm as it appears in the text.
         """
         text = super().render_instructions(slave)
         if self.corridor_m is not None:
@@ -264,9 +273,10 @@ class ReachTrial(TrialTask, frozen=True, tag="reach"):
 
     @property
     def longest_s(self) -> float:
-        """Longest duration of a trial after its target appears, in s.
+        """Longest possible duration of a reaching trial after its target has appeared, in s.
 
-        It is the time-out. With a handover, the time-out begins again at the second target.
+        It is `timeout_s`. If the first user hands the slave over to the second user, a second
+        target appears after the handover, and the time-out starts again.
         """
         if self.handover_s is None:
             return self.timeout_s
@@ -274,13 +284,15 @@ class ReachTrial(TrialTask, frozen=True, tag="reach"):
         return self.timeout_s + second_appears_s
 
     def make_goal(self, start_m: Array, number: int, seed: int) -> TrialGoal:  # noqa: ARG002 - the order is fixed
-        """Creates the goal of a trial: a target of the ring, and the target after it.
+        """Creates the goal of a reaching trial: its target on a ring around the start.
+
+        The goal also contains the next target on the ring, which appears after a handover.
 
         Args:
-            start_m: Position of the slave's end effector at the start, in m, the centre of the
-                ring.
+            start_m: Position of the slave's end effector at the start of the trial, in m. It is
+                the centre of the ring.
             number: Number of the target, from 0.
-            seed: Seed of the trial.
+            seed: Not used, because the order of the targets is fixed.
         """
         target_m = self._place_target_m(start_m, number)
         next_target_m = self._place_target_m(start_m, number + 1)
@@ -517,17 +529,27 @@ class TrackTrial(TrialTask, frozen=True, tag="track"):
 
     @property
     def has_limit(self) -> bool:
-        """False, because every trial lasts `duration_s` and none fails."""
+        """False, because a tracking trial cannot run out of time.
+
+        Every trial lasts exactly `duration_s`, and none fails.
+        """
         return False
 
     @property
     def needs_pair(self) -> bool:
-        """True if two users see different targets, and must agree on a position."""
+        """True if the tracking task needs two users.
+
+        This is so if the users see different targets, so that they must agree on a position of
+        the slave arm.
+        """
         return self.apart_m > 0.0
 
     @property
     def longest_s(self) -> float:
-        """Duration of every trial after its target appears, in s."""
+        """Duration of a tracking trial after its target has appeared, in s.
+
+        All trials have the same duration.
+        """
         return self.duration_s
 
     def make_goal(self, start_m: Array, number: int, seed: int) -> TrialGoal:  # noqa: ARG002 - the seed draws the path
@@ -559,10 +581,16 @@ class _TrackGoal(TrialGoal):
         position_m: Array,
         force_n: Array,  # noqa: ARG002
     ) -> dict[str, float]:
-        """Computes whose target the slave followed, if the two users see different targets.
+        """Computes which user's target the slave arm stayed closer to, if the targets differ.
 
-        The measure is 1 for the first user's target, 0 for the second user's, and 0.5 for the
-        middle between them.
+        The measure `first_settled` is 1 for the position of the first user's target, 0 for the
+        position of the second user's target, and 0.5 for the middle between them. It is
+        averaged over the trial.
+
+        Args:
+            after_s: Times since the target's appearance, shape (K,), in s, for K records.
+            position_m: Positions of the slave's end effector, shape (K, 2) or (K, 3), in m.
+            force_n: Not used.
 
         Returns:
             The measure by its name. Empty if both users have the same target.

@@ -1,14 +1,15 @@
 """Runs and judges one trial of an experiment, and computes its measures from its log.
 
 In a trial the participants move the slave arm over the network, to do a task such as reaching a
-target. `ExperimentTrial` is a trial with people, whose log a live session records.
-`SyntheticTrial` is a trial of synthetic participants, which runs in virtual time.
+target. `ExperimentTrial` is a trial with people, recorded by a live session. `SyntheticTrial`
+is a trial of synthetic participants, which are models of people, and runs in virtual time.
 
 Invariant:
-    - The result of a trial follows from its log, for people and for synthetic participants
-      alike. The log is executed again, and judged by every record of the slave in it.
-    - A trial of synthetic participants is run twice with the same numbers: first compiled, to
-      find the trial's end, and then into its log, which ends shortly after the trial.
+    - The result of a trial follows from its log. The log is executed again, and the task is
+      judged by the state of the slave in every period of its control loop.
+    - A trial of synthetic participants is simulated twice. The first simulation is fast, writes
+      no log, and finds out when the trial ends. The second simulation repeats the same motion,
+      writes the log, and stops shortly after this end.
 """
 
 import hashlib
@@ -131,21 +132,22 @@ class _MotionSamples(NamedTuple):
 
 
 class ExperimentTrial:
-    """One trial with people: its scenario, its goal, and the result from its log.
+    """One trial of an experiment with people: its scenario, its goal, and its result.
 
     Args:
-        protocol: Protocol of the experiment.
-        scenario: Scenario of the trial's condition.
-        planned: The trial in the plan.
-        digest: Digest of the plan.
+        protocol: Protocol of the experiment, with the task and the users.
+        scenario: Scenario of the condition: the arms, their control and the network.
+        planned: Entry of this trial in the list of all trials, with its participants, its
+            condition and its seed.
+        digest: Checksum that identifies the list of all trials. It is stored in the log.
 
     Attributes:
-        people: False for synthetic participants.
-        protocol: Protocol of the experiment.
-        planned: The trial in the plan.
-        slave: Name of the site of the slave.
-        arm: Arm of the slave.
-        scenario: Scenario of this trial, which lasts as long as the trial may.
+        people: False for synthetic participants, which are models of people.
+        protocol: Same as the argument.
+        planned: Same as the argument.
+        slave: Name of the slave in the scenario.
+        arm: Model of the slave arm.
+        scenario: Scenario of this trial, with the longest duration that the trial may have.
         appears_s: Time at which the target appears, in s.
         longest_s: Latest end of the trial, in s.
     """
@@ -201,7 +203,12 @@ class ExperimentTrial:
         sum_of_shares = row[first] + row[second]
 
         def divide_shares(lead: float) -> dict[str, float]:
-            """Returns the dominance factors, given the first user's part from 0 to 1."""
+            """Returns the weights with which the slave arm follows the other arms.
+
+            Args:
+                lead: First user's part of the authority over the slave, from 0 to 1. The second
+                    user has the rest.
+            """
             first_share = sum_of_shares * lead
             return {**row, first: first_share, second: sum_of_shares - first_share}
 
@@ -480,16 +487,20 @@ class SyntheticTrial(ExperimentTrial):
 
 
 def run_trial(task: tuple[Protocol, str, PlannedTrial, str, Path]) -> TrialEntry:
-    """Runs a trial of synthetic participants, and keeps its log.
+    """Runs a trial of synthetic participants, which are models of people, and keeps its log.
 
-    Worker processes call this function. The task is one argument, because it is sent to them.
+    Worker processes call this function. All inputs are in one argument, because it is sent to
+    the worker as a whole.
 
     Args:
-        task: The protocol, the text of the scenario, the planned trial, the digest of the plan,
-            and the folder of the log.
+        task: The protocol of the experiment, the text of the scenario, the planned trial, the
+            digest that identifies the plan of all trials, and the folder of the log.
+
+    Returns:
+        The result of the trial.
 
     Raises:
-        LogError: The log is not that of its run.
+        LogError: The written log does not reproduce the run.
     """
     protocol, text, planned, digest, folder = task
     trial = SyntheticTrial(protocol, parse_scenario(text), planned, digest)
