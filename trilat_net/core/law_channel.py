@@ -1,14 +1,17 @@
-"""Describes the vectors that a control law sends to its peers besides the motion of its arm.
+"""Describes the numbers that a control law sends to other arms besides the motion of its arm.
 
-A peer is a site (a process that runs one arm) that exchanges its state with this site. A law
-may send for example waves or energies. Some vectors go to all peers, others to one peer alone.
-All these numbers stand one after another in a single row. The record of a tick, its stored
-result, contains the row in the field `ch`. A peer receives the part of the row that is meant
-for it, so what a site received can be found in the sender's record.
+A site is a process that runs one arm, and its peers are the other sites. Some control laws send
+vectors of numbers to their peers, for example wave variables or energies. A vector either goes
+to all peers, or each peer gets a vector of its own.
+
+In each tick, a period of the control loop, the site stores all numbers that its law sends in
+the field `ch` of its record. A peer receives the part that is meant for it. Therefore the
+records of the sender show what each peer received.
 
 Invariant:
-    - The row contains first the vectors that go to all peers. The vectors for a single peer
-      follow, peer by peer in the order of the scenario, the file that describes the experiment.
+    - The field contains first the vectors for all peers. The vectors for a single peer follow,
+      peer by peer in the order in which the scenario, the description of the experiment, lists
+      the sites.
 """
 
 from collections.abc import Iterator, Sequence
@@ -53,9 +56,10 @@ class SentEntry(NamedTuple):
 
     @property
     def key(self) -> str:
-        """Name of the vector, followed by its receiver in brackets: "E", "u[m2]".
+        """Label of the vector to which the number belongs, for example "E" or "u[m2]".
 
-        There are no brackets if all peers receive the vector.
+        The label is the name of the vector. If only one peer (another arm's process) receives
+        the vector, the name of this peer follows in brackets.
         """
         return f"{self.vector.name}[{self.peer}]" if self.peer else self.vector.name
 
@@ -64,11 +68,14 @@ class SentEntry(NamedTuple):
 
 
 class LawChannel(NamedTuple):
-    """All vectors that the law of a site sends, in the order of the record.
+    """All vectors that the control law of an arm sends to the control laws of other arms.
+
+    The vectors are in the order in which a record stores them.
 
     Attributes:
-        vectors: The vectors, those for all peers before those for each peer.
-        peers: Number of the site's peers.
+        vectors: The vectors. Vectors that all peers (the other arms) receive come before
+            vectors of which each peer gets its own.
+        peers: Number of peers.
     """
 
     vectors: tuple[SentVector, ...] = ()
@@ -83,10 +90,12 @@ class LawChannel(NamedTuple):
         return tuple(vector for vector in self.vectors if vector.per_peer is per_peer)
 
     def count_numbers(self, *, per_peer: bool) -> int:
-        """Returns how many numbers the vectors of one kind have together.
+        """Counts the numbers of all vectors that have the same kind of receiver.
 
         Args:
-            per_peer: True: numbers that go to each peer alone; false: numbers that go to all.
+            per_peer: True for the vectors of which each peer (the process of another arm) gets
+                its own. The result is then the count for a single peer. False for the vectors
+                that all peers receive.
         """
         return sum(vector.length for vector in self.select_vectors(per_peer=per_peer))
 
@@ -97,19 +106,24 @@ class LawChannel(NamedTuple):
 
     @property
     def record_size(self) -> int:
-        """Count of the numbers that the law sends in one tick, which its record contains."""
+        """Number of floating-point numbers that the law sends in a period of the control loop.
+
+        This is the length of the field `ch` of a record. A vector of which each peer (the
+        process of another arm) gets its own counts once for each peer.
+        """
         to_all = self.count_numbers(per_peer=False)
         to_each = self.count_numbers(per_peer=True)
         return to_all + self.peers * to_each
 
     def find_columns(self, vectors: Sequence[SentVector]) -> list[int]:
-        """Returns where the numbers that a peer's law reads stand among those that it receives.
+        """Finds the numbers that another control law reads, among the numbers that this law sends.
 
         Args:
-            vectors: The vectors that the law of the peer reads.
+            vectors: The vectors that the other law reads.
 
         Returns:
-            An index per number. It is -1 for a vector that this law does not send.
+            For each number of these vectors its index among the numbers that this law sends to
+            a peer. The index is -1 for the numbers of a vector that this law does not send.
         """
         start = 0
         starts = {}
@@ -124,10 +138,16 @@ class LawChannel(NamedTuple):
         return columns
 
     def entries(self, peers: Sequence[str]) -> Iterator[SentEntry]:
-        """Yields a description of each number that a record of this law contains, in order.
+        """Describes each number that the law sends in a period of the control loop.
+
+        The numbers are in the order of the field `ch` of a record, which stores them.
 
         Args:
-            peers: Names of the site's peers, in scenario order.
+            peers: Names of the sites that run the other arms, in the order of the scenario.
+
+        Yields:
+            The vector to which the number belongs, its receiver, and its position in the
+            vector.
         """
         to_each = self.select_vectors(per_peer=True)
         groups = [("", self.select_vectors(per_peer=False))]

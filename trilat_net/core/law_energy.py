@@ -1,14 +1,16 @@
-"""Describes the energies that prove a control law passive, as functions of its site's records.
+"""Describes the energies with which a control law proves that it is passive.
 
-A law is passive if it never gives more energy than it received. Some laws keep accounts of
-energy: what they sent to peers (the sites that they follow), what they took, and what they
-store. Such a law computes these accounts from the records of a run, the stored results of each
-tick. The certificate, a check after the run, compares them with the motion of the arms.
+A control law is passive if it never gives more energy than it received. Some laws keep an
+account of their energy: the energy that they sent to other arms, took from other arms, stored
+and dissipated. Such a law has a method that computes this account from the records of a run,
+which contain the numbers of each period of the control loop. After the run, a check compares
+the account with the motion of the arms.
 
 Invariant:
-    - A peer takes no more energy than has arrived from the law that gave it.
+    - The energy that arm i takes from arm j is never more than the energy that the law of arm j
+      sent and that has arrived.
     - The stored energy of a law is never below zero, and its dissipated energy never falls.
-    - From these rules it follows that the arms get no more energy than they gave.
+    - From these two rules it follows that the arms get no more energy than they gave.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,13 +22,17 @@ from .vectors import Array, IntArray
 
 
 class PeerRecords(NamedTuple):
-    """Peer as the law saw it in K ticks, one row per tick, and the vectors sent to it.
+    """What the control law of an arm received from another arm and sent to it, in K control periods.
+
+    In each period, a site (the process that runs one arm) sends a sample with its state. The
+    law uses the newest sample that has arrived.
 
     Attributes:
-        tick: Stamp of the sample in use, shape (K,); -1 before the first sample.
-        received: Vectors of that sample by name, shape (K, length); zeros before the first
-            sample.
-        sent: Vectors that went to this peer alone, by name, shape (K, length).
+        tick: Number of the period in which the used sample was sent, shape (K,). -1 before the
+            first sample.
+        received: Vectors that came with this sample, by name, each of shape (K, length). Zeros
+            before the first sample.
+        sent: Vectors that the law sent to this arm alone, by name, each of shape (K, length).
     """
 
     tick: IntArray

@@ -45,17 +45,17 @@ def _update_model(s: Row, chain: RowArray | None) -> None:
 def update_law_view(
     k: int, t_ns: int, site: RowArray, links: RowArray, chain: RowArray | None
 ) -> None:
-    """Prepares the input of a user's law for one tick: time, arm model and peers.
+    """Prepares the input of a user's control law: the time, the model of the arm and the ages of data.
 
-    These are the parts of the input that no earlier stage of the tick has written. The torque
-    becomes NaN, so that the check after the law finds a torque that the law has not written.
+    All other parts of the input exist already. The torque is set to NaN, so that a law that
+    does not write its torque is noticed.
 
     Args:
-        k: The tick.
-        t_ns: Nominal time of the tick, ns since the epoch, the common start of the session.
-        site: Row of the site; written.
-        links: Rows of the site's links; written.
-        chain: Rows of the chain of joints, or None for the planar arm.
+        k: Number of the control period.
+        t_ns: Nominal time of the period, ns since the start of the session.
+        site: State of the site (the process that runs the arm), shape (1,); written.
+        links: States of the links from the other sites, one row per link; written.
+        chain: Data of the joints, one row per joint. None for the planar two-link arm.
     """
     s: Row = site[0]
     s.k = k
@@ -142,27 +142,28 @@ class PlainLaw:
         self._peer_size = channel.count_numbers(per_peer=True)
 
     def bind(self) -> None:
-        """Compiles the function that prepares the law's input.
+        """Compiles the function that collects the input of the control law.
 
-        Without this call, the first tick would wait for the compilation.
+        Without this call, the first period of the control loop would wait for the compilation.
         """
         a = self._arrays
         self._update = bind_leaf(update_law_view, 0, 0, a.site, a.links, a.chain)
 
     def compute(self, k: int, t_ns: int) -> list[float]:
-        """Computes the torque of one tick (stage 6), by a call of the user's law.
+        """Computes the torque of one control period by a call of the user's law.
 
-        Torque, estimate and sent vectors are written into the site's arrays.
+        The torque, the parameter estimate and the vectors for other sites are written into the
+        arrays of this site (the process that runs the arm).
 
         Args:
-            k: The tick.
-            t_ns: Nominal time of the tick, ns since the epoch, the common start of the session.
+            k: Number of the control period.
+            t_ns: Nominal time of the period, ns since the start of the session.
 
         Returns:
-            The memory of the law after the tick, which the record contains.
+            The numbers that the law remembers for the next period.
 
         Raises:
-            LawFailed: The law failed.
+            LawFailed: The law raised an exception, or returned an invalid result.
         """
         a = self._arrays
         setup = self._setup
@@ -176,9 +177,10 @@ class PlainLaw:
 
     @property
     def memory(self) -> list[float]:
-        """Numbers that the law keeps from tick to tick, as they are now.
+        """Numbers that the law remembers for the next period of the control loop.
 
-        A record contains them, so that `restore` can continue the run from there.
+        They are stored with the results of each period. `restore` can continue the run from
+        them.
         """
         return read_memory(self._law)
 

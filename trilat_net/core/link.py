@@ -1,24 +1,23 @@
-"""Applies the delay of a link, at its receiving end.
+"""Simulates the delay of a network link, at its receiving end.
 
-A site is a process that runs one arm, and a link is the directed connection from site j to site
-i. Site j sends a sample, the state of its arm, in each tick (period of its control loop). The
-number of the tick is the stamp of the sample. The delay of the network is simulated by keeping
-each sample until it is due.
+A site is a process that runs one arm, and a link is the one-way connection from one site to
+another. In each tick, a period of its control loop, a site sends a sample, which is the state
+of its arm. The sample carries the number of the tick, which is called its stamp. The receiver
+keeps each sample until its simulated delivery time, which is called the due time.
 
-A link is a calendar: a ring of pages, one for each of the receiver's next ticks.
-`accept_sample` files a sample in the page of the tick that releases it, unless that page holds
-a newer sample. `release_sample` reads the page of the present tick. Both cost the same at any
-delay. A calendar only spans the ticks for which samples may wait. The due times of samples, of
-eight bytes each, are kept for as long as a late sample or a duplicate may arrive.
+Samples wait in a ring buffer, which is called the calendar of the link. It has a page for each
+of the next ticks of the receiver. `accept_sample` writes a sample into the page of the tick
+that will use it, unless this page holds a newer sample. `release_sample` reads the page of the
+present tick. Both take the same time for any delay. Due times are kept longer than samples, for
+as long as a late sample or a duplicate may arrive.
 
 Invariant:
-
-- (L2) The due time of sample m follows from the nominal stamp of m and the link's channel, in
-  integer nanoseconds. The sample is in use from the receiver's first tick at or after its due
-  time, and never at its own stamp.
-- An arrival before the due time has no influence on that tick. On a measured link a sample is
-  due at once, so that only its arrival counts.
-- The newest sample wins: an older sample never replaces a newer one.
+    - The due time of a sample is an integer in ns. It follows from the time at which the sample
+      was sent, and from the link's model of delay and loss. The sample is used from the
+      receiver's first tick at or after its due time, but never at the time when it was sent.
+    - The actual arrival has no influence if it is before the due time. On a link without a
+      simulated delay, a sample is used as soon as it arrives.
+    - The newest sample wins: an older sample never replaces a newer one.
 """
 
 from functools import cache
@@ -48,26 +47,30 @@ def link_dtype(shared: int) -> np.dtype[np.void]:
 
 @cache
 def sample_dtype(shared: int) -> np.dtype[np.void]:
-    """Returns the NumPy data type of a waiting sample, see `SampleRow`.
+    """Returns the NumPy data type of a sample that waits until its simulated delay has passed.
 
-    Samples wait in the calendar of their link, a ring whose number of pages is a power of two.
+    A sample is the state that another arm's process sends, see `SampleRow`.
 
     Args:
-        shared: Number of coordinates that sites share, the length of the sample's vectors.
+        shared: Number of coordinates of a sample: joint angles, or coordinates of the end
+            effector.
     """
     return row_dtype("sample", {"shared": shared})
 
 
 class ChannelArrays(NamedTuple):
-    """Numbers that a peer's law sends, in the order in which the receiver's law reads them.
+    """Numbers that the control law of another arm sends, in the order in which this law reads them.
 
-    The arrays of all peers, and of all sites of a stack, have further axes in front.
+    C is the count of these numbers. If the arrays are for several peers (the processes of other
+    arms) or for several sites (the receivers), they have additional first axes.
 
     Attributes:
-        waiting: Numbers of the waiting samples, by page of the calendar, shape (pages, C).
-        received: Numbers of the sample in use, shape (C,); zeros before the first sample.
-        columns: For each number its column among the numbers that arrive with a sample, shape
-            (C,); -1: the peer does not send the number, which is 0.
+        waiting: Numbers that came with the samples whose simulated delay has not passed, one
+            row per entry of the ring buffer `LinkArrays.calendar`, shape (pages, C).
+        received: Numbers that came with the sample in use, shape (C,). Zeros before the first
+            sample.
+        columns: For each number its index among all numbers that arrive with a sample, shape
+            (C,). -1 if the other law does not send the number, which is then 0.
     """
 
     waiting: Array
@@ -76,16 +79,19 @@ class ChannelArrays(NamedTuple):
 
 
 class LinkArrays(NamedTuple):
-    """Arrays of one link.
+    """Arrays that hold the state of a link, the one-way connection from another arm's process.
 
     Attributes:
-        state: Row of the link, shape (1,), see `link_dtype`.
-        models: Models of the link's delay and loss, shape (M,), LINK_MODEL_DTYPE.
-        dues: Due times of its newest samples, ns, or LOST; sample m is at m modulo the length.
-            The entry of a sample that has arrived is `_FILED` minus the due time.
-        calendar: Samples that wait, shape (pages,), see `sample_dtype`.
-        points: The site's traces and outages, shape (n, 2).
-        channel: Numbers that the peer's law sends; None: the site's law ignores them.
+        state: State of the link, shape (1,), see `link_dtype`.
+        models: Models of the link's delay and loss, in the order in which they come into force.
+        dues: Times at which the newest samples (states of the other arm) are to be delivered,
+            in ns since the start of the session. LOST for a lost sample. This is a ring buffer:
+            sample m is at index m modulo the length. After the arrival of the sample, the entry
+            becomes `_FILED` minus the time.
+        calendar: Ring buffer of the samples whose delay has not passed, see `sample_dtype`.
+        points: Traces and outages of all links of the receiver, shape (n, 2).
+        channel: Further numbers that the other control law sends. None if the law of the
+            receiver does not read them.
     """
 
     state: RowArray
@@ -124,14 +130,18 @@ def span_ticks(span_ns: int, rate_hz: int) -> int:
 def calendar_pages(
     rate_hz: int, delay_us: int = MAX_DELAY_US, ahead_ns: int = AHEAD_LIMIT_NS
 ) -> int:
-    """Returns the number of pages of a calendar, a power of two.
+    """Computes how many entries the ring buffer needs in which delayed samples wait.
 
-    By default this is the largest number that any link needs.
+    There is one entry for each period of the receiver's control loop in which a sample may be
+    used first. The default arguments give the largest number that any link needs.
 
     Args:
-        rate_hz: Tick rate of the receiver, Hz.
+        rate_hz: Rate of the receiver's control loop, Hz.
         delay_us: Longest delay, us.
-        ahead_ns: Longest time by which a sender may be ahead of the receiver, ns.
+        ahead_ns: Longest time by which the clock of a sender may be ahead of the receiver, ns.
+
+    Returns:
+        The number of entries, a power of two.
     """
     span = span_ticks(delay_us * 1000 + ahead_ns, rate_hz)
     return 1 << (span + 2).bit_length()
@@ -139,16 +149,18 @@ def calendar_pages(
 
 @leaf
 def release_tick(tick: int, rate_hz: int, link: LinkArrays) -> int:
-    """Returns the receiver's tick in which a sample comes into use if it arrives in time.
+    """Computes in which period of the receiver's control loop a sample is used first.
+
+    A sample is the state that a sender publishes in one period of its own control loop.
 
     Args:
-        tick: Stamp of the sample, a tick of the sender.
-        rate_hz: Tick rate of the receiver, Hz.
+        tick: Number of the period in which the sample was sent.
+        rate_hz: Rate of the receiver's control loop, Hz.
         link: Arrays of the link.
 
     Returns:
-        The tick. LOST if the link loses the sample, or if the sample is so old that the link
-        has forgotten its due time.
+        The number of the receiver's period, if the sample arrives in time. LOST if the link
+        loses the sample, or if the sample is so old that its delivery time is no longer stored.
     """
     row: LinkRow = link.state[0]
     dues = link.dues
@@ -218,19 +230,21 @@ def accept_sample(
     sent: Array,
     link: LinkArrays,
 ) -> None:
-    """Stores a sample that arrived until its delay has passed, or counts why it is not used.
+    """Stores a sample that arrived, until its simulated delay has passed.
 
-    A late sample, which arrives after its due time, is used at the present tick if no newer
-    sample is in use: see `release < k` below.
+    A sample is the state of a peer, the process of another arm. A sample that arrives after its
+    delivery time is used in the present tick, unless a newer sample is in use. Samples that
+    cannot be used are counted as refused, lost or duplicate.
 
     Args:
-        k: Present tick of the receiver.
-        rate_hz: Tick rate of the receiver, Hz.
-        tick: Stamp of the sample, a tick of the peer.
+        k: Present tick, the number of the receiver's control period.
+        rate_hz: Rate of the receiver's control loop, Hz.
+        tick: Tick of the peer in which it sent the sample.
         q: Joint angles or pose of the peer, rad or m.
         qd: Derivative of q.
-        tau_x: Exogenous torque of the peer, N m.
-        sent: Numbers that the peer's law sent; ignored if the receiver's law ignores them.
+        tau_x: External torque of the peer, N m; the torque ON its arm is the negative.
+        sent: Further numbers from the control law of the peer. They are ignored if the law of
+            the receiver does not read them.
         link: Arrays of the link; written.
     """
     row: LinkRow = link.state[0]

@@ -1,36 +1,33 @@
-"""Computes the action of an operator on an arm in each tick, from the operator's messages.
+"""Computes how a person or program pulls an arm, from the messages that it sends during a run.
 
-A live hand is a person or program that moves an arm while the session runs. It sends messages
-with goals. The arm is pulled by a spring towards a target, which follows the goals, with a
-force that is multiplied by the grip, a number from 0 to 1.
+A person or program that moves an arm during the run is called a live hand. Its messages contain
+goals. A target moves towards the newest goal, and a simulated spring pulls the arm to the
+target. The force of the spring is multiplied by the grip, a number from 0 to 1.
 
-A new hold starts with no force at the arm's pose, and the grip grows from 0 to 1 within
-`GRIP_NS`. If an earlier grip is still fading, the hold starts from that grip, its target and
-the target's velocity. A target glides to its newest goal in a straight line. The glide takes a
-quarter more than the time between the last two messages, so that the target does not stop when
-a message is a little late. A hand that is silent for `SILENCE_NS` releases the arm: the target
-comes to rest, and the grip fades within `GRIP_NS`.
+Rules:
 
-Goals beyond the arm's reach are moved to the nearest point within reach. From tick to tick the
-velocity of a target changes by at most its acceleration limit times the period, for any
-sequence of messages. While it glides, its speed does not exceed the largest speed from which it
-can stop at its goal, Eq. (L1):
+- A new hold starts with no force at the pose of the arm. The grip grows from 0 to 1 within
+  `GRIP_NS`. If the grip of an earlier hold has not faded yet, the new hold continues from it.
+- The target moves in a straight line to the newest goal. This takes a quarter more than the
+  time between the last two messages, so that the target does not stop if a message is late.
+- After a silence of `SILENCE_NS`, the target comes to rest and the grip fades to 0.
+- A goal that the arm cannot reach is moved to the nearest point that it can reach.
+- The acceleration and the speed of the target are limited. At the distance d from its goal, the
+  speed is at most
 
-    v(d) = a h (D / (n + 1) + n / 2)                                                        (L1)
-    D = d / (a h^2),    n = floor((sqrt(1 + 8 D) - 1) / 2)
+      v(d) = a h (D / (n + 1) + n / 2)
+      D = d / (a h^2),    n = floor((sqrt(1 + 8 D) - 1) / 2)
 
-where d is the distance to the goal, a the acceleration limit and h the period. A target at that
-speed needs n more ticks, each a h slower than the one before, and the steps h v, h (v - a h),
-... add up to d exactly. A target that starts at rest therefore moves in a straight line and
-comes to rest at a still goal without overshoot. If the goal moves back along that line, the
-target overshoots it by at most the stopping distance, V^2 / (2 a) + V h / 2 at the speed limit
-V.
+  where a is the acceleration limit and h the period of the control loop. From this speed the
+  target stops exactly at the goal in n more periods, and each period is slower by a h.
+  Therefore a target that starts at rest does not overshoot a goal at rest. If the goal moves
+  back along the line, the overshoot is at most V^2 / (2 a) + V h / 2 at the speed limit V.
 
 Invariant:
-    - `advance_hand` is the whole state machine: a pure function of its memory and of the
-      messages received before a tick.
-    - The action of the hand in a tick is an input of the tick and part of its record, so a log
-      repeats people without their messages.
+    - `advance_hand` contains all of these rules. Its result depends only on its stored state
+      and on the messages that were received before the control period.
+    - The result is stored in the record of each control period. Therefore a log repeats what
+      people did without their messages.
 """
 
 import math
@@ -56,13 +53,15 @@ SILENT = "is silent: let go"
 
 
 class HandReach(NamedTuple):
-    """Region of the goals that an arm can reach, or a bound of it: a shell and a box.
+    """Region of the goals that an arm can reach: a spherical shell, a box, or both.
+
+    The region may be larger than what the arm can really reach.
 
     Attributes:
-        centre: Centre of the shell, m; () without a shell.
+        centre: Centre of the shell, m. Empty if there is no shell.
         inner_m: Inner radius of the shell, m.
         outer_m: Outer radius of the shell, m.
-        low: Least coordinates of the box, rad or m; () without a box.
+        low: Smallest coordinates of the box, rad or m. Empty if there is no box.
         high: Largest coordinates of the box, rad or m.
     """
 
@@ -73,9 +72,10 @@ class HandReach(NamedTuple):
     high: Vector = ()
 
     def find_nearest(self, goal: Sequence[float]) -> tuple[float, ...]:
-        """Returns the nearest reachable goal; a reachable goal is returned unchanged.
+        """Moves a goal into the reachable region; a reachable goal stays unchanged.
 
-        The goal is moved into the box first, then into the shell.
+        The goal is moved to the nearest point of the box, and then to the nearest point of the
+        spherical shell.
 
         Args:
             goal: The goal, rad or m.
@@ -103,17 +103,22 @@ class HandReach(NamedTuple):
 
 
 class HandRules(NamedTuple):
-    """Limits of a live hand, a person or program that moves an arm during the run.
+    """Limits for a person or program that moves an arm during the run.
+
+    The person or program sends goals. A target moves smoothly to the newest goal, and the arm
+    is pulled to the target. In some cases the goal and the target are forces instead of
+    positions.
 
     Attributes:
-        size: Count of the target's numbers: one per axis, or one per joint.
-        rate_hz: Tick rate of the site, Hz.
+        size: Number of coordinates of a target, one per axis or one per joint.
+        rate_hz: Rate of the control loop, Hz.
         speed_limit: Largest speed of the target, m/s or rad/s.
-        starts_at_arm: True: the target starts at the arm's pose; false: the target is a force,
-            which starts at 0.
+        starts_at_arm: True if the target is a position, which starts at the pose of the arm.
+            False if it is a force, which starts at 0.
         max_goal_norm: Largest norm of an accepted goal, m, rad or N.
-        acceleration_limit: Largest acceleration of the target, m/s^2 or rad/s^2; inf: no limit.
-        reach: The reachable goals.
+        acceleration_limit: Largest acceleration of the target, m/s^2 or rad/s^2; inf for no
+            limit.
+        reach: Region of the goals that the arm can reach.
     """
 
     size: int
@@ -126,13 +131,15 @@ class HandRules(NamedTuple):
 
 
 class HandCommand(NamedTuple):
-    """One message by which a person or program moves an arm.
+    """Message by which a person or program moves an arm during the run.
 
     Attributes:
-        source: The sender, a random number above 0.
-        number: Number of the sender's target; a repeated number means an unchanged target.
-        grip: False releases the arm.
-        target: The goal, m or rad, or the force, N.
+        source: Identifies the sender, a random number above 0.
+        number: Counts the goals of the sender. If two messages have the same number, the goal
+            is unchanged.
+        grip: True if the sender holds the arm, False to release it.
+        target: The goal to which the sender pulls the arm, m or rad. If the sender pushes with
+            a force instead, this is the force, N.
         sent_ns: Time of sending by the sender's clock, ns.
     """
 
@@ -193,10 +200,11 @@ class HandInForce(NamedTuple):
 
     @classmethod
     def read(cls, vector: Sequence[float]) -> "HandInForce":
-        """Returns what a live hand did in a tick, from the record of that tick.
+        """Restores what a person or program did with the arm from the record of a control period.
 
         Args:
-            vector: Numbers of the record's field `hand`.
+            vector: Field `hand` of the record. It contains the numbers of all fields of this
+                class, in their order.
         """
         size = (len(vector) - 3) // 2
         grip, number, source, *numbers = vector
@@ -210,13 +218,15 @@ class HandInForce(NamedTuple):
 
 
 class HandStep(NamedTuple):
-    """Result of `advance_hand`: what the person or program that moves an arm does in a tick.
+    """What a person or program that moves an arm does in one control period, and the messages used.
 
     Attributes:
-        memory: State for the next tick.
-        vector: Action in the tick, see `HandInForce`.
-        refused: A reason for each message that had no effect.
-        changes: Changes of the holder in order: the source, and TAKEN, RELEASED or SILENT.
+        memory: State for the next period.
+        vector: Grip, target and velocity of the target in this period, in the form of
+            `HandInForce`.
+        refused: For each message that had no effect, the reason.
+        changes: Who took hold of the arm or left it, in order. Each entry contains the sender
+            of the messages, and TAKEN, RELEASED or SILENT (no message for too long).
     """
 
     memory: HandMemory
@@ -226,19 +236,22 @@ class HandStep(NamedTuple):
 
 
 def count_hand_numbers(size: int) -> int:
-    """Returns the length of the field `hand` of a record, which contains a `HandInForce`.
+    """Computes the length of the field `hand` of a record.
+
+    The field states what a person or program did with the arm in a control period. It contains
+    the numbers of a `HandInForce`.
 
     Args:
-        size: Count of the numbers of a target.
+        size: Number of coordinates of the target to which the arm is pulled.
     """
     return 3 + 2 * size
 
 
 def empty_hand_vector(size: int) -> list[float]:
-    """Returns the field `hand` of a record while nobody holds the arm.
+    """Returns the field `hand` of a record for a control period in which nobody holds the arm.
 
     Args:
-        size: Count of the numbers of a target.
+        size: Number of coordinates of the target to which a holder would pull the arm.
     """
     return [0.0, -1.0, 0.0, *[0.0] * (2 * size)]
 
@@ -250,21 +263,23 @@ def advance_hand(
     commands: Sequence[HandCommand],
     locate: Callable[[], Sequence[float]],
 ) -> HandStep:
-    """Computes what a live hand, a person or program that moves an arm, does in a tick.
+    """Computes how a person or program pulls the arm in one control period.
 
-    The hand holds the arm at a target, which moves to the goal of the newest message. The steps
-    are: move the target by one period; accept the messages; release a silent hand; choose the
-    velocity of the target.
+    The person or program sends goals. A target moves smoothly to the newest goal, and the arm
+    is pulled to the target. This function moves the target by one period, accepts the messages,
+    ends the hold of a sender that is silent for too long, and chooses the next velocity of the
+    target.
 
     Args:
-        rules: Limits of the hand.
-        memory: State after the previous tick.
-        t_ns: Nominal time of the tick, ns since the epoch, the common start of the session.
-        commands: Messages received since the previous tick, in order.
-        locate: Function that returns the arm's pose now, in the coordinates of the target.
+        rules: Limits of the goals and of the target's motion.
+        memory: State after the previous period.
+        t_ns: Nominal time of the period, ns since the start of the session.
+        commands: Messages received since the previous period, in order.
+        locate: Function that returns the present pose of the arm, in the coordinates of the
+            target.
 
     Returns:
-        The action in the tick, and the state for the next tick.
+        The action in this period, and the state for the next period.
     """
     refused: list[str] = []
     changes: list[tuple[int, str]] = []

@@ -1,20 +1,20 @@
-"""Lets a site continue without a lost peer, and gives the weight of this peer to the others.
+"""Lets an arm continue without a lost peer, and gives the weight of this peer to the others.
 
-A site is a process that runs one arm, and a peer is another site whose states (samples) this
-site receives. A peer is lost if none of its samples came into use for some time. The dominance
-factor, or share, is the weight with which a site follows a peer.
+A site is a process that runs one arm. Its peers are the other sites, from which it receives
+samples (states of their arms). A site follows each peer with a certain weight, the dominance
+factor or share. A peer is lost if no sample of it could be used for some time.
 
 Invariant:
+    - All decisions follow from the samples in use and from the stored state of the site. They
+      are made in each tick, a period of the control loop.
+    - A site only continues without a peer if the remaining sites all reach each other without
+      it, and if the site still follows another peer. Otherwise the arm stops.
+    - The reference, the position that the arm follows, never jumps. It moves smoothly to the
+      position of the remaining peers, and later back if the lost peer returns.
 
-- Each decision follows from the samples in use and from the memory of the site, tick by tick (a
-  tick is one period of the control loop).
-- A peer is only dropped if the remaining sites all reach each other without it, and if it is
-  not the last peer that the site follows. Otherwise the site holds its pose.
-- The reference, the position that the arm follows, never jumps. The site aligns smoothly with
-  the remaining peers, and later with a peer that returns.
-
-The field `gone` of a link is 0 while the peer is present, and -1 while the peer is lost. When a
-lost peer is heard again, `gone` becomes the time of that tick, ns since the epoch.
+The field `gone` of a link stores the state of the peer. It is 0 while the peer is present, and
+-1 while the peer is lost. After the return of the peer, it is the time of the return, in ns
+since the start of the session.
 """
 
 from .chain import add, scale, three

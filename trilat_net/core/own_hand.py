@@ -107,9 +107,10 @@ class HandView(NamedTuple):
 
 
 class HandProgram(Protocol):
-    """A user's hand program.
+    """Interface of a program, written by a user, that moves an arm as an operator would.
 
-    Its class is called with `HandContext` and with its settings by name.
+    The class of the program is called with two kinds of arguments: a `HandContext`, and the
+    settings of the program as keyword arguments.
     """
 
     def act(self, now: HandView) -> Sequence[float] | None:
@@ -125,16 +126,19 @@ class HandProgram(Protocol):
 
 
 class OwnHand:
-    """Program that moves the arm of one site, and the times at which its decisions act.
+    """Runs a user's program that moves an arm during a simulation or a live session.
 
-    It is created from the scenario, and asked in each tick for the action of the program.
+    At regular times, the program gets a view of what the site (the process that runs the arm)
+    knows, and decides where to pull the arm. The decision acts after a delay, like the reaction
+    time of a person.
 
     Args:
         rules: Limits of the program's actions.
-        period_ticks: Ticks from one decision to the next.
-        delay_ticks: Ticks from a view to the action that is based on it.
-        locate: Function that returns the arm's pose in the coordinates of the target, from its
-            joint angles.
+        period_ticks: Time from one decision to the next, in periods of the control loop.
+        delay_ticks: Time from a view to the start of the action that is based on it, in periods
+            of the control loop.
+        locate: Function that computes the pose of the arm from its joint angles, in the
+            coordinates in which the program acts.
     """
 
     def __init__(
@@ -153,7 +157,7 @@ class OwnHand:
         self._newest = -1
 
     def is_decision_tick(self, k: int) -> bool:
-        """Returns True if the program is asked for a decision at tick `k`."""
+        """Returns True if the user's program must decide in control period k how to pull the arm."""
         return k % self.period_ticks == 0
 
     def find_next_event(self, k: int) -> int:
@@ -162,11 +166,11 @@ class OwnHand:
         return min([next_decision, *(due for due, _ in self._due if due > k)])
 
     def build_view(self, k: int, arrays: SiteArrays, layout: Layout) -> HandView:
-        """Returns what the program may know at tick `k`, before the site computes this tick.
+        """Collects what the user's program may know when it decides how to pull the arm.
 
         Args:
-            k: The tick.
-            arrays: Arrays of the site after the previous tick.
+            k: Control period of the decision. Its results have not been computed yet.
+            arrays: State of the site (the process that runs the arm) after the previous period.
             layout: Lengths of the site's vectors.
         """
         # NumPy reads fields of plain arrays faster than those of records.
@@ -221,15 +225,16 @@ class OwnHand:
     def accept_decision(self, k: int, goal: Sequence[float] | None) -> None:
         """Schedules a decision of the program, which acts after the delay of the program.
 
-        A decision that is older than the newest one is ignored.
+        A decision is ignored if it is based on an older view than an earlier decision.
 
         Args:
-            k: Tick of the view on which the decision is based.
-            goal: Target or force; None releases the arm.
+            k: Control period whose view of the arm the decision is based on.
+            goal: Position to which the program pulls the arm, m or rad, or the force, N. None
+                to release the arm.
 
         Raises:
-            ValueError: The target or force has the wrong count of numbers, is not finite, or is
-                too large.
+            ValueError: The goal has the wrong number of coordinates, is not finite, or is too
+                large.
         """
         numbers = () if goal is None else tuple(float(number) for number in goal)
         if goal is not None and len(numbers) != self._rules.size:
@@ -251,7 +256,10 @@ class OwnHand:
         self._schedule(k, k + self.delay_ticks, numbers, grip=goal is not None)
 
     def release(self, k: int) -> None:
-        """Releases the arm at tick k, and cancels all earlier decisions."""
+        """Makes the program release the arm in control period k.
+
+        All earlier decisions of the program that have not acted yet are cancelled.
+        """
         self._due.clear()
         self._schedule(k, k, (), grip=False)
 
@@ -274,14 +282,14 @@ class OwnHand:
         self._due.append((due, command))
 
     def advance_to(self, k: int, read_angles: Callable[[], Sequence[float]]) -> HandStep:
-        """Advances the target of the program to tick k, and returns the action in this tick.
+        """Computes how the program pulls the arm in the next control period.
 
         Args:
-            k: The tick after that of the previous call.
+            k: Number of the control period. It must follow the period of the previous call.
             read_angles: Function that returns the joint angles, rad.
 
         Returns:
-            The action and the state after the tick, as from `advance_hand`.
+            The action in this period and the state for the next period, see `advance_hand`.
         """
         commands = []
         while self._due and self._due[0][0] <= k:
@@ -299,18 +307,18 @@ class OwnHand:
     def advance_span(
         self, k: int, end: int, read_angles: Callable[[], Sequence[float]]
     ) -> Array:
-        """Returns the program's actions from tick `k` until it needs the arm again.
+        """Computes how the program pulls the arm in several control periods, in one compiled call.
 
-        The result equals that of `advance_to`, tick by tick, bit for bit. A span of ticks
-        without a decision is computed by one compiled call.
+        The span ends before the next period in which the program makes a decision or a decision
+        starts to act. The results are exactly those of repeated calls of `advance_to`.
 
         Args:
-            k: The first tick.
-            end: The actions end before this tick at the latest.
-            read_angles: Function that returns the joint angles at tick `k`, rad.
+            k: The first control period.
+            end: The span ends before this period at the latest.
+            read_angles: Function that returns the joint angles in period k, rad.
 
         Returns:
-            One row per tick, with the numbers of `HandInForce`.
+            One row per period, in the form of `HandInForce`.
         """
         size = self._rules.size
         rate_hz = self._rules.rate_hz

@@ -39,11 +39,14 @@ DrawKey = np.uint64
 
 
 def link_key(seed: int, link: str) -> int:
-    """Returns the key from which all random numbers of a link follow, 64 bits.
+    """Derives the seed of all random numbers of a network link.
 
     Args:
-        seed: Seed of the scenario.
-        link: Name of the link, like "m1->s".
+        seed: Seed of the experiment.
+        link: Name of the link, for example "m1->s".
+
+    Returns:
+        An unsigned number of 64 bits.
     """
     digest = hashlib.sha256(f"{seed}/{link}".encode()).digest()
     return int.from_bytes(digest[:8], "little")
@@ -142,16 +145,17 @@ def standard_normal(key: DrawKey, sample: int, purpose: int, attempt: int) -> fl
 
 @leaf
 def standard_gamma(key: DrawKey, sample: int, purpose: int, shape: float) -> float:
-    """Returns a gamma-distributed number of scale 1.
+    """Draws a random number from a gamma distribution with scale 1.
 
     The method is rejection after Marsaglia and Tsang, "A Simple Method for Generating Gamma
-    Variables", ACM TOMS 26 (2000). For shapes below 1 a number of shape + 1 is multiplied by
-    u^(1 / shape). The draws use `purpose`, `purpose + 1` and `purpose + 2`.
+    Variables", ACM TOMS 26 (2000). If the shape is below 1, a number of shape + 1 is drawn and
+    multiplied by u^(1 / shape), where u is uniformly distributed from 0 to 1.
 
     Args:
-        key: Key of the link.
-        sample: Index of the sample.
-        purpose: Purpose of the draw.
+        key: Seed of the network link for which the number is drawn.
+        sample: Index of the message on this link.
+        purpose: Distinguishes several draws for the same message. The draw uses the streams
+            `purpose`, `purpose + 1` and `purpose + 2`.
         shape: Shape of the distribution.
     """
     boost = 1.0

@@ -1,14 +1,16 @@
-"""Compiles functions of operators and delay models, which the kernel calls by their address.
+"""Compiles models that users write as Python classes, so that the simulation can call them.
 
-The kernel is the compiled code that computes a tick, one period of a control loop. A model
-describes, for example, an operator who moves an arm, or the delays of a network. It consists of
-a few numbers and of a function. The function computes with these numbers and with a row of the
-kernel's arrays.
+A model describes an operator who moves an arm, an environment that the arm touches, or the
+delays of a network. It consists of numbers, its parameters, and of a function. The simulation
+calls the function with the parameters and with a row of an array. The function reads its input
+from the row and writes its result into it.
 
 Invariant:
-    - A function is compiled for the layout of its numbers and of its row. The numbers
-      themselves are stored in a table, so new values need no compilation.
-    - A new function does not recompile the kernel, because the kernel knows only its address.
+    - A function is compiled again only if the shapes of its parameters or the fields of the row
+      change. The values of the parameters are stored in a table, so new values need no
+      compilation.
+    - The simulation itself is never compiled again for a new function, because it calls the
+      function by its address.
 """
 
 import hashlib
@@ -67,16 +69,16 @@ call_address: Any = _call_plain if _config.DISABLE_JIT else _call_compiled
 
 
 def digest_sibling_sources(function: Callable[..., Any]) -> str:
-    """Returns a hash of all source files in the folder of a function.
+    """Computes a hash of all source files in the folder of a function.
 
-    The hash names the compiled function on disk, so that a change of the source compiles it
-    again.
+    Compiled code is stored on disk under this hash. After a change of a source file, the hash
+    is different, and the function is compiled again.
 
     Args:
-        function: The function.
+        function: A function.
 
     Returns:
-        The hash. Empty for a function outside of this package, which is not stored.
+        The hash. Empty if the function is not part of this package; its code is not stored.
     """
     folder = Path(function.__code__.co_filename).parent
     if not folder.is_relative_to(Path(__file__).parents[1]):
@@ -107,10 +109,13 @@ def _find_numbers(model: Any) -> dict[str, Array]:
 
 
 def list_numbers(model: Any) -> Array:
-    """Returns the numbers of a model one after another, in the order of its fields.
+    """Returns all parameters of a user's model in one array, in the order of the model's fields.
 
     Args:
-        model: An operator, an environment or a delay model.
+        model: A model of an operator, an environment or network delays.
+
+    Returns:
+        The numbers. The array is empty if the model has no parameters.
     """
     fields = [value.ravel() for value in _find_numbers(model).values()]
     # A model without numbers gives an empty array.
@@ -148,16 +153,17 @@ def _compile(
 
 
 def compile_to_address(model: Any, name: str, row: np.dtype[np.void]) -> int:
-    """Compiles a function of a model, and returns the address of the machine code.
-
-    While Numba is disabled, the result is a number under which the plain function is
-    registered.
+    """Compiles a function of a user's model, and returns the address of its machine code.
 
     Args:
-        model: An operator, an environment or a delay model. The function is called with the
-            model's numbers and a row.
-        name: Name of the function.
-        row: Layout of the row.
+        model: A model of an operator, an environment or network delays. The compiled function
+            is called with the parameters of the model and with a row of an array.
+        name: Name of the function in the class of the model.
+        row: Data type of the row.
+
+    Returns:
+        The address. If Numba is disabled, a number under which the Python function is
+        registered.
     """
     fields: Any = []
     for field, value in _find_numbers(model).items():
