@@ -1,4 +1,4 @@
-"""Describes the numbers that a control law sends to other arms besides the motion of its arm.
+"""Describes the numbers that a control law sends to other arms besides the motion.
 
 A site is a process that runs one arm, and its peers are the other sites. Some control laws send
 vectors of numbers to their peers, for example wave variables or energies. A vector either goes
@@ -116,7 +116,7 @@ class LawChannel(NamedTuple):
         return to_all + self.peers * to_each
 
     def find_columns(self, vectors: Sequence[SentVector]) -> list[int]:
-        """Finds the numbers that another control law reads, among the numbers that this law sends.
+        """Finds the numbers that another control law reads, among those that this law sends.
 
         Args:
             vectors: The vectors that the other law reads.

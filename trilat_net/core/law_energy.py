@@ -22,10 +22,10 @@ from .vectors import Array, IntArray
 
 
 class PeerRecords(NamedTuple):
-    """What the control law of an arm received from another arm and sent to it, in K control periods.
+    """Numbers that a control law received from another arm and sent to it, in K periods.
 
-    In each period, a site (the process that runs one arm) sends a sample with its state. The
-    law uses the newest sample that has arrived.
+    In each period of its control loop, a site (the process that runs one arm) sends a sample
+    with its state. The law uses the newest sample that has arrived.
 
     Attributes:
         tick: Number of the period in which the used sample was sent, shape (K,). -1 before the

@@ -45,10 +45,10 @@ def _update_model(s: Row, chain: RowArray | None) -> None:
 def update_law_view(
     k: int, t_ns: int, site: RowArray, links: RowArray, chain: RowArray | None
 ) -> None:
-    """Prepares the input of a user's control law: the time, the model of the arm and the ages of data.
+    """Prepares the input of a user's control law: time, arm model and ages of the samples.
 
-    All other parts of the input exist already. The torque is set to NaN, so that a law that
-    does not write its torque is noticed.
+    A sample is the state that another arm sends. All other parts of the input exist already.
+    The torque is set to NaN, so that a law that does not write its torque is noticed.
 
     Args:
         k: Number of the control period.

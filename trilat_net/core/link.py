@@ -59,7 +59,7 @@ def sample_dtype(shared: int) -> np.dtype[np.void]:
 
 
 class ChannelArrays(NamedTuple):
-    """Numbers that the control law of another arm sends, in the order in which this law reads them.
+    """Numbers that another control law sends, in the order in which this law reads them.
 
     C is the count of these numbers. If the arrays are for several peers (the processes of other
     arms) or for several sites (the receivers), they have additional first axes.

@@ -1,4 +1,4 @@
-"""Computes how a person or program pulls an arm, from the messages that it sends during a run.
+"""Computes how a person or program pulls an arm, from its messages during a run.
 
 A person or program that moves an arm during the run is called a live hand. Its messages contain
 goals. A target moves towards the newest goal, and a simulated spring pulls the arm to the
@@ -200,7 +200,7 @@ class HandInForce(NamedTuple):
 
     @classmethod
     def read(cls, vector: Sequence[float]) -> "HandInForce":
-        """Restores what a person or program did with the arm from the record of a control period.
+        """Reads from a record what a person or program did with the arm in a control period.
 
         Args:
             vector: Field `hand` of the record. It contains the numbers of all fields of this
@@ -218,7 +218,7 @@ class HandInForce(NamedTuple):
 
 
 class HandStep(NamedTuple):
-    """What a person or program that moves an arm does in one control period, and the messages used.
+    """What a person or program does with an arm in one control period.
 
     Attributes:
         memory: State for the next period.

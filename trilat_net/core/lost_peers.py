@@ -1,4 +1,4 @@
-"""Lets an arm continue without a lost peer, and gives the weight of this peer to the others.
+"""Lets an arm continue without a lost peer, whose weight the other peers get.
 
 A site is a process that runs one arm. Its peers are the other sites, from which it receives
 samples (states of their arms). A site follows each peer with a certain weight, the dominance

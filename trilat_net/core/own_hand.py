@@ -157,7 +157,7 @@ class OwnHand:
         self._newest = -1
 
     def is_decision_tick(self, k: int) -> bool:
-        """Returns True if the user's program must decide in control period k how to pull the arm."""
+        """Returns True if the user's program makes a decision in control period k."""
         return k % self.period_ticks == 0
 
     def find_next_event(self, k: int) -> int:
@@ -307,10 +307,11 @@ class OwnHand:
     def advance_span(
         self, k: int, end: int, read_angles: Callable[[], Sequence[float]]
     ) -> Array:
-        """Computes how the program pulls the arm in several control periods, in one compiled call.
+        """Computes how the program pulls the arm in several control periods at once.
 
-        The span ends before the next period in which the program makes a decision or a decision
-        starts to act. The results are exactly those of repeated calls of `advance_to`.
+        One compiled call computes the span of periods. It ends before the next period in which
+        the program makes a decision or a decision starts to act. The results are exactly those
+        of repeated calls of `advance_to`.
 
         Args:
             k: The first control period.

@@ -1,4 +1,4 @@
-"""Compiles models that users write as Python classes, so that the simulation can call them.
+"""Compiles models that users write in Python, so that the simulation can call them.
 
 A model describes an operator who moves an arm, an environment that the arm touches, or the
 delays of a network. It consists of numbers, its parameters, and of a function. The simulation
@@ -109,7 +109,7 @@ def _find_numbers(model: Any) -> dict[str, Array]:
 
 
 def list_numbers(model: Any) -> Array:
-    """Returns all parameters of a user's model in one array, in the order of the model's fields.
+    """Returns all parameters of a user's model in one array, in the order of its fields.
 
     Args:
         model: A model of an operator, an environment or network delays.
