@@ -15,7 +15,7 @@ Rules:
 - The acceleration and the speed of the target are limited. At the distance d from its goal, the
   speed is at most
 
-      v(d) = a h (D / (n + 1) + n / 2)
+      v(d) = a h (D / (n + 1) + n / 2)                                                     (L1)
       D = d / (a h^2),    n = floor((sqrt(1 + 8 D) - 1) / 2)
 
   where a is the acceleration limit and h the period of the control loop. From this speed the

@@ -1,53 +1,41 @@
-"""Lets an arm come to rest where it is, and keeps it there.
+"""Brings an arm to rest where it is, and keeps it there.
 
-An arm rests while its site, the process that runs the arm, waits, holds, is stopped or in
-fault. The reference q_ref is the position at which the control law aims, and qd_ref is its
-velocity. The reference of a joint starts at the joint's angle q and speed v, and comes to rest
-within the time T. In each period h of the control loop, at the time t since the start,
+An arm rests while its site (the process that runs the arm) waits for other sites, is stopped,
+or has a fault. Each joint follows a reference, the position q_ref with the velocity qd_ref,
+which slows down smoothly to zero.
 
-    |qd_ref| falls by the factor 1 - h / T_left,
-    T_left = max(LEAST_STOP_S - t, max_i |qd_ref_i| / a_i),
-    qd_ref = 0 from the tick on in which the joint reverses,
-    |qd_ref| is never larger than the speed of the joint,
+Reference: It starts at the angle q and the velocity qd of the joint. In each period h of the
+control loop, its speed falls by the factor
 
-where a_i is the deceleration that half of the torque limit gives. If nothing slows the joints
-down sooner, this is qd_ref = v (1 - t / T) with T = max(LEAST_STOP_S, max_i |v_i| / a_i). q_ref
-is the integral of qd_ref. While an arm is fast (see below) or a torque is at its limit, q_ref
-moves along with a joint that would otherwise move away from it.
+    1 - h / T_left,    T_left = max(LEAST_STOP_S - t, max_i |qd_ref_i| / a_i)
 
-The control law computes the torque for this reference. The gravity torque, as far as it is
-known or estimated, replaces the law's torque
+where t is the time since the start, in s, and a_i the deceleration that half of the torque
+limit of joint i gives. The reference is never faster than the joint, and stops when the joint
+reverses. While the arm is fast or a torque is at its limit, q_ref moves along with a joint that
+moves away from it.
 
-- if the law failed,
-- if a user's law does not declare (`holds = True`) that it is right while its reference rests,
-- in task space, unless the law is a kernel law of known gravity,
-- while the arm is fast: while B |qd| of some joint exceeds the limit of its torque.
+Torque: The control law computes a torque for this reference. It is replaced by the known or
+estimated gravity torque if the law cannot be used, see `rests_by_law`. In both cases these
+terms are added:
 
-To either torque the kernel, the compiled code of the control loop, adds
+    w - B s,    s = qd - qd_ref + Lambda (q - q_ref),    dw/dt = -k B s
 
-    w - B s,    s = qd - qd_ref + Lambda (q - q_ref),    w' = -k B s
+- B is the damping in N m s/rad, and k = 1 / (4 `RestGains.time_s`). Lambda is the convergence
+  rate, in 1/s: the rate of the adaptive law in joint space, otherwise `REST_RATE_1_S`.
+- w carries a constant load, for example unknown gravity. It starts as the part of the last
+  torque that the law does not explain, times 1 - max B |qd| / tau_limit. While the arm brakes,
+  w loses B |qd| in each period in which it acts in the direction of motion.
 
-w starts as the part of the last torque that the law does not explain, times 1 - max B |qd| /
-tau_limit: the torque of a slow arm holds unknown gravity or hands, the torque of a fast arm
-follows from its motion. While the arm brakes, w loses B |qd| in each tick in which w acts in
-the direction of the joint's motion. Lambda is that of the adaptive law in joint space, and
-otherwise `REST_RATE_1_S`. In task space the estimate is kept. docs/links.md derives the energy
-that these terms can add to an arm.
-
-The limit of a torque's rate never delays a torque that takes power from the arm: against the
-motion of a joint its torque may change by B |qd| more in a tick. This is the step of a viscous
-brake B that is applied at that speed. The brake brings the joint to rest within
-`RestGains.time_s`, and vanishes with the speed.
+An arm is fast while B |qd| of some joint exceeds its torque limit `tau_limit`. The limit on the
+rate of the torque does not delay braking: against the motion, the torque may change by B |qd|
+more per period.
 
 Invariant:
-
-- The reference of a joint only slows down, keeps its direction, and is never faster than the
-  joint.
-- While an arm brakes, no term but w acts in the direction of a joint's motion, and w adds at
-  most h w^2 / 2 B.
-- Once the reference rests and no torque is limited, S + 1/2 w' (k B)^-1 w of the adaptive law
-  in joint space never rises, with S the storage of the law: B adds to Kp, and w is a further
-  estimate, of a constant torque whose true value is zero.
+    - The reference of a joint keeps its direction and never becomes faster.
+    - While an arm brakes, no term but w acts in the direction of motion, and w adds at most the
+      energy h w^2 / 2 B per period. docs/links.md derives this.
+    - Once the reference rests and no torque is limited, the energy function of the adaptive law
+      in joint space plus 1/2 w' (k B)^-1 w never rises.
 """
 
 from math import inf, isfinite
@@ -78,10 +66,11 @@ _KNOWN = int(Law.KNOWN)
 
 @leaf
 def rests(site: SiteRow) -> bool:
-    """Returns True if the arm comes to rest or stays at rest in the present mode.
+    """Returns True if the arm comes to rest or is at rest in the present mode.
 
-    Only a site whose reference glides to rest (`StaleAction.GLIDE`) does so, in the modes
-    WAITING, HOLD, FAULT and STOPPED.
+    This is the case in the modes WAITING, HOLD, FAULT and STOPPED, but only if the rule of the
+    site for silent peers is `StaleAction.GLIDE`. Under the other rules, these modes do not stop
+    the arm smoothly.
     """
     still = site.mode in (_WAITING, _HOLD, _FAULT, _STOPPED)
     return bool(still and site.on_stale == _GLIDE)
@@ -114,10 +103,16 @@ def is_fast(site: SiteRow) -> bool:
 
 @leaf
 def rests_by_law(site: SiteRow) -> bool:
-    """Returns True if the control law goes on acting and adapting while the arm rests.
+    """Returns True if the control law can hold the arm at rest.
 
-    It does not if it needs live peers, learns in task space or failed before, or while the arm
-    is too fast, see `is_fast`.
+    Otherwise the known or estimated gravity torque holds the arm. This is the case in any of
+    these situations:
+
+    - The law was written by a user, and does not declare with `holds = True` that it works
+      without the motion of other arms.
+    - The law works in task space, and does not know the gravity torque.
+    - The law computed a number that is not finite.
+    - The arm is too fast, see `is_fast`.
     """
     holds = site.law != _USER or site.holds != 0
     learns_in_task = site.task != 0 and site.law != _KNOWN
@@ -193,15 +188,15 @@ def _find_remaining_s(elapsed_s: float, site: SiteRow) -> float:
 
 @leaf
 def advance_rest_reference(t_ns: int, ticks: int, site: SiteRow) -> None:
-    """Advances the rest reference to the present tick.
+    """Slows down the reference that brings the joints to rest, and moves it to the present period.
 
-    The reference slows down as described at the top of this module. While the arm is fast, or
-    its torque is limited, the reference moves along with a joint that would move away from it.
+    The rules are at the top of this module.
 
     Args:
-        t_ns: Time of the present tick, ns since the epoch.
-        ticks: Number of periods since the last tick; more than 1 if the site missed ticks.
-        site: Row of the site.
+        t_ns: Time of the present period of the control loop, ns since the start of the session.
+        ticks: Number of periods since the last call. It is more than 1 if the site (the process
+            that runs the arm) was too slow and missed periods.
+        site: State of the site; the reference is changed.
     """
     if t_ns == site.return_from_ns:
         return  # the reference starts in this tick
@@ -252,17 +247,16 @@ def _brakes(t_ns: int, site: SiteRow) -> bool:
 
 @leaf
 def put_rest_reference(site: SiteRow, q: Array, qd: Array) -> None:
-    """Writes the rest reference in the coordinates that the sites share.
+    """Computes the reference of an arm that comes to rest, in the coordinates of its control law.
 
-    The rest reference is the position that the joints follow until they stand still. If the
-    sites share joint angles, q and qd are this reference. In task space, where they share the
-    pose of the end effector, q and qd are the present pose and its velocity, because the joints
-    come to rest by themselves.
+    In joint space, it is the motion that brings the joints to rest. In task space, the
+    coordinates describe the pose of the end effector. Their reference is then the present pose
+    and its velocity, because the joints are brought to rest one by one.
 
     Args:
-        site: Row of the site.
-        q: Written: the reference, one number per shared coordinate.
-        qd: Written: the rate of the reference.
+        site: State of the site (the process that runs the arm).
+        q: Receives the reference, one number per coordinate, rad or m.
+        qd: Receives the velocity of the reference, rad/s or m/s.
     """
     for i in range(q.shape[0]):
         if site.task:
@@ -293,16 +287,17 @@ def _shrink(torque: float, change: float) -> float:
 
 @leaf
 def add_rest_torque(k: int, t_ns: int, site: SiteRow) -> None:
-    """Adds the torque w - B s of an arm at rest to its torque `tau`, and limits the sum.
+    """Adds damping and a constant load to the torque `tau` of an arm at rest, and limits the sum.
 
-    B s damps the slip s, the filtered deviation of a joint from the rest reference. The torque
-    w carries a constant load; at the start of a rest it is the part of the last torque that the
-    control law does not explain. The sum without the limit is written into `u`.
+    The added torque is w - B s. B is the damping in N m s/rad, and s the filtered deviation of
+    a joint from its reference in rad/s. The torque w carries a constant load. At the start of
+    the rest, it is the part of the previous torque that the control law does not explain. The
+    sum before the limit is stored in `u`.
 
     Args:
-        k: The tick.
-        t_ns: Time of the tick, ns since the epoch.
-        site: Row of the site; changed.
+        k: Number of the control period.
+        t_ns: Time of the period, ns since the start of the session.
+        site: State of the site (the process that runs the arm); changed.
     """
     brakes = _brakes(t_ns, site)
     held_part = 0.0
@@ -328,11 +323,12 @@ def add_rest_torque(k: int, t_ns: int, site: SiteRow) -> None:
 
 @leaf
 def advance_rest(site: SiteRow) -> None:
-    """Advances w, the torque that holds the arm against a constant load, to the next tick.
+    """Updates the integral term w of the torque that holds an arm at rest.
 
-    The step is -h k B s, where h is the period, k and B are the rest gains, and s is the slip
-    of the joint, all defined at the top of this module. If the torque is already limited in the
-    direction of the step, w does not change (anti-windup).
+    The term w carries a constant load. In a period h of the control loop it changes by -h k B
+    s, where B is the damping of the arm at rest, k B the integral gain, and s the filtered
+    deviation of the joint from its reference. If the torque is already limited in the direction
+    of the change, w stays unchanged (anti-windup).
     """
     for i in range(site.joints):
         step = -site.integral[i] * _find_slip(site, i) / site.rate_hz
@@ -343,14 +339,14 @@ def advance_rest(site: SiteRow) -> None:
 
 @leaf
 def limit_torque_rate(site: SiteRow) -> None:
-    """Limits the change of the torque from the previous tick to this tick.
+    """Limits the change of the torque from the previous control period to the present one.
 
-    Before the first tick the torque counts as zero. While an arm comes to rest, the torque that
-    brakes a joint may change by B |qd| more in a tick, where B is the damping at rest and qd
-    the joint velocity.
+    Before the first period the torque is zero. While an arm comes to rest, the torque against
+    the motion of a joint may change by B |qd| more in a period. B is the damping of the arm at
+    rest in N m s/rad, and qd the velocity of the joint in rad/s.
 
     Args:
-        site: Row of the site, whose torque `tau` is limited in place.
+        site: State of the site (the process that runs the arm); its torque `tau` is limited.
     """
     braking = rests(site)
     for i in range(site.joints):

@@ -1,16 +1,16 @@
-"""Lists the fields of the rows that hold a site's state: shape, unit, meaning and stage.
+"""Defines the arrays that hold the state of a simulated arm and of its network links.
 
-A row is one record of a NumPy structured array, and a stage is a part of a tick, one period of
-the control loop. Each class below describes a row twice: its attributes tell readers and mypy
-the types, and `row_dtype` reads the `Field` of each attribute to lay the row out in memory.
-`FIELDS` collects the tables, which README.md of this folder shows.
+The process that runs one arm is called a site. Its state is stored in NumPy structured arrays,
+whose elements are called rows. Each class below describes the fields of one kind of row: their
+shape, unit and meaning, and the stage of a control period that writes them. The types of the
+attributes serve readers and mypy, and `row_dtype` derives the memory layout from the `Field` of
+each attribute. README.md of this folder shows the same information as tables.
 
 Invariant:
-
-- The order of the attributes is the order of the fields in memory. Digests of runs, cached
-  machine code and users' compiled laws depend on it.
-- A row has no other fields, and the kernel (the compiled code of a tick) keeps no state outside
-  of its rows and tables.
+    - The order of the attributes is the order of the fields in memory. Digests of runs, cached
+      machine code and users' compiled control laws depend on it.
+    - The compiled code of a control period keeps no state outside of these rows and of the
+      tables in `SiteArrays`.
 """
 
 from collections.abc import Mapping
@@ -23,17 +23,19 @@ from .vectors import Array
 
 
 class Field(NamedTuple):
-    """Description of a field of a row.
+    """Describes a field of a structured array: its shape, unit and meaning, and who writes it.
 
     Attributes:
-        shape: Axes, of words such as "joints" or of numbers, joined by " x "; "": a scalar.
-        unit: Unit; the name of an enumeration for its members; "": a number, an index or a
-            flag.
-        meaning: Quantity that the field contains.
-        stage: Stage that writes the field (see README.md), "setup" for constants, "input" for
-            what is written before a tick, "scratch" for intermediate results.
-        chain_only: True: only the row of a chain of joints has the field.
-        kind: NumPy's code of the field's numbers.
+        shape: Axes, joined by " x ". Each axis is a number, or a name such as "joints" whose
+            length depends on the arm. Empty for a single number.
+        unit: Unit of the numbers. If the field holds a member of an enumeration, the name of
+            the enumeration. Empty for counts, indices and flags.
+        meaning: Quantity that the field holds.
+        stage: Stage of a control period that writes the field, see README.md. Otherwise "setup"
+            for constants, "input" for values that are written before the period, or "scratch"
+            for intermediate results.
+        chain_only: True if only an arm that is a chain of joints has the field.
+        kind: NumPy's code of the number type.
     """
 
     shape: str
@@ -45,10 +47,11 @@ class Field(NamedTuple):
 
 
 class SiteRow(Protocol):
-    """The row of a site: its settings and gains, its state, and the results within a tick.
+    """State of a site, the process that runs one arm: settings, gains, motion and results.
 
-    "shared" is the number of coordinates that sites exchange. Fields that the laws of users
-    read in `LawInput` keep its names.
+    The axis "shared" has one element for each coordinate that sites send each other. Users'
+    compiled control laws read this row through `LawInput`. Therefore the fields that both have
+    in common have the same names.
     """
 
     rate_hz: Annotated[int, Field("", "Hz", "tick rate", "setup")]
@@ -255,9 +258,11 @@ class SiteRow(Protocol):
 
 
 class LinkRow(Protocol):
-    """The row of a link from a peer: the sample in use, and the memory of the link's channel.
+    """State of a network link, the one-way connection from another arm's process (the peer).
 
-    Until the first sample is released, q and qd are the peer's start pose, at rest (L7).
+    It contains the sample in use, which is the newest state of the peer whose simulated delay
+    has passed, and the state of the random models of loss and delay. Before the first sample, q
+    and qd are the start pose of the peer and zero (law L7 of docs/design.md).
     """
 
     alpha: Annotated[
@@ -311,7 +316,12 @@ class LinkRow(Protocol):
 
 
 class SampleRow(Protocol):
-    """The row of a calendar's page: the newest sample that a tick of the receiver releases."""
+    """Sample that waits until its simulated delay has passed.
+
+    A sample is the state that another arm's process sends in one period of its control loop.
+    Each period of the receiver has an entry for the newest sample that is used from that period
+    on.
+    """
 
     tick: Annotated[int, Field("", "tick", "stamp of the sample; -1: no sample", "1 accept")]
     q: Annotated[Array, Field("shared", "rad or m", "joint angles or pose", "1 accept")]
@@ -320,7 +330,10 @@ class SampleRow(Protocol):
 
 
 class ArrivalRow(Protocol):
-    """The row of an arrival in the buffers of a tick."""
+    """Sample that arrived from another arm's process since the previous control period.
+
+    A sample is the state that a process sends in one period of its control loop.
+    """
 
     peer: Annotated[int, Field("", "", "index of the link", "input")]
     tick: Annotated[int, Field("", "tick", "stamp of the sample", "input")]
@@ -329,7 +342,11 @@ class ArrivalRow(Protocol):
 
 
 class ProgressRow(Protocol):
-    """The row of a site's progress in the fused run of all sites."""
+    """How far the simulation of one arm has advanced, and statistics of its motion.
+
+    A tick is one period of the control loop. A bucket is an interval of time, for which the
+    largest errors and speeds are collected.
+    """
 
     tick: Annotated[int, Field("", "tick", "next tick", "fused run")]
     t_ns: Annotated[int, Field("", "ns", "its nominal time; NEVER_NS at the end", "fused run")]
@@ -347,7 +364,10 @@ class ProgressRow(Protocol):
 
 
 class SumsRow(Protocol):
-    """The row of a site's sums over its records in the fused run, from which metrics follow."""
+    """Sums over the records of a simulated arm, from which the metrics of the run are computed.
+
+    A record contains the results of one period of the control loop.
+    """
 
     first_environment: Annotated[
         int, Field("", "", "index of the first environment; -1: no environment", "setup")
@@ -396,11 +416,14 @@ FIELDS: dict[str, dict[str, Field]] = {
 
 
 def field_shape(field: Field, lengths: Mapping[str, int]) -> tuple[int, ...]:
-    """Returns the shape of a field.
+    """Computes the shape of a field for an arm with given numbers of joints and coordinates.
 
     Args:
-        field: The field.
-        lengths: Lengths of the axes that are words: joints, shared, parameters.
+        field: The field, whose axes may be named, for example "joints".
+        lengths: Length of each named axis.
+
+    Returns:
+        The shape. () for a field that holds a single number.
     """
     axes = field.shape.split(" x ") if field.shape else []
     return tuple(int(axis) if axis.isdigit() else lengths[axis] for axis in axes)
@@ -409,12 +432,14 @@ def field_shape(field: Field, lengths: Mapping[str, int]) -> tuple[int, ...]:
 def row_dtype(
     row: str, lengths: Mapping[str, int], *, chain: bool = False
 ) -> np.dtype[np.void]:
-    """Returns the layout of a row, a NumPy structured type.
+    """Computes the NumPy data type of an array that stores one kind of row of this module.
 
     Args:
-        row: Name of the row in `FIELDS`.
-        lengths: Lengths of the axes that are words: joints, shared, parameters.
-        chain: True: with the fields that only a chain of joints has.
+        row: Name of the kind in `FIELDS`, for example "site" or "link".
+        lengths: Number of joints, of shared coordinates and of dynamic parameters of the arm,
+            under the names "joints", "shared" and "parameters". Only the names that the fields
+            use are needed.
+        chain: True to include the fields that only an arm which is a chain of joints needs.
     """
     columns: list[Any] = [
         (name, field.kind, field_shape(field, lengths))

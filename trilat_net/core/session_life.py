@@ -1,35 +1,36 @@
-"""Changes the mode of a site under the rule `glide`: it waits, aligns, follows, and holds.
+"""Decides when an arm waits, follows the other arms, comes to rest, or stops after a fault.
 
-A site is a process that runs one arm, and its peers are the other sites whose states it
-receives. The rule `glide` lets a site start and end smoothly when its peers appear or fall
-silent. The modes of a site are:
+A site is a process that runs one arm, and its peers are the other sites, whose states it
+receives. The rules of this module are called `glide`. They let an arm start and stop smoothly
+when its peers appear or fall silent. A site has one of these modes:
 
-    WAITING -> RETURN (aligns) -> RUN (engaged) -> HOLD (a peer is silent) -> RETURN -> RUN
-    any mode -> FAULT (limit exceeded, number not finite, arm lost) -- order RESET -> WAITING
-    any mode -> STOPPED (order STOP, or switch released) -- order ENABLE or HELD -> WAITING
+- WAITING: The arm is at rest, until all peers are heard. Then the mode becomes RETURN.
+- RETURN: The arm moves smoothly to the peers. After that, the mode becomes RUN.
+- RUN: The arm follows the peers. If a peer falls silent, the mode becomes HOLD.
+- HOLD: The arm comes to rest. If all peers are heard again, the mode becomes RETURN.
+- FAULT: A limit was exceeded, a number was not finite, or the arm was lost. The arm comes to
+  rest. Only the order RESET leads back to WAITING.
+- STOPPED: The arm was stopped by order, or its dead-man switch was released. The arm comes to
+  rest. The order ENABLE leads back to WAITING. If the switch was the cause, holding the switch
+  again does so too.
 
-The reference of a site is the position that its arm follows; the reference of the peers is the
-weighted mean of their positions. While a site aligns, its reference is the reference of the
-peers plus an offset. The offset starts at the difference between the two, and falls to zero
-within T:
+The reference of a site is the position that its arm follows. In RUN, it is the weighted mean of
+the positions of the peers. In RETURN, an offset is added, which falls from its start value D to
+zero within the time T:
 
     offset(x) = D (1 - 3 x^2 + 2 x^3) + T D' x (1 - x)^2,    x = t / T from 0 to 1
     T = max(MIN_ALIGN_NS, 1.5 |D| / align_speed)
 
-with D the offset and D' its rate at the start. The factor 1.5 is the largest slope of the
-polynomial, so that the offset is no faster than `align_speed` beyond its initial rate. For an
-orientation the offset is the rotation vector of the turn from the peers' orientation to the
-site's own, and a rate is an angular velocity.
+Here t is the time since the start of RETURN, and D' the start value of the rate of the offset.
+The factor 1.5 is the largest slope of the polynomial. Therefore the offset is no faster than
+`align_speed`, apart from the effect of D'. For an orientation, the offset is a rotation vector.
 
 Invariant:
-
-- In WAITING, HOLD, STOPPED and FAULT the arm comes to rest where it is and stays there, always
-  in the same way (`resting`): the reference starts at the pose and the velocity of the arm.
-- From there to the peers, and while the site follows them, neither the reference nor its
-  derivative jumps, and the derivative is that of the reference.
-- A peer that rests or aligns is followed like any other peer.
-- FAULT and STOPPED are latched: no message of a peer leads to them or out of them.
-- A switch that is held again ends the stop that its release caused, but no stop by order.
+    - In WAITING, HOLD, STOPPED and FAULT, the arm comes to rest in the same way, see `resting`.
+    - In RETURN and RUN neither the reference nor its velocity jumps, and the velocity is always
+      the derivative of the reference.
+    - A peer that is at rest is followed like any other peer.
+    - Messages of peers neither cause nor end FAULT and STOPPED.
 """
 
 from math import isfinite
@@ -203,14 +204,15 @@ def _extrapolate_reference(site: SiteRow) -> None:
 
 @leaf
 def is_law_returning(t_ns: int, site: SiteRow) -> bool:
-    """Returns True while the torque changes from that of an arm at rest to that of the law.
+    """Returns True while the arm changes over from the torque at rest to that of its control law.
 
-    This change takes RETURN_NS, from the start of an alignment with the peers on. A site that
-    aligns without having rested, because it dropped or restored a peer, needs no change.
+    The change starts when the arm begins to move from rest towards the other arms, and takes
+    `RETURN_NS`. An arm that aligns with the remaining arms after one was lost, or after a lost
+    one came back, was not at rest. It needs no change.
 
     Args:
-        t_ns: Time, ns since the epoch, the common start of the session.
-        site: Row of the site.
+        t_ns: Time, ns since the start of the session.
+        site: State of the site, the process that runs the arm.
     """
     # A site that drops or restores a peer aligns without a rest before.
     rested = site.reason != _DROPPED and site.reason != _RESTORED
@@ -338,16 +340,17 @@ def _update_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
 
 @leaf
 def update_session_life(t_ns: int, site: SiteRow, links: RowArray) -> None:
-    """Changes the mode of a site, and computes the reference of the arm in this mode.
+    """Changes the mode of a site by the rules of this module, and computes the reference of its arm.
 
-    This is the rule `glide`, described at the top of this module. The peers' reference is in
-    `q_des` and `qd_des`, where the new reference is written. The reference of the previous tick
-    is in `q_followed` and `qd_followed`.
+    A site is the process that runs the arm, and the reference is the position that the arm
+    follows. Before the call, `q_des` and `qd_des` contain the weighted mean of the other arms'
+    positions and its derivative. After the call, they contain the new reference. The reference
+    of the previous control period is in `q_followed` and `qd_followed`.
 
     Args:
-        t_ns: Time, ns since the epoch, the common start of the session.
-        site: Row of the site; changed.
-        links: Rows of the site's links, one per peer.
+        t_ns: Time, ns since the start of the session.
+        site: State of the site; changed.
+        links: States of the links from the other sites, one row per link.
     """
     if site.mode == _DIVERGED:
         return

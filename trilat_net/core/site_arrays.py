@@ -1,19 +1,20 @@
-"""Builds the arrays of a running site from its setup, and enlarges them during a run.
+"""Creates the arrays that hold the state of a running arm, and enlarges them during a run.
 
-A site is a process that runs one arm and its control loop. It receives samples, the states of
-other sites, over links with a delay. A calendar stores the samples of a link until they are
-due.
+A site is a process that runs one arm and its control loop. Over network links it receives
+samples, the states of other sites. The arrays contain the state of the arm and its control law
+(`SiteRow`), and the state of each link (`LinkRow`) with its models of delay and loss. They also
+contain a ring buffer per link, called calendar, in which samples wait until their simulated
+delay has passed. Each entry of a calendar is called a page.
 
-The state of a site is one row of a structured array (`SiteRow`, in `row_fields`). As an
-argument of compiled code, a row costs a quarter of a microsecond, and its fields have the
-paper's names. Each peer has a row of its link (`LinkRow`), a table of link models and a
-calendar.
+Structured arrays are used because they are cheap to pass to compiled code, and because their
+fields can have the same names as the symbols in the equations.
 
 Invariant:
-
-- The kernel reads and writes nothing but these arrays and the buffers of the tick.
-- Two sites of one setup have equal arrays.
-- The links of a site take at most `MAX_LINKS_BYTES` of memory beyond what their delays need.
+    - The compiled code of a control period reads and writes nothing but these arrays and
+      `TickBuffers`.
+    - Two sites with equal setups have equal arrays.
+    - The links of a site take at most `MAX_LINKS_BYTES` of memory beyond what the delays in the
+      setup need.
 """
 
 from collections.abc import Sequence
@@ -99,13 +100,19 @@ class SiteArrays(NamedTuple):
 
 
 class TickBuffers(NamedTuple):
-    """The input and the output of one tick.
+    """Input and output of one period of the control loop.
+
+    The input consists of samples, the states that other sites (processes that run one arm each)
+    sent. A sample has m coordinates.
 
     Attributes:
-        arrivals: The samples that arrived, shape (MAX_ARRIVALS,), see `arrival_dtype`.
-        forces: Their exogenous torques, shape (MAX_ARRIVALS, m), N m.
-        sent: The numbers that the peers' laws sent with them, shape (MAX_ARRIVALS, C).
-        record: Output: the floats of the record, see `Layout.columns`.
+        arrivals: Samples that arrived since the previous period, shape (MAX_ARRIVALS,), see
+            `arrival_dtype`.
+        forces: External torques or forces on the arms of the senders, N m or N, shape
+            (MAX_ARRIVALS, m).
+        sent: Further numbers that the control laws of the senders sent, shape (MAX_ARRIVALS, C)
+            for at most C numbers per sample.
+        record: Receives the floating-point numbers of the record, see `Layout.columns`.
     """
 
     arrivals: RowArray
@@ -142,15 +149,17 @@ def build_site_arrays(
     *,
     plugged: bool = False,
 ) -> SiteArrays:
-    """Returns the arrays of a site before its first tick.
+    """Creates the arrays of a site, the process that runs one arm, before its first control period.
 
     Args:
-        setup: The setup of the site.
-        spare: Free rows for later changes: of each link's model, and of the dominance factors.
-        pages: Pages of each calendar and due times that each link keeps; 0: pages for the
-            delays of the setup, and due times for as long as a sample may be late.
-        layout: Layout of the arrays if they are larger than the site needs.
-        plugged: True: with the arrays of a user's law even if the site has no such law.
+        setup: Setup of the site.
+        spare: Two numbers of free rows for changes during the run: for changes of each link's
+            delay model, and for changes of the weights with which the site follows the other
+            sites.
+        pages: Number of samples that can wait on each link, which is also the number of
+            delivery times that each link stores. 0 to derive both numbers from the setup.
+        layout: Lengths of the vectors in the arrays, if they are larger than this site needs.
+        plugged: True to include the arrays of a user's control law, even if this site has none.
     """
     links = setup.links
     layout = layout or setup.layout
@@ -189,14 +198,17 @@ def build_site_arrays(
 
 
 def needed_pages(setup: SiteSetup) -> int:
-    """Returns the number of pages that each calendar of a site needs.
+    """Computes how many samples must be able to wait on each link of a site.
 
-    Samples wait in the calendar of their link until their delay has passed, so its length
-    follows from the longest delay of the setup. Senders may be up to `_NEAR_NS` ahead of the
-    site.
+    A site is a process that runs one arm. Its samples, the states of other sites, wait until
+    their simulated delay has passed. The result follows from the longest delay in the setup,
+    and from the time `_NEAR_NS` by which the clock of a sender may be ahead.
 
     Args:
         setup: Setup of the site.
+
+    Returns:
+        The number of entries of the ring buffer of a link, a power of two.
     """
     longest_us = max(max_delay_us(link.models, link.traces) for link in setup.links)
     return calendar_pages(setup.rate_hz, longest_us, _NEAR_NS)
@@ -230,12 +242,17 @@ def _count_kept_dues(setup: SiteSetup) -> int:
 
 
 def widen_calendars(arrays: SiteArrays, k: int, pages: int) -> SiteArrays:
-    """Returns arrays with larger calendars and the same waiting samples.
+    """Enlarges the ring buffers in which samples wait until their simulated delay has passed.
+
+    A sample is the state that another arm's process sends. All waiting samples are kept.
 
     Args:
-        arrays: The arrays before tick k.
-        k: The next tick that the calendars release.
-        pages: The new number of pages, a power of two.
+        arrays: Arrays of the site, the process that runs the arm.
+        k: The next control period of the site.
+        pages: New number of entries of each buffer, a power of two.
+
+    Returns:
+        New arrays with the larger buffers.
     """
     ticks = np.arange(k, k + arrays.calendars.shape[1])
     # A tick's page is its lowest bits, as the number of pages is a power of two.
@@ -253,15 +270,17 @@ def widen_calendars(arrays: SiteArrays, k: int, pages: int) -> SiteArrays:
 
 
 class CalendarSizer:
-    """Enlarges the calendars of a site when a sample arrives that needs more pages.
+    """Enlarges the ring buffers in which samples wait, when a sample arrives that does not fit.
 
-    A sample needs more pages if its sender is far ahead or if the delays of its link grew. The
-    links never take more than `MAX_LINKS_BYTES`, or what the delays of the setup need: a sample
-    that does not fit is refused in stage 1, like a sample whose stamp is out of range.
+    A sample is the state of a peer, the process of another arm. It waits until its simulated
+    delay has passed. A buffer is too short if the delays have become longer, or if the clock of
+    the peer is far ahead. The buffers never take more memory than `MAX_LINKS_BYTES`, or than
+    the delays in the setup need. A sample that still does not fit is refused later.
 
     Attributes:
-        newest: Per peer the newest stamp that fits at the last tick and at all later ones.
-        most_pages: The largest number of pages.
+        newest: For each peer the number of the newest sample that is known to fit now and
+            later.
+        most_pages: Largest number of entries of a buffer.
     """
 
     def __init__(self, setup: SiteSetup) -> None:
@@ -277,33 +296,39 @@ class CalendarSizer:
             self.most_pages *= 2
 
     def clear(self) -> None:
-        """Forgets which stamps fit, so that the next sample of each peer is checked again."""
+        """Forgets which samples are known to fit into the buffers.
+
+        The next sample of each peer (another arm's process) is checked again.
+        """
         self.newest = [-1] * len(self.newest)
 
     def add_model(self, peer: int, model: LinkModel) -> None:
-        """Takes into account that the delays of a link will follow another model.
+        """Notes that the delay model of a link will change, so that longer delays get enough room.
 
         Args:
-            peer: Index of the peer at the other end of the link.
-            model: The new model of the link's delays.
+            peer: Index of the sender at the other end of the link.
+            model: New model of the link's delays.
         """
         longest_us = max_delay_us([model], [None])
         self._delay_us[peer] = max(self._delay_us[peer], longest_us)
         self.newest[peer] = -1
 
     def make_room(self, arrays: SiteArrays, k: int, peer: int, tick: int) -> SiteArrays:
-        """Returns arrays in which there is room for a sample of a peer.
+        """Makes sure that a sample fits into the ring buffer of its link.
 
-        A sample whose stamp is out of range gets no room, and is refused later.
+        A sample is the state that a peer (another arm's process) sends. It waits in the buffer
+        until its simulated delay has passed. If its number is out of range, the buffer is not
+        enlarged, and the sample is refused later.
 
         Args:
-            arrays: Arrays of the site at tick k.
-            k: Present tick of the site.
+            arrays: Arrays of the site, the process that receives the sample.
+            k: Present control period of the site.
             peer: Index of the peer.
-            tick: Stamp of the sample, a tick of the peer.
+            tick: Number of the peer's control period in which it sent the sample.
 
         Returns:
-            The same arrays, or arrays with larger calendars.
+            The same arrays if the sample fits or is to be refused. Otherwise arrays with larger
+            buffers.
         """
         rate_hz = self._rate_hz
         peer_hz = self._peer_hz[peer]
@@ -325,11 +350,14 @@ class CalendarSizer:
 
 
 def add_ramp(arrays: SiteArrays, ramp: DominanceRamp) -> None:
-    """Inserts a change of the dominance factors into the planned ones, ordered by start.
+    """Adds a planned change of the weights with which an arm follows the other arms.
+
+    The table of changes is sorted by their start times.
 
     Args:
-        arrays: Arrays of the site, which have a free row.
-        ramp: The change.
+        arrays: Arrays of the site (the process that runs the arm). Their table must have a free
+            row.
+        ramp: The change, a ramp in time.
     """
     site: Row = arrays.site[0]
     count = int(site.ramps)
@@ -342,12 +370,15 @@ def add_ramp(arrays: SiteArrays, ramp: DominanceRamp) -> None:
 
 
 def add_model(arrays: SiteArrays, peer: int, model: LinkModel) -> None:
-    """Inserts a change of a link into the planned ones, ordered by first stamp.
+    """Adds a planned change of a link's delay and loss to the table of changes.
+
+    The table is sorted by the time from which a change applies.
 
     Args:
-        arrays: Arrays of the site, which have a free row.
-        peer: Index of the peer.
-        model: The new model of the link.
+        arrays: Arrays of the site (the process that runs the arm). Their table must have a free
+            row.
+        peer: Index of the site at the other end of the link.
+        model: Model of delay and loss, with the time from which it applies.
     """
     link: Row = arrays.links[peer]
     models = arrays.models[peer]
@@ -373,15 +404,18 @@ A run may have any number of changes: those that have begun are folded, see `fol
 
 
 def apply_change(arrays: SiteArrays, change: CoreChange, t_ns: int) -> None:
-    """Applies a change, or adds it to the planned ones; other planned changes stay planned.
+    """Applies a change to a running site, for example a new delay model of a link.
+
+    A change that starts later is added to the table of planned changes.
 
     Args:
-        arrays: The arrays of the site.
+        arrays: Arrays of the site, the process that runs one arm; changed.
         change: The change.
-        t_ns: a time before which the site makes no more ticks, ns since the epoch.
+        t_ns: Present time in ns since the start of the session. The site computes no more
+            control periods before this time.
 
     Raises:
-        ValueError: The arrays have no free row for the change.
+        ValueError: There are too many planned changes.
     """
     s: Row = arrays.site[0]
     if change.order is LifeOrder.OVERRUN:
@@ -414,15 +448,18 @@ _NEVER_SAMPLED = 2
 def stack_site_arrays(
     setups: Sequence[SiteSetup], spare: int = 0, longest_us: int = 0, late_ns: int = 0
 ) -> SiteArrays:
-    """Returns the arrays of all sites of a run, stacked, with calendars as long as needed.
+    """Creates the arrays for a simulation of several sites, stacked along a first axis.
 
-    An array that is shorter than another site's is filled up with rows that are never read.
+    A site is a process that runs one arm. If the arrays of a site are shorter than those of
+    another site, they are filled up with rows that are never read. The ring buffers for delayed
+    samples (states of other sites) are long enough for all delays.
 
     Args:
-        setups: The setups of the sites.
-        spare: Free rows for later changes, of each link and of each site's dominance factors.
-        longest_us: The longest delay of such a change, us.
-        late_ns: Largest lateness of a sample, ns.
+        setups: Setups of the sites.
+        spare: Number of changes during the run for which there is room, for each link and for
+            the weights with which each site follows the others.
+        longest_us: Longest delay that the changes can lead to, us.
+        late_ns: Longest time by which a sample may arrive after its delivery time, ns.
     """
     for setup in setups:
         for link in setup.links:

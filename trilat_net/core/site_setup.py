@@ -1,12 +1,12 @@
-"""Defines the setup of a site: the numbers and names from which a site is built.
+"""Defines the setup of a site: all numbers and names that are needed to run one arm.
 
-A site is a process that runs one arm and its control loop. Its setup is derived from a
-scenario, the file that describes an experiment: defaults are filled in, and names are replaced
-by the numbers that they stand for.
+A site is a process that runs one arm and its control loop. The setup is derived from a
+scenario, the file that describes an experiment. In contrast to the scenario, the setup has no
+missing values, and refers to other sites by index instead of name.
 
 Invariant:
-    - The numbers that a site computes depend only on its setup and on the inputs of its ticks,
-      the periods of the loop.
+    - All numbers that a site computes depend only on its setup and on the inputs of its control
+      periods.
 """
 
 import math
@@ -29,11 +29,11 @@ from .vectors import Array, Points, Vector
 
 
 class Scheme(IntEnum):
-    """The sampling of the continuous law.
+    """How the continuous control law is converted to a discrete one.
 
-    SECOND_ORDER extrapolates the torque to the middle of the period and updates the estimate by
-    the trapezoid rule. DIGITAL is zero-order hold and forward Euler, as in a plain digital
-    controller.
+    SECOND_ORDER extrapolates the torque to the middle of the control period, and updates the
+    parameter estimate by the trapezoid rule. DIGITAL uses a zero-order hold and the forward
+    Euler rule, as a plain digital controller does.
     """
 
     SECOND_ORDER = 0
@@ -41,12 +41,18 @@ class Scheme(IntEnum):
 
 
 class Law(IntEnum):
-    """The control law of a site.
+    """Kind of control law of an arm.
 
-    ADAPTIVE is the paper's law, Eq. (13) and (15), with its estimate in a box if bounds are
-    given. KNOWN assumes known gravity: tau = G(q) - K e - d qd - Kd ed + k_f felt, which is
-    P+d, PD+d or direct force reflection. USER is a law in Python, of a user or of
-    `trilat_net.laws`.
+    ADAPTIVE estimates the dynamic parameters of the arm, optionally within bounds. KNOWN
+    compensates the known gravity torque:
+
+        tau = G(q) - K e - d qd - Kd ed + k_f felt
+
+    Here q and qd are the joint angles and velocities, G is the gravity torque, e and ed are the
+    errors of position and velocity, and felt is the external torque of the other arms. The
+    gains are the stiffness K, the damping d, the derivative gain Kd and the force gain k_f. The
+    gains decide whether this is P+d, PD+d or direct force reflection. USER is a law in Python,
+    either written by a user or from `trilat_net.laws`.
     """
 
     ADAPTIVE = 0
@@ -59,10 +65,13 @@ LEAST_STOP_S = 0.1
 
 
 class StaleAction(IntEnum):
-    """Action of a site while a peer that it follows is stale, which means silent for too long.
+    """What a site does while a peer is silent for too long.
 
-    USE continues with the last sample. HOLD keeps the last reference, BRAKE the pose of the
-    arm. GLIDE lets the reference come to rest, and starts by waiting for all peers, see
+    A site is a process that runs one arm, and a peer is another site that it follows.
+
+    USE follows the last known state of the peer. HOLD keeps the last reference, the position
+    that the arm follows. BRAKE keeps the present pose of the arm. GLIDE brings the arm smoothly
+    to rest. With GLIDE, the arm also waits at the start until all peers are heard, see
     `session_life`.
     """
 
@@ -73,17 +82,20 @@ class StaleAction(IntEnum):
 
 
 class StaleRule(NamedTuple):
-    """When a peer counts as stale (silent for too long), and what the site then does.
+    """Rule of a site for a stale peer, from which no new sample has come for too long.
+
+    A site is a process that runs one arm, and a peer is another site that it follows. A sample
+    is the state that a peer sends in each period of its control loop.
 
     Attributes:
-        action: Action of the site while a peer is stale.
-        age_ns: Largest age of the sample in use, ns; for GLIDE the largest time since a sample
-            of the peer came into use.
-        return_ns: Duration of the return to the peers, ns.
-        align_speed: For GLIDE, the largest speed of an alignment, in which the arm moves to its
-            peers, rad/s (of a position m/s).
-        align_limit: For GLIDE, the longest distance of an alignment, rad (of a position m).
-        degrades: For GLIDE, true: the site goes on without a lost peer, see `lost_peers`.
+        action: What the site does while a peer is stale.
+        age_ns: Largest age of the newest sample, ns. For GLIDE, the largest time since a new
+            sample could be used.
+        return_ns: Duration of the return to the reference of the peers, ns. Not used for GLIDE.
+        align_speed: For GLIDE: largest speed with which the arm returns to its peers, rad/s or
+            m/s.
+        align_limit: For GLIDE: longest distance of this return, rad or m.
+        degrades: For GLIDE: True if the site continues without a lost peer, see `lost_peers`.
     """
 
     action: StaleAction = StaleAction.USE
@@ -113,13 +125,16 @@ class MotionLimits(NamedTuple):
 
 
 class RestGains(NamedTuple):
-    """The gains of an arm that comes to rest, see `resting`; one number, or one per joint.
+    """Gains of the torque that brings an arm to rest, see `resting`.
+
+    Each vector has either a single number or a number per joint.
 
     Attributes:
-        damping: B, N m s/rad.
-        time_s: Time constant in which B alone stops a joint of the inertia for which B was
-            chosen, s.
-        deceleration: Deceleration of the reference, rad/s^2.
+        damping: Damping B of the joints, N m s/rad.
+        time_s: Time constant with which the damping alone stops a joint, s. It holds for the
+            inertia for which B was chosen.
+        deceleration: Deceleration of the reference, the motion that the joints follow while
+            they come to rest, rad/s^2.
     """
 
     damping: Vector = (0.0,)
@@ -127,11 +142,11 @@ class RestGains(NamedTuple):
     deceleration: Vector = (math.inf,)
 
     def vectors(self) -> dict[str, Vector]:
-        """Returns the gains in the form in which the row of a site stores them.
+        """Returns the gains in the form in which the state arrays store them.
 
         Returns:
-            By name the damping B, the product k B with k = 1 / (4 time_s), and the
-            deceleration.
+            By name: "damping", "integral" and "deceleration". The integral gain is the damping
+            divided by 4 `time_s`, in N m/rad.
         """
         integral = tuple(float(B) / (4.0 * self.time_s) for B in self.damping)
         return {
@@ -141,13 +156,14 @@ class RestGains(NamedTuple):
         }
 
     def stop_s(self, qd: Array) -> Array:
-        """Returns the time in which the reference comes to rest from joint velocities, s.
+        """Computes how long it takes to bring an arm to rest from given joint velocities.
 
         Args:
-            qd: Joint velocities, shape (..., n), rad/s.
+            qd: Joint velocities of one or several arms, shape (..., n), rad/s.
 
         Returns:
-            A time per row of velocities, shape (...).
+            The time in s for each set of n velocities, shape (...). If nothing else slows down
+            the joints, their reference has stopped after this time.
         """
         slowest_s = (np.abs(qd) / self.deceleration).max(axis=-1)
         duration_s: Array = np.maximum(LEAST_STOP_S, slowest_s)
@@ -195,17 +211,20 @@ class LinkSetup(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """Lengths of a site's vectors.
+    """Lengths of the vectors that describe an arm and its control law.
 
     Attributes:
-        joints: Joints of the arm.
-        shared: Coordinates that sites exchange.
-        parameters: Dynamic parameters of the arm.
-        chain: True: the arm is a chain of joints; false: the planar two-link arm.
-        task: True: the shared coordinates are those of the end effector; false: joint angles.
-        sent: Numbers that the law sends in a record, see `LawChannel.record_size`.
-        hand: Numbers of a live hand in a record, see `live_hand`; 0: no live hand.
-        bodies: Numbers of the poses of the plant's bodies, see `TickRecord.bodies`.
+        joints: Number of joints of the arm.
+        shared: Number of coordinates that the arms send each other.
+        parameters: Number of dynamic parameters of the arm.
+        chain: True if the arm is a chain of joints. False for the planar two-link arm.
+        task: True if the coordinates are the pose of the end effector. False if they are joint
+            angles.
+        sent: Number of values that the control law sends to other arms in each period.
+        hand: Number of values that describe the person or program who moves the arm during the
+            run, see `live_hand`. 0 if there is none.
+        bodies: Number of values in the poses of other bodies in the scene, see
+            `TickRecord.bodies`.
     """
 
     joints: int = JOINTS
@@ -221,13 +240,13 @@ class Layout(NamedTuple):
     def of_arm(
         cls, chain: "ChainSetup | None", sent: int = 0, actors: Sequence[TorqueSource] = ()
     ) -> "Layout":
-        """Returns the layout of an arm.
+        """Computes the lengths of the vectors of an arm.
 
         Args:
-            chain: The chain of joints; None: the planar two-link arm.
-            sent: Numbers that the law sends in a record.
-            actors: Operators and environments. At most one of them is a live hand, which a
-                person moves during the run.
+            chain: The arm if it is a chain of joints. None for the planar two-link arm.
+            sent: Number of values that the control law sends to other arms in each period.
+            actors: Operators and environments of the arm. At most one of them is a person or
+                program that moves the arm during the run.
         """
         joints = JOINTS if chain is None else len(chain.joints)
 
@@ -253,7 +272,10 @@ class Layout(NamedTuple):
         )
 
     def axes(self) -> dict[str, int]:
-        """Returns the lengths to which the fields of rows refer by name, see `row_fields`."""
+        """Returns the lengths of the named axes that fields of the state arrays have.
+
+        The names are "joints", "shared" and "parameters", see `row_fields`.
+        """
         return {"joints": self.joints, "shared": self.shared, "parameters": self.parameters}
 
     def lengths(self) -> dict[str, int]:
@@ -272,9 +294,11 @@ class Layout(NamedTuple):
         return lengths
 
     def columns(self) -> dict[str, slice]:
-        """Returns where each vector of a record stands in the floats that a tick computes.
+        """Finds each vector of a record among the floating-point values that a control period computes.
 
-        Vectors that are inputs of the tick have no columns.
+        Returns:
+            A slice for each vector, by name. Vectors that are inputs of the period are left
+            out.
         """
         lengths = self.lengths()
         for name in ("hand", "bodies"):  # inputs of the tick
@@ -286,28 +310,31 @@ class Layout(NamedTuple):
         }
 
     def count_life_memory(self, peers: int, *, degrades: bool = False) -> int:
-        """Returns how many numbers the rule `glide` keeps in a record's field `mem`.
+        """Counts the values that a site under the rule `glide` stores in the field `mem` of a record.
 
-        By this rule, explained in `session_life`, an arm comes to rest while a peer is silent.
-        In task space the numbers contain the pose and the velocities of `rest_columns`. The
-        numbers of a site that degrades, which means that it goes on without lost peers, end
-        with `gone` of its peers.
+        A site is the process that runs one arm. By the rule `glide`, its arm comes to rest
+        while another site is silent, see `session_life`. The values are the state of this rule,
+        from which a run can be continued.
 
         Args:
-            peers: Number of peers.
-            degrades: True: the site goes on without lost peers.
+            peers: Number of the other sites from which this site receives data.
+            degrades: True if the site continues without a lost site. The state then has a
+                further value for each peer.
         """
         end: int = self.rest_columns(peers).stop
         return end + peers * degrades
 
     def rest_columns(self, peers: int) -> slice:
-        """Returns the columns of the rest reference in the field `mem` of a site in task space.
+        """Finds the values of the reference that brings the joints to rest, in a record's field `mem`.
 
-        They contain the pose of the joints and then their velocities. In joint space there are
-        no such columns.
+        Only a site (the process of an arm) in task space has these values: the positions and
+        then the velocities of the joints. In joint space, the reference is stored elsewhere.
 
         Args:
-            peers: Number of peers.
+            peers: Number of the other sites from which this site receives data.
+
+        Returns:
+            The slice of the field. Empty in joint space.
         """
         first = 2 * (self.shared + 1) + peers + self.joints
         return slice(first, first + 2 * self.joints * self.task)
@@ -326,21 +353,26 @@ class Layout(NamedTuple):
 
     @property
     def floats(self) -> int:
-        """Length of the row of floats that a tick computes."""
+        """Number of floating-point values in a record, without the values that are inputs.
+
+        A record contains the inputs and results of one period of the control loop.
+        """
         shared_vectors = 5 if self.task else 2
         return 4 * self.joints + shared_vectors * self.shared + self.parameters + self.sent
 
 
 class TaskSetup(NamedTuple):
-    """The setup of a site that follows its peers with its end effector.
+    """Setup of an arm whose end effector follows the end effectors of other arms.
 
     Attributes:
-        axes: Per coordinate 1 if the site follows along it, otherwise 0. Three coordinates are
-            a position, six are a pose.
-        scale: Metres of the task per metre of this arm.
-        posture: Joint angles that the arm seeks as far as the task leaves it free, rad.
-        posture_rate: Rate of the approach to the posture, 1/s.
-        singular_value: Least singular value of the Jacobian without damping, m/rad.
+        axes: For each coordinate of the end effector 1 if it follows the other arms, otherwise
+            0. Three coordinates are a position, and six are a pose.
+        scale: Size of the common coordinates in relation to this arm: 2 means that 1 m of
+            motion of this arm counts as 2 m.
+        posture: Joint angles that the arm prefers if the end effector leaves it a choice, rad.
+        posture_rate: Rate with which the arm approaches these angles, 1/s.
+        singular_value: Near a singular pose, the Jacobian is damped if its least singular value
+            may be below this number, m/rad.
     """
 
     axes: tuple[float, ...]
@@ -475,9 +507,13 @@ class SiteSetup(NamedTuple):
 
     @property
     def received_vectors(self) -> tuple[SentVector, ...]:
-        """Vectors that the control law of the site reads from each peer.
+        """Vectors that the control law of this site reads from each of the other sites.
 
-        A vector that a peer does not send is zero.
+        A site is the process that runs one arm. A control law may send vectors to other sites
+        besides the motion of its arm. A vector that another site does not send is zero.
+
+        Returns:
+            A description of each vector, in the order in which the law receives them.
         """
         channels = [link.channel for link in self.links]
         return join_received([*channels, self.channel])

@@ -1,20 +1,18 @@
-"""Computes each tick of a site, by `Site.step`.
+"""Runs the control loop of an arm, one period per call of `Site.step`.
 
-A site is a process that runs one arm and its control loop; a tick is one period of the loop. A
-site receives samples from its peers, the other sites: a sample is the state that a site
-publishes in a tick.
+A site is a process that runs one arm and its control loop, and a tick is one period of the
+loop. In each tick, a site sends a sample with its state to its peers, the other sites.
 
-`Site` is thin Python around `kernel.site_tick`: it packs the arrivals into arrays, calls the
-compiled tick, and unpacks the record. A user's law runs between two compiled halves of the
-tick.
+`Site.step` writes the samples that arrived into arrays, calls the compiled function
+`kernel.site_tick`, and converts the results to a record. If the control law was written by a
+user, the law is called between the two halves of the tick, which are compiled separately.
 
 Invariant:
-
-- A site advances by `Site.step` alone: no other code computes a tick. (The fused run calls the
-  same compiled stages.)
-- `Site.step` is a pure function of the site's state and the tick's input. It reads no clock and
-  no socket, and draws no random number.
-- Live, in virtual time and from a log, the same inputs give the same bits.
+    - Live sessions, simulations and the verification of logs use `Site.step`. Only the fast
+      simulation of all sites (`fused_run`) does not, and it calls the same compiled functions.
+    - The result of `Site.step` depends only on the state of the site and on its argument. The
+      method reads no clock and no network connection, and draws no random number.
+    - Equal inputs give results that are equal to the last bit.
 """
 
 import math
@@ -181,16 +179,17 @@ class Site:
             )
 
     def apply_change(self, command: CoreChange, t_ns: int) -> None:
-        """Applies a command from outside, for example a change of a link.
+        """Applies a change to the running site, for example a new delay model of a link.
 
-        A change with a later start is added to the planned changes, which stay planned.
+        A change that starts later is added to the planned changes.
 
         Args:
             command: The change.
-            t_ns: A time before which the site makes no more ticks, ns since the epoch.
+            t_ns: Present time in ns since the start of the session. The site computes no more
+                control periods before this time.
 
         Raises:
-            ValueError: The arrays have no free row for the change.
+            ValueError: There are too many planned changes.
         """
         apply_change(self._arrays, command, t_ns)
         if command.model is not None:
@@ -215,16 +214,19 @@ class Site:
         self._links["copies"] = 0
 
     def step(self, tick: TickInput) -> TickRecord:
-        """Computes one tick and returns its record.
+        """Computes one period of the control loop.
 
         Args:
-            tick: Number of the tick, which follows that of the last tick, and the input since
-                then.
+            tick: Number of the period and its inputs. The number must follow that of the
+                previous call.
+
+        Returns:
+            The record of the period: its inputs and results.
 
         Raises:
-            ValueError: There are more than MAX_ARRIVALS arrivals, or more changes than
-                `apply_change` accepts.
-            LawFailed: A user's law failed, and the site is not under the rule `glide`.
+            ValueError: There are more than MAX_ARRIVALS arrivals, or too many planned changes.
+            LawFailed: A user's control law failed. Under the rule `glide`, see `session_life`,
+                the site enters the mode FAULT instead.
         """
         t_ns = tick.k * NS_PER_S // self.rate_hz
         count = len(tick.arrivals)
@@ -335,17 +337,17 @@ class Site:
 
     @property
     def mode(self) -> Mode:
-        """Mode of the site at the last tick."""
+        """Mode of the site after the last tick, for example RUN while the arm follows other arms."""
         return _MODES[self._mode.item()]
 
     @property
     def life_reason(self) -> LifeReason:
-        """Reason of the last change of mode under the rule `glide`."""
+        """Why the site last changed its mode under the rule `glide`, see `session_life`."""
         return LifeReason(self._reason.item())
 
     @property
     def arrays(self) -> SiteArrays:
-        """Arrays of the site before the next tick, to be read and not written."""
+        """Arrays with the present state of the site. They must not be changed."""
         return self._arrays
 
     @property
@@ -420,23 +422,28 @@ class Site:
         )
 
     def release_tick(self, peer: int, tick: int) -> int | None:
-        """Returns the tick that brings a peer's sample into use if it arrives in time.
+        """Finds the control period of this site in which a sample of a peer is used first.
+
+        A peer is another site (process that runs one arm). A sample is the state that it sends
+        in one period of its own control loop.
 
         Args:
             peer: Index of the peer.
-            tick: Stamp of the sample, a tick of the peer.
+            tick: Number of the period in which the peer sent the sample.
 
         Returns:
-            The tick. None if the link loses the sample or has forgotten its due time.
+            The number of this site's period if the sample arrives in time. None if the link
+            loses the sample, or if the sample is so old that its delivery time is no longer
+            stored.
         """
         release = int(find_release(peer, tick, self._arrays))
         return None if release == LOST else release
 
     def is_measured(self, peer: int) -> bool:
-        """Returns True if a link has no simulated delay, so that no sample can be late on it.
+        """Returns True if no delay is simulated on a link, so that only the real network delays samples.
 
         Args:
-            peer: Index of the peer from which the link comes.
+            peer: Index of the sender at the other end of the link.
         """
         link: Row = self._links[peer]
         return bool(self._arrays.models[peer, link.model]["kind"] == DelayKind.MEASURED)
@@ -450,13 +457,14 @@ class Site:
         return int(self._links[peer]["rate_hz"])
 
     def restore_state(self, before: TickRecord, last: TickRecord) -> None:
-        """Restores the state of the site, without its links, after a tick that was recorded.
+        """Restores the state of the arm and its control law from the records of a run.
 
-        `restore_links` restores the links. After both calls `step` continues the run.
+        After a further call of `restore_links`, `step` continues the run.
 
         Args:
-            before: Record of the tick before the last one; any record if that is tick 0.
-            last: Record of the last tick.
+            before: Record of the control period before `last`. If `last` is the first record,
+                any record can be given.
+            last: Last record of the part that is not computed again.
         """
         s: Row = self._site[0]
         shared = self.layout.shared
@@ -516,15 +524,18 @@ class Site:
     def restore_links(
         self, k: int, in_use: Sequence[Arrival | None], waiting: Sequence[Arrival]
     ) -> None:
-        """Restores the links before tick `k`, from samples in use and samples that still wait.
+        """Restores the state of the network links, so that a recorded run can continue at tick k.
 
-        The memory of a link's model is not restored but computed again: it is a function of the
-        samples before k (L4).
+        A site is a process that runs one arm, its peers are the other sites, and a tick is one
+        period of the control loop. A peer sends a sample, its state, in each tick. The state of
+        random models of delay and loss is not recorded. It is computed again from the start of
+        the run, which gives the same numbers.
 
         Args:
             k: The next tick.
-            in_use: Per peer the sample in use, or None before the first.
-            waiting: Arrivals that are not in use yet.
+            in_use: For each peer the newest sample that has been used. None if there was no
+                sample.
+            waiting: Samples that have arrived, but whose simulated delay has not passed.
 
         Raises:
             ValueError: More than MAX_ARRIVALS samples wait.

@@ -1,22 +1,25 @@
-"""Lets the end effectors of unlike arms agree on a position or a pose (task space).
+"""Lets the end effectors of different arms follow each other (control in task space).
 
-Without task space, sites compare joint angles, which requires equal arms.
+Without task space, arms compare their joint angles, which requires equal arms.
 
-Let q and qd be the positions and velocities of the joints, J the Jacobian of the followed axes,
-Jd its derivative, x the pose of the end effector, x_des the pose that it shall reach, e = x -
-x_des the error, Lambda the rate at which it decays, and y an auxiliary vector. The reference
-velocity v of the joints and its derivative a are
+Symbols: q and qd are the positions and velocities of the joints, J is the Jacobian of the
+coordinates that are followed, and Jd its derivative. x is the pose of the end effector, and e
+the difference from the desired pose. The error decays with the rate Lambda, in 1/s. The
+transpose of a matrix is written J', and the derivative of a vector dx/dt.
 
-    v = psi + J' y          J J' y  = -Lambda e - J psi
-    a = v'                  J J' y' = -Lambda e' - Jd psi - J psi' - (Jd J' + J Jd') y
+The control law needs a reference velocity v of the joints and its derivative a:
 
-where psi = -k (q - q_posture) pulls the joints to the preferred posture q_posture with the rate
-k, as far as this does not move the end effector. With the pseudoinverse J+, v equals J+
-(-Lambda e) + (I - J+ J) psi. The filtered error r = qd - v then satisfies J r = x' + Lambda e.
-A prime at a matrix means its transpose, and at a vector its derivative.
+    v = psi + J' y                J J' y     = -Lambda e - J psi
+    a = dpsi/dt + d(J' y)/dt      J J' dy/dt = -Lambda de/dt - Jd psi - J dpsi/dt
+                                               - (Jd J' + J Jd') y
 
-Near singular poses, J J' is damped. The damping is zero while 1 / trace((J J')^-1), a lower
-bound of the square of the least singular value, is above the square of `singular_value`.
+Here psi = -k (q - q_posture) pulls the joints to a preferred posture with the rate k, as far as
+this does not move the end effector. The second equation defines y. With the filtered error r =
+qd - v it follows that J r = dx/dt + Lambda e if the desired pose is at rest.
+
+Near singular poses, J J' is damped. The damping is zero while 1 / trace((J J')^-1) is above the
+square of `singular_value`. This number is a lower bound of the square of the least singular
+value of J.
 
 Source: Y.-C. Liu and N. Chopra, "Controlled synchronization of heterogeneous robotic
 manipulators in the task space", IEEE Trans. Robotics 28 (2012); damping after Y. Nakamura and
@@ -24,9 +27,9 @@ H. Hanafusa, "Inverse kinematic solutions with singularity robustness", J. Dynam
 Measurement, and Control 108 (1986).
 
 Invariant:
-    - All vectors of the task are in the frame that the sites share. They have `shared` numbers:
-      3 for a position, m, and for a pose 3 more for the orientation (`rotation_vector`).
-    - An axis that a site does not follow has no effect on the site.
+    - All vectors of the task refer to a frame that all arms share. They have 3 numbers for a
+      position, m, or 6 for a pose with an orientation (`rotation_vector`).
+    - A coordinate that an arm does not follow has no effect on this arm.
 """
 
 from .chain import Three, add, cross, place_end_effector, put_three, scale, subtract, three
@@ -144,16 +147,21 @@ def _update_jacobian_rate(s: Row, chain: RowArray, tip: Three) -> None:
 
 @leaf
 def update_orientation_reference(s: Row, links: RowArray) -> None:
-    """Computes the orientation that the end effector follows, and its angular velocity.
+    """Computes the orientation that the end effector shall reach, and its angular velocity.
 
-    The reference is the site's own orientation R_i, turned back by the weighted differences
-    from its peers, sum_j alpha_ij Log(R_i R_j'). Here alpha_ij is the weight of peer j, R_j its
-    orientation and Log the rotation vector. The velocity sum_j alpha_ij w_j of the peers'
-    angular velocities w_j is exact only if the orientations agree.
+    The reference results from the own orientation R_i by a rotation towards the other arms. The
+    rotation vector is
+
+        -sum_j alpha_ij Log(R_i R_j')
+
+    where R_j is the orientation of arm j, alpha_ij the weight with which this arm follows it,
+    and Log converts a rotation matrix to a rotation vector. The angular velocity is the
+    weighted sum of the other arms' angular velocities. It is exact only if the orientations
+    agree.
 
     Args:
-        s: Row of the site, with its pose; written.
-        links: Rows of the site's links.
+        s: State of the site (the process that runs this arm); the reference is written into it.
+        links: States of the links from the other arms, one row per link.
     """
     orientation = rotation_matrix(three(s.x[3:]))
     difference = (0.0, 0.0, 0.0)
@@ -269,15 +277,17 @@ def _update_axis_errors(s: Row) -> None:
 
 @leaf
 def update_task_errors(s: Row) -> None:
-    """Computes the errors in task space and the reference motion of the joints.
+    """Computes the errors of the end effector, and the reference motion of the joints.
 
-    These are the errors e and ed of the followed axes, the reference velocity v and
-    acceleration a of the joints, and the filtered error r. The equations are those at the head
-    of this module. The arrays `stage_q` and `stage_qd` of the integrator serve as work space
-    for Jd' y and J' y.
+    The results are the errors e and ed of the coordinates that are followed, the reference
+    velocity v and acceleration a of the joints, and the filtered error r = qd - v. The
+    equations are at the top of this module.
+
+    The fields `stage_q` and `stage_qd`, which the integrator needs later, are overwritten with
+    intermediate results.
 
     Args:
-        s: Row of the site; written.
+        s: State of the site (the process that runs the arm); the results are written into it.
     """
     n = s.joints
     m = s.shared

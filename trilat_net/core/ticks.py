@@ -1,16 +1,14 @@
-"""Defines ticks: their nominal times, their inputs and records, and texts about a site's modes.
+"""Defines the inputs, the results and the times of the control periods of an arm.
 
-A site is a process that runs one arm, and a tick is one period of its control loop. The input
-of a tick consists of the samples (states) that arrived from other sites, and of the commands,
-since the previous tick. Its record is the stored result.
+A site is a process that runs one arm, and a tick is one period of its control loop. The inputs
+of a tick are the samples (states) that arrived from other sites, and commands. Its record is
+the stored result. This module also defines the modes in which a site can be.
 
-Invariant:
-
-- (L1) Tick k of a loop of `rate_hz` lies at `k * 10^9 // rate_hz` nanoseconds after the epoch,
-  the common start of the session. These are integers with one rounding rule, so that no drift
-  builds up.
-- (L3) The record of a tick names the inputs of the tick. Which sample of a peer was in use is
-  a result of the tick, not an input.
+Invariant (laws L1 and L3 of docs/design.md):
+    - The nominal time of tick k is `k * 10^9 // rate_hz` nanoseconds after the start of the
+      session, where `rate_hz` is the rate of the loop. The integer division is exact for each
+      k, so that no drift builds up.
+    - The record of a tick contains all inputs of the tick.
 """
 
 from collections.abc import Sequence
@@ -56,16 +54,16 @@ MAX_ARRIVALS = 4096
 
 
 class Mode(IntEnum):
-    """The mode of a site in a tick.
+    """What a site, the process that runs one arm, does in a period of its control loop.
 
-    In RUN the site follows its peers. A stale peer leads to HOLD (the site keeps its last
-    reference) or to BRAKE (the site keeps the pose of its arm). A fresh sample then leads to
-    RETURN (the site returns to its peers within a fixed time) and from there to RUN. DIVERGED,
-    beyond a limit, is final.
+    RUN: the arm follows the other arms. If no samples (states) come from one of them, the mode
+    becomes HOLD (the arm keeps its last reference) or BRAKE (the arm keeps its pose). When
+    samples come again, it becomes RETURN (the arm moves smoothly back to the others), and then
+    RUN. DIVERGED: a joint was too fast. This mode is final.
 
-    Under the rule `glide` a site is WAITING for its peers before it aligns with them, see
-    `session_life`. There a limit leads to FAULT instead of DIVERGED, and a stop order to
-    STOPPED: the arm comes to rest, as in HOLD, and only another order leads back to WAITING.
+    Under the rule `glide`, explained in `session_life`, there are further modes, and the arm is
+    at rest in all of them. WAITING: not all other arms are heard yet. FAULT: a limit was
+    exceeded; it replaces DIVERGED. STOPPED: the arm was stopped by order.
     """
 
     RUN = 1
@@ -79,9 +77,11 @@ class Mode(IntEnum):
 
 
 class LifeReason(IntEnum):
-    """The reason for which a site under the rule `glide` last changed its mode.
+    """Why a site last changed its mode, or what last happened to it.
 
-    `session_life` explains the changes of mode.
+    A site is the process that runs one arm. The reasons only exist under the rule `glide`, by
+    which an arm waits for the other arms and comes to rest while one of them is silent.
+    `session_life` explains this rule.
     """
 
     START = 0
@@ -107,19 +107,26 @@ class LifeReason(IntEnum):
 
 
 class LifeOrder(IntEnum):
-    """Order to a site under the rule `glide`, see `session_life`.
+    """Order to a site, the process that runs one arm.
 
-    STOP leads to STOPPED, and ENABLE back to WAITING. RESET leads from FAULT to WAITING. The
-    site itself gives the other orders if its arm is outside of the program:
+    Orders only exist under the rule `glide`, which `session_life` explains. Users give these
+    orders:
 
-    - ARM_SILENT and ARM_LOST: the arm sent no measurement for a shorter or a longer time.
-    - ARM_BACK: the arm sends measurements again.
+    - STOP: bring the arm to rest, in the mode STOPPED.
+    - ENABLE: leave the mode STOPPED.
+    - RESET: leave the mode FAULT.
+
+    The site gives the other orders itself. Most of them concern a real arm:
+
+    - ARM_SILENT: the arm has not sent its position for a short time.
+    - ARM_LOST: the arm has not sent its position for a long time.
+    - ARM_BACK: the arm sends its position again.
     - RELEASED: nobody holds the dead-man switch.
     - HELD: somebody holds the dead-man switch again.
-    - OVERRUN: the site missed ticks.
+    - OVERRUN: the site was too slow and missed control periods.
 
-    If several orders come in one tick, the order with the highest number counts. OVERRUN is
-    applied in addition.
+    If several orders come in the same period, the order with the highest number counts. OVERRUN
+    is applied in addition.
     """
 
     ENABLE = 1
@@ -134,16 +141,21 @@ class LifeOrder(IntEnum):
 
 
 class Arrival(NamedTuple):
-    """Sample of a peer, the state that it published in one tick, as it arrived at a site.
+    """Sample that arrived at a site from one of its peers.
+
+    A site is a process that runs one arm, and its peers are the other sites. A sample is the
+    state that a peer sends in each period of its control loop.
 
     Attributes:
-        peer: Index of the peer among the site's links.
-        tick: Stamp of the sample, a tick at the peer's rate.
-        q: The peer's joint angles, rad.
-        qd: The peer's joint velocities, rad/s.
-        latency_us: Measured latency, us; telemetry that enters no formula.
-        tau_x: Exogenous torque of the peer's record, N m, for laws that reflect force.
-        ch: Numbers that the peer's law sent to this site, see `LawChannel.select_for_peer`.
+        peer: Index of the peer.
+        tick: Number of the peer's control period in which it sent the sample.
+        q: Joint angles of the peer, rad.
+        qd: Joint velocities of the peer, rad/s.
+        latency_us: Measured latency of the network, us. It is only recorded, and has no effect.
+        tau_x: External torque of the peer, N m, for control laws that reflect force. The torque
+            ON its arm is the negative.
+        ch: Further numbers that the control law of the peer sent, see
+            `LawChannel.select_for_peer`.
     """
 
     peer: int
@@ -192,13 +204,13 @@ class CoreChange(NamedTuple):
 
 
 class PlantState(NamedTuple):
-    """Measured state of an arm that is outside of the program, for example of a real arm.
+    """Measured state of an arm that the program does not simulate, for example of a real arm.
 
     Attributes:
         q: Joint angles, rad.
         qd: Joint velocities, rad/s.
-        tau_x: Torque of operator and environment, N m, in the sign of the record, which is the
-            negative of the torque ON the arm. Empty if the arm does not measure it.
+        tau_x: Negative of the torque with which operator and environment act ON the arm, N m.
+            Empty if the arm does not measure this torque.
         bodies: Poses of the other bodies of the scene, as in `TickRecord.bodies`.
     """
 
@@ -209,15 +221,17 @@ class PlantState(NamedTuple):
 
 
 class TickInput(NamedTuple):
-    """Input of one call of `Site.step`.
+    """Input of one period of the control loop, for `Site.step`.
 
     Attributes:
-        k: The tick.
-        arrivals: Samples that arrived since the previous tick, in order.
-        commands: Changes that were commanded since the previous tick.
-        measured: Present state of an external arm; None: unchanged.
-        hand: Action of a live hand, an operator who moves the arm during the run, in this tick,
-            see `live_hand.empty_hand_vector`. Empty if nobody holds the arm.
+        k: Number of the period.
+        arrivals: Samples (states of other arms) that arrived since the previous period, in
+            order.
+        commands: Changes of the settings that were ordered since the previous period.
+        measured: Measured state of a real or otherwise external arm. None if there is no new
+            measurement.
+        hand: What a person or program does with the arm in this period, see `live_hand`. Empty
+            if nobody holds the arm.
     """
 
     k: int
@@ -494,11 +508,11 @@ def describe_mode(
 
 
 def describe_divergence(site: str, output: TickRecord) -> str:
-    """Returns the sentence with which a site reports in the log that its run diverged.
+    """Writes the sentence that a log contains if an arm moved faster than its limit.
 
     Args:
-        site: Name of the site.
-        output: Record of the tick in which the arm went beyond its limits.
+        site: Name of the process that runs the arm.
+        output: Record of the control period in which this happened.
     """
     speed = max(abs(v) for v in output.qd)
     t_s = output.t_ns * 1e-9

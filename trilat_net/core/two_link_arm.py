@@ -74,13 +74,14 @@ def theta_from_links(links: ArmLinks) -> Array:
 
 
 def is_positive_definite(theta: Array) -> bool:
-    """Returns True if the inertia matrix M(q) is positive definite in any pose (Property 1).
+    """Returns True if the inertia matrix of the planar arm is positive definite in any pose.
 
-    Otherwise the parameters describe no real arm. The check has a margin. The determinant of M,
-    theta_1 theta_3 - theta_3^2 - theta_2^2 cos^2 q_2, is smallest for the stretched arm.
+    Otherwise the parameters describe no real arm. The determinant of the inertia matrix is
+    smallest for the stretched arm, so only this pose is checked. The check has a margin for
+    rounding.
 
     Args:
-        theta: Parameters of the arm, shape (5,).
+        theta: Dynamic parameters of the arm, shape (5,).
     """
     least_determinant = theta[0] * theta[2] - theta[2] ** 2 - theta[1] ** 2
     margin = 1e-9 * theta[0] * theta[2]
@@ -156,20 +157,21 @@ def regressor(g: float, q: Vector, qd: Vector, v: Vector, a: Vector) -> tuple[Fi
 
 @leaf
 def forward_dynamics(theta: Vector, g: float, q: Vector, qd: Vector, torque: Vector) -> Pair:
-    """Returns the joint accelerations that a torque causes, rad/s^2, Eq. (8).
+    """Computes the joint accelerations of the planar arm that a torque causes.
 
-        qdd = M^-1 (torque - C qd - G)
+        qdd = M(q)^-1 (torque - C(q, qd) qd - G(q))
 
-    M is the inertia matrix, C the Coriolis matrix and G the gravity torque. Cramer's rule is
-    written out. An integration step needs four evaluations, and the sines take most of their
-    time.
+    M is the inertia matrix, C the Coriolis matrix and G the gravity torque.
 
     Args:
-        theta: Parameters of the arm, shape (5,).
+        theta: Dynamic parameters of the arm, shape (5,).
         g: Gravitational acceleration, m/s^2.
         q: Joint angles, rad.
         qd: Joint velocities, rad/s.
-        torque: The whole torque on the joints, tau - tau_x, N m.
+        torque: Total torque of motors, operators and environments on the joints, N m.
+
+    Returns:
+        The accelerations qdd of the two joints, rad/s^2.
     """
     s1, c1 = sincos(q[0])
     s2, c2 = sincos(q[1])

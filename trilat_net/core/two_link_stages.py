@@ -23,14 +23,15 @@ _ADAPTIVE = int(Law.ADAPTIVE)
 
 @leaf
 def update_errors(s: Row) -> None:
-    """Computes the errors of the planar arm, and the products that its control law needs.
+    """Computes the tracking errors of the planar arm, and the regressor of its dynamics.
 
-    These are the errors e and ed, the filtered error r, the regressor Y of Eq. (12), which
-    gives a torque if it is multiplied by parameters of the arm, and Y' r. All are written into
-    the row.
+    The results are the errors e of the position and ed of the velocity, the filtered error r,
+    the regressor Y, and the product Y' r. The regressor is the matrix whose product with the
+    dynamic parameters of the arm is a torque. Y' r drives the estimate of these parameters.
 
     Args:
-        s: Row of the site, with q, qd and the reference; written.
+        s: State of the site (the process that runs the arm), with q, qd and the reference; the
+            results are written into it.
     """
     q = pair(s.q)
     qd = pair(s.qd)
@@ -49,12 +50,15 @@ def update_errors(s: Row) -> None:
 
 @leaf
 def advance_estimate(s: Row, gain_s: float, Yr: Vector) -> None:
-    """Advances the estimate of the arm's parameters by a step of Eq. (15), within its box.
+    """Integrates the adaptive law's estimate of the dynamic parameters over a time step.
+
+    The result is limited to lower and upper bounds.
 
     Args:
-        s: Row of the site, with its settings and its state.
+        s: State of the site (the process that runs the arm), with the estimate, its gains and
+            its bounds; the estimate is changed.
         gain_s: Duration of the step, s.
-        Yr: Y' r, shape (5,).
+        Yr: Product Y' r of the regressor Y and the filtered error r, shape (5,).
     """
     estimate = control.update_estimate(s.theta_hat, gain_s, s.Gamma, Yr)
     put(s.theta_hat, control.project_estimate(estimate, s.low, s.high))
@@ -62,13 +66,14 @@ def advance_estimate(s: Row, gain_s: float, Yr: Vector) -> None:
 
 @leaf
 def update_torque(s: Row) -> None:
-    """Computes the torque of the site's control law, within its limits.
+    """Computes the motor torque of a built-in control law, limited to the range of the motors.
 
-    The law is the adaptive law, Eq. (13), with its robust term, or a law of known gravity
-    (`control.damped_torque`).
+    The law is either the adaptive law or a law that compensates a known gravity torque
+    (`control.damped_torque`). The adaptive law includes its robust term, a bounded torque
+    against disturbances.
 
     Args:
-        s: Row of the site, in which the torque is written.
+        s: State of the site (the process that runs the arm); the torque is written into it.
     """
     if s.law == _ADAPTIVE:
         Y = (five(s.Y[0]), five(s.Y[1]))
@@ -101,11 +106,12 @@ def update_torque(s: Row) -> None:
 
 @leaf
 def put_gravity_torque(s: Row, torque: Array) -> None:
-    """Computes the gravity torque G(q) of the true parameters of the arm.
+    """Computes the gravity torque of the planar arm with its true dynamic parameters.
 
     Args:
-        s: Row of the site, with its settings and its state.
-        torque: Written: the torque, shape (2,), N m.
+        s: State of the site (the process that runs the arm), with the joint angles and
+            parameters.
+        torque: Receives the gravity torque, shape (2,), N m.
     """
     put_gravity(s, s.theta, torque)
 
@@ -157,16 +163,19 @@ def put_source_torque(
     sampled: int,
     torque: Array,
 ) -> None:
-    """Computes the torque of operators and environments ON the arm, the held part or the rest.
+    """Computes the torque with which some of the operators and environments act on the planar arm.
+
+    A sampled operator or environment is evaluated once per period of the control loop, and its
+    torque is constant until the next period. All others act continuously.
 
     Args:
-        t_s: Time since the epoch, the common start of the session, s.
-        s: Row of the site, with its settings and its state.
-        state: q and qd of the arm, shape (4,).
-        actors: Rows of operators and environments.
-        table: Their numbers, for example recorded torques.
-        sampled: 1: only those whose torque is held over a tick; 0: only the others.
-        torque: Written: the torque, shape (2,), N m.
+        t_s: Time since the start of the session, s.
+        s: Settings of the site (the process that runs the arm).
+        state: Two joint angles in rad, followed by two joint velocities in rad/s.
+        actors: Operators and environments, one row for each.
+        table: Numbers of all operators and environments, for example recorded torques.
+        sampled: 1 for the torque of the sampled operators and environments, 0 for all others.
+        torque: Receives the torque on the arm, shape (2,), N m.
     """
     q = (state[0], state[1])
     qd = (state[2], state[3])
@@ -186,16 +195,16 @@ def put_source_torque(
 def update_external_torque(
     t_s: float, s: Row, actors: TorqueSourceRows, table: TorqueTable
 ) -> None:
-    """Computes the torque that operators and environments exert in a tick.
+    """Computes the torque that operators and environments exert on the planar arm now.
 
-    The whole torque, the part of it that is held over the tick, and the force of the walls are
-    written into the row of the site.
+    The state of the site receives the whole torque, the part that stays constant until the next
+    period of the control loop, and the largest force of a wall.
 
     Args:
-        t_s: Time since the epoch, the common start of the session, s.
-        s: Row of the site; written.
-        actors: Rows of operators and environments.
-        table: Their numbers, for example recorded torques.
+        t_s: Time since the start of the session, s.
+        s: State of the site (the process that runs the arm); written.
+        actors: Operators and environments, one row for each.
+        table: Numbers of all operators and environments, for example recorded torques.
     """
     q = pair(s.q)
     qd = pair(s.qd)
@@ -267,19 +276,26 @@ def rk4_step(
     actors: TorqueSourceRows,
     table: TorqueTable,
 ) -> tuple[Pair, Pair]:
-    """Returns q and qd one period later, Eq. (8), by the classical Runge-Kutta method.
+    """Simulates the motion of the planar arm over one period of the control loop.
+
+    The method is the classical Runge-Kutta method of fourth order. Operators and environments
+    act continuously, except for those that are marked as sampled.
 
     Args:
-        t_s: Time at the beginning of the period, s since the epoch.
+        t_s: Time at the beginning of the period, in s since the start of the session.
         h_s: The period, s.
         q: Joint angles at the beginning, rad.
         qd: Joint velocities at the beginning, rad/s.
-        u: Torque that is held over the period (control and sampled actors), shape (2,), N m.
-        theta: The arm's parameters, shape (5,).
+        u: Torque that is constant over the period, shape (2,), N m: the torque of the motors,
+            and of sampled operators and environments.
+        theta: Dynamic parameters of the arm, shape (5,).
         g: Gravitational acceleration, m/s^2.
         lengths: Lengths of the two links, m.
-        actors: Operators and environments.
-        table: Their recorded torques.
+        actors: Operators and environments, one row for each.
+        table: Numbers of all operators and environments, for example recorded torques.
+
+    Returns:
+        Joint angles and joint velocities at the end of the period.
     """
     half = 0.5 * h_s
     sixth = h_s / 6.0

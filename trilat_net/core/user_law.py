@@ -65,7 +65,15 @@ def _make_operator(operate: Callable[[Any, Any], Any]) -> Any:
     """
 
     def compute(numbers: "LawVector", other: Any) -> Any:
-        """Applies the operation to each number, and to the other operand's number."""
+        """Applies an arithmetic operation to two vectors, or to a vector and a number.
+
+        Args:
+            numbers: The first vector.
+            other: A vector with as many numbers, or a single number.
+
+        Returns:
+            The resulting vector. NotImplemented if `other` is of another type.
+        """
         if isinstance(other, Real):
             return LawVector([operate(number, other) for number in numbers])
         if not isinstance(other, list | tuple):
@@ -185,25 +193,33 @@ class LawInput(NamedTuple):
 
 
 class UserLaw(Protocol):
-    """A user's control law.
+    """Interface of a control law that a user writes in Python.
 
-    Its class is called with `LawContext` and with the keys of its `[control]` table by name.
+    The class of the law is called with a `LawContext`, which describes the arm, and with the
+    gains of the law as keyword arguments. The method `torque` is called in each period of the
+    control loop.
 
-    The memory of a law contains all that `torque` needs of earlier ticks: the attributes that
-    the class names in `remembers`, or the numbers that a method `memory()` returns and from
-    which `recall(memory)` restores the law. The record contains an optional attribute
-    `theta_hat`, a number per parameter. `holds = True` marks a law that depends on its peers
-    through the reference alone, so that its torque remains right while the reference is held.
+    Optional attributes and methods:
+
+    - If `torque` needs numbers from earlier periods, the law must declare them, so that a run
+      can be repeated. Either the class lists the names of these attributes in `remembers`, or a
+      method `memory()` returns the numbers and a method `recall(memory)` restores them.
+    - An attribute `theta_hat` with a number per dynamic parameter is stored in the records.
+    - `holds = True` states that the law knows the other arms only through the reference, the
+      position that its arm follows. Its torque is then also used while the arm is at rest.
     """
 
     def torque(self, now: LawInput) -> Sequence[float] | None:
-        """Computes the torque of each joint in one tick, N m, which is limited afterwards.
+        """Computes the motor torque of each joint in a period of the control loop.
+
+        The program limits the torque to the range of the motors afterwards.
 
         Args:
-            now: State of the arm and its peers, and the places for the results.
+            now: State of the arm and of the other arms. The law may also write results into it,
+                for example numbers for other arms.
 
         Returns:
-            The torque. None if the law wrote it to `now.tau` instead.
+            The torques, N m. None if the law has written them into `now.tau`.
         """
 
 
@@ -359,10 +375,10 @@ def read_memory(law: Any) -> list[float]:
 
 
 def write_memory(law: Any, memory: Sequence[float]) -> None:
-    """Restores the numbers that a law keeps from tick to tick.
+    """Gives a control law the numbers that it remembered from earlier control periods.
 
-    They are passed to the law's method `recall` if it has one, otherwise written into the
-    attributes that its class lists in `remembers`.
+    If the law has a method `recall`, the numbers are passed to this method. Otherwise they are
+    written into the attributes that the class of the law lists in `remembers`.
 
     Args:
         law: The law, which is changed.
@@ -377,12 +393,12 @@ def write_memory(law: Any, memory: Sequence[float]) -> None:
 
 
 def restore_law(law: UserLaw, site: str, memory: Sequence[float]) -> None:
-    """Restores a law to its state after a tick, from the record of that tick.
+    """Restores the state that a control law had after a recorded control period.
 
     Args:
         law: The law, which is changed.
-        site: Name of the site, for the error.
-        memory: Numbers of the law's memory in the record.
+        site: Name of the process that runs the arm, for the text of the exception.
+        memory: Numbers that the law remembered, from the record of the period.
 
     Raises:
         LawFailed: The law raised an exception.

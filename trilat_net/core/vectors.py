@@ -1,12 +1,14 @@
-"""Defines the types of the core's numbers: arrays, rows of arrays, and vectors as tuples.
+"""Defines the types of vectors and arrays that compiled functions use.
 
-The functions of the core that are compiled are called leaves.
+A compiled function must not allocate memory for its results, because this takes longer than the
+computation. Therefore short vectors are tuples of numbers, which stay in the registers of the
+processor.
 
 Invariant:
-
-- A leaf reads vectors by index, so that a vector may be a tuple or a row of an array.
-- A leaf returns vectors as tuples, because these stay in registers while a tick (period of the
-  control loop) is computed. The function `put` writes a result into an array.
+    - A compiled function reads a vector only by index. Therefore its argument may be a tuple or
+      an array.
+    - A compiled function returns a vector as a tuple. The function `put` copies a tuple into an
+      array.
 """
 
 from collections.abc import Sequence
