@@ -1,4 +1,4 @@
-"""Computes what the network does to each sample of a link: when it arrives, or that it is lost.
+"""Computes when a simulated network delivers each sample, or that it loses the sample.
 
 A link is the directed connection between two sites, the processes that run one arm each. A
 sample is the state that a site sends in one tick (period of its control loop), and its stamp is

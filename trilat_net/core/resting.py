@@ -105,12 +105,12 @@ def is_fast(site: SiteRow) -> bool:
 def rests_by_law(site: SiteRow) -> bool:
     """Returns True if the control law can hold the arm at rest.
 
-    Otherwise the known or estimated gravity torque holds the arm. This is the case in any of
-    these situations:
+    Otherwise the known or estimated gravity torque holds the arm, and the estimate of the
+    dynamic parameters is not updated. This is the case in any of these situations:
 
     - The law was written by a user, and does not declare with `holds = True` that it works
       without the motion of other arms.
-    - The law works in task space, and does not know the gravity torque.
+    - The law works in task space, and is not the built-in law that knows the gravity torque.
     - The law computed a number that is not finite.
     - The arm is too fast, see `is_fast`.
     """
@@ -188,7 +188,7 @@ def _find_remaining_s(elapsed_s: float, site: SiteRow) -> float:
 
 @leaf
 def advance_rest_reference(t_ns: int, ticks: int, site: SiteRow) -> None:
-    """Slows down the reference that brings the joints to rest, and moves it to the present period.
+    """Slows down the reference that brings the joints to rest, by one or more periods.
 
     The rules are at the top of this module.
 
@@ -247,11 +247,11 @@ def _brakes(t_ns: int, site: SiteRow) -> bool:
 
 @leaf
 def put_rest_reference(site: SiteRow, q: Array, qd: Array) -> None:
-    """Computes the reference of an arm that comes to rest, in the coordinates of its control law.
+    """Computes the reference of an arm at rest, in the coordinates of its control law.
 
     In joint space, it is the motion that brings the joints to rest. In task space, the
     coordinates describe the pose of the end effector. Their reference is then the present pose
-    and its velocity, because the joints are brought to rest one by one.
+    and its velocity, because the joints have a reference of their own that brings them to rest.
 
     Args:
         site: State of the site (the process that runs the arm).
@@ -287,12 +287,12 @@ def _shrink(torque: float, change: float) -> float:
 
 @leaf
 def add_rest_torque(k: int, t_ns: int, site: SiteRow) -> None:
-    """Adds damping and a constant load to the torque `tau` of an arm at rest, and limits the sum.
+    """Adds damping and an integral term to the torque of an arm at rest, and limits the sum.
 
-    The added torque is w - B s. B is the damping in N m s/rad, and s the filtered deviation of
-    a joint from its reference in rad/s. The torque w carries a constant load. At the start of
-    the rest, it is the part of the previous torque that the control law does not explain. The
-    sum before the limit is stored in `u`.
+    The sum w - B s is added to the torque `tau`. B is the damping in N m s/rad, and s the
+    filtered deviation of a joint from its reference in rad/s. The integral term w carries a
+    constant load. At the start of the rest, it is the part of the previous torque that the
+    control law does not explain. The torque before the limit is stored in `u`.
 
     Args:
         k: Number of the control period.

@@ -1,4 +1,4 @@
-"""Computes with rotations as vectors (axis times angle, rad), with equal bits on any machine.
+"""Computes with rotation vectors (axis times angle, rad), with equal bits on any machine.
 
 The angular velocity of a changing rotation vector u is J(u) u', where J is the left Jacobian of
 the rotation group (J. Sola, J. Deray and D. Atchuthan, "A micro Lie theory for state estimation

@@ -364,7 +364,7 @@ class ProgressRow(Protocol):
 
 
 class SumsRow(Protocol):
-    """Sums over the records of a simulated arm, from which the metrics of the run are computed.
+    """Sums over the records of a simulated arm, from which metrics are computed.
 
     A record contains the results of one period of the control loop.
     """

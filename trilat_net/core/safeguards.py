@@ -1,4 +1,4 @@
-"""Limits the speed of a site's reference, and blends its torque from rest to the control law.
+"""Limits the speed of a site's reference, and blends its torque after a rest.
 
 A site is a process that runs one arm. The reference is the position that its control law aims
 at. When an arm leaves its rest, the torque changes gradually from the torque that holds the arm

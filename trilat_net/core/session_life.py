@@ -1,12 +1,14 @@
-"""Decides when an arm waits, follows the other arms, comes to rest, or stops after a fault.
+"""Decides when an arm waits, follows other arms, comes to rest, or stops after a fault.
 
 A site is a process that runs one arm, and its peers are the other sites, whose states it
 receives. The rules of this module are called `glide`. They let an arm start and stop smoothly
 when its peers appear or fall silent. A site has one of these modes:
 
-- WAITING: The arm is at rest, until all peers are heard. Then the mode becomes RETURN.
+- WAITING: The arm is at rest, until all peers that it follows are heard. Then the mode becomes
+  RETURN.
 - RETURN: The arm moves smoothly to the peers. After that, the mode becomes RUN.
-- RUN: The arm follows the peers. If a peer falls silent, the mode becomes HOLD.
+- RUN: The arm follows the peers. If a peer that it follows falls silent, the mode becomes
+  HOLD.
 - HOLD: The arm comes to rest. If all peers are heard again, the mode becomes RETURN.
 - FAULT: A limit was exceeded, a number was not finite, or the arm was lost. The arm comes to
   rest. Only the order RESET leads back to WAITING.
@@ -204,7 +206,7 @@ def _extrapolate_reference(site: SiteRow) -> None:
 
 @leaf
 def is_law_returning(t_ns: int, site: SiteRow) -> bool:
-    """Returns True while the arm changes over from the torque at rest to that of its control law.
+    """Returns True while the torque blends from the torque at rest to that of the control law.
 
     The change starts when the arm begins to move from rest towards the other arms, and takes
     `RETURN_NS`. An arm that aligns with the remaining arms after one was lost, or after a lost
@@ -340,7 +342,7 @@ def _update_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
 
 @leaf
 def update_session_life(t_ns: int, site: SiteRow, links: RowArray) -> None:
-    """Changes the mode of a site by the rules of this module, and computes the reference of its arm.
+    """Changes the mode of a site by the rules of this module, and computes its reference.
 
     A site is the process that runs the arm, and the reference is the position that the arm
     follows. Before the call, `q_des` and `qd_des` contain the weighted mean of the other arms'

@@ -149,7 +149,7 @@ def build_site_arrays(
     *,
     plugged: bool = False,
 ) -> SiteArrays:
-    """Creates the arrays of a site, the process that runs one arm, before its first control period.
+    """Creates the arrays of a site (the process of one arm) before its first control period.
 
     Args:
         setup: Setup of the site.
@@ -270,7 +270,7 @@ def widen_calendars(arrays: SiteArrays, k: int, pages: int) -> SiteArrays:
 
 
 class CalendarSizer:
-    """Enlarges the ring buffers in which samples wait, when a sample arrives that does not fit.
+    """Enlarges the ring buffers of delayed samples when a sample arrives that does not fit.
 
     A sample is the state of a peer, the process of another arm. It waits until its simulated
     delay has passed. A buffer is too short if the delays have become longer, or if the clock of
@@ -303,7 +303,7 @@ class CalendarSizer:
         self.newest = [-1] * len(self.newest)
 
     def add_model(self, peer: int, model: LinkModel) -> None:
-        """Notes that the delay model of a link will change, so that longer delays get enough room.
+        """Notes that the delays of a link will change, so that longer delays get room.
 
         Args:
             peer: Index of the sender at the other end of the link.

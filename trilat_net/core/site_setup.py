@@ -294,7 +294,7 @@ class Layout(NamedTuple):
         return lengths
 
     def columns(self) -> dict[str, slice]:
-        """Finds each vector of a record among the floating-point values that a control period computes.
+        """Finds each vector of a record among the values that a control period computes.
 
         Returns:
             A slice for each vector, by name. Vectors that are inputs of the period are left
@@ -310,7 +310,7 @@ class Layout(NamedTuple):
         }
 
     def count_life_memory(self, peers: int, *, degrades: bool = False) -> int:
-        """Counts the values that a site under the rule `glide` stores in the field `mem` of a record.
+        """Counts the values that the rule `glide` stores in the field `mem` of a record.
 
         A site is the process that runs one arm. By the rule `glide`, its arm comes to rest
         while another site is silent, see `session_life`. The values are the state of this rule,
@@ -325,10 +325,11 @@ class Layout(NamedTuple):
         return end + peers * degrades
 
     def rest_columns(self, peers: int) -> slice:
-        """Finds the values of the reference that brings the joints to rest, in a record's field `mem`.
+        """Finds the reference that brings the joints to rest, in the field `mem` of a record.
 
-        Only a site (the process of an arm) in task space has these values: the positions and
-        then the velocities of the joints. In joint space, the reference is stored elsewhere.
+        Only a site (the process of an arm) in task space stores the reference there: the
+        positions and then the velocities of the joints. In joint space, the reference is stored
+        elsewhere.
 
         Args:
             peers: Number of the other sites from which this site receives data.

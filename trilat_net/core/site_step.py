@@ -337,7 +337,7 @@ class Site:
 
     @property
     def mode(self) -> Mode:
-        """Mode of the site after the last tick, for example RUN while the arm follows other arms."""
+        """Mode of the site after the last tick, for example RUN while it follows others."""
         return _MODES[self._mode.item()]
 
     @property
@@ -440,7 +440,7 @@ class Site:
         return None if release == LOST else release
 
     def is_measured(self, peer: int) -> bool:
-        """Returns True if no delay is simulated on a link, so that only the real network delays samples.
+        """Returns True if the real network alone delays the samples of a link.
 
         Args:
             peer: Index of the sender at the other end of the link.
@@ -524,7 +524,7 @@ class Site:
     def restore_links(
         self, k: int, in_use: Sequence[Arrival | None], waiting: Sequence[Arrival]
     ) -> None:
-        """Restores the state of the network links, so that a recorded run can continue at tick k.
+        """Restores the state of the network links, to continue a recorded run at tick k.
 
         A site is a process that runs one arm, its peers are the other sites, and a tick is one
         period of the control loop. A peer sends a sample, its state, in each tick. The state of

@@ -6,8 +6,8 @@ the stored result. This module also defines the modes in which a site can be.
 
 Invariant (laws L1 and L3 of docs/design.md):
     - The nominal time of tick k is `k * 10^9 // rate_hz` nanoseconds after the start of the
-      session, where `rate_hz` is the rate of the loop. The integer division is exact for each
-      k, so that no drift builds up.
+      session, where `rate_hz` is the rate of the loop. It is computed from k anew in each tick,
+      so that rounding errors do not add up.
     - The record of a tick contains all inputs of the tick.
 """
 

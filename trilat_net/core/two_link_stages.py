@@ -163,7 +163,7 @@ def put_source_torque(
     sampled: int,
     torque: Array,
 ) -> None:
-    """Computes the torque with which some of the operators and environments act on the planar arm.
+    """Computes the torque with which some operators and environments act on the planar arm.
 
     A sampled operator or environment is evaluated once per period of the control loop, and its
     torque is constant until the next period. All others act continuously.

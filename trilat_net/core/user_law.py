@@ -196,8 +196,8 @@ class UserLaw(Protocol):
     """Interface of a control law that a user writes in Python.
 
     The class of the law is called with a `LawContext`, which describes the arm, and with the
-    gains of the law as keyword arguments. The method `torque` is called in each period of the
-    control loop.
+    entries of the table `[control]` of the scenario as keyword arguments. The method `torque`
+    is called in each period of the control loop.
 
     Optional attributes and methods:
 
