@@ -3,19 +3,22 @@
 The process that runs one arm is called a site, and one period of its control loop a tick. A
 tick has eight stages, in this order:
 
-1. accept: store the samples (states) that arrived from other sites. 2. release: take the newest
-sample of each site whose simulated delay has passed. 3. reference: compute the position that
-the arm shall follow. 4. errors: compute the tracking errors. 5. estimate: update the estimate
-of the arm's dynamic parameters. 6. torque: compute the torque of the control law. 7. emit:
-write the record, which contains the results of the tick. 8. advance: simulate the arm until the
-next tick.
+- 1 accept: store the samples (states) that arrived from other sites.
+- 2 release: take the newest sample of each site whose simulated delay has passed.
+- 3 reference: compute the position that the arm shall follow.
+- 4 errors: compute the tracking errors.
+- 5 estimate: update the estimate of the arm's dynamic parameters.
+- 6 torque: compute the torque of the control law.
+- 7 emit: write the record, which contains the results of the tick.
+- 8 advance: simulate the arm until the next tick.
 
 The state of a site is a row of numbers, `SiteRow`, which the stages read and write. For an arm
 that is a chain of joints, `chain` contains the data of its joints. For the planar two-link arm
 it is None.
 
 Invariant:
-    - Live sites and simulations of several sites call the same functions for the stages.
+    - Live sites and the fused run, a simulation of all sites in one compiled loop, call the
+      same functions for the stages.
     - Stage 8 integrates with the classical Runge-Kutta method of fourth order. The torque of
       the motors is constant during the tick. The torques of operators and environments are
       computed anew in each of the four evaluations, unless they are marked as sampled.
