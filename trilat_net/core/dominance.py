@@ -305,8 +305,9 @@ def update_stale_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
 
     A site is the process that runs one arm, and the reference is the position that its arm
     follows. A peer, a site that it follows, is silent if its last sample is too old. In mode
-    HOLD the reference stays where it was, and in BRAKE it is the present pose of the arm. In
-    RETURN the reference moves smoothly back to the position q_des that the peers ask for:
+    HOLD the reference stays where it was. In BRAKE it is the pose that the arm had when the
+    peer fell silent. In RETURN the reference moves smoothly back to the position q_des that the
+    peers ask for:
 
         reference = q_held + s (q_des - q_held),    s = 3 x^2 - 2 x^3
 

@@ -13,9 +13,9 @@ The control law needs a reference velocity v of the joints and its derivative a:
     a = dpsi/dt + d(J' y)/dt      J J' dy/dt = -Lambda de/dt - Jd psi - J dpsi/dt
                                                - (Jd J' + J Jd') y
 
-Here psi = -k (q - q_posture) pulls the joints to a preferred posture with the rate k, as far as
-this does not move the end effector. The second equation defines y. With the filtered error r =
-qd - v it follows that J r = dx/dt + Lambda e if the desired pose is at rest.
+Here psi = -k (q - q_posture) pulls the joints to a preferred posture with the rate k, in 1/s,
+as far as this does not move the end effector. The second equation defines y. For the filtered
+error r = qd - v it follows that J r = dx/dt + Lambda e.
 
 Near singular poses, J J' is damped. The damping is zero while 1 / trace((J J')^-1) is above the
 square of `singular_value`. This number is a lower bound of the square of the least singular

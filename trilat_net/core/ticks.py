@@ -59,7 +59,7 @@ class Mode(IntEnum):
     RUN: the arm follows the other arms. If no samples (states) come from one of them, the mode
     becomes HOLD (the arm keeps its last reference) or BRAKE (the arm keeps its pose). When
     samples come again, it becomes RETURN (the arm moves smoothly back to the others), and then
-    RUN. DIVERGED: a joint was too fast. This mode is final.
+    RUN. DIVERGED: a joint was too fast, or a number was not finite. This mode is final.
 
     Under the rule `glide`, explained in `session_life`, there are further modes, and the arm is
     at rest in all of them. WAITING: not all other arms are heard yet. FAULT: a limit was
