@@ -97,9 +97,9 @@ class ReplayedInputs(NamedTuple):
     (states) it receives. A tick is one period of the control loop of a site.
 
     Attributes:
-        first: Index into `samples` of the first arrival, by site, peer and tick. For K ticks the
-            shape is (N, P, K + 1). If K is 0, each sample arrives at the first tick after it was
-            sent.
+        first: Index into `samples` of the first arrival, by site, peer and tick. For K ticks
+            the shape is (N, P, K + 1). If K is 0, each sample arrives at the first tick after
+            it was sent.
         samples: The ticks in which the peers sent the samples, in the order of arrival.
         hands: What the person or program that moves the arm does, by site and tick. The shape
             is (N, K, 1 + 2 m). The numbers are the firmness of the grip from 0 to 1, the m

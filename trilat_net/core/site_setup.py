@@ -70,9 +70,9 @@ class StaleAction(IntEnum):
     A site is a process that runs one arm, and a peer is another site that it follows.
 
     USE follows the last known state of the peer. HOLD keeps the last reference, the position
-    that the arm follows. BRAKE keeps the present pose of the arm. GLIDE brings the arm smoothly
-    to rest. With GLIDE, the arm also waits at the start until all peers are heard, see
-    `session_life`.
+    that the arm follows. BRAKE keeps the pose that the arm had when the peer fell silent.
+    GLIDE brings the arm smoothly to rest. With GLIDE, the arm also waits at the start until all
+    peers are heard, see `session_life`.
     """
 
     USE = 0
