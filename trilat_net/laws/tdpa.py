@@ -1,27 +1,26 @@
-"""Couples sites by time-domain passivity control (TDPA).
+"""Couples arms by time-domain passivity control (TDPA): delays cannot create energy.
 
-Each end of a coupling observes the energy that has passed through it. If an end would take out
-more energy than it knows the other end to have put in, its controller reduces the torque or
-the velocity. Delays and lost messages therefore cannot create energy.
+A coupling connects two arms, a leader and a follower. Each end of a coupling keeps an account
+of the energy that went in and out. If an end is about to take out more energy than the other
+end has reported as put in, its controller reduces the torque or the velocity.
 
-A follower is moved by the force F of a spring K and a damper B towards a moving goal,
+A follower is pulled to a moving goal by a spring K and a damper B with the torque F:
 
-    F = K (goal - q) + B (v - qd),    goal' = v,    v = sum_j alpha_j v_j
+    F = K (goal - q) + B (v - qd)
+    rate of goal = v = sum_j alpha_j v_j
 
-where q and qd are the position and velocity of the follower, v_j are the velocities of its
-peers and alpha_j its dominance factors, the weights with which it follows them. Peer j is the
-leader in this coupling and feels -alpha_j F. If all sites follow, there is one coupling in each
-direction between two sites. While a site waits, aligns or holds, the difference between its
-reference and its peers is added to the goal without an energy cost.
+q and qd are position and velocity of the follower, v_j the velocity of leader j and alpha_j the
+weight with which the follower follows it. Leader j feels -alpha_j F. Two arms that follow each
+other have two couplings. While an arm waits or is being aligned with its leaders, the goal is
+shifted, which costs no energy.
 
-In the names below, E is a sum of energy that an end has put in or taken out, and W is an energy
-that an end observes. Names with "led" belong to the leader's end of a coupling, and names with
-"followed" to the follower's end. Accounts of energy are kept "by step", from the motion of the
-arm, or "by velocity", as in the publication (`Tdpa.energy`).
+Names: E is a sum of energy that an end has put in or taken out, and W the energy that an end
+may still use. "led" stands for the leader's end and "followed" for the follower's end. The work
+in a control period is the torque times the motion of the joint (`energy` = "step") or times its
+velocity and the period ("velocity", as in the publication of Ryu and others).
 
 Invariant:
-    - In each directed coupling of a follower to a leader, each end accounts cumulatively, per
-      joint, for the energy that it puts in.
+    - In each coupling and at each joint, each end adds up the energy that it puts in.
     - The other end takes no more energy out than it knows to have been put in.
 """
 
@@ -53,18 +52,21 @@ _SLACK_NM = 1e-9
 
 @compiled
 def book_leader_work(now: LawInput, j: int, i: int, torque: float, step: float) -> float:
-    """Books the energy that a leader's arm puts into a coupling in one period.
+    """Adds the work of a leader's arm in one period to the energy account of a coupling.
+
+    A coupling connects the leader to an arm that follows it. If the work is positive, the arm
+    puts energy into the coupling, and the sum E_led that is sent to the follower grows. If it
+    is negative, the arm takes energy out.
 
     Args:
-        now: Inputs and outputs of the law in this tick. Its sum E_led of peer j is increased by
-            positive work.
-        j: Index of the peer that follows.
+        now: Inputs and outputs of the law in this control period.
+        j: Index of the peer (the other arm) that follows.
         i: Index of the joint.
         torque: Torque of the coupling, N m.
         step: Motion of the joint, rad.
 
     Returns:
-        The energy that the arm takes out of the coupling, J, zero or negative.
+        The work if the arm takes energy out, J, which is negative. Otherwise 0.
     """
     work = torque * step
     now.sent[j].E_led[i] += max(work, 0.0)
@@ -74,16 +76,17 @@ def book_leader_work(now: LawInput, j: int, i: int, torque: float, step: float) 
 
 @compiled
 def observe_leader(law: Any, now: LawInput, j: int, i: int) -> None:
-    """Updates the energy that is known at the leader's end of its coupling to a follower.
+    """Updates how much energy the leader's arm may still take out of a coupling.
 
-    This energy, W_led, may be spent by the leader's arm. It grows by the part of the follower's
-    reported sum E_followed that has arrived since the previous tick. If work is computed by
-    step, the work of the arm in the previous period is added.
+    A coupling connects the leader to an arm that follows it. The energy grows by the amount
+    that the follower has reported since the previous control period. If work is computed from
+    the motion of the arm (`energy` = "step"), the work of the arm in the previous period is
+    included as well.
 
     Args:
-        law: The law; its account W_led is changed.
-        now: Inputs and outputs of the law in this tick.
-        j: Index of the peer that follows.
+        law: The law; the energy known so far and the last report of the follower are changed.
+        now: Inputs and outputs of the law in this period; the energy is written as W_led.
+        j: Index of the peer (the other arm) that follows.
         i: Index of the joint.
     """
     index = j * now.joints + i
@@ -204,16 +207,18 @@ def limit_leader_torque(law: Any, now: LawInput, j: int, i: int) -> None:
 
 @compiled
 def find_known_energy(law: Any, now: LawInput, j: int, i: int) -> float:
-    """Returns the energy that the follower's end of a coupling may still take out, J.
+    """Returns the energy that may still be used to move the follower in one coupling, J.
 
-    This is the energy that the leader has put in, less the energy that moved the follower, plus
-    the energy that the controller gave up. Half of the reserve is kept for steps that cost more
-    than planned.
+    A coupling connects a leader to this arm, its follower. The known energy is the sum of three
+    parts: the energy that the leader is known to have put in, minus the energy that moved the
+    follower, plus the energy that was saved when the controller reduced the velocity. Half of
+    the initial reserve is added. The other half is kept for periods that cost more than
+    predicted.
 
     Args:
         law: The law, with its energy accounts.
-        now: Inputs and outputs of the law in this tick.
-        j: Index of the peer that is followed.
+        now: Inputs and outputs of the law in this control period.
+        j: Index of the peer (the other arm) that is followed.
         i: Index of the joint.
     """
     index = j * now.joints + i
@@ -228,21 +233,23 @@ def find_known_energy(law: Any, now: LawInput, j: int, i: int) -> float:
 def limit_follower_velocity(
     law: Any, now: LawInput, j: int, i: int, force: float, price: float
 ) -> float:
-    """Limits the velocity by which peer j is followed to what the known energy pays.
+    """Reduces the velocity of a followed peer if the known energy does not cover its work.
 
-    The velocity of the peer is reduced if the energy that the leader put in does not suffice.
-    The result is written into `law.v_led`.
+    The peer is another arm, the leader of this coupling. The reduced velocity is stored as
+    `law.v_led`; later it moves the goal to which the spring pulls this arm.
 
     Args:
-        law: The law, whose velocity v_led of the coupling is written.
-        now: Inputs and outputs of the law in this tick.
+        law: The law; the velocity of the coupling is written.
+        now: Inputs and outputs of the law in this control period.
         j: Index of the peer that is followed.
         i: Index of the joint.
-        force: Part of the following force that belongs to the peer, N m.
-        price: Expected cost of the period beyond the work of the peer's velocity, J.
+        force: Part of the torque of spring and damper that belongs to this peer, N m.
+        price: Energy that this period is expected to need besides the force times the motion of
+            the peer, J.
 
     Returns:
-        The energy that remains, J; negative if the peer's velocity costs more than is known.
+        The known energy that remains, J. It is negative if the unreduced velocity of the peer
+        costs more than is known.
     """
     index = j * now.joints + i
     h = now.h_s
@@ -303,16 +310,18 @@ def compute_drift_velocity(
 
 @compiled
 def find_affordable_velocity(law: Any, now: LawInput, j: int, i: int, force: float) -> float:
-    """Returns the velocity with which peer j moves the goal of a joint, rad/s.
+    """Returns the largest velocity of a followed peer that the known energy covers, rad/s.
 
-    It is the velocity of the peer, reduced to what the known energy of the coupling pays for.
+    The peer is another arm. Its velocity moves the goal to which a spring pulls this arm, and
+    the torque of the spring does work. The velocity is reduced if this work would exceed the
+    energy that the peer is known to have put in.
 
     Args:
         law: The law, with its energy accounts.
-        now: Inputs and outputs of the law in this tick.
+        now: Inputs and outputs of the law in this control period.
         j: Index of the peer that is followed.
         i: Index of the joint.
-        force: The following force of the joint, N m.
+        force: Torque of spring and damper at the joint, N m.
     """
     index = j * now.joints + i
     # The work of the force per velocity of the goal in a period.
@@ -359,17 +368,21 @@ def book_follower(law: Any, now: LawInput, j: int, i: int, force: float, drift: 
 
 @compiled
 def charge_unpaid_energy(law: Any, now: LawInput, i: int, spring: float) -> None:
-    """Charges the couplings for energy of the previous period that they have not paid.
+    """Subtracts energy that the follower used in the last period from the couplings' accounts.
 
-    This is the energy that the spring and the arm received beyond what the couplings paid for
-    in advance. Energy that the damper takes in other periods repays the charge, up to its
-    amount.
+    Before a control period, each coupling (the connection to an arm that is followed) pays for
+    the predicted work. The true work is known only afterwards. If the arm and its spring
+    received more energy than was paid, this function subtracts the difference from the accounts
+    of the couplings. If they received less, it pays earlier differences back, but no more than
+    these.
+
+    Nothing is subtracted in the published form of the law, which computes work by velocity.
 
     Args:
-        law: The law; its accounts are changed.
-        now: Inputs and outputs of the law in this tick.
+        law: The law; its energy accounts are changed.
+        now: Inputs and outputs of the law in this period.
         i: Index of the joint.
-        spring: Energy of the joint's spring now, J.
+        spring: Energy in the joint's spring now, J.
     """
     arm_step = now.q[i] - now.q_before[i] - law.alignment_step[i]
     arm_work = law.force[i] * arm_step
@@ -389,18 +402,20 @@ def charge_unpaid_energy(law: Any, now: LawInput, i: int, spring: float) -> None
 def settle_follower(
     law: Any, now: LawInput, i: int, stretch: float, drift_velocity: float, available_J: float
 ) -> None:
-    """Finds the torque and the velocities of a joint that follows, and books the energies.
+    """Computes the torque of a following joint so that known energy covers its work.
 
-    If work is computed by step, the torque must be paid for by the velocities that cause it.
-    Since several peers share one torque, torque and velocities depend on each other. They are
-    computed by a fixed number of iterations (`SWEEPS`).
+    The follower is the arm that follows its peers, the other arms, in one coupling each. The
+    torque depends on the velocity with which the spring's goal moves. The velocity depends on
+    the energy, and the energy depends on the torque. Therefore both are computed by a fixed
+    number of iterations (`SWEEPS`), unless work is computed by velocity. Finally, the work is
+    subtracted from the energy account of each coupling.
 
     Args:
-        law: The law; its accounts are changed.
-        now: Inputs and outputs of the law in this tick; the torque is written.
+        law: The law; its energy accounts, goal and torque are changed.
+        now: Inputs and outputs of the law in this control period.
         i: Index of the joint.
         stretch: Elongation of the spring between the arm and its goal, rad.
-        drift_velocity: Velocity by which drifted positions are brought together, rad/s.
+        drift_velocity: Velocity of the goal that reduces its distance from the peers, rad/s.
         available_J: Energy that remains in all couplings together, J.
     """
     n = now.joints
@@ -441,15 +456,20 @@ def settle_follower(
 
 @compiled
 def follow_peers(law: Any, now: LawInput, i: int) -> None:
-    """Moves the goal of a joint with the peers' velocities, and writes the following torque.
+    """Computes the torque with which a joint follows its peers, and the motion of its goal.
 
-    The steps are: compute the force of spring and damper; charge the couplings for the previous
-    period; reduce the velocities of the peers to the energy that is known; add drift
-    compensation from the energy that remains; settle torque and goal.
+    A spring and a damper pull the joint to a goal that moves with the velocities of the peers,
+    which are the other arms. The steps are:
+
+    1. Compute the torque of spring and damper.
+    2. Subtract energy that the previous period used beyond its prediction.
+    3. Reduce the velocities of the peers until the known energy covers their work.
+    4. If energy remains, move the goal back towards the true position of the peers.
+    5. Compute the final torque, and move the goal.
 
     Args:
-        law: The law, with its energy accounts.
-        now: Inputs and outputs of the law in this tick.
+        law: The law; its energy accounts, goal and torque are changed.
+        now: Inputs and outputs of the law in this control period.
         i: Index of the joint.
     """
     n = now.joints
@@ -673,14 +693,18 @@ class Tdpa(EnergyLaw):
             now.tau[i] = self.carried[i] + (force - applied) / self.beta
 
     def energies(self, seen: LawRecords) -> LawEnergies:
-        """Returns the energies that show whether the law was passive in a run.
+        """Computes the energies that show whether the law was passive in a run.
 
-        In each coupling both ends put energy in and take energy out. The follower's energies
-        are those up to the previous period, because the work of a period is known only at its
-        end.
+        A coupling connects an arm to a peer, another arm, which leads or follows. The result
+        contains, for each peer, the energy that this arm put into its two couplings, the energy
+        that it took out, and the energy that it observed. It also contains the energy of the
+        springs and the energy that the arm gave to its controller.
+
+        The energies of the follower are one period old, because the work of a period is known
+        only at its end.
 
         Args:
-            seen: Records of the site in the run.
+            seen: Records of the site in the run, one per control period.
         """
         gave = []
         took = []
@@ -713,22 +737,25 @@ class Tdpa(EnergyLaw):
         return "its controllers act by energies, which are of second order in the motion"
 
     def explain_idle_shares(self, situation: LawSituation) -> str:  # noqa: ARG002
-        """Explains to the user that the dominance factors of a site have no effect.
+        """Explains to the user that the dominance factors of an arm have no effect.
 
-        A site without the spring K and the damper B follows nobody, whatever its dominance
-        factors.
+        A dominance factor is the weight with which an arm follows another arm. If the stiffness
+        K and the damping B are zero, the arm follows nobody.
 
         Returns:
-            A sentence. Empty if the dominance factors have an effect.
+            A sentence for the user. Empty if K or B is not zero.
         """
         return "" if any(self.K) or any(self.B) else "K = 0 and B = 0 follow nobody"
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:  # noqa: ARG002
-        """Returns the stability condition: operators and environments must be passive.
+        """Evaluates whether the law keeps the session passive.
 
-        In addition, the motion of the arms must be predictable, because the controllers of the
-        ends plan ahead. If work is computed by velocity, as published, a small energy is not
-        accounted for, which the text states.
+        The law is passive for any delays and lost messages, if operators and environments are
+        passive. It pays for energy in advance and therefore predicts the motion of the arm.
+        Half of the reserve of energy covers errors of the prediction, which the text states.
+
+        With `energy` = "velocity", as the law was published, the text instead states the energy
+        that its accounts miss.
         """
         text = (
             "couplings are passive for any delays, jitter, loss and shares, where "

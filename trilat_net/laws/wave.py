@@ -1,36 +1,33 @@
-"""Couples sites by wave variables, so that delays and lost messages cannot create energy.
+"""Couples arms by wave variables, so that delays and lost messages cannot create energy.
 
-Two sites are joined by a wave line. Instead of force and velocity, its ends exchange waves: a
-wave is a signal whose square is a power, so that a delayed wave is stored energy. The line has
-an impedance b, in N m s/rad, per joint. For one line and one joint, let
+Two sites, the processes that run one arm each, are joined by a virtual line. Instead of force
+and velocity, the two ends of a line exchange waves. The square of a wave is twice a power, so a
+delayed wave is stored energy.
 
-    q, qd       position and velocity of the arm
-    h           period of the control loop
-    v           the wave that the end plays, which is the received wave or a substitute for it
-    c           sqrt(2 b)
-    step        motion of the joint in the period that has just ended
-    q_sd        position of the end's spring on the side of the line
+For one line and one joint let q and qd be the position and velocity of the arm, b the impedance
+of the line (N m s/rad), c = sqrt(2 b), h the control period, and v the received wave (or its
+substitute, if a message is late). The torque on the arm and the sent wave u are
 
-The force F of an end then is
+    without a spring:    torque = c v - b qd
+                         u = c step / h - v, sent one period later
+    with spring K        rate of q_s = (c v - K (q_s - q) + B qd) / (b + B)
+    and damper B:        torque = K (q_s - q) + B (rate of q_s - qd)
+                         u = v - (c / b) torque
 
-    without a spring (K = 0)    F = b qd - c v, the arm gets -F,
-                                sends c step / h - v one tick later
-    with K and B                qd_sd = (c v - K (q_sd - q) + B qd) / (b + B), q_sd' = qd_sd,
-                                F = K (q_sd - q) + B (qd_sd - qd), the arm gets F,
-                                sends v - (c / b) F
+where q_s is the end of the spring that moves with the line, and `step` the motion in a period.
 
-Each end keeps an account H of its energy: the energy that it took out of its lines, less the
-work of its torque on the arm, tau times the step in q. An end without a spring sends the motion
-of the period that has just ended. Therefore its waves add up to the steps of its arm, and their
-energy is b h qd^2 / 4 larger than the work of the arm. H lends this energy until the arm slows
-down.
+Two accounts limit the energy:
+- W, for each line: energy that has arrived in waves and has not acted on the arm yet.
+- H, for each end: energy that it may put into its lines. It contains the energy taken out of
+  the lines minus the work on the arm.
 
-Each end also keeps an account W per line: the energy that is known to have arrived and has not
-been played yet.
+Without a spring, waves carry b h qd^2 / 4 more energy than the work of the arm, because they
+describe a period that is over. H lends this energy until the arm slows down.
 
 Invariant:
-    - An end takes no more energy out of a line than it knows the other end to have put in, for
-      any delay or loss of samples (except with the reception `hold`).
+    - An end takes no more energy out of a line than the other end has put in, whatever messages
+      are late or lost. The setting `hold` of `reception`, which only serves comparisons, is an
+      exception.
     - An end puts no more energy into its lines than its account H contains.
 """
 
@@ -112,20 +109,21 @@ def replay_wave(law: Any, index: int, fresh: float, energy: float, h: float) -> 
 
 @compiled
 def conceal_wave(law: Any, index: int, energy: float, h: float) -> float:
-    """Returns the wave that is played in a tick without a new sample.
+    """Returns the wave that acts on the arm in a period in which no message has arrived.
 
-    It is the last wave, limited by the known energy so that it could be held for `CONCEALED_S`.
-    The wave anticipates the next sample, so its integral is subtracted from the owed integral,
-    the integral of waves that have not been played yet.
+    The previous wave is repeated. It is limited so that the energy that has arrived and not
+    been used would last for the time `CONCEALED_S`. The repeated wave anticipates the missing
+    one. Therefore its time integral is subtracted from the integral of the lost waves, which
+    the arm is to receive later.
 
     Args:
-        law: The law, with its energy accounts.
+        law: The law, with its accounts.
         index: Index of the line and joint in the law's lists.
-        energy: The known energy that has not been played, J.
-        h: The period, s.
+        energy: Energy that has arrived and not been used, J.
+        h: Control period, s.
 
     Returns:
-        The wave to play, sqrt(W).
+        The wave, sqrt(W).
     """
     duration_s = max(CONCEALED_S, h)
     largest_wave = math.sqrt(2.0 * max(energy, 0.0) / duration_s)
@@ -210,20 +208,21 @@ def receive_wave(law: Any, now: LawInput, j: int, i: int, missed: float) -> floa
 
 @compiled
 def follow_wave(law: Any, now: LawInput, j: int, i: int, v: float) -> float:
-    """Moves the spring of an end by the wave that it plays, and sends the reflected wave.
+    """Computes the torque by which a received wave moves the arm through a spring.
 
-    An end is the site at one side of a line. Its equations, with the spring K and the damper B,
-    are given at the top of this module.
+    The wave moves one end of a spring and damper, and the other end pulls the arm. Part of the
+    wave is reflected; the reflected wave is stored in `now` and will be sent to the peer. The
+    module docstring gives the equations.
 
     Args:
-        law: The law, with its energy accounts.
-        now: Inputs and outputs of the law in this tick.
-        j: Index of the peer at the other end of the line.
+        law: The law; the position of the spring is changed.
+        now: Inputs and outputs of the law in this control period.
+        j: Index of the peer (the other arm) from which the wave came.
         i: Index of the joint.
-        v: The wave that the end plays, sqrt(W).
+        v: The wave, sqrt(W).
 
     Returns:
-        The torque ON the arm, N m.
+        The torque on the arm, N m.
     """
     index = j * now.joints + i
     h = now.h_s
@@ -246,15 +245,17 @@ def follow_wave(law: Any, now: LawInput, j: int, i: int, v: float) -> float:
 
 @compiled
 def close_wave_period(law: Any, now: LawInput, i: int) -> None:
-    """Books the work of the torque on the arm in the previous period in the account H.
+    """Updates the energy of this end of the lines after a control period.
 
-    The energy of an end's springs is part of H. If H contains more than the springs and the
-    reserve, the damper of the end has dissipated the difference. In tick 0, this function
-    initialises the springs and H.
+    The energy H is what this site, the process of one arm, may send to its peers in waves,
+    together with the energy in its springs. The function subtracts the work of the torque on
+    the arm in the previous period. If H then exceeds the energy of the springs and the initial
+    reserve, the dampers have dissipated the excess, and it is removed. In the first period, the
+    function initialises the springs and H.
 
     Args:
-        law: The law, with its energy accounts.
-        now: Inputs and outputs of the law in this tick.
+        law: The law, with its accounts.
+        now: Inputs and outputs of the law in this period.
         i: Index of the joint.
     """
     H = now.to_all.H
@@ -282,16 +283,17 @@ def close_wave_period(law: Any, now: LawInput, i: int) -> None:
 
 @compiled
 def send_waves(law: Any, now: LawInput, i: int, committed: float) -> None:
-    """Limits the waves of a joint to the energy in the account H, and books their energy.
+    """Scales down the waves of a joint if the site does not have the energy to send them.
 
-    H is the energy that this end of the lines may still put into them.
+    The site, the process of one arm, keeps an account H of the energy that it may send. The
+    energy of the waves is subtracted from H and added to the sums that the peers (the other
+    arms) receive.
 
     Args:
-        law: The law, with its energy accounts.
-        now: Inputs and outputs of the law in this tick, with the waves that the end would like
-            to send.
+        law: The law, with its accounts.
+        now: Inputs and outputs of the law in this control period. The waves in it are scaled.
         i: Index of the joint.
-        committed: Energy that the coming period needs besides the waves, J.
+        committed: Energy that the coming period needs for other purposes, J.
     """
     h = now.h_s
     requested = 0.0
@@ -315,15 +317,18 @@ def send_waves(law: Any, now: LawInput, i: int, committed: float) -> None:
 
 
 def find_line_impedance(lines: Mapping[str, Any], site: str, peer: str) -> Any:
-    """Returns the impedance that the settings give a line, in either order of its ends.
+    """Returns the impedance that a user stated for the line between two sites.
+
+    A line is the virtual connection over which two sites exchange waves. The order of the two
+    names does not matter.
 
     Args:
-        lines: Impedances by line, as in {"m1-s": 18.0}.
-        site: The site at one end of the line.
-        peer: The site at the other end.
+        lines: Impedances by name of the line, for example {"m1-s": 18.0}, N m s/rad.
+        site: Name of the site at one end of the line.
+        peer: Name of the site at the other end.
 
     Returns:
-        A number for all joints, or a number per joint. None if the line is not named.
+        A number for all joints, or one number per joint. None if no impedance is stated.
     """
     return lines.get(f"{site}-{peer}", lines.get(f"{peer}-{site}"))
 
@@ -394,11 +399,14 @@ class Wave(EnergyLaw):
     tune: ClassVar = {"b": DAMPING, "K": STIFFNESS}
 
     def begin(self, facts: LawContext) -> None:
-        """Creates the state of the lines at this end, all of it at rest and without energy.
+        """Prepares the law before a run: creates the state of the lines, without waves.
 
-        A line is the virtual connection to a peer along which waves travel. Lists per line and
-        joint are flat: joint i of peer j has the index j n + i, where n is the number of
-        joints.
+        A line is the virtual connection over which this site exchanges waves with a peer,
+        another site. Lists with one number per line and joint are flat: joint i of peer j has
+        the index j n + i, where n is the number of joints.
+
+        Args:
+            facts: Facts about the site that are known before the run.
         """
         n = facts.joints
         peers = len(facts.peers)
@@ -426,14 +434,18 @@ class Wave(EnergyLaw):
         self.damped = [0.0] * n
 
     def torque(self, now: LawInput) -> None:
-        """Computes the torque of one tick, and sends the waves to the peers.
+        """Computes the torque of one control period, and sends waves to the other arms.
 
-        The steps of a tick are: book the work of the previous period; send the waves of joints
-        without a spring; play the waves that have arrived, which means to let them act on the
-        arm; send the waves of joints with a spring, which depend on the waves that were played.
+        The torque is the sum of the effects of all arriving waves. The steps are:
+
+        1. Update the energy account of each joint with the work of the previous period.
+        2. Send the waves of joints without a spring.
+        3. Compute the torque that the arriving waves exert on the arm.
+        4. Send the waves of joints with a spring. These depend on the result of step 3.
 
         Args:
-            now: Inputs and outputs of the law in this tick.
+            now: Inputs and outputs of the law in this period. The torque is written into
+                `now.tau`.
         """
         n = now.joints
         for i in range(n):
@@ -480,14 +492,15 @@ class Wave(EnergyLaw):
                 send_waves(self, now, i, work + self.spring_gain_J[i])
 
     def energies(self, seen: LawRecords) -> LawEnergies:
-        """Returns the energies that show whether the law was passive in a run.
+        """Computes the energies that show whether the law was passive in a run.
 
-        Energy is put into a line by the waves that this site sends, and taken out by the waves
-        that it plays. The account H of the energy at this end contains the energy of the
-        springs. The dampers dissipate energy for good.
+        The result contains, for each peer (another arm), the energy of the waves sent to it and
+        the energy of its waves that acted on this arm. It also contains the energy H that this
+        site keeps (the energy of its springs included), the energy that the dampers dissipated,
+        and the energy that the arm gave to its controller.
 
         Args:
-            seen: Records of the site in the run.
+            seen: Records of the site in the run, one per control period.
         """
         coupling_torque = seen.tau - seen.memory["carried"]
         return LawEnergies(
@@ -502,13 +515,14 @@ class Wave(EnergyLaw):
         )
 
     def find_problem(self, rates_hz: Mapping[str, int]) -> KeyProblem | None:
-        """Returns the setting that prevents the use of this law in a scenario.
+        """Finds a setting that prevents the use of this law in a scenario.
 
-        Each named line must join two sites of the scenario. All sites must have the same tick
-        rate, because a wave lasts for one tick.
+        Each line that the settings name must join two sites of the scenario, for example
+        "m1-s". All sites must have the same rate of the control loop, because one wave is sent
+        per period.
 
         Args:
-            rates_hz: Tick rate of each site, by name.
+            rates_hz: Rate of the control loop of each site, in Hz, by name of the site.
 
         Returns:
             The key of the setting and the problem. None if the law can be used.
@@ -529,20 +543,26 @@ class Wave(EnergyLaw):
         return None
 
     def resolve_shares(self, names: Sequence[str], alpha: Array) -> Any:
-        """Returns the law with a number for the impedance of each line.
+        """Computes the impedance of each line from the dominance factors of the scenario.
 
-        The impedances reproduce the dominance factors alpha of the start, the weights with
-        which sites follow each other, if positive weights D exist that make D_i alpha_ij
-        symmetric:
+        A line is the virtual connection over which two sites, the processes of one arm each,
+        exchange waves. The dominance factor alpha_ij is the weight with which site i should
+        follow site j. Site i follows site j in proportion to the impedance of their line, so
+        the impedances are
 
-            b_ij = D_i alpha_ij b / mean,    where D_i alpha_ij = D_j alpha_ji
+            b_ij = b D_i alpha_ij / m
 
-        Here b is the impedance in the settings, and `mean` is the mean of D_i alpha_ij over all
-        pairs of sites. If no such D exists, all lines keep b.
+        where b is the impedance in the settings, D_i are positive weights with D_i alpha_ij =
+        D_j alpha_ji, and m is the mean of D_i alpha_ij over all pairs of sites. If no weights
+        of this kind exist, all lines get the impedance b. If the user stated impedances, they
+        are kept.
 
         Args:
-            names: The names of the sites.
-            alpha: Dominance matrix at the start, shape (N, N).
+            names: Names of the N sites.
+            alpha: Dominance factors at the start, shape (N, N).
+
+        Returns:
+            The law with these impedances.
         """
         if self.lines != "shares":
             return self  # the user has stated the impedances
@@ -561,11 +581,12 @@ class Wave(EnergyLaw):
         return replace(cast(Any, self), lines=lines)
 
     def explain_idle_shares(self, situation: LawSituation) -> str:
-        """Explains that the wave lines decide how strongly a site follows each peer.
+        """Explains to the user that impedances decide how strongly an arm follows others.
 
-        With this law, site i follows peer j with the weight b_ij / sum_k b_ik, where b_ij is
-        the impedance of the line between them. The dominance factors of the scenario have an
-        effect only if the impedances were chosen to reproduce them.
+        Sites i and j, the processes of two arms, exchange waves over a line with the impedance
+        b_ij. Site i follows site j with the weight b_ij / sum_k b_ik. The dominance factors of
+        the scenario, which are the weights that its author wants, have an effect only if the
+        impedances were computed from them.
 
         Args:
             situation: The site, and the dominance factors of the scenario.
@@ -591,11 +612,15 @@ class Wave(EnergyLaw):
         return f"{explanation}, as the shares of sites are not reversible"
 
     def find_impedances(self, site: str, peer: str) -> tuple[float, ...]:
-        """Returns the impedance of a line at each joint, after `resolve_shares`, N m s/rad.
+        """Returns the impedance of the line between two sites, for each joint, N m s/rad.
+
+        A line is the virtual connection over which two sites, the processes of one arm each,
+        exchange waves. If the settings state no impedance for the line, it is the common
+        impedance `b`.
 
         Args:
-            site: The site at one end of the line.
-            peer: The site at the other end.
+            site: Name of the site at one end of the line.
+            peer: Name of the site at the other end.
         """
         lines = {} if self.lines == "shares" else self.lines
         line = find_line_impedance(lines, site, peer)
@@ -604,27 +629,30 @@ class Wave(EnergyLaw):
         return tuple(np.broadcast_to(line, len(self.b)).tolist())
 
     def linear_gains(self, theta: Array) -> Gains | None:
-        """Returns gains of the kernel's law of known gravity that are all zero.
+        """Returns gains for the linear analysis that only compensate gravity.
 
-        The kernel's law then only compensates gravity. The waves are described by
-        `linear_form`.
+        The linear analysis considers small motions around a pose at rest. `linear_form` adds
+        the waves, which cause all other torques of this law.
 
         Args:
-            theta: Parameters of the arm, shape (P,).
+            theta: Parameters of the arm's dynamics, such as masses, shape (P,), where P is
+                their number.
         """
         return Gains(Law.KNOWN, known=(theta * self.gravity).tolist())
 
     def linear_form(self, situation: LinearSituation) -> LinearForm | None:
-        """Returns the ends of the lines at a site for small motions, for the linear analysis.
+        """Returns the torque and the sent waves as functions of motion and received waves.
 
-        Time is continuous, a line between two ends is a pure delay, and waves are never late or
-        lost.
+        The linear analysis uses them for small motions around a pose at rest. It treats a line,
+        over which two sites exchange waves, as a pure delay in continuous time. No wave is late
+        or lost.
 
         Args:
-            situation: The site and its arm.
+            situation: The site, its arm and the other sites.
 
         Returns:
-            The linear form of the site. None if some joints have a spring and others do not.
+            The functions as blocks of a matrix. None if some joints have a spring and others do
+            not.
         """
         has_springs = any(self.K)
         if has_springs and not all(self.K):
@@ -674,12 +702,15 @@ class Wave(EnergyLaw):
         form.add(("to", j), ("from", j), 1.0)
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns the stability condition: operators and environments must be passive.
+        """Evaluates whether the law keeps the session passive.
 
-        Its text also states the weights with which the lines let the site follow its peers.
+        The law is passive for any delays and lost messages, if operators and environments are
+        passive. The text also states with which weight this site, the process of one arm,
+        follows each other site. The weights are proportional to the impedances of the lines,
+        over which the sites exchange waves.
 
         Args:
-            situation: The site and its lines.
+            situation: The site and the other sites.
         """
         site = situation.names[situation.site]
         peers = [name for name in situation.names if name != site]
@@ -696,13 +727,14 @@ class Wave(EnergyLaw):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
-        """Returns the [control] table of a site for tuned gains.
+        """Returns the settings of this law for one site, after its gains were tuned.
 
-        All ends, the masters' too, are matched to their lines (B = b), so that waves are not
-        reflected again and again.
+        The settings form the table [control] of a scenario, the description of an experiment.
+        The damping B is set to the impedance b, with which waves travel between the sites. An
+        arm with B = b absorbs arriving waves, so that they are not reflected again and again.
 
         Args:
-            gains: The tuned gains by name.
-            site: The site whose table is written.
+            gains: Tuned gains by name.
+            site: Facts about the site for which the table is written.
         """
         return {**gains, "B": gains["b"], "gravity": site.gravity}
