@@ -26,7 +26,7 @@ describe a period that is over. H lends this energy until the arm slows down.
 
 Invariant:
     - An end takes no more energy out of a line than the other end has put in, whatever messages
-      are late or lost. The setting `hold` of `reception`, which only serves comparisons, is an
+      are late or lost. The reception "hold", which serves only for comparisons, is an
       exception.
     - An end puts no more energy into its lines than its account H contains.
 """
