@@ -1,16 +1,17 @@
-"""Defines the arms of a scenario: the planar two-link arm, and chains from URDF files.
+"""Defines the arms of an experiment: the planar two-link arm, and chains from URDF files.
 
-`Arm` and `Task` are tables of a scenario. `build_arm` converts them to an `ArmModel`, which has
-the parameters and the geometry that computations need. `compute_rest_gains` and
-`bound_estimates` derive controller parameters from the model: gains with which the arm comes to
-rest, and bounds for the parameters that an adaptive law estimates.
+`Arm` and `Task` are parts of a scenario, the description of an experiment. `build_arm` converts
+them to an `ArmModel` with the geometry and the dynamic parameters that computations need. From
+the model, `compute_rest_gains` derives the damping with which an arm is brought to rest.
+`bound_estimates` derives bounds for the parameters that an adaptive control law estimates.
 
 Invariant:
-    - If one arm of a scenario is a chain, all arms are. The planar arm is then modelled as a
-      chain of two joints in the x-y plane. Therefore all sites of a scenario are computed by
-      the same functions, in live sessions, in virtual time and in parameter studies.
-    - Times that are computed with eigenvalues are rounded up to a millisecond. Eigenvalues
-      differ between machines in the last bits, and the rounded times do not.
+    - If one arm of a scenario is a chain, all arms are modelled as chains. The planar arm is
+      then a chain of two joints in the x-y plane. Therefore the same functions compute all
+      arms.
+    - Results are the same on every machine. The computation of eigenvalues differs between
+      machines in the last bits, so a time that follows from eigenvalues is rounded up to whole
+      milliseconds.
 """
 
 import math
@@ -223,9 +224,11 @@ class Task(fields.Frozen, frozen=True, omit_defaults=True):
 
     @property
     def setup(self) -> TaskSetup | None:
-        """The task in the form in which the simulation kernel uses it.
+        """Settings of the shared coordinates, for the compiled control loop.
 
-        None if the sites share joint angles, because the kernel needs no task then.
+        They state along which axes of the end effector the arms follow each other, and with
+        which scale and posture. None if the arms follow each other's joint angles, because no
+        settings are needed then.
         """
         if not self.shared:
             return None

@@ -304,7 +304,11 @@ class MeasuredTrace(Result):
         }
 
     def blocks(self) -> list[str]:
-        """Returns the lines with which the command shows the statistics of the trace."""
+        """Returns statistics of the recorded delays as lines of text.
+
+        The command `trilat trace import` prints them. The lines contain the number of messages,
+        the losses, the delays, and how many messages were left out.
+        """
         statistics = self.to_dict()
         samples = count_nouns(statistics["samples"], "sample")
         lost_percent = f"{statistics['lost_percent']:.2f} % lost"

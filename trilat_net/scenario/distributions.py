@@ -32,13 +32,13 @@ _MAX_LIST_LENGTH = 64
 class Distribution(Frozen, frozen=True, omit_defaults=True, kw_only=True):
     """Random distribution of a number in a scenario, together with the number drawn from it.
 
-    A scenario may state a distribution in place of a number. The start pose of an operator may
-    have been copied from a drawn start pose of the arm. It then has neither of the two
-    distributions.
+    The author of a scenario, the description of an experiment, may state a distribution in
+    place of a number. The value can also be a pose of an operator that was copied from the
+    random start pose of an arm. Then both distributions are None.
 
     Attributes:
-        normal: Mean and standard deviation of a normal distribution. None for another one.
-        uniform: Lower and upper end of a uniform distribution. None for another one.
+        normal: Mean and standard deviation of a normal distribution. None for other kinds.
+        uniform: Lower and upper limit of a uniform distribution. None for other kinds.
         value: The drawn number, or the copied pose.
     """
 
@@ -71,7 +71,11 @@ class Distribution(Frozen, frozen=True, omit_defaults=True, kw_only=True):
         return float(f"{number:.9g}")
 
     def describe(self) -> str:
-        """Returns the kind of the distribution and its two numbers as a text for the user."""
+        """Returns a text that describes the distribution to a user.
+
+        It states the mean and standard deviation of a normal distribution, or the limits of a
+        uniform distribution. For a copied start pose, it says so.
+        """
         if self.normal is not None:
             mean, deviation = self.normal
             return f"normal, {mean:g} with a deviation of {deviation:g}"
@@ -159,15 +163,17 @@ class Draws:
     def follow_start(
         self, table: TomlTable, key: str, pose: Sequence[float], path: str
     ) -> None:
-        """Sets a pose of an operator to the arm's start pose, unless the author wrote another.
+        """Sets the start pose of an operator to the start pose of the operator's arm.
 
-        A pose that was copied from an earlier draw of the start pose is replaced.
+        An operator is a person or program, or a model of a person. A pose that the author of
+        the scenario wrote is kept. A pose that this method set before is replaced, because the
+        random start pose of the arm may have changed.
 
         Args:
-            table: Table of the operator. It is changed.
-            key: Key of the pose in the operator's table.
-            pose: Start pose of the arm.
-            path: Path of the operator's table in the scenario.
+            table: Settings of the operator. They are changed.
+            key: Key of the pose in these settings.
+            pose: Start pose of the arm, in rad, or the position of its end effector, in m.
+            path: Path of the settings in the scenario.
         """
         pose_key = dotted_key(f"{path}.{key}")
         known = self._known.get(pose_key)

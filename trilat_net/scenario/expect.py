@@ -102,10 +102,10 @@ class ExpectWindow(_JointPart, frozen=True, kw_only=True):
 
     @property
     def limits(self) -> Iterator[tuple[str, tuple[float, ...]]]:
-        """Pairs of each quantity that the window limits and its permitted values.
+        """Yields each quantity that is checked in this part of a run, with its limits.
 
-        The permitted values are the smallest and the largest one, in the unit that the name of
-        the quantity states. Empty if the window limits nothing.
+        Each item is the name of the quantity, whose ending states the unit, and a pair of the
+        smallest and the largest permitted value. Yields nothing if no quantity is checked.
         """
         for key in _QUANTITIES:
             limits = getattr(self, key)

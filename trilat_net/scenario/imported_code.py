@@ -84,7 +84,7 @@ class NamedCode(Protocol):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Arguments with which the class is created, by name."""
+        """Arguments with which an object of the user's class is created, by name."""
 
 
 ANY_SETTINGS = "*"
@@ -113,10 +113,11 @@ class CodeKey(NamedTuple):
 
     @classmethod
     def of(cls, named: NamedCode) -> "CodeKey":
-        """Returns the key under which a user's class of a scenario may be permitted.
+        """Returns the identification under which a user's class may be permitted to run.
 
         Args:
-            named: Control law, operator or plant of the scenario.
+            named: Entry of a scenario that names the class: a control law, an operator or a
+                plant.
         """
         return cls(
             named.code,

@@ -49,9 +49,9 @@ class LinkInertia(fields.Frozen, frozen=True, omit_defaults=True):
     inertia_kg_m2: TensorEntries | None = None
 
     def list_given_keys(self) -> list[str]:
-        """Returns the names of those keys that the author of the scenario stated.
+        """Returns the names of the inertial parameters that the author of the scenario stated.
 
-        The other values are those of the URDF file.
+        The parameters that are not in the list are taken from the URDF file of the arm.
         """
         keys = fields.field_names(LinkInertia)
         return [key for key in keys if getattr(self, key) is not None]
@@ -97,7 +97,15 @@ def balance_tensor(tensor: Matrix) -> Matrix:
     balanced = [total - second for second in second_moments]
 
     def compute_entry(i: int, j: int) -> float:
-        """Returns the entry (i, j) of axes diag(balanced) axes'."""
+        """Returns an entry of the corrected inertia tensor, in kg m^2.
+
+        The tensor is R diag(m) R', where the columns of R are the principal axes and m contains
+        the corrected principal moments of inertia.
+
+        Args:
+            i: Row of the entry, from 0 to 2.
+            j: Column of the entry, from 0 to 2.
+        """
         first = axes[i][0] * balanced[0] * axes[j][0]
         second = axes[i][1] * balanced[1] * axes[j][1]
         third = axes[i][2] * balanced[2] * axes[j][2]

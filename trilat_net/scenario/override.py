@@ -34,21 +34,22 @@ Override = tuple[str, Any]
 
 
 def expand_overrides(scenario: Scenario, pairs: Sequence[Override]) -> dict[str, Any]:
-    """Replaces overrides that concern many sites or links by one override for each of them.
+    """Replaces each override of a whole group by overrides for its single members.
 
-    For example, an override of `control` becomes one for each site whose control law has the
-    key.
+    An override replaces one value of a scenario, the description of an experiment. Groups are
+    all sites (the processes of the arms) or all links (the connections between them). For
+    example, an override of `control.K` becomes one override for each site whose control law has
+    a gain K.
 
     Args:
-        scenario: The resolved scenario.
-        pairs: The overrides, as pairs of a dotted key and a value.
+        scenario: The complete scenario.
+        pairs: The overrides. Each is a pair of a dotted key and a value.
 
     Returns:
-        Values by dotted key.
+        Values by the dotted key of a single site or link.
 
     Raises:
-        ScenarioError: The group has no such key, or no site or link of the scenario can have
-            it.
+        ScenarioError: The key does not exist, or no site or link of the scenario can have it.
     """
     flat_pairs = _flatten_groups(pairs)
     overridden = dict(flat_pairs)
@@ -193,18 +194,21 @@ def _split_entry(key: str) -> tuple[str, str]:
 def split_entries(
     tables: TomlTable, pairs: Sequence[Override]
 ) -> tuple[dict[str, Any], list[Override]]:
-    """Separates overrides that can be applied to a scenario file from those that must wait.
+    """Separates overrides that can be applied to a scenario file at once from all others.
 
-    An override replaces one value of a scenario. An override of an entry of a list must wait if
-    the file does not contain the list. The list may be written as a single number, or for all
-    sites. Only the resolved scenario contains its entries then.
+    An override replaces one value of a scenario, the description of an experiment. Some
+    overrides replace one entry of a list, such as the stiffness of joint 2. The file may not
+    contain this list, because its author wrote one number for all joints or left the setting
+    out. These overrides must wait until the scenario has been completed with all lists.
 
     Args:
-        tables: Tables of the scenario file.
-        pairs: The overrides, as pairs of a dotted key and a value.
+        tables: Content of the scenario file.
+        pairs: The overrides. Each is a pair of a dotted key, such as `control.K.1`, and a
+            value.
 
     Returns:
-        The overrides that apply to the tables, and those that must wait.
+        The overrides that can be applied now, as values by key, and the overrides that must
+        wait.
     """
     applicable = {}
     waiting = []

@@ -125,16 +125,24 @@ class OwnPlant(Frozen, frozen=True, rename={"code": "class"}, omit_defaults=True
 
 
 def resolve_plant(written: Any, path: str) -> Any:
-    """Returns the complete table of a site's plant, with the hash of the file of its class.
+    """Completes the settings of a user's plant in a scenario.
 
-    A text such as "external", and a value of a wrong type, are returned unchanged.
+    A plant is a user's Python class that computes the motion of an arm, and of bodies such as a
+    box that it moves. The result contains the SHA-256 hash of the file with the class, the
+    arguments of the class, and the sizes of the bodies.
 
     Args:
-        written: Value of the key `plant` as the author of the scenario wrote it.
+        written: Value of the key `plant` as the author of the scenario wrote it: a class name,
+            as in "my_plant:Scene", or a table.
         path: Path of the key, for error messages.
 
+    Returns:
+        The completed table. A text that is not a class name, such as "external", and a value of
+        a wrong type are returned unchanged.
+
     Raises:
-        ScenarioError: The class is missing, its file cannot be read, or a body is not valid.
+        ScenarioError: The class is missing, its file cannot be read, or the size of a body is
+            not valid.
     """
     table = written
     if isinstance(written, str) and ":" in written:

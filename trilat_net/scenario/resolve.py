@@ -900,16 +900,22 @@ def _complete_link(
 
 
 def resolve_link(written: Any, base: TomlTable, path: str) -> TomlTable:
-    """Returns a link in which missing keys are taken from a base or from a preset.
+    """Completes the settings of a link with defaults.
 
-    A link that names a preset takes all other keys from the preset. A link that names a delay
-    model takes no keys from elsewhere, because the models have different keys. Otherwise the
-    missing keys are those of the base. Files of delays are not read here.
+    A link is the one-way network connection between two sites, the processes of the arms. The
+    source of settings that its author left out depends on what the author wrote:
+
+    - If the link names a preset, they are taken from the preset.
+    - If it names only a delay model, no other settings are taken over, because each model has
+      its own.
+    - Otherwise they are taken from the common settings of all links.
+
+    Files with recorded delays are not read here.
 
     Args:
-        written: Table of the link as its author wrote it.
-        base: Resolved link, usually that of the table `link`.
-        path: Path of the table, for error messages.
+        written: Settings of the link as the author wrote them.
+        base: Common settings of all links, completed.
+        path: Path of the settings in the scenario, for error messages.
 
     Raises:
         ScenarioError: There is no such preset, model or key, or the preset has another model.
@@ -1032,13 +1038,19 @@ def resolve_timeline(written: Any, links: TomlTable, names: list[str]) -> list[T
 def resolve_target(
     change: TomlTable, current_links: TomlTable, names: list[str], path: str
 ) -> TomlTable:
-    """Returns the state after a change: a complete link, or all dominance factors of a site.
+    """Completes the new settings that a change during a run states.
+
+    A change concerns a link, which is the one-way connection between two sites (the processes
+    of the arms), or the weights with which one site follows the others.
 
     Args:
-        change: Table of the change, with a key `link` or `dominance`.
-        current_links: Links before the change, by name.
+        change: The change. It contains the key `link` or `dominance`, and the new settings.
+        current_links: Settings of all links before the change, by name.
         names: Names of all sites of the scenario.
         path: Path of the change, for error messages.
+
+    Returns:
+        All settings of the link after the change, or the weights for all other sites.
 
     Raises:
         ScenarioError: There is no such link or site, or a value is not valid.

@@ -1,13 +1,16 @@
-"""Bounds how an arm comes to rest: the time, the largest speeds, and the load of the motors.
+"""Bounds the motion of an arm that stops: the time until it rests, and its speeds.
 
-If a site, a process that runs one arm, must stop, its controller damps the joints until the arm
-is at rest (`core.resting`). The bounds of this motion follow from the model of the arm, from
-the limits of its torques, and from the rule by which the controller damps. docs/links.md
-derives the bounds. Numbers of equations in comments refer to this document.
+When a site, the process that runs one arm, must stop, its controller brakes the joints until
+they rest. Each joint is damped in proportion to its speed, within the limits of the torques
+(`core.resting`). From the model of the arm and these limits, this module computes in advance
+how long this takes, how fast the joints may become, and whether the motors are strong enough
+for the arm's gravity and Coriolis torques.
+
+The formulas are derived in docs/links.md, and the numbers of equations in comments refer to it.
 
 Invariant:
-    - The bounds of a scenario are always the same, because the poses at which the model is
-      evaluated are drawn with a fixed seed.
+    - The bounds of a scenario, the description of an experiment, are always the same. The poses
+      at which the model is evaluated are random, but the seed of the generator is fixed.
 """
 
 import math
@@ -37,16 +40,20 @@ _MAX_PATTERNS = 64
 
 
 class RestBounds(NamedTuple):
-    """Bounds of how an arm comes to rest after a stop, from a certain speed of its joints.
+    """Bounds of the motion with which an arm comes to rest after a stop.
+
+    The bounds hold for a certain speed of the joints at the beginning of the stop.
 
     Attributes:
         rest_s: Time within which the arm is at rest, in s. Infinite if its motors cannot hold
-            it against gravity.
-        bearable_share: Fraction of the speed up to which the motors can balance the Coriolis
-            torques between the joints. It may exceed 1.
-        kinetic_j: Largest kinetic energy of the arm at this speed, in J.
-        blend_j: Largest energy that the last torques before the stop add, in J.
-        peak_rad_s: Largest speed of each joint that the energy permits, in rad/s, shape (n,).
+            the arm against gravity.
+        bearable_share: Ratio of two speeds of the joints: the speed up to which the motors can
+            balance the Coriolis torques besides gravity, and the speed at the beginning.
+        kinetic_j: Largest kinetic energy of the arm at the beginning, in J.
+        blend_j: Largest energy that the motors add to the arm, in J, because their torques fade
+            out gradually instead of stopping at once.
+        peak_rad_s: Largest speed of each joint that these energies permit, in rad/s, shape
+            (n,).
     """
 
     rest_s: float
@@ -235,7 +242,13 @@ def _sample_chain(model: ArmModel, q0: Array, speed: Array) -> _ArmSamples:
     velocities = speed * _list_patterns(joints)
 
     def compute_torque(v: Array) -> Array:
-        """Returns the torque of the motion at `v` without acceleration, in the current pose."""
+        """Returns the torque that gravity and Coriolis forces require in a pose, in N m.
+
+        The pose is the one for which the chain was placed last.
+
+        Args:
+            v: Joint velocities, in rad/s, shape (n,). The joints do not accelerate.
+        """
         torque = np.zeros(joints)
         propagate_motion(chain=rows, gravity=gravity, qd=v, v=v, a=still)
         inverse_dynamics(chain=rows, theta=model.theta, v=v, a=still, torque=torque)

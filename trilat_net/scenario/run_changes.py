@@ -1,14 +1,18 @@
-"""Checks and describes changes during a run: of links, dominance factors, or a site's mode.
+"""Checks and describes changes of a running experiment.
 
-A site is a process that runs one arm, and a link is the directed network connection between two
-sites. A dominance factor is the weight with which a site follows another one. Changes are
-planned in the timeline of a scenario (the description of the experiment), or requested during
-the run. Commands to a site, such as stop, enable and reset, are changes as well.
+Three things can change: a link, the weights with which a site follows other sites (dominance
+factors), and the state of a site. A site is the process that runs one arm, and a link is the
+one-way network connection between two sites. Commands such as stop, enable and reset change the
+state of a site.
+
+Changes are planned in a scenario, the description of the experiment, or requested during the
+run.
 
 Invariant:
-    - A request may state only a part of a link's or site's settings. The settings before the
-      change complete it, and the log contains the complete change as a text. Therefore every
-      reader of the log derives the same `CoreChange`, the form that the controller uses.
+    - A request may state only the settings that change. They are completed with the settings
+      before the change, and the log contains the complete change as a text. Therefore all
+      programs that read the log derive the same `CoreChange`, the record that the control loop
+      uses.
 """
 
 import re
@@ -58,18 +62,21 @@ class LinkTables(dict[str, dict[str, Any]]):
 def resolve_change(
     scenario: Scenario, current_links: LinkTables, written: dict[str, Any], from_ns: int
 ) -> Change:
-    """Completes and checks a change that a user requested during a run.
+    """Completes and checks a change that a user requests during a run.
 
-    The request may state only those keys of a link that change. The other keys are added.
+    A change concerns a link, which is the connection between two sites (the processes of the
+    arms), or the weights with which one site follows the others. A user may state only the
+    settings of a link that change. The others are taken from its current settings.
 
     Args:
-        scenario: Scenario of the run, against which the change is checked.
-        current_links: Current settings of every link, which complete the change.
-        written: The change in the form of a scenario's timeline, without `at_s`.
-        from_ns: Time at which the change takes effect, in ns after the epoch.
+        scenario: Description of the experiment.
+        current_links: Current settings of all links.
+        written: The request: `link` or `dominance`, and the new settings as `to`.
+        from_ns: Time at which the change takes effect, in ns after the common start time of all
+            sites.
 
     Returns:
-        The change, complete in itself.
+        The change with all settings.
 
     Raises:
         ScenarioError: There is no such link or site, or a value is not valid.
@@ -115,20 +122,22 @@ def find_owner(change: Change) -> str:
 def make_site_order(
     scenario: Scenario, site: str, order: SiteOrder, from_ns: int, ticks: int = 0
 ) -> Change:
-    """Converts a command to a site, such as stop, to the form of a change of the run.
+    """Converts a command to a site, such as stop, to a change that can be sent and recorded.
 
-    In this form, the command can be sent and recorded like any other change.
+    A site is the process that runs one arm. Commands use the same record as changes of the
+    network or of the weights with which sites follow each other.
 
     Args:
-        scenario: Scenario of the run.
+        scenario: Description of the experiment.
         site: Name of the site that must carry out the command.
-        order: The command, for example to stop the arm.
-        from_ns: Time of the tick in which the site carries out the command, in ns after the
-            epoch.
-        ticks: For the command "overrun": number of ticks that the site missed.
+        order: The command, for example "stop".
+        from_ns: Time of the control period in which the site carries it out, in ns after the
+            common start time of all sites.
+        ticks: For the command "overrun": number of control periods that the site missed.
 
     Raises:
-        ScenarioError: The site does not have the stale rule "glide", which commands require.
+        ScenarioError: The site cannot stop and go on smoothly, because its setting
+            `on_stale.action` is not "glide".
     """
     action = scenario.sites[site].on_stale.action
     if action != "glide":
@@ -213,11 +222,12 @@ def count_skipped_ticks(texts: Sequence[str]) -> int:
 
 
 def to_core_change(scenario: Scenario, change: Change) -> CoreChange:
-    """Converts a change to the form in which the simulation kernel of its site applies it.
+    """Converts a change during a run to the record that the compiled control loop reads.
 
     Args:
-        scenario: Scenario of the run.
-        change: Change of a link or of dominance factors, or a command to a site.
+        scenario: Description of the experiment.
+        change: Change of a link or of the weights with which a site follows the others, or a
+            command to a site.
     """
     text = msgspec.json.encode(change).decode()
     site = find_owner(change)

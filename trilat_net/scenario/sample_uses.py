@@ -1,14 +1,14 @@
-"""Computes in advance which samples of its peers a site uses, and which samples its user sees.
+"""Predicts which messages of the other arms a controller uses and a user sees.
 
-A site is a process that runs one arm, and the other sites are its peers. A sample is the state
-that a site publishes in one tick, a period of its control loop. The delay and the loss of a
-sample are random, but the generator starts from the seed in the scenario (the description of
-the experiment). Therefore the same random numbers can be drawn without a run.
+In each control period, a site (the process that runs one arm) sends the state of its arm to the
+other sites. These messages are delayed and lost at random. The random numbers follow from a
+seed in the scenario, the description of the experiment, so they can be drawn again without a
+run. For example, a report can show what a user saw although the log does not contain it.
 
 Invariant:
-    - The random numbers of a link are drawn with the same key of the generator as in a run.
-    - The samples that a user sees depend only on the scenario, its seed and the tick. Therefore
-      logs need not contain them.
+    - The random numbers of a connection are the same as in a run.
+    - What a user sees depends only on the scenario, its seed and the number of the control
+      period.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -101,17 +101,18 @@ class LinkSchedule:
         return due_ns
 
     def draw_releases(self, end: int, receiver_hz: int) -> tuple[IntArray, IntArray]:
-        """Computes in which ticks of the receiver the next samples come into use.
+        """Computes when the next messages of the link are used by the receiver.
 
-        Samples that are lost are left out.
+        A message is used in the first control period of the receiver that begins at or after
+        its arrival. Lost messages are left out.
 
         Args:
-            end: Number of the sample after the last one.
-            receiver_hz: Tick rate of the receiver, in Hz.
+            end: Number of the message before which the computation ends.
+            receiver_hz: Rate of the receiver's control loop, in Hz.
 
         Returns:
-            Numbers of the samples, and for each the receiver's first tick at or after its due
-            time.
+            Two arrays of the same length: the numbers of the messages, and for each the number
+            of the receiver's control period in which it is first used.
         """
         samples = np.arange(int(self.row.scheduled) + 1, end)
         due_ns = self.draw(end)
@@ -211,11 +212,13 @@ def count_silences(used: IntArray, receiver_hz: int, silence_ns: int) -> int:
 class PictureDelay:
     """Delay of the picture in which the user of a site sees the other arms.
 
-    The table `[sites.NAME.view]` of a scenario describes it. The picture is transmitted over a
-    link of its own, with random draws of its own (L4). The user sees a sample from the site's
-    first tick at or after its arrival over that link (L2), until a newer one is shown. Without
-    such a table, the user sees the samples that the controller uses. A sample is the state that
-    a site publishes in one tick.
+    A site is the process that runs one arm, and its user is the person who moves the arm. The
+    picture is transmitted over a network connection of its own, with its own random delays and
+    losses. It changes in the first control period in which a newer state of another arm has
+    arrived.
+
+    The table `[sites.NAME.view]` of a scenario describes the delay. Without the table, the user
+    sees the states that the controller uses.
 
     Args:
         scenario: Description of the experiment.
@@ -270,14 +273,15 @@ class PictureDelay:
         return {**used, **self._shown}
 
     def list_shown_samples(self, ticks: int) -> dict[str, IntArray]:
-        """Returns the samples that are shown in the first ticks of a run.
+        """Returns which state of the other arms the user sees in each control period.
 
         Args:
-            ticks: Number of ticks of the site, from the start of the run on.
+            ticks: Number of control periods of the user's site, from the start of the run.
 
         Returns:
-            For each peer, an array of shape (ticks,), with -1 before the first sample. Empty
-            without a view.
+            For each other site, by name, the number of the shown message in every period, shape
+            (ticks,). It is -1 before the first message. Empty if the scenario describes no
+            delay of the picture; then the user sees what the controller uses.
         """
         return {
             peer: _list_newest(samples, releases, ticks)

@@ -171,11 +171,14 @@ class ExperimentText(NamedTuple):
     folder: Path | None
 
     def load(self, overrides: Sequence[str] = ()) -> Scenario:
-        """Converts the text to a checked scenario.
+        """Checks and completes the description of an experiment.
 
         Args:
-            overrides: Texts KEY=VALUE, each of which replaces one value. By default, there are
-                none.
+            overrides: Texts KEY=VALUE, each of which replaces one value of the description. By
+                default, there are none.
+
+        Returns:
+            The scenario, in which every setting has a value.
 
         Raises:
             ScenarioError: The result is not a valid scenario.
@@ -189,7 +192,11 @@ def read_experiment(source: str | Path | Mapping[str, Any] | Scenario) -> Experi
     """Reads the description of an experiment as its author wrote it, without checking it.
 
     Args:
-        source: Name of a scenario in the package, path, TOML text, tables, or a `Scenario`.
+        source: One of the following: the name of a scenario in the package, the path of a file,
+            a TOML text, nested dictionaries of settings, or a `Scenario`.
+
+    Returns:
+        The description as a TOML text, with a name and the folder of the files that it names.
 
     Raises:
         ScenarioError: The source cannot be read.

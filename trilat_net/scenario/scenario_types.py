@@ -92,7 +92,10 @@ class OnStale(Frozen, frozen=True, omit_defaults=True):
 
     @property
     def rule(self) -> site_setup.StaleRule:
-        """The reaction in the form in which the simulation kernel uses it, with times in ns."""
+        """Reaction to missing messages of another site, as a record for the control loop.
+
+        A site is the process that runs one arm. Times in the record are in ns.
+        """
         if self.action == "glide":
             return site_setup.StaleRule(
                 action=site_setup.StaleAction.GLIDE,
@@ -155,9 +158,10 @@ class Limits(Frozen, frozen=True):
 
     @property
     def motion(self) -> site_setup.MotionLimits:
-        """Limits of speeds and positions in the form in which the simulation kernel uses them.
+        """Limits of joint angles, reference speed and torque rate, for the control loop.
 
-        A limit that the author of the scenario left out is infinite.
+        This is the record that the compiled control loop reads. A limit that the author of the
+        scenario left out is infinite.
         """
         return site_setup.MotionLimits(
             q_min=-math.inf if self.q_min_rad is None else self.q_min_rad,
@@ -295,10 +299,7 @@ class Change(Frozen, frozen=True, omit_defaults=True):
 
     @property
     def after(self) -> LinkBase:
-        """The link after the change, with all its keys.
-
-        It exists only for a change of a link.
-        """
+        """All settings of the link after this change. Only a change of a link has them."""
         return msgspec.convert(self.to, Link)
 
 
@@ -466,12 +467,13 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @property
     def beta(self) -> Array | None:
-        """Weights of the sites in the energy function V of the stability proof, shape (N,).
+        """Weights of the sites in the energy function of the stability proof, shape (N,).
 
-        The weights follow from the dominance factors, with which the sites follow each other.
-        The vector is the left null vector of the matrix Upsilon, scaled to the sum 1, Eq. (20).
-        None if the matrix alpha of dominance factors is reducible, because the vector is not
-        unique then.
+        N is the number of sites, the processes of the arms. The dominance matrix alpha contains
+        the weights with which the sites follow each other. The weights beta are positive, have
+        the sum 1 and satisfy beta' alpha = beta', where the prime denotes the transpose. None
+        if a site follows another site neither directly nor through other sites, because beta is
+        not unique then.
         """
         if not dominance.is_irreducible(self.alpha):
             return None
@@ -507,7 +509,7 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @cached_property
     def sha256(self) -> str:
-        """SHA-256 hash of the canonical text.
+        """SHA-256 hash of the scenario's TOML text in its canonical form (`text`).
 
         Two scenarios have the same hash only if they describe the same experiment.
         """
@@ -662,9 +664,10 @@ class Scenario(Frozen, frozen=True, dict=True):
         return build_channel(sends, layout, len(self.names) - 1)
 
     def layout(self, site: str) -> site_setup.Layout:
-        """Returns the lengths of the vectors in the records of a site.
+        """Returns the lengths of all vectors in the log of a site.
 
-        A record is the stored result of one tick.
+        The log of a site, the process that runs one arm, has one entry for each control period.
+        An entry contains vectors such as the joint angles and the torques.
 
         Args:
             site: Name of the site.
@@ -693,10 +696,10 @@ class Scenario(Frozen, frozen=True, dict=True):
         return plant.bodies if isinstance(plant, OwnPlant) else {}
 
     def setup(self, site: str) -> site_setup.SiteSetup:
-        """Returns everything from which the simulation kernel builds a site.
+        """Returns all settings from which the compiled control loop of a site is built.
 
-        It contains the arm, the control law, the links and the limits in the form of the
-        kernel.
+        A site is the process that runs one arm. The result contains its arm, control law,
+        network connections and limits.
 
         Args:
             site: Name of the site.
@@ -764,10 +767,11 @@ class Scenario(Frozen, frozen=True, dict=True):
         )
 
     def gains(self, site: str) -> site_setup.Gains:
-        """Returns the gains of a site's control law in the form of the simulation kernel.
+        """Returns the gains of a site's control law, as the record that the control loop reads.
 
-        An adaptive law estimates the parameters of the arm. Under the stale rule "glide", see
-        `OnStale`, the gains include bounds of these estimates.
+        A site is the process that runs one arm. If the law is adaptive, it estimates the
+        parameters of the arm. If the site can also be stopped smoothly (its setting
+        `on_stale.action` is "glide"), the record contains bounds of these estimates.
 
         Args:
             site: Name of the site.
@@ -850,15 +854,16 @@ class Scenario(Frozen, frozen=True, dict=True):
     def ramp(
         self, site: str, shares: dict[str, float], start_ns: int, ramp_s: float
     ) -> DominanceRamp:
-        """Returns a gradual change of a site's dominance factors in the form of the kernel.
+        """Returns a gradual change of the weights with which a site follows the others.
 
-        A dominance factor is the weight with which the site follows a peer.
+        A site is the process that runs one arm. The result is the record that the compiled
+        control loop reads.
 
         Args:
             site: Name of the site.
-            shares: Dominance factors after the change, by peer. A peer that is missing has the
-                factor 0.
-            start_ns: Start of the change, in ns after the epoch.
+            shares: Weights after the change, by name of the followed site. A site that is
+                missing gets the weight 0.
+            start_ns: Start of the change, in ns after the common start time of all sites.
             ramp_s: Duration of the linear transition, in s.
         """
         alpha = tuple(shares.get(peer, 0.0) for peer in self.peers(site))

@@ -742,16 +742,18 @@ def _can_lose_master(scenario: Scenario, name: str) -> bool:
 
 
 def check_change(change: Change, path: str) -> None:
-    """Refuses a change of a link after which the link is not valid.
+    """Checks that a link has valid settings after a change during a run.
 
-    Changes of dominance factors have been checked when they were resolved, and are accepted.
+    A link is the one-way network connection between two sites, the processes of the arms. Other
+    changes are accepted, because they have been checked before.
 
     Args:
-        change: Change of a link or of dominance factors.
-        path: Path of the change, for error messages.
+        change: The change, of a link or of the weights with which a site follows the others.
+        path: Path of the change in the scenario, for error messages.
 
     Raises:
-        ScenarioError: The link is not valid. The error contains the path of the key.
+        ScenarioError: A setting of the link is not valid, or the change of a link states a
+            transition time. The error contains the path of the key.
     """
     if not change.link:
         return

@@ -47,8 +47,7 @@ class DelayMoments(NamedTuple):
 def ms_to_us(milliseconds: float) -> int:
     """Converts a time in milliseconds to whole microseconds.
 
-    The simulation kernel uses integer times, so that results are the same on every machine
-    (L4).
+    The compiled simulation uses integer times, so that results are the same on every machine.
     """
     return round(milliseconds * 1_000)
 
@@ -146,10 +145,12 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         return f"{self.__struct_config__.tag} {mean_ms:.4g} +- {deviation_ms:.3g} ms"
 
     def moments(self) -> DelayMoments:
-        """Mean and standard deviation of the delay that the keys of the link describe.
+        """Mean and standard deviation of the random delay that a link is described with.
 
-        The delay of the simulation may differ: the effects of `playout_ms`, of `order`, and of
-        the cut at `MAX_DELAY_MS` are not included.
+        A link is the one-way network connection between two sites, the processes of the arms.
+        The delay in a run can differ, because three effects are left out: the hold time
+        `playout_ms`, the enforced order of messages (`order`), and the upper limit of all
+        delays, `MAX_DELAY_MS`.
         """
         return DelayMoments(*self._moments())
 
@@ -172,15 +173,21 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
 
     @property
     def points(self) -> Points | None:
-        """Points of a recorded course of delays. None for links of other delay models."""
+        """Measured delays over time, for a link that repeats a recorded trace of delays.
+
+        A link is the one-way network connection between two sites, the processes of the arms.
+        None for links whose delay is not recorded.
+        """
         return None
 
     def to_core_model(self, from_ns: int = 0) -> LinkModel:
-        """Returns the delay and losses of the link in the form that the simulation kernel uses.
+        """Converts the delay and losses of a link to the record of the compiled simulation.
+
+        The compiled simulation draws the random delays and losses from this record.
 
         Args:
-            from_ns: Send time of the first sample to which this state of the link applies, in
-                ns after the epoch.
+            from_ns: Send time of the first message to which these settings apply, in ns after
+                the common start time of all sites.
         """
         chain = self._loss_chain()
         return self._delay()._replace(
@@ -289,11 +296,15 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
 
 
 class OwnDelay(LinkBase, frozen=True, kw_only=True):
-    """Delay model whose delays are computed by a function in a file of this folder.
+    """Delay model that consists of a Python file with a function for the delay of one message.
 
-    A contributor adds a new model by adding such a file. The keys of the model are numbers. A
-    subclass defines `draw` and `_moments`. It also defines `_reach_ms` if its longest delay is
-    not three standard deviations above the mean.
+    To add a model, a contributor adds a file to this folder with a subclass. Its attributes are
+    the numerical settings of the model. The subclass defines
+
+    - `draw`, which computes the delay of one message,
+    - `_moments`, which returns the mean and standard deviation of the delay in ms,
+    - optionally `_reach_ms`, which returns the longest delay in ms. By default, this is three
+      standard deviations above the mean.
     """
 
     def draw(self, now: Any) -> None:
@@ -311,10 +322,11 @@ class OwnDelay(LinkBase, frozen=True, kw_only=True):
 
     @property
     def points(self) -> Points:
-        """Numbers of the model's keys, stored where a recorded trace would have its points.
+        """Numerical settings of this delay model, packed for the compiled simulation.
 
-        The kernel has one integer array per link for such data, with two columns. The
-        floating-point numbers of the keys are stored in it bit by bit, two numbers per row.
+        The compiled simulation has one table of integers for each link. A link with recorded
+        delays stores its measurements there. This model stores its floating-point settings bit
+        by bit in the same table, two in each row.
         """
         numbers = list_numbers(self)
         rows = math.ceil(max(len(numbers), 1) / 2)
@@ -325,14 +337,14 @@ class OwnDelay(LinkBase, frozen=True, kw_only=True):
         return LinkModel(kind=DelayKind.CUSTOM, location=1e3 * self._reach_ms())
 
     def to_core_model(self, from_ns: int = 0) -> LinkModel:
-        """Returns the link in the form in which the simulation kernel uses it.
+        """Converts the link to the record that the compiled simulation reads.
 
-        It contains the address of the compiled `draw`, with which the kernel computes the
+        The record contains the address of the compiled method `draw`, which computes the
         delays.
 
         Args:
-            from_ns: Send time of the first sample to which this state of the link applies, in
-                ns after the epoch.
+            from_ns: Send time of the first message to which these settings apply, in ns after
+                the common start time of all sites.
         """
         model = super().to_core_model(from_ns)
         return model._replace(call=compile_to_address(self, "draw", LINK_MODEL_DTYPE))

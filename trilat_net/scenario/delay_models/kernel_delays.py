@@ -55,12 +55,15 @@ class UniformDelay(LinkBase, frozen=True, kw_only=True, tag="uniform"):
 
     @classmethod
     def derive_keys(cls, table: TomlTable) -> TomlTable:
-        """Returns the default of the half width, which is half of the mean.
+        """Returns the default width of the distribution: half of the mean to each side.
 
-        With it, an author may state the mean alone. Empty if the mean is not a number.
+        Therefore the description of a link may state the mean delay alone.
 
         Args:
-            table: Table of the link as its author wrote it.
+            table: Settings of the link as the author of the scenario wrote them.
+
+        Returns:
+            The setting `half_width_ms`. Empty if the mean is missing or not a number.
         """
         delay_ms = table.get("delay_ms")
         return {"half_width_ms": 0.5 * delay_ms} if is_number(delay_ms) else {}

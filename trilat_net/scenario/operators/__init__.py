@@ -27,17 +27,17 @@ from ..distributions import Draws
 
 
 class HeldArm(NamedTuple):
-    """Arm on which an operator or environment acts, as far as its table depends on the arm.
+    """Facts about an arm from which settings of its operators and environments follow.
 
-    For example, the target of an operator starts at the arm by default.
+    An operator moves the arm, and an environment is a body that the arm touches. For example,
+    the point to which an operator pulls the arm is at first the position of the arm.
 
     Attributes:
         counts: Numbers of joints, task coordinates and parameters of the arm.
-        q0_rad: Start pose of the arm, in rad. It may be invalid if the table of the arm is
-            wrong.
+        q0_rad: Start pose of the arm, in rad. It is not checked yet and may be invalid.
         end_effector_m: Function that returns the position of the end effector in the start
             pose, in m.
-        draws: Object that draws the numbers that a scenario states as distributions.
+        draws: Object that replaces a random distribution in the settings by a drawn number.
     """
 
     counts: fields.VectorCounts
@@ -64,22 +64,27 @@ class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
 
     @property
     def actor(self) -> TorqueSource:
-        """The operator or environment in the form in which the simulation kernel uses it."""
+        """Operator or environment, as a record for the compiled simulation.
+
+        From this record, the compiled simulation computes the torque on the arm.
+        """
         return self._source()
 
     @classmethod
     def complete_table(
         cls, table: fields.TomlTable, entry: fields.TomlTable, held_arm: HeldArm, path: str
     ) -> None:
-        """Adds keys that the author left out, if their values follow from the arm.
+        """Adds settings that the author of a scenario left out and that depend on the arm.
 
-        By default, there are no such keys. A subclass that has some overrides this method.
+        For example, the start position of an operator is the position of the arm. A subclass
+        without settings of this kind does not override this method, which adds nothing.
 
         Args:
-            table: Table of the actor. It is changed.
-            entry: Table as its author wrote it.
-            held_arm: Arm on which the actor acts.
-            path: Path of the table, for error messages.
+            table: Settings of the operator or environment, completed with defaults. They are
+                changed.
+            entry: The same settings as the author wrote them.
+            held_arm: Arm on which the operator or environment acts.
+            path: Path of the settings in the scenario, for error messages.
         """
 
     def find_problem(self) -> fields.KeyProblem | None:
@@ -111,10 +116,12 @@ class TimedActor(ActorBase, frozen=True, kw_only=True):
 
 
 class SampledActor(TimedActor, frozen=True, kw_only=True):
-    """Operator or environment whose torque may be computed only once per tick.
+    """Operator or environment whose force can be held constant during a control period.
 
-    Between two ticks, the torque is then constant, as if a real haptic device rendered a wall.
-    Otherwise, the torque is computed in every stage of the integration.
+    Attributes:
+        sampled: If True, the force is computed once per control period and held, as by a real
+            haptic device that renders a wall. If False, it is computed in every stage of the
+            numerical integration.
     """
 
     sampled: bool = False
@@ -227,19 +234,20 @@ def resolve_operators(
     held_arm: HeldArm,
     path: str,
 ) -> list[fields.TomlTable]:
-    """Completes the tables of all operators, or of all environments, of a site.
+    """Completes the settings of all operators, or of all environments, of one arm.
 
-    Missing keys get their defaults, and numbers are drawn where the author stated a
-    distribution.
+    An operator moves the arm, and an environment is a body that the arm touches. Settings that
+    the author of the scenario left out get their defaults. Where the author stated a random
+    distribution, a number is drawn.
 
     Args:
-        written: List of tables as its author wrote it.
-        kinds: Classes that the list may contain, by name.
-        held_arm: Arm of the site, on which the operators act.
-        path: Path of the list, for error messages.
+        written: List of the settings, one table for each operator, as the author wrote it.
+        kinds: Class of each permitted kind of operator, by name of the kind.
+        held_arm: Arm on which the operators act.
+        path: Path of the list in the scenario, for error messages.
 
     Returns:
-        One complete table for each operator or environment, in the order of the list.
+        The completed tables, in the order of the list.
 
     Raises:
         ScenarioError: A table is not valid.

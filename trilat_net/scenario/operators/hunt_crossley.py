@@ -79,15 +79,16 @@ class HuntCrossley(OwnActor, frozen=True, kw_only=True, tag="hunt_crossley"):
 
     # The force does not depend on the time.
     def effort(self, t_s: Array, position: Array, speed: Array) -> Array:  # noqa: ARG002
-        """Computes the force of the body on the end effector for many rows.
+        """Computes the contact force of a compliant body on the end effector.
 
         Args:
             t_s: Times, in s. The force does not depend on them.
-            position: Positions of the end effector, in m, shape (..., n).
+            position: Positions of the end effector, in m, shape (..., n), where n is the number
+                of coordinates. Leading dimensions are independent cases.
             speed: Velocities of the end effector, in m/s, shape (..., n).
 
         Returns:
-            Forces in N, shape (..., n). Zero outside of the body.
+            Forces in N, shape (..., n). Zero where the end effector is outside of the body.
         """
         normal = np.array(self.normal) / np.linalg.norm(self.normal)
         depth = (np.array(self.point_m) - position) @ normal

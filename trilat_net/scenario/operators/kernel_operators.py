@@ -1,14 +1,15 @@
-"""Defines the operators and environments that the simulation kernel computes itself.
+"""Defines the operators and environments that the compiled simulation computes itself.
 
-An operator is a person or program who moves an arm, and an environment is a wall or another
-body that acts on it. The kernel is the compiled code that advances a simulation. Each class
-translates the keys of a scenario, the description of an experiment, to a `TorqueSource`, the
-form in which the kernel receives an operator. Its `TorqueKind` selects the function that
-computes the torque. The documentation of `TorqueSource` defines its vectors for each kind.
+An operator is a person or program who moves an arm, or a model of a person. An environment is a
+wall or another body that the arm touches. Each class here stores the settings of one kind, such
+as a spring towards a moving target, a recorded torque or a wall. It converts them to a
+`TorqueSource`, a record from which the compiled simulation computes the torque on the arm. The
+`TorqueKind` in this record selects the formula, and the documentation of `TorqueSource` states
+the meaning of its numbers for each kind.
 
 Invariant:
-    - An operator for whom no start pose is written holds the arm at the start pose of the arm,
-      so that the run starts without a jump.
+    - If the author of an experiment states no start for an operator, the operator holds the arm
+      at its start pose. Therefore the run starts without a jump.
 """
 
 import math
@@ -110,9 +111,17 @@ class MovingSpring(ActorBase, frozen=True, kw_only=True):
         held_arm: HeldArm,
         path: str,
     ) -> None:
-        """Adds the start position of the arm as the start of the target.
+        """Adds the start and end of the operator's motion, if the author left them out.
 
-        Nothing is added if the author stated a start.
+        The operator pulls the arm to a moving target. By default, the target starts where the
+        arm starts, and its end is its start.
+
+        Args:
+            table: Settings of the operator, completed with other defaults. They are changed.
+            entry: The same settings as the author of the scenario wrote them. They are not
+                used.
+            held_arm: Arm that the operator moves.
+            path: Path of the settings in the scenario, for error messages.
         """
         end_key, start_key = fields.field_names(cls)[:2]
         start_pose = held_arm.end_effector_m() if cls.at_tip else held_arm.q0_rad
@@ -120,7 +129,13 @@ class MovingSpring(ActorBase, frozen=True, kw_only=True):
         held_arm.draws.follow_start(table, end_key, table[start_key], path)
 
     def find_problem(self) -> fields.KeyProblem | None:
-        """Returns a contradiction between the times of the motion. None if there is none."""
+        """Checks that the target of the operator does not arrive before it starts to move.
+
+        The checks of the base class are included.
+
+        Returns:
+            The setting that is wrong and the reason. None if there is no problem.
+        """
         problem = super().find_problem()
         if problem is not None or self.move_end_s >= self.move_start_s:
             return problem
@@ -198,7 +213,11 @@ class RecordedTorque(ActorBase, frozen=True, tag="recorded"):
     points: Annotated[tuple[RecordedPoint, ...], Meta(min_length=1, max_length=1_000_000)]
 
     def find_problem(self) -> fields.KeyProblem | None:
-        """Returns a problem if the points are not in the order of time, otherwise None."""
+        """Checks that the recorded torques are in the order of time.
+
+        Returns:
+            The setting `points` and the reason. None if there is no problem.
+        """
         if any(later[0] <= earlier[0] for earlier, later in pairwise(self.points)):
             return fields.KeyProblem("points", "must be in the order of their times")
         return None
@@ -257,9 +276,10 @@ class Multisine(TimedActor, frozen=True, tag="multisine"):
     phases_rad: Annotated[tuple[fields.Real, ...], Meta(max_length=64)] = ()
 
     def find_problem(self) -> fields.KeyProblem | None:
-        """Returns a problem if the phases do not match the frequencies, or a time is wrong.
+        """Checks that each sine has its phase, and that the operator lets go after taking hold.
 
-        None if there is no problem.
+        Returns:
+            The setting that is wrong and the reason. None if there is no problem.
         """
         count = len(self.frequencies_hz)
         if len(self.phases_rad) not in (0, count):
@@ -309,13 +329,14 @@ class DeviceSettings(fields.Frozen, frozen=True, omit_defaults=True):
     jump_m_s: fields.Positive = 5.0
 
     def rows(self, axes: int) -> list[tuple[float, ...]]:
-        """Returns the direction of each axis of the arm as the person sees it.
+        """Returns the direction in which the user of a haptic device sees each axis of the arm.
 
         Args:
-            axes: Number of axes of the arm: 2 in the plane, 3 in space. It decides the default.
+            axes: Number of axes of the arm: 2 for a planar arm, 3 in space. If the settings
+                state no directions, the number selects the default.
 
         Returns:
-            One vector per axis of the arm, in the coordinates of the person.
+            One unit vector per axis of the arm, in the coordinates of the user.
         """
         return [DIRECTIONS[name] for name in self.frame or FRAMES[axes]]
 
@@ -373,11 +394,21 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
     def complete_table(
         cls, table: fields.TomlTable, entry: fields.TomlTable, held_arm: HeldArm, path: str
     ) -> None:
-        """Removes the keys of the other modes, because they would have no effect.
+        """Checks the settings of a live operator, and removes defaults that have no effect.
+
+        A live operator moves the arm by hand during the run. In the mode "tip" the operator
+        moves the end effector, in "joint" the joints, and in "force" a force is applied. Each
+        mode has settings of its own. The defaults of the other modes are removed.
+
+        Args:
+            table: Settings of the operator, completed with defaults. They are changed.
+            entry: The same settings as the author of the scenario wrote them.
+            held_arm: Arm that the operator moves.
+            path: Path of the settings in the scenario, for error messages.
 
         Raises:
-            ScenarioError: The author wrote a key of another mode, or a wrong direction of an
-                axis.
+            ScenarioError: The author wrote a setting of another mode, or a wrong direction of
+                an axis.
         """
         mode = entry.get("mode", "tip")
         fields.check_choice(mode, list(LIVE_KEYS), f"{path}.mode")

@@ -91,9 +91,21 @@ class ProgramHand(
     def complete_table(
         cls, table: fields.TomlTable, entry: fields.TomlTable, held_arm: HeldArm, path: str
     ) -> None:
-        """Adds the hash of the file of the program's class, and the keys of a live operator.
+        """Completes the settings of a program that operates an arm.
 
-        The hash identifies the version of the program with which an experiment was made.
+        The user wrote the program as a Python class. The method adds the SHA-256 hash of the
+        file that contains the class. The hash identifies the version of the program with which
+        an experiment was made. Settings that the program has in common with a person who moves
+        the arm are completed as for a person.
+
+        Args:
+            table: Settings of the operator, completed with defaults. They are changed.
+            entry: The same settings as the author of the scenario wrote them.
+            held_arm: Arm that the program moves.
+            path: Path of the settings in the scenario, for error messages.
+
+        Raises:
+            ScenarioError: The file of the class cannot be read, or a setting is not valid.
         """
         code = table.get("class")
         if isinstance(code, str) and "source_sha256" not in entry:
@@ -105,16 +117,16 @@ class ProgramHand(
 
 
 class HandSite(NamedTuple):
-    """A site whose operator is a program, with the settings of the program.
+    """Site, the process that runs one arm, whose arm is moved by a program.
 
-    An operator is whoever moves the arm of the site.
+    The program is a user's Python class, which takes the place of a person.
 
     Attributes:
-        scenario: The scenario.
+        scenario: Description of the experiment.
         name: Name of the site.
-        spec: Table of the operator in the scenario.
+        spec: Settings of the program in the scenario.
         rate_hz: Rate at which the program is called, in Hz.
-        delay_s: Time from the observation to the resulting action, in s.
+        delay_s: Time from an observation of the arm to the resulting action, in s.
     """
 
     scenario: "Scenario"
@@ -125,7 +137,7 @@ class HandSite(NamedTuple):
 
     @property
     def program(self) -> str:
-        """Class of the program as the scenario names it, for example "my_policy:Reach"."""
+        """Name of the Python class that operates the arm, for example "my_policy:Reach"."""
         return self.spec.code if isinstance(self.spec, ProgramHand) else "a program"
 
     @property
@@ -145,7 +157,12 @@ class HandSite(NamedTuple):
         return f"{self.program[:40]} {self.scenario.sha256[:16]}"
 
     def describe(self) -> HandContext:
-        """Returns what the program is told about the experiment when it is created."""
+        """Returns the facts about the experiment that the program receives when it is created.
+
+        The program is a user's Python class that operates an arm. The facts include the name of
+        its site (the process of the arm), the other sites, and the mode in which it moves the
+        arm.
+        """
         spec = self.spec
         rules = spec.make_rules(
             self.scenario.sites[self.name].rate_hz, self.scenario.arms[self.name]
@@ -163,9 +180,10 @@ class HandSite(NamedTuple):
         )
 
     def make_hand(self) -> OwnHand:
-        """Returns the schedule of the program.
+        """Creates the schedule of the program that operates the arm.
 
-        It decides in which ticks the program is called, and in which its actions apply.
+        The schedule decides in which control periods the program is called, and in which
+        periods its actions take effect after their delay.
         """
         tick_rate_hz = self.scenario.sites[self.name].rate_hz
         arm = self.scenario.arms[self.name]
@@ -177,19 +195,21 @@ class HandSite(NamedTuple):
 
 
 class HandPlayer:
-    """Calls the program that operates an arm, and passes its actions to the site.
+    """Calls a program that operates an arm, and passes its actions to the site of the arm.
 
-    If the program fails, it lets go of the arm for the rest of the run.
+    The program is a user's Python class, and the site is the process that runs the arm. If the
+    program fails, it no longer moves the arm for the rest of the run.
 
     Args:
-        hand_site: The site and the settings of the program.
+        hand_site: The site, and the settings of the program.
         program: The program, an instance of the user's class.
-        watch: Function that makes the call, for example with a time limit.
+        watch: Function through which the program is called, for example with a time limit.
 
     Attributes:
-        hand: Schedule that decides when the program is called and when its actions apply.
+        hand: Schedule that decides when the program is called and when its actions take effect.
         failure: Reason why the program failed. Empty if it did not fail.
-        news: Ticks and sentences about changes that have not been published as events yet.
+        news: Changes that have not been published yet, for example that the program took hold
+            of the arm. Each change is the number of the control period and a sentence.
     """
 
     def __init__(self, hand_site: HandSite, program: Any, watch: Watch = call_directly) -> None:
@@ -205,34 +225,39 @@ class HandPlayer:
         self.hand = hand_site.make_hand()
 
     def track(self, site: Site, k: int) -> list[float]:
-        """Returns what the program does in tick `k`, and calls the program if this is due.
+        """Returns the action of the program that operates the arm, in one control period.
 
-        The method must be called once for each tick of the site, in order.
+        The program is called if this is due; otherwise, its earlier action goes on. The method
+        must be called once for each control period, in order.
 
         Args:
-            site: The site, before the tick.
-            k: Number of the tick.
+            site: The process of the arm, before the period.
+            k: Number of the control period.
 
         Returns:
-            The action that applies in this tick, in the form of `HandInForce`.
+            The action as the numbers of `HandInForce`: for example the target to which the
+            program pulls the arm.
         """
         step = self.hand.advance_to(k, self._prepare(k, site.arrays))
         self.news += [(k, self._describe_change(k, change)) for _, change in step.changes]
         return step.vector
 
     def compute_actions(self, k: int, end: int, arrays: SiteArrays) -> Array:
-        """Returns what the program does from tick `k` on, for as many ticks as are certain.
+        """Computes the actions of a program that operates the arm, for several periods.
 
-        The result ends before the first tick in which the program must observe a state of the
+        A period is one cycle of the control loop.
+
+        The result ends before the first period in which the program must observe a state of the
         arm that has not been computed yet.
 
         Args:
-            k: Number of the first tick.
-            end: Number of the tick before which the result ends at the latest.
-            arrays: State of the site before tick `k`.
+            k: Number of the first control period.
+            end: Number of the control period before which the result ends at the latest.
+            arrays: State of the arm's process before period `k`.
 
         Returns:
-            An array with one row per tick.
+            One row per control period, with the numbers of `HandInForce`: for example the
+            target to which the program pulls the arm.
         """
         return self.hand.advance_span(k, end, self._prepare(k, arrays))
 
@@ -334,17 +359,20 @@ def make_hand_program(hand_site: HandSite) -> HandProgram:
 
 
 def make_hand_players(scenario: "Scenario") -> dict[str, HandPlayer]:
-    """Creates the programs that operate arms, for all sites that have one.
+    """Creates the programs that operate arms, for all sites that have a program.
+
+    A site is the process that runs one arm. Its operator can be a program, which is a user's
+    Python class, in place of a person.
 
     Args:
         scenario: Description of the experiment.
 
     Returns:
-        An object that calls the program, by the name of the site. Empty if no site has a
-        program.
+        For each site with a program, by name, the object that calls the program. Empty if no
+        site has a program.
 
     Raises:
-        CodeWithheld: A class may not run.
+        CodeWithheld: Nobody has permitted the code of a class to run.
         ScenarioError: A program cannot be created.
     """
     players = {}
