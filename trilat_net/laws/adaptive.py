@@ -1,8 +1,8 @@
 """Implements the adaptive control law, which learns the parameters of the arm's dynamics.
 
-The law is that of Eq. (13) and (15) of the paper on which this project is based, "Adaptive
-Control of Dual User Teleoperation with Time Delay and Dynamic Uncertainty". It needs no model
-of the arm. While it controls the arm, it estimates the dynamic parameters theta, which are
+The law is stated by Eq. (13) and (15) of the paper "Adaptive Control of Dual User Teleoperation
+with Time Delay and Dynamic Uncertainty", on which this project is based. It needs no model of
+the arm. While it controls the arm, it estimates the dynamic parameters theta, which are
 combinations of masses, lengths and inertias:
 
     torque = Y theta_hat - Kp r - Kd ed

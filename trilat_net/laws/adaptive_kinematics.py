@@ -22,9 +22,9 @@ Symbols:
     - Y_k: matrix with Y_k l_hat = J_hat qd.
     - Lambda, Kp, Kd, Gamma, Gamma_l: gains.
 
-The stability proof is that of the law `adaptive`: the adaptation of l_hat cancels the term that
-wrong lengths add (docs/laws.md). Source of the adaptive Jacobian: Cheah, Liu and Slotine, Int.
-J. Robotics Research 25 (2006).
+The stability proof of the law `adaptive` applies, because the adaptation of l_hat cancels the
+term that wrong lengths add (docs/laws.md). Source of the adaptive Jacobian: Cheah, Liu and
+Slotine, Int. J. Robotics Research 25 (2006).
 
 Invariant:
     - Both estimates are integrated by the trapezoid rule, like the estimate of `adaptive`.

@@ -84,8 +84,9 @@ class Authority(ControlLaw):
     def linear_gains(self, theta: Array) -> Gains | None:
         """Returns the damping of this law for the linear analysis.
 
-        The gains are those of the built-in law tau = G - d qd, where G is the gravity torque, d
-        the damping in N m s/rad and qd the joint velocity. `linear_form` adds the springs.
+        The gains are written for the built-in law tau = G - d qd, where G is the gravity
+        torque, d the damping in N m s/rad and qd the joint velocity. `linear_form` adds the
+        springs.
 
         Args:
             theta: Parameters of the arm's dynamics, such as masses, shape (P,), where P is

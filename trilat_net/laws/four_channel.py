@@ -166,8 +166,8 @@ class FourChannel(ControlLaw):
     def linear_gains(self, theta: Array) -> Gains | None:
         """Returns the gains of spring, damper and felt torque for the linear analysis.
 
-        The gains are those of the built-in law tau = G - K e - Kd ed + k_f felt. Here G is the
-        gravity torque, e the position error, ed its derivative and `felt` the torque on the
+        The gains are written for the built-in law tau = G - K e - Kd ed + k_f felt. Here G is
+        the gravity torque, e the position error, ed its derivative and `felt` the torque on the
         arms of the peers. K, Kd and k_f are the gains `K`, `B` and `force_peer` of this law.
         `linear_form` adds the remaining terms.
 

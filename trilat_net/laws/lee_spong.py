@@ -94,8 +94,8 @@ class LeeSpong(ControlLaw):
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
         """Evaluates for which gains and delays this law is stable at one site of a scenario.
 
-        The condition is that of a spring with a damper. It bounds the damping from below by the
-        stiffness times the delay.
+        The known condition for a spring with a damper is used. It bounds the damping from below
+        by the stiffness times the delay.
 
         Args:
             situation: The site, its peers (the other sites) and the delays between them.

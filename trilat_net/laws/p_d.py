@@ -43,13 +43,15 @@ class PD(ControlLaw):
     tune: ClassVar = {"K": STIFFNESS, "d": DAMPING}
 
     def compute_torque(self, G: Array, e: Array, qd: Array) -> Array:
-        """Returns the torque of each joint before the torque limits, N m.
+        """Computes the torque of each joint before the torque limits, N m.
 
-            tau = G(q) - K e - d qd
+            tau = G - K e - d qd
+
+        K is the stiffness (N m/rad) and d the damping of the arm (N m s/rad).
 
         Args:
-            G: Torque of the known gravity, shape (n,), N m.
-            e: Position error q - q_des, Eq. (9), shape (n,), rad.
+            G: Torque that compensates gravity, shape (n,) for n joints, N m.
+            e: Position error: position minus reference, shape (n,), rad.
             qd: Joint velocities, shape (n,), rad/s.
         """
         spring = np.array(self.K) * e
