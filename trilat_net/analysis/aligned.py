@@ -1,18 +1,19 @@
-"""Gives each arm's records a row for every tick, and shows the peers as the arm sees them.
+"""Arranges the records of each arm with one row per tick, and views peers as it sees them.
 
-A site is the process that runs one arm, and its peers are the sites that it follows. A record
-is the result of one tick of its control loop. Analyses need a row for every tick, also if the
-log lacks some records. They also need the motion of a peer at times between its ticks, for
-example at the time at which a delayed sample was sent.
+A site is the process that runs one arm, and its peers are the sites that it follows. In each
+tick, the period of its control loop, a site stores one record with its state. It also uses one
+sample per peer, which is a state that the peer sent earlier. Analyses need a row for every
+tick, even if the log lacks some records. They also need the motion of a peer at times between
+its ticks, for example at the time at which a sample was sent.
 
 Invariant:
-    - A gap in the records is filled by interpolation, so that sums have all their terms and
-      rows keep their times. Filled rows are not marked as `known`, and no metric uses them.
+    - A missing record is interpolated, so that sums have all their terms. Interpolated rows are
+      not marked as `known`, and no metric uses them.
     - Between two records a peer moves along a cubic polynomial that meets the recorded angles
-      and velocities. Before its first record it rests (rule L7 of docs/design.md).
-    - Within a tick period the sample in use is assumed to keep its age, as under the constant
-      delay of the stability theorem. At the end of the period, the difference from the sample
-      that is used next is treated as a jump.
+      and velocities. Before its first record it does not move.
+    - Within a tick period the delay of a peer's sample is assumed to be constant, as in the
+      stability theorem. At the end of the period, the difference from the next sample is
+      treated as a jump.
 """
 
 from collections.abc import Sequence

@@ -1,19 +1,18 @@
-"""Traces the weights with which the arms follow each other, and derives those of the proof.
+"""Traces the weights with which arms follow each other, and computes their energy weights.
 
-The dominance factor alpha_ij of Eq. (6) of the paper is the weight with which site i, the
-process that runs one arm, follows site j. The factors may change during a run, at once or in a
-ramp. The energy function V of the stability proof is a weighted sum over the sites with the
-Lyapunov weights
+A site is the process that runs one arm. The dominance factor alpha_ij is the weight with which
+site i follows the motion of site j. The factors may change during a run, at once or in a ramp.
+
+The stability proof uses the sum of the energies of all sites, in which site i has the weight
 
     beta_i = pi_i / c_i
 
-Here pi is the left Perron vector of the matrix alpha, which satisfies pi' alpha = pi', and c_i
-is the scalar of site i in Kd_i = c_i Kbar, where Kd_i is the damping gain of the site and Kbar
-a matrix that all sites share. Both these weights and this form of the gains are necessary for
-the proof (docs/errata.md). The paper itself uses weights of 1.
+Here pi is the left eigenvector of the matrix alpha for the eigenvalue 1 (the Perron vector),
+and c_i is the factor by which the damping gain of site i differs from that of the first site.
+Without these weights the proof does not hold (docs/errata.md).
 
 Invariant:
-    - The factors depend only on time and on the applied changes.
+    - The factors depend only on time and on the changes that were carried out.
     - A ramp starts from the value that the preceding ramp has reached at that time.
 """
 
@@ -99,10 +98,11 @@ def trace_dominance(log: Log, site: str, t_s: Array) -> DominanceHistory:
 
 
 def list_ramps(log: Log, site: str) -> tuple[Array, list[DominanceRamp]]:
-    """Lists how the dominance factors of a site were planned and commanded to change.
+    """Lists the planned and commanded changes of the weights with which a site follows others.
 
-    Every change is a ramp from the old to the new factors. A step is a ramp without length.
-    Both the changes of the scenario and the recorded commands are included.
+    A site is the process that runs one arm. It follows each of its P peers with a weight, the
+    dominance factor. Every change is a ramp from the old to the new factors. A sudden change is
+    a ramp without length.
 
     Args:
         log: The log of the run.
@@ -113,7 +113,7 @@ def list_ramps(log: Log, site: str) -> tuple[Array, list[DominanceRamp]]:
         The ramps.
 
     Raises:
-        LogError: A record names a change that is not valid.
+        LogError: A recorded change is not valid.
     """
     start, ramps = list_scripted_ramps(log.scenario, site)
     ramps = list(ramps)
@@ -165,17 +165,21 @@ class UserShares(NamedTuple):
 
 
 def find_user_shares(scenario: Scenario, alpha: Array, program: str = "") -> UserShares:
-    """Returns how the slave of a scenario divides its motion between its users.
+    """Returns the weights with which the slave arm follows each of its users over time.
 
     `find_users` determines the slave and the users.
 
     Args:
         scenario: The description of the experiment.
-        alpha: Dominance factors of the slave for its P peers, shape (K, P).
-        program: Name of the user whose arm a program moves. By default the last user.
+        alpha: Dominance factors of the slave, the weights with which it follows its P peers, at
+            K times, shape (K, P).
+        program: Name of the user whose arm a program moves. Empty for the last user.
+
+    Returns:
+        The weights, and the user with the largest weight at each time.
 
     Raises:
-        UsageError: There is no such user.
+        UsageError: There is no user with this name.
     """
     slave, users = find_users(scenario)
     program = program or users[-1]
@@ -378,10 +382,14 @@ class LyapunovWeights(NamedTuple):
 
 
 def find_closed_groups(alpha: Array) -> tuple[tuple[int, ...], ...]:
-    """Finds the groups of sites that follow each other, and no site outside the group.
+    """Finds the groups of sites that follow each other, and that follow nobody else.
+
+    A site is the process that runs one arm. It may follow another site directly or through
+    further sites.
 
     Args:
-        alpha: Matrix of the dominance factors, shape (N, N).
+        alpha: Dominance factors: entry (i, j) is the weight with which site i follows site j,
+            shape (N, N).
 
     Returns:
         Indices of the sites of each group.
@@ -423,16 +431,15 @@ def left_perron_vector(alpha: Array) -> Array:
 
 
 def find_kd_scales(Kd: Array) -> Array | None:
-    """Finds the factors c_i by which the gains Kd of the sites differ.
-
-    They satisfy Kd_i = c_i Kbar with a common Kbar, and c_1 = 1. If all gains are zero, nothing
-    couples the sites, and any factors are right: they are 1.
+    """Finds the factors by which the damping gains Kd of the arms differ from the first arm's.
 
     Args:
-        Kd: Gains of the N sites, shape (N, n). NaN along an axis that a site does not follow.
+        Kd: Damping gains of the N arms along n axes, shape (N, n). NaN along an axis that an
+            arm does not follow.
 
     Returns:
-        The factors, shape (N,). None if the gains do not differ by factors only.
+        The factors, shape (N,). All are 1 if all gains are zero. None if the gains of the arms
+        are not multiples of each other.
     """
     if not np.nan_to_num(Kd).any():
         return np.ones(len(Kd))
@@ -453,15 +460,17 @@ def find_kd_scales(Kd: Array) -> Array | None:
 
 
 def compute_lyapunov_weights(alpha: Array, Kd: Array) -> LyapunovWeights:
-    """Computes the weights of the sites in the energy function V of the stability proof.
+    """Computes the weight of each site in the energy function of the stability proof.
 
-    They are beta_i = pi_i / c_i, scaled to the sum N. pi is the left eigenvector of the
-    dominance factors (`left_perron_vector`), and c_i are the factors between the gains
-    (`find_kd_scales`). If no such factors exist, pi alone determines beta, and V may rise.
+    A site is the process that runs one arm. Its weight is beta_i = pi_i / c_i, where pi is the
+    left eigenvector of `alpha` for the eigenvalue 1, and c_i is the factor between the damping
+    gain of site i and that of the first site. The weights are scaled so that their sum is N. If
+    the gains differ by more than a factor, c_i = 1 is used, and the energy may rise.
 
     Args:
-        alpha: Matrix of the dominance factors, shape (N, N).
-        Kd: Gains of the N sites, shape (N, n).
+        alpha: Dominance factors: entry (i, j) is the weight with which site i follows site j,
+            shape (N, N).
+        Kd: Damping gains of the N sites along n axes, shape (N, n).
     """
     pi = left_perron_vector(alpha)
     scales = find_kd_scales(Kd)

@@ -1,35 +1,28 @@
-"""Classifies the trend of an envelope over the second half of a run: it grows, decays or stays.
+"""Decides whether an oscillation grows, decays or stays, over the second half of a run.
 
-An envelope is the largest size of a signal in short intervals of time, such as the largest
-error |e| in each twentieth of a second. A class describes the record and predicts nothing (see
-docs/definitions.md, "Stable").
+The envelope of a signal is its largest magnitude in each short interval of time. The second
+half of the run is divided into 16 equal windows. If these do not decide, it is divided into 8.
+The maximum of each window, at least `FLOOR_RAD`, is taken. A straight line is fitted to the
+logarithms of these maxima. Its slope has one-sided confidence bounds of 99.5 % (Student's t).
 
-The half is divided into n equal windows, with n = 16 and, if these do not decide, n = 8. A
-window counts with its largest value, at least `FLOOR_RAD`. A straight line is fitted to the
-logarithms of these maxima, with the one-sided 99.5 % bounds of its slope (Student's t, n - 2
-degrees of freedom).
+The classes use the four quarters of the second half, and the three steps between the maxima of
+successive quarters:
 
-The classes, with "quarters" for the four quarters of the second half:
+- GROWS: the lower bound of the slope is positive, and each step is a rise by 1 % or more. The
+  rise does not slow down: in logarithms, the last step is at least 3/4 of the first. If the
+  maxima rise by more than a factor of 8/5 in all, 0.45 of the first step suffices, because no
+  saturating response that starts at zero does that. Growth does not count if the first half of
+  the run falls by 1 % or more from each quarter to the next.
+- DECAYS: the upper bound of the slope is negative, and the line falls by a factor of two or
+  more. The last step is a fall of at least half the size that it has in a steady fall by a
+  factor of two. An envelope whose last quarter does not exceed `FLOOR_RAD` decays as well.
+- HARDLY: the upper bound is negative, and the line falls by 4 % or more, but the conditions of
+  DECAYS do not hold.
+- STEADY: the bounds show that the envelope neither doubles nor halves within the half.
+- UNDECIDED: no other class applies, or the last step is more than a doubling without growth.
 
-- GROWS: the lower bound is positive, the maxima rise by 1 % or more from quarter to quarter,
-  and the rise does not die away: the last of the three steps, in logarithms, is at least 3/4 of
-  the first step. At least 0.45 of the first step suffices if the maxima rise by more than a
-  factor of 8/5 in all, because no response that starts at zero and saturates does that. In the
-  first half of the record the maxima must not fall by 1 % or more from quarter to quarter: a
-  fall followed by a rise needs a longer record.
-- DECAYS: the upper bound is negative, the line falls by a factor of two or more over the half,
-  and the last step is a fall of at least half the size that it has in a steady fall by a factor
-  of two. An envelope whose last quarter does not exceed `FLOOR_RAD` decays as well.
-- HARDLY: the line falls by 4 % or more, but the conditions of DECAYS do not hold.
-- STEADY: the bounds exclude that the envelope doubles or halves within the half.
-- UNDECIDED: the record is too short or too irregular, growth slows down, or a fall is
-  followed by a rise.
-
-Every class but GROWS and UNDECIDED requires that the maximum of the last quarter is at most
-twice the maximum of the quarter before.
-
-No finite record excludes growth that starts later. A beat that is longer than the run looks
-like growth while it rises.
+A class describes the record and predicts nothing. No finite record excludes growth that starts
+later. A beat that is longer than the run looks like growth while it rises.
 """
 
 import math
@@ -62,9 +55,10 @@ _LARGEST_RISE_FROM_ZERO = math.log(8.0 / 5.0)
 
 
 class EnvelopeTrend(StrEnum):
-    """Trend of an envelope, the bound of an oscillation, at the end of a run.
+    """Trend of the magnitude of an oscillation in the second half of a run.
 
-    The value of each member is the text for people.
+    The module's docstring defines the classes. The value of each member is a phrase for the
+    user.
     """
 
     DECAYS = "decays"
@@ -75,17 +69,18 @@ class EnvelopeTrend(StrEnum):
 
 
 class EnvelopeFit(NamedTuple):
-    """Trend of an envelope over the second half of a run, computed by `fit_envelopes`.
+    """Trend of the magnitude of an oscillation, computed by `fit_envelopes`.
 
-    An envelope is a bound that an oscillating quantity touches in its maxima.
+    The envelope is the largest magnitude of a signal in each short interval of time.
 
     Attributes:
         trend: Class of the trend, such as growing or decaying.
-        rate_per_s: Slope of the logarithm of the maxima, in 1/s: the envelope is proportional
-            to exp(rate t). NaN if there are too few points.
-        calm: True if the envelope is not about to grow. First, it falls, or the upper bound of
-            its rate excludes a rise by a quarter within the half. Second, the maximum of the
-            last quarter is at most 1.5 times the maximum of the quarter before.
+        rate_per_s: Rate of the envelope, which is proportional to exp(rate t), in 1/s. NaN if
+            the record is too short.
+        calm: True if the envelope is not about to grow. Two conditions must hold. First, it
+            falls, or it certainly rises by less than a quarter within the second half of the
+            run. Second, its maximum in the last quarter of this half is at most 1.5 times its
+            maximum in the quarter before.
     """
 
     trend: EnvelopeTrend
@@ -94,14 +89,18 @@ class EnvelopeFit(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The trend as a verb for people, such as "grows"."""
+        """The trend of the envelope in a few words for the user, such as "grows"."""
         if self.trend is EnvelopeTrend.UNDECIDED:
             return "shows no trend"
         return self.trend.value
 
     @property
     def rate_text(self) -> str:
-        """The trend for people: its rate if the envelope grows or decays, otherwise a verb."""
+        """The trend of the envelope in a few words for the user.
+
+        If the envelope grows or decays, it is the rate, such as "+0.12/s". Otherwise it is
+        `text`, such as "steady".
+        """
         if self.trend in (EnvelopeTrend.STEADY, EnvelopeTrend.UNDECIDED):
             return self.text
         return f"{self.rate_per_s:+.3g}/s"
@@ -114,17 +113,17 @@ def fit_envelopes(
     *,
     falls_first: bool = False,
 ) -> list[EnvelopeFit]:
-    """Determines whether envelopes grow, decay or neither, over the second half of a run.
+    """Determines whether oscillations grow, decay or stay, over the second half of a run.
 
-    The module's docstring defines the classes.
+    The module's docstring defines the classes of the trend.
 
     Args:
         t_s: Ascending times, shape (K,), in s.
-        values: The envelopes, such as the largest error |e| since the time before, shape (K,
-            C).
-        floor: Value below which an envelope counts as zero, in place of `FLOOR_RAD`.
-        falls_first: True if an envelope that rises after a fall counts as growing too, because
-            the fall is known to have another cause than the rise.
+        values: The C envelopes, shape (K, C). Each is the largest magnitude of a signal in the
+            interval that ends at a time.
+        floor: Value below which an envelope counts as zero. It has the unit of `values`.
+        falls_first: True if an envelope that falls and then rises counts as growing too. By
+            default its trend is undecided.
 
     Returns:
         The trend of each of the C envelopes.

@@ -1,15 +1,15 @@
-"""Gives an overview of MCAP files, and summarises recorded runs.
+"""Gives an overview of recorded files, and summarises recorded runs.
 
-`info` lists the layout, the channels, the gaps and the message rates of any MCAP file. For a
-log of this program it adds the health of the session, of the control loops, of the links and of
-the clocks. `summarise_run` computes the content of `summary.json` of a run. Neither executes
-the run again.
+`info` lists the content of any MCAP file: its layout, its channels, missing messages, and
+message rates. For a log of this program it adds how well the control loops, the network links
+and the clocks worked. `summarise_run` computes the content of the file `summary.json` of a run.
 
 Invariant:
-    - The inventory of a file decodes no message, so that it works for any MCAP file. If a log
-      cannot be opened, the overview states the reason.
-    - Gaps are counted only in channels whose messages have consecutive numbers.
+    - The list of channels and messages decodes no message, so that it works for any MCAP file.
+      If a log cannot be opened, the overview states the reason.
+    - Missing messages are counted only in channels whose messages have consecutive numbers.
     - Keys end in their unit. A quantity that the log does not determine is None, never NaN.
+    - A run is never executed again for its summary.
 """
 
 from array import array
@@ -141,14 +141,19 @@ class FileInventory:
         rates_hz: Mapping[str, int],
         absences: Absences,
     ) -> dict[str, JsonObject]:
-        """Returns what each channel contains, by topic, as plain values for `trilat log info`.
+        """Describes the messages in each channel of the files, for `trilat log info`.
 
-        Gaps are counted only in channels of one session, whose tick rates are known.
+        A channel contains the messages of one topic. Missing messages are counted only for a
+        session whose tick rates are known.
 
         Args:
-            session: Name of the session. Empty to count no gaps.
-            rates_hz: Tick rates of the session's sites, by name.
-            absences: Ticks during which the sites were absent from the session.
+            session: Name of the session. Empty to count no missing messages.
+            rates_hz: Tick rates of the session's sites, the processes that run one arm each, by
+                name.
+            absences: Ticks in which sites were absent from the session. They are not missing.
+
+        Returns:
+            Plain values by topic.
         """
         topics_in_order = dict.fromkeys([*self._channel_infos, *self._messages])
         channels = {}
@@ -242,10 +247,12 @@ def _count_gaps(
 
 @dataclass(frozen=True, repr=False)
 class FileOverview(Result):
-    """Content of an MCAP file, or of the parts of one log, returned by `info`.
+    """Overview of one or several recorded files, returned by `info`.
+
+    The files are MCAP files. A log that was recorded in several files is described as a whole.
 
     Attributes:
-        facts: The content as plain values, with the keys of `trilat log info --json`.
+        facts: The overview as plain values. The keys are those of `trilat log info --json`.
     """
 
     facts: JsonObject
@@ -288,7 +295,15 @@ def info(*files: str | Path, progress: Progress | None = None) -> FileOverview:
     paths = [Path(file) for file in files]
 
     def report_pass(number: int) -> Progress | None:
-        """Returns the progress of the first (0) or the second (1) pass over the files."""
+        """Returns a function that reports the progress of one of two passes over the files.
+
+        Args:
+            number: 0 for the first pass, which covers the first half of the progress, 1 for the
+                second.
+
+        Returns:
+            The function. It is None if the caller of `info` wants no reports.
+        """
         return progress and (lambda done, total: progress(number * total + done, 2 * total))
 
     inventory = FileInventory(paths, report_pass(0))

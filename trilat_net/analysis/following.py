@@ -1,19 +1,19 @@
-"""Translates the errors with which an arm follows others into motion and torque of its joints.
+"""Computes how an arm moves its joints to follow other arms, for all records at once.
 
-A site, the process that runs one arm, follows its peers (other arms) either joint by joint, or
-in task space with its end effector. In task space, the error of the end effector is translated
-to the joints with an inverse of the Jacobian J, which is damped near singular poses. The
-classes `JointFollowing` and `TaskFollowing` have the same methods for the two cases. Their
-functions work on all records of a run at once.
+A site is the process that runs one arm. It follows other arms either joint by joint
+(`JointFollowing`), or with its end effector (`TaskFollowing`). Both classes have the same
+methods. The error e is the difference between the position of the arm and the position that it
+follows. From e the classes compute the reference velocity of the joints, which reduces e.
+`TaskFollowing` uses an inverse of the Jacobian J that is damped near singular poses.
 
 Invariant:
-    - All functions are written with NumPy from the equations of `docs/laws.md`, independently
-      of the simulation kernel.
-    - Axes of space that are not followed have no effect, because only the rows of J and of its
-      derivative J' that belong to followed axes are used.
-    - Near a singular pose the end effector misses the demanded velocity -Lambda e, where e is
-      its error and Lambda a gain. The reference velocity v of the joints then satisfies
-      J v = -Lambda e - damping y, where y is the solution of the damped system of equations.
+    - All functions are written with NumPy from the equations of docs/laws.md, independently of
+      the simulation.
+    - Directions of space in which the end effector does not follow have no effect.
+    - Near a singular pose the end effector does not reach the velocity -Lambda e, where Lambda
+      is a gain in 1/s. The joint velocity v then satisfies J v = -Lambda e - d y. Here d is the
+      damping, y solves (J J' + d) y = -Lambda e - J p, and p is the velocity of the joints
+      towards a preferred posture.
 """
 
 from collections.abc import Callable
@@ -89,12 +89,16 @@ class JointFollowing(NamedTuple):
         e: Array,
         ed: Array,
     ) -> tuple[Array, Array]:
-        """Returns the reference velocity v = -Lambda e of the joints, and its derivative.
+        """Returns the joint velocity that should reduce the errors, and its derivative.
+
+        The velocity is -Lambda e, with the error e of the joints and the gain Lambda.
 
         Args:
-            rows: Rows of the records. Not needed here, as the result depends on no pose.
-            e: Synchronisation errors, shape (K, n), in rad.
-            ed: Their derivatives, shape (K, n), in rad/s.
+            rows: Rows of the records. They have no effect, because the result depends on no
+                pose.
+            e: Differences between the joint angles and the angles that the arm follows, shape
+                (K, n), in rad.
+            ed: Derivatives of the errors, shape (K, n), in rad/s.
 
         Returns:
             Reference velocity, shape (K, n), in rad/s.
@@ -125,7 +129,12 @@ class JointFollowing(NamedTuple):
         return force
 
     def without_posture(self) -> "JointFollowing":
-        """Returns this object, because joint-by-joint following has no preferred posture."""
+        """Returns this object unchanged.
+
+        `TaskFollowing` needs this method to leave out the motion towards a preferred posture.
+        An arm that follows joint by joint has no free joints, and therefore no preferred
+        posture.
+        """
         return self
 
     def compute_damping_deviation(
@@ -133,7 +142,18 @@ class JointFollowing(NamedTuple):
         rows: Rows,  # noqa: ARG002
         e: Array,
     ) -> tuple[Array, Array]:
-        """Returns zeros: there are no singular poses near which motion would be damped."""
+        """Returns two arrays of zeros, because no motion is damped near singular poses here.
+
+        Singular poses matter only for arms that follow with their end effectors, see
+        `TaskFollowing`.
+
+        Args:
+            rows: Rows of the records. They have no effect.
+            e: Synchronisation errors of the joints, shape (K, n), in rad.
+
+        Returns:
+            Two arrays of zeros, shape (K, n).
+        """
         zeros = np.zeros_like(e)
         return zeros, zeros
 
@@ -177,18 +197,17 @@ class TaskFollowing:
         return y
 
     def compute_reference(self, rows: Rows, e: Array, ed: Array) -> tuple[Array, Array]:
-        """Returns the reference velocity of the joints, and its derivative.
-
-        `find_task_reference` has the equations.
+        """Returns the joint velocity with which the end effector should reduce its error.
 
         Args:
             rows: Rows of the records whose pose is used.
-            e: Synchronisation errors of the end effector, shape (K, m).
-            ed: Their derivatives, shape (K, m).
+            e: Differences between the position of the end effector and the position that it
+                follows, shape (K, m) for m coordinates.
+            ed: Derivatives of the errors, shape (K, m).
 
         Returns:
-            Reference velocity v, shape (K, n), in rad/s.
-            Its derivative a, shape (K, n), in rad/s^2.
+            Reference velocity of the n joints, shape (K, n), in rad/s.
+            Its derivative as the control law computes it, shape (K, n), in rad/s^2.
         """
         # `find_task_reference` has the rows on the last axis
         inverse = np.moveaxis(self.inverse[rows], 0, -1)
@@ -206,13 +225,18 @@ class TaskFollowing:
         return v.T, a.T
 
     def compute_jump_of_r(self, rows: Rows, de: Array) -> Array:
-        """Returns the jump of the filtered error r when the error e jumps, shape (K, n).
+        """Returns how much the filtered error r jumps when the error of the end effector jumps.
 
-        It is J+ Lambda de, with the damped inverse J+ of the Jacobian.
+        The filtered error r is the joint velocity minus its reference. Errors jump when a new
+        state of another arm arrives. The jump of r is the damped inverse of the Jacobian times
+        Lambda times the jump of the error, with the gain Lambda in 1/s.
 
         Args:
             rows: Rows of the records whose pose is used.
-            de: Jumps of e, shape (K, m).
+            de: Jumps of the error, shape (K, m) for m coordinates of the end effector.
+
+        Returns:
+            Jumps of r, shape (K, n) for n joints, in rad/s.
         """
         y = self._solve(rows, self.Lambda * de)
         return self.compute_joint_torque(rows, y)
@@ -240,27 +264,29 @@ class TaskFollowing:
         return self._solve(slice(None), along_axes)
 
     def without_posture(self) -> "TaskFollowing":
-        """Returns the same functions without the motion towards the preferred posture.
+        """Returns a copy of this object in which free joints keep their positions.
 
-        The reference velocity is then linear in the errors e and ed.
+        They do not move to a preferred posture. The reference velocity is then linear in the
+        error of the end effector.
         """
         still = np.zeros_like(self.psi)
         return replace(self, psi=still, psi_rate=still)
 
     def compute_damping_deviation(self, rows: Rows, e: Array) -> tuple[Array, Array]:
-        """Returns what the damping near singular poses changes in the equations of the proof.
+        """Returns by how much damping near singular poses violates two equations of the proof.
 
-        Without damping, J r = x' + Lambda e and a = v' hold exactly, where r is the filtered
-        error, x' the velocity of the end effector, v the reference velocity of the joints and a
-        the acceleration that the law uses for it. The result is zero away from singular poses.
+        Without damping, the equations J r = xd + Lambda e and a = dv/dt hold exactly. Here J is
+        the Jacobian, r the filtered error, xd the velocity of the end effector, e its error and
+        Lambda a gain. The reference velocity of the joints is v, and a is the acceleration that
+        the control law uses for dv/dt. Away from singular poses the result is zero.
 
         Args:
             rows: Rows of the records whose pose is used.
-            e: Synchronisation errors of the end effector, shape (K, m).
+            e: Errors of the end effector, shape (K, m) for m coordinates.
 
         Returns:
-            J r - x' - Lambda e, shape (K, m).
-            a - v', shape (K, n).
+            J r - xd - Lambda e, shape (K, m).
+            a - dv/dt, shape (K, n) for n joints.
         """
         damping = self.damping[rows, np.newaxis]
         rate = self.damping_rate[rows, np.newaxis]
@@ -288,13 +314,16 @@ def build_following(
     qd: Array,
     Lambda: Array,
 ) -> Following:
-    """Builds the functions that turn a site's errors into motion and torque of its joints.
+    """Builds the object that computes how an arm moves its joints to follow other arms.
+
+    An arm follows either joint by joint or with its end effector.
 
     Args:
-        arm: Arm of the site. Its task decides whether the site follows with the end effector.
-        q: Joint angles, shape (K, n), in rad.
+        arm: The arm. If it has a task for its end effector, it follows with the end effector.
+        q: Joint angles in K records, shape (K, n) for n joints, in rad.
         qd: Joint velocities, shape (K, n), in rad/s.
-        Lambda: Gain of the error, 0 along axes that are not followed, shape (n,) or (m,).
+        Lambda: Gain of the error in 1/s, shape (n,). If the arm follows with its end effector,
+            the shape is (m,) for m coordinates, with 0 for coordinates that are not followed.
     """
     task = arm.task
     if isinstance(arm, PlanarArmRows) or task is None:

@@ -1,23 +1,21 @@
-"""Summarises the links of a recorded run: their delays, losses, sample counts and clocks.
+"""Summarises the network links of a recorded run: delays, losses, counts and clocks.
 
-A site is the process that runs one arm. A link is the directed connection from one site (the
-peer) to another. The peer publishes a sample of its state in every tick of its control loop,
-and the receiving site uses the newest sample that has arrived and whose emulated delay has
-passed. The effective delay of the link is the age of the sample in use at a tick (age of
-information; Kaul, Yates and Gruteser 2012). docs/definitions.md defines each quantity.
+A site is the process that runs one arm. A link is the one-way connection from one site to
+another. In every tick of its control loop, a site sends a sample of its state. The receiver
+uses the newest sample that has arrived and whose emulated delay has passed. The effective delay
+of the link is the age of the sample in use (age of information; Kaul, Yates and Gruteser 2012).
+docs/definitions.md defines each quantity.
 
-The program itself delays samples, to emulate a network. The delay of each sample is a function
-of the seed, the link and the number of the sample. This module computes these delays again from
-the scenario, and compares them with the recorded arrivals.
+The program delays samples itself, to emulate a network. Each delay depends only on the seed,
+the link and the number of the sample. Therefore this module can compute the delays again from
+the scenario, and compare them with the recorded arrivals. It also knows the delays of samples
+that never arrived.
 
 Invariant:
     - A quantity that the log does not determine is None.
-    - The reported estimates of clocks are those that were used while the session ran. They are
-      not improved later.
-    - The delays of samples that never arrived are known too (rule L4 of docs/design.md),
-      because the scenario and the recorded changes of the link determine them.
-    - A record, the result of one tick, names the samples that the site received (rule L3). If a
-      record is missing, its samples count neither as arrived nor as missing.
+    - Estimates of clocks are reported as they were used while the session ran.
+    - Every record of a tick names the samples that arrived. If a record is missing, its samples
+      count neither as arrived nor as lost.
 """
 
 from typing import NamedTuple
@@ -70,23 +68,25 @@ class PredictedDelivery(NamedTuple):
 
     @property
     def drawn_ms(self) -> Array:
-        """Delays that the program adds to the samples which are not lost, in ms.
+        """Delays that the delay model of the scenario adds to the samples, in ms.
 
-        There is one entry for each of these samples.
+        Samples that the model loses, and samples that have only the delay of the real network,
+        are left out. Duplicates, reordering and the play-out buffer do not count.
         """
         delivered = ~self.lost & ~self.measured
         return (self.drawn_ns[delivered] - self.stamp_ns[delivered]) / 1e6
 
     def release(self, rate_hz: int) -> Ints:
-        """Computes the ticks of the receiver in which the samples should come into use.
+        """Computes the tick of the receiver in which each sample may first be used.
 
-        A sample comes into use in this tick only if it has arrived by then.
+        This is the first tick after the delay of the sample. If the sample has not arrived by
+        then, the receiver uses it later.
 
         Args:
             rate_hz: Tick rate of the receiver, in Hz.
 
         Returns:
-            The tick of each sample, shape (M,). `LOST` for a lost sample.
+            The tick of each of the M samples, shape (M,). `LOST` for a lost sample.
         """
         ticks = first_ticks(np.maximum(self.due_ns, self.stamp_ns + 1), rate_hz)
         return np.where(self.lost, LOST, ticks)
@@ -98,16 +98,19 @@ def predict_delivery(
     site: str,
     count: int,
 ) -> PredictedDelivery:
-    """Computes when the first samples of the link from a peer to a site are due.
+    """Computes when a site may use each of the first samples that another site sent.
+
+    A site is the process that runs one arm, and a sample is the state that it sends in every
+    tick. The scenario delays samples in a repeatable way to emulate a network.
 
     Args:
-        log: The log of the run, which contains the scenario and the changes of the link.
-        peer: Name of the sender.
-        site: Name of the receiver.
-        count: Number of samples.
+        log: The log of the run, which contains the scenario and the changes of the delays.
+        peer: Name of the site that sends.
+        site: Name of the site that receives.
+        count: Number of samples to predict.
 
     Raises:
-        LogError: A record names a change that is not valid.
+        LogError: A recorded change is not valid.
     """
     links = log.scenario.setup(site).links
     setup = next(link for link in links if link.peer == peer)
@@ -161,23 +164,26 @@ class Arrivals(NamedTuple):
 
     @property
     def first(self) -> "Arrivals":
-        """The first arrival of each sample, ordered by the number of the sample.
+        """These arrivals without duplicates: only the first arrival of each sample is kept.
 
-        Duplicates are left out.
+        They are ordered by the number of the sample, which the sender counts from 0.
         """
         sample, rows = np.unique(self.sample, return_index=True)
         return Arrivals(self.tick[rows], sample, self.delay_us[rows], self.refused)
 
 
 def read_arrivals(log: Log, site: str) -> dict[str, Arrivals]:
-    """Reads the arrivals at a site from its records.
+    """Reads from a log which samples of other sites arrived at a site, and when.
+
+    A site is the process that runs one arm, and a sample is the state that it sends in every
+    tick.
 
     Args:
         log: The log of the run.
-        site: Name of the receiver.
+        site: Name of the site that receives.
 
     Returns:
-        The arrivals, by peer.
+        The arrived samples in the order of their arrival, by name of the sending site.
     """
     part = log[site]
     counts, entries = part.arrivals
@@ -343,7 +349,7 @@ class ClockSummary(NamedTuple):
 
     @property
     def shared(self) -> bool:
-        """True if both ends read the same clock, because they run on the same machine."""
+        """True if sender and receiver read the same clock, as they run on one machine."""
         return self.bound_max_us == 0 and self.offset_us == 0
 
 

@@ -1,24 +1,25 @@
 """Judges by the motion at the end of a run whether it is stable, not stable, or open.
 
 A site is the process that runs one arm. The judgement uses the error e of each site (the
-difference between its motion and the motion that it follows) and the joint velocities qd, and
-no theory. The envelopes of a joint are the largest |e| and |qd| in intervals of 1 / 20 s. Their
-trends over the second half of the run, which `envelope_trend` determines, decide whether the
-joint converges, decays, oscillates, drifts or grows.
+difference between its motion and the motion that it follows) and the joint velocities qd. It
+uses no theory. The largest |e| and |qd| of each joint in intervals of 50 ms are called
+envelopes. Their trends over the second half of the run, which `envelope_trend` determines,
+decide whether the joint converges, decays, oscillates, drifts or grows. If the record does not
+decide this, the joint is undecided, and the judgement is open.
 
-If an operator acts or the loop changes within this half, the time after the last action or
-change is judged instead, provided that it is long enough.
+If an operator acts or the control loop changes within the second half, only the time after the
+last action or change is judged, provided that it is long enough.
 
-A sustained oscillation of any size counts as steady. However, an oscillation that decays may
-look steady for a while, because the joint receives energy from a faster joint of the coupled
-arms. If such a faster joint decays, the steady joint is undecided.
+A lasting oscillation makes a run not stable. There is an exception: a joint may oscillate
+steadily for a while, because it receives energy from a faster joint. If the faster joint
+decays, the joint is undecided.
 
 Invariant:
     - All commands use the judgement of this module (docs/definitions.md, "Stable").
     - Each joint of each site is judged separately, and the worst joint decides.
     - A judgement describes the record and predicts nothing.
-    - Further knowledge about a run, such as its energy function V from the stability proof or
-      its characteristic roots, may turn a stable run into an open one, but never the reverse.
+    - Further knowledge, such as the energy function V of the stability proof or the
+      characteristic roots, may turn a stable run into an open run, but never the reverse.
 """
 
 import math
@@ -96,7 +97,10 @@ class Stability(StrEnum):
 
 
 class EndBehaviour(StrEnum):
-    """Behaviour of a run at its end, from best to worst. The value is the text for people."""
+    """How the arms move at the end of a run, from the best to the worst behaviour.
+
+    The value of each member is a phrase for the user.
+    """
 
     CONVERGED = "converged"
     DECAYS = "decaying"
@@ -110,7 +114,10 @@ class EndBehaviour(StrEnum):
 
     @property
     def stability(self) -> Stability:
-        """The stability judgement that this behaviour suggests, if nothing else is known."""
+        """The stability judgement that follows from the behaviour at the end of a run.
+
+        Other knowledge about the run may change it.
+        """
         if self in (EndBehaviour.CONVERGED, EndBehaviour.DECAYS):
             return Stability.STABLE
         if self in (EndBehaviour.HARDLY, EndBehaviour.UNDECIDED, EndBehaviour.COASTS):
@@ -168,10 +175,11 @@ class RunEnd(NamedTuple):
 
     @property
     def stability(self) -> Stability:
-        """The judgement of the run: stable, not stable, or open.
+        """The judgement of the run by its end: stable, not stable, or open.
 
-        It stays open if an operator may have caused the motion at the end, unless a site
-        exceeded its limits.
+        A run that looks stable is open if `reasons` contains a doubt. A run that does not look
+        stable is open if an operator acts, who may have caused the motion. If the motion
+        exceeded the limits of an arm, it is not stable in any case.
         """
         stability = self.behaviour.stability
         if stability is not Stability.NOT_STABLE:
@@ -183,7 +191,11 @@ class RunEnd(NamedTuple):
 
     @property
     def text(self) -> str:
-        """A sentence with the behaviour, its numbers, and the reasons that leave it open."""
+        """A sentence for the user on how the run ends.
+
+        It contains the behaviour at the end, the numbers that show it, and the reasons why the
+        run cannot be called stable.
+        """
         return "; ".join([self._behaviour_text, *self.reasons])
 
     @property
@@ -301,10 +313,15 @@ def reduce_to_buckets(
 
 
 def trace_log(log: Log) -> RunTrace:
-    """Reduces the records of a log to the data from which the end of the run is judged.
+    """Reduces a log to the data that are needed to judge the end of the run.
 
     Args:
         log: The log of the run.
+
+    Returns:
+        For each joint and each interval of 50 ms: the largest magnitude of its error and of its
+        velocity, and its last angle. Also the external torques at the end, and the times of the
+        last push and the last change.
     """
     buckets = []
     tau_x = []
@@ -974,17 +991,17 @@ def find_last_operator_action(scenario: Scenario, span_s: float) -> float:
 
 
 def find_last_change(scenario: Scenario, span_s: float) -> float:
-    """Returns the last time before `span_s` at which the loop changed, in s.
+    """Returns the time of the last planned change in the control of the arms, in s.
 
-    Changes are those of the scenario's timeline, and the starts and ends of environments. A
-    change with a ramp lasts until the end of its ramp.
+    These changes are the scenario's changes of settings, and the start and end of environments,
+    such as virtual walls. A gradual change counts at its end.
 
     Args:
-        scenario: Scenario of the run.
-        span_s: Length of the run, in s.
+        scenario: The description of the experiment.
+        span_s: Length of the run. Changes that start later are ignored.
 
     Returns:
-        The time. 0 if the loop never changed.
+        The time. 0 if there is no change.
     """
     changes = [change for change in scenario.timeline if change.at_s < span_s]
     change_times_s = [0.0, *(change.at_s + change.ramp_s for change in changes)]

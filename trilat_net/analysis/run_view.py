@@ -1,13 +1,13 @@
-"""Provides one view of a recorded run, from which all metrics are computed.
+"""Provides the data of a recorded run from which all metrics are computed.
 
-The view contains the records of the sites, which are the results of the ticks of each arm's
-control loop. It also contains the torques by source, the dominance factors (the weights with
-which the arms follow each other), the links and the walls. Metrics request from the view what
-they need.
+A site is the process that runs one arm. For each site, the data contain the records of all
+ticks of its control loop, and the torques of operators and environments on its arm. They also
+contain the dominance factors (the weights with which the sites follow each other), the network
+links between the sites, and the virtual walls.
 
 Invariant:
-    - Each quantity is derived from the log only once, by `RunView.compute_once` or by a cached
-      property.
+    - Each quantity is computed from the log only once, when a metric needs it first, by
+      `RunView.compute_once` or by a cached property.
 """
 
 from collections.abc import Callable, Iterable
@@ -91,10 +91,11 @@ class RunView:
 
     @cached_property
     def shared(self) -> dict[str, SiteRun]:
-        """The sites with records, in the coordinates that sites share.
+        """Motion and torques of each site in the coordinates that sites exchange, by name.
 
-        In task space, poses of end effectors take the place of joint angles, and forces take
-        the place of torques.
+        A site is the process that runs one arm. Sites exchange either joint angles, or poses of
+        their end effectors. In the second case the result contains poses in place of angles,
+        and forces in place of torques. Sites without records are missing.
         """
         shared = {}
         for site, run in self.sites.items():

@@ -70,14 +70,16 @@ def follows_in_task_space(log: Log) -> bool:
 
 
 def joint_error_rates(part: SiteLog) -> Array:
-    """Returns the velocity errors of a site, the rates of its synchronisation errors.
+    """Returns the derivative of a site's error: its velocity minus the followed velocity.
+
+    A site is the process that runs one arm.
 
     Args:
-        part: Log of the site.
+        part: The site's part of the log, with K records.
 
     Returns:
-        qd - qd_des of Eq. (18), shape (K, n), in rad/s. In task space xd - xd_des of the end
-        effector, shape (K, m).
+        Velocity errors of the n joints, shape (K, n), in rad/s. If the arm follows with its end
+        effector, they are the errors of its m coordinates, shape (K, m).
     """
     if part.layout.task:
         # in task space the column qd_des holds xd_des

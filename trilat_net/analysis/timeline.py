@@ -54,7 +54,7 @@ class AppliedChange(NamedTuple):
 
     @property
     def text(self) -> str:
-        """A phrase that describes the state after the change."""
+        """A phrase for the user: the order, or the setting that applies after the change."""
         change = self.change
         if change.order:
             order = change.order.replace("_", " ")
@@ -82,7 +82,7 @@ class ModeInterval(NamedTuple):
 
     @property
     def meaning(self) -> ModeMeaning:
-        """An explanation of what a site does in this mode."""
+        """An explanation of what the arm does in this mode, such as holding its position."""
         return MODES[self.mode]
 
 
@@ -175,13 +175,16 @@ def recorded_end_s(log: Log) -> float:
 
 
 def find_mode_intervals(part: SiteLog) -> list[ModeInterval]:
-    """Finds the intervals in which a site held, braked or returned, in order.
+    """Finds the times in which an arm did not follow the other arms, in order.
+
+    In these times the site, the process that runs the arm, held its position, slowed down to a
+    stop, or moved back to the motion that it should follow.
 
     Args:
-        part: Log of the site.
+        part: The site's part of the log.
 
     Returns:
-        The intervals. Empty if the site followed its peers all the time.
+        The intervals. Empty if the arm followed the others all the time.
     """
     modes: list[str] = part.mode.tolist()
     if all(MODES[mode].follows for mode in modes):

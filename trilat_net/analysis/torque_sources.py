@@ -1,17 +1,17 @@
-"""Splits the external torque on an arm by its sources, and evaluates models of the sources.
+"""Splits the external torque on an arm into the torques of operator and environment.
 
-An arm is pushed by operators and by environments such as walls. The scenario, the description
-of the run, contains a model of each. The records, the results of the ticks of the control loop,
-contain their total torque. All functions work on all records of a log at once. All torques
-are those that act on the arm.
+Operators and environments, such as virtual walls, push an arm. The scenario, the description of
+the experiment, contains a model of each. In every tick of the control loop, the sum of their
+torques is recorded. This module evaluates the models for all records at once, and splits the
+sum. All torques are those that act on the arm.
 
 Invariant:
-    - All torques are computed from the definitions in the scenario, independently of the
-      simulation kernel. The tests compare the two.
-    - The recorded torque less the environment's torque is attributed to the operator, even if
+    - Torques are computed from the definitions in the scenario, independently of the
+      simulation. The tests compare the two.
+    - The recorded torque minus the environment's torque is attributed to the operator, even if
       the scenario does not explain it.
-    - The planned motion of an operator is known only if the operator's torque agrees with the
-      scenario.
+    - The scenario may plan what an operator does. This plan is used only if the operator's
+      recorded torque agrees with it.
 """
 
 from collections.abc import Iterable
@@ -287,18 +287,25 @@ class TorqueSplit(NamedTuple):
 
     @property
     def environment(self) -> Array:
-        """The environment's whole torque, shape (K, n), in N m."""
+        """The torque of the environment, such as walls, on the arm, shape (K, n), in N m.
+
+        It is the sum of the continuous part and the part that is computed once per tick.
+        """
         return self.environment_now + self.environment_held
 
 
 def split_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit:
-    """Divides the external torque on a site's arm into operator and environment.
+    """Splits the recorded external torque on an arm into operator and environment.
 
-    The operator's plan is left out. `attribute_torque` adds it.
+    The environment's torque is computed from the scenario. The rest belongs to the operator.
+    Use `attribute_torque` to find also what the scenario plans for the operator.
 
     Args:
-        records: Records of the site.
+        records: Records of the arm's site, the process that runs the arm.
         scenario: The description of the experiment.
+
+    Returns:
+        The torques at every record. The attribute `script` is None.
     """
     spec = scenario.sites[records.site]
     t_s = records.nominal_s
@@ -306,7 +313,13 @@ def split_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit:
     end_effector = arm.place_end_effector(records.q, records.qd)
 
     def add_torques(sources: Iterable[ActorBase], *, sampled: bool) -> Array:
-        """Returns the sum of the torques of sources that are held, or that follow the state."""
+        """Returns the sum of the torques of some operators or environments, shape (K, n).
+
+        Args:
+            sources: The operators or environments.
+            sampled: True to add only torques that are computed once per tick and then constant.
+                False to add only torques that follow the motion continuously.
+        """
         total = np.zeros_like(records.q)
         for source in sources:
             actor = source.actor
@@ -421,14 +434,18 @@ def _evaluate_scripted_torque(source: TorqueSource, t_s: Array) -> Array:
 
 
 def attribute_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit:
-    """Divides the external torque on a site's arm, and adds the operator's plan.
+    """Splits the external torque on an arm into the torques of operator and environment.
 
-    If the scenario has no operator, the operator's torque is set to zero where only rounding
-    errors are left.
+    The result also contains the torque that the scenario plans for the operator, if the
+    recorded torque agrees with it. If the scenario has no operator, rounding errors are removed
+    from the operator's torque.
 
     Args:
-        records: Records of the site.
+        records: Records of the arm's site, the process that runs the arm.
         scenario: The description of the experiment.
+
+    Returns:
+        The torques at every record.
     """
     split = split_torque(records, scenario)
     t_s = records.nominal_s
@@ -518,12 +535,17 @@ def list_sampled_walls(spec: SiteSpec) -> list[TorqueSource]:
 
 
 def find_wall_energies(log: Log) -> list[WallEnergy]:
-    """Computes the energies that the touched walls of a run generated, in scenario order.
+    """Computes the energy that each virtual wall of a run generated by itself.
 
-    Only sampled walls are included, whose force is computed once per tick and held.
+    A real wall generates no energy. The force of a virtual wall is computed once per tick and
+    constant until the next tick, so that the wall may push back with more energy than it
+    received. Walls that follow the motion continuously are left out.
 
     Args:
         log: The log of the run.
+
+    Returns:
+        The energies in scenario order, for the walls that were touched.
     """
     energies = []
     for site, records in align_records(log).items():

@@ -1,22 +1,23 @@
 """Measures whether small disturbances of a run grow or die away, by repeating the run.
 
-A twin is a repeated execution of a run in which a joint received a small push. This module
-judges the difference between the joint velocities of the twin and those of the run, which is
-called d and is sampled at 20 Hz. The amplitude A of the difference is
+A twin is a repetition of a run that receives a small push, for example of one joint. Without
+the push, it would be identical to the run. The effect of the push is measured by the
+differences d of the joint velocities between the twin and the run, 20 times per second. Their
+amplitude A is
 
-    A^2 = sum over joints of d^2 + (d' / w)^2,
+    A^2 = sum over joints of d^2 + (a / w)^2
 
-where d' is the time derivative of d. The frequency w, in rad/s, is chosen so that both parts
-are equal on average. For a single mode that grows or decays at a certain rate, A is
-proportional to exp(rate t) over the time t, without the oscillation of the mode. The rate is
-the slope of log A over the judged part of the run. `envelope_trend` defines the bounds of the
-slope, and the classes such as "grows" and "decays".
+Here a is the time derivative of d. The frequency w, in rad/s, is chosen so that both parts are
+equal on average. If d is an oscillation that grows or decays with a certain rate, A does not
+oscillate, but is proportional to exp(rate t) over the time t. The rate is the slope of log A
+over the part of the run that is judged. `envelope_trend` defines the bounds of the slope, and
+the classes such as "grows" and "decays".
 
 Invariant:
-    - If a push merely shifts all arms to another rest position, the difference becomes zero,
-      because velocities are compared.
-    - Groups of arms that do not follow each other are judged separately, so that growth in one
-      group does not hide the behaviour of the other groups.
+    - Velocities are compared. If a push merely shifts all arms to another position of rest, the
+      difference becomes zero.
+    - A scenario may contain several groups of arms that do not follow each other. Each group is
+      judged separately, so that growth in one group is not hidden by another group.
 """
 
 import math
@@ -164,7 +165,10 @@ class TwinGrowth(NamedTuple):
 
     @property
     def worst(self) -> PushGrowth | None:
-        """The push that grew most or died away most slowly. None without pushes."""
+        """The push whose effect grew most, or died away most slowly.
+
+        A push is a small disturbance in a repetition of the run. None if there are no pushes.
+        """
         return max(
             self.pushes,
             key=lambda push: (_TRENDS_FROM_BEST.index(push.trend), push.rate_per_s),
@@ -173,24 +177,32 @@ class TwinGrowth(NamedTuple):
 
     @property
     def trend(self) -> EnvelopeTrend:
-        """Class of the trend of the worst push. Undecided without pushes."""
+        """Whether the worst push of the run grows or dies away, as a class.
+
+        The worst push is the push whose effect grows most or dies away most slowly. Undecided
+        if there are no pushes.
+        """
         return EnvelopeTrend.UNDECIDED if self.worst is None else self.worst.trend
 
     @property
     def grows(self) -> bool:
-        """True if at least half of the pushes in some group of sites grow all the time.
+        """True if small pushes of the run grow, so that the run is unstable.
 
-        A group contains sites that follow each other. If the delays of links are random, the
-        pushes must also grow by a factor of two over the judged part.
+        Arms that follow each other form a group. In at least one group, at least half of the
+        pushes must grow all the time from `from_s` to `to_s`. If network delays are random,
+        they must also grow by a factor of two, to exclude chance.
         """
         return self.grows_by(DOUBLES if self.links_random else 1.0, always=True)
 
     def grows_by(self, factor: float, *, always: bool) -> bool:
-        """Returns True if at least half of the pushes of some group of sites grow by a factor.
+        """Returns True if small pushes of the run grow by a factor at some of the arms.
+
+        Arms that follow each other form a group. At least half of the pushes must grow by the
+        factor in at least one group. The growth is measured from `from_s` to `to_s`.
 
         Args:
-            factor: Least factor over the judged part.
-            always: True to count only pushes whose trend is a growth throughout.
+            factor: Least growth of the effect of a push, as a factor.
+            always: True to count only effects that grow all the time (class "grows").
         """
         for group in {push.group for push in self.pushes}:
             pushes = [push for push in self.pushes if push.group == group]
@@ -203,11 +215,11 @@ class TwinGrowth(NamedTuple):
 
     @property
     def needs_s(self) -> float | None:
-        """Length that the run should have to show clearly that pushes die away, in s.
+        """Length that the run should have to show clearly that small pushes die away, in s.
 
-        The slowest push, at its present rate, would halve four times between the end of the
-        judged part and this time. None if the pushes do not fall, or if it is clear already
-        that they die away.
+        This length gives the push that dies away most slowly the time to halve four more times
+        at its present rate. None if the pushes do not die away, or if the run is long enough
+        already.
         """
         worst = self.worst
         if worst is None or not worst.rate_per_s < 0.0 or self.trend is EnvelopeTrend.DECAYS:
@@ -216,17 +228,21 @@ class TwinGrowth(NamedTuple):
 
     @property
     def excluded_rate_per_s(self) -> float:
-        """Growth rate that the twins exclude: no disturbance grows faster than this, in 1/s.
+        """Rate in 1/s above which no disturbance of the run can grow.
 
-        A motion with a larger rate would have grown by `CLEAR_GROWTH` in the judged part, and
-        would have been seen. The value is infinite unless every push dies away.
+        A disturbance with a larger rate would have grown by the factor `CLEAR_GROWTH` from
+        `from_s` to `to_s`, and would have been seen in the repeated runs. If not every push
+        dies away, no rate is excluded, and the value is infinite.
         """
         judged_s = self.to_s - self.from_s
         dies = self.trend is EnvelopeTrend.DECAYS and judged_s > 0.0
         return math.log(CLEAR_GROWTH) / judged_s if dies else math.inf
 
     def to_json(self) -> dict[str, Any]:
-        """Returns the growth of all pushes as plain values, with the keys of the JSON file."""
+        """Returns how each small push of the run grows or dies away, as plain values.
+
+        They are ready for JSON.
+        """
         pushes = [
             {
                 "push": growth.push.name,
@@ -253,9 +269,11 @@ class TwinGrowth(NamedTuple):
 
     @property
     def text(self) -> str:
-        """A sentence on the worst push or on a departure from a rest.
+        """A sentence for the user that says whether small pushes of the run grow or die away.
 
-        It is the reason why there are no twins if there are none.
+        It describes the push that grows most or dies away most slowly. If the arms left a
+        position of rest by themselves, the sentence describes that motion instead. If the run
+        was not repeated with pushes, the sentence gives the reason.
         """
         worst = self.worst
         departure = self.departure
@@ -482,18 +500,20 @@ def judge_twins(
 
 
 def measure_amplitude(path: TwinPath, group: Sequence[int]) -> Array:
-    """Computes the size of the difference between a twin and its run, as a logarithm.
+    """Computes the effect of a small push on a run over time, as a logarithm.
 
-    A twin is a repetition of the run with a small push. A push that died down to the rounding
-    errors is repeated. Each stretch from one push to the next (a leg) is evaluated by itself.
+    A twin is a repetition of the run with a small push. The effect is the amplitude A of the
+    difference between twin and run, which the module's docstring defines. A push whose effect
+    died down to the rounding errors is repeated. The times between two pushes are evaluated
+    separately.
 
     Args:
-        path: The twin's difference from its run.
+        path: The twin's difference from its run at K times.
         group: Indices of the joints that count.
 
     Returns:
-        log A as the module's docstring defines it, shape (K,). It is -inf where the difference
-        is zero, and at least the logarithm of the largest difference of a joint.
+        log A, shape (K,), with A in rad/s. It is -inf where the difference is zero. It is never
+        less than the logarithm of the largest velocity difference of a joint.
     """
     amplitude: Array = path.largest[:, group].max(axis=1)
     leg_ends = [*path.pushed[1:], len(amplitude)]
@@ -682,9 +702,12 @@ def _find_departures(
 class LinearSizes(NamedTuple):
     """The range of sizes for which the effect of a push is proportional to its size.
 
+    A push is a small disturbance in a repetition of the run. Its size is in rad, in rad/s or in
+    the unit of a parameter estimate, depending on what is pushed.
+
     Attributes:
-        smallest: The smallest size.
-        largest: The largest size.
+        smallest: The smallest size of the push in this range.
+        largest: The largest size of the push in this range.
         text: A sentence on this range, and on the effect of a larger push.
     """
 
@@ -713,10 +736,10 @@ class PushedTwins(Result):
     linear: LinearSizes | None = None
 
     def describe(self, pushed: PushGrowth) -> str:
-        """Returns a sentence that tells the user how a push developed.
+        """Returns a sentence for the user on whether the effect of a push grows or dies away.
 
         Args:
-            pushed: Growth of the push.
+            pushed: The push and its effect.
         """
         rate = "" if math.isnan(pushed.rate_per_s) else f" ({pushed.rate_per_s:+.3g} /s)"
         push = f"a push of {pushed.push.name} at {self.at_s:.4g} s"
@@ -734,14 +757,23 @@ class PushedTwins(Result):
         return text if pushed.trend in _FALLING else f"{text}; it shows no clear trend"
 
     def headline(self) -> str:
-        """Returns a sentence on the linear range if requested, else on the worst push."""
+        """Returns a sentence for the user on how the pushes develop.
+
+        It describes the worst push, which grows most or dies away most slowly. If the user
+        asked for pushes of several sizes, it says instead for which sizes the effect is
+        proportional to the size.
+        """
         if self.linear:
             return self.linear.text
         worst = self.growth.worst
         return self.describe(worst) if worst else self.growth.text
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row of plain values for each push."""
+        """Returns a row for each push: what was pushed, and how its effect develops.
+
+        A push is a small disturbance in a repetition of the run. The keys are those of an entry
+        of `pushes` in `trilat twin --json`.
+        """
         rows = self.growth.to_json()["pushes"]
         return [
             {**row, "text": self.describe(push)}
@@ -749,7 +781,10 @@ class PushedTwins(Result):
         ]
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the result as plain values, with the keys of `trilat twin --json`."""
+        """Returns the pushes and how they develop as plain values, ready for JSON.
+
+        The keys are those of `trilat twin --json`.
+        """
         growth = self.growth.to_json()
         return {
             "log": self.log.source,

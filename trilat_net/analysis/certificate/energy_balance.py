@@ -78,9 +78,10 @@ class SiteEnergy:
 
     @cached_property
     def judged(self) -> Bools:
-        """Marks the periods whose energies follow from records alone, shape (K - 1,).
+        """Marks the tick periods in which all energies come from records, shape (K - 1,).
 
-        Other periods contain interpolated motion and are not judged.
+        In the other periods some motion had to be interpolated, because records are missing.
+        These periods do not count in the energy balance.
         """
         known_views = [view.known for view in self.followed.values()]
         known = [self.motion.records.known_periods, *known_views]

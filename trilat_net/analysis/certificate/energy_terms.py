@@ -103,9 +103,10 @@ class SiteConstants(NamedTuple):
 
     @property
     def weighing_Kd(self) -> Array:  # noqa: N802 - the paper's symbol
-        """The gain Kd from which the weights of the sites in V are computed, shape (m,).
+        """The damping gain Kd, which determines the weight of the site in the total energy.
 
-        It is NaN along axes that the site does not follow, where Kd has no meaning.
+        Its shape is (m,) for m coordinates. It is NaN along axes that the site does not follow,
+        where Kd has no effect.
         """
         if not self.axes:
             return self.Kd

@@ -1,25 +1,23 @@
 """Checks whether a recorded run meets the conditions of the stability theorem.
 
-A site is the process that runs one arm. The theorem says that an energy function V of all arms
-never rises, unless an operator supplies energy. It is the paper's theorem, with the weights and
-the repaired proof of docs/errata.md. It holds only under certain conditions, which this package
-calls premises:
+A site is the process that runs one arm, and the sites follow each other's motion. The theorem
+says that an energy function V of all arms never rises, unless an operator supplies energy. Its
+proof is in docs/errata.md. The theorem has conditions, called premises:
 
-- The delays are constant.
-- The dominance factors, with which the sites follow each other, are constant, and every site
-  reaches every other site through them.
-- The gain Kd is the same at every site, up to a scalar per site.
+- The delays of the links are constant.
+- The dominance factors, the weights with which the sites follow each other, are constant. Every
+  site follows every other site, at least through further sites.
+- The damping gain Kd is the same at every site, up to a factor per site.
 - Every site uses the adaptive law, which estimates the parameters theta of its arm.
-- No operator moves an arm, or the operators are passive with respect to the filtered error r,
-  the joint velocity plus Lambda times the position error, with a gain Lambda.
+- No operator moves an arm, or the operators are passive with respect to the filtered error r.
+  This is the joint velocity plus a gain Lambda times the position error.
 
-A certificate also states on how many records it rests. This module collects that evidence.
+The module also collects how many records were available.
 
 Invariant:
     - A premise holds, fails, or cannot be decided, and always states its evidence.
-    - Missing information never makes a run stable. The run is left open if too few of its
-      ticks or periods of V can be judged, or if a repeated execution of the run copied the
-      motion of some sites from the log.
+    - Missing information never makes a run stable. The run is not judged if records are missing
+      for too many ticks, or if some motion was copied from another log.
     - A log that was changed after it was written does not pass.
 """
 
@@ -107,16 +105,17 @@ class Premise(NamedTuple):
 
 
 def explain_no_functional(scenario: Scenario) -> str:
-    """Explains why the energy function V of the stability proof does not exist for some sites.
+    """Explains for which arms the energy function of the stability proof does not exist.
 
-    V needs the true parameters theta of the arm, a control law for which V is defined, and a
-    task other than following orientations.
+    The energy exists only for certain control laws. It requires the true dynamic parameters of
+    the arm. It is not defined if the end effector also follows the orientation of other arms.
 
     Args:
         scenario: The description of the experiment.
 
     Returns:
-        The sites and the reasons, separated by semicolons. Empty if V exists for every site.
+        The names of these arms' sites and the reasons, separated by semicolons. Empty if the
+        energy exists for every arm.
     """
     sites_by_reason: dict[str, list[str]] = {}
     for site, spec in scenario.sites.items():
@@ -176,15 +175,15 @@ class FunctionalFacts(NamedTuple):
 
 
 class RunFacts(NamedTuple):
-    """Everything from a log on which the checks of the stability theorem are based.
+    """Everything from a log that is needed to check the conditions of the stability theorem.
 
-    V is the energy function of the stability proof.
+    The theorem says that an energy function V of all arms does not rise by itself.
 
     Attributes:
         log: The log of the run.
-        constants: Gains and limits of every site, by name. Empty if V does not exist for some
-            site.
-        functional: What the log shows about V. None if V cannot be computed.
+        constants: Gains and limits of every site, the process that runs one arm, by name. Empty
+            if V does not exist for some site.
+        functional: V over time, and what changed it. None if V cannot be computed.
         unknown: The reason why V cannot be computed. Empty if it can.
     """
 
@@ -195,16 +194,18 @@ class RunFacts(NamedTuple):
 
 
 def gather_facts(log: Log) -> RunFacts:
-    """Computes from a log what the checks of the stability theorem need.
+    """Computes from a log what is needed to check the conditions of the stability theorem.
 
-    The energy function V of the proof does not exist for every control law, and cannot be
-    computed if too few records overlap. The result then contains the reason.
+    The theorem uses an energy function of all arms. This function does not exist for every
+    control law. It cannot be computed if the records of the arms have too few times in common.
+    The result then contains the reason.
 
     Args:
         log: The log of the run.
 
     Raises:
-        LogError: A record names a change that is not valid.
+        LogError: A recorded change of the settings, such as of a dominance factor, is not
+            valid.
     """
     lacking = explain_no_functional(log.scenario)
     if lacking:
@@ -241,11 +242,11 @@ def gather_facts(log: Log) -> RunFacts:
 
 
 def check_premises(run: RunFacts) -> list[Premise]:
-    """Checks the conditions (premises) of the stability theorem for a run.
+    """Checks whether a run meets the conditions (premises) of the stability theorem.
 
     It also checks that virtual walls, whose force is computed once per tick, generate no
-    energy. Without the energy function V of the proof, only the premises on the control laws
-    and on the walls can be checked.
+    energy. If the energy function of the theorem cannot be computed, only the control laws and
+    the walls are checked.
 
     Args:
         run: Facts of the run, from `gather_facts`.
@@ -393,13 +394,13 @@ def _check_dominance(run: FunctionalFacts) -> Premise:
 
 
 def describe_closed_groups(groups: Sequence[Sequence[str]]) -> str:
-    """Returns the sentence that several groups of sites do not follow each other.
+    """Returns a sentence that the total energy of all arms is not defined, and why.
 
-    V needs a weight beta for each site. The weights of closed groups relative to each other are
-    arbitrary, so that V of all sites together means nothing.
+    The total energy weights each site, the process that runs one arm. If no group of sites
+    follows another group, the weights of the groups relative to each other are arbitrary.
 
     Args:
-        groups: Names of the sites of each closed group, which follow nobody outside their
+        groups: Names of the sites in each group. They follow each other and no site outside the
             group.
     """
     group_texts = " and ".join("{" + ", ".join(group) + "}" for group in groups)
@@ -816,18 +817,20 @@ def _format_by_site(values: Mapping[str, float]) -> str:
 
 
 class Evidence(NamedTuple):
-    """The records on which a certificate rests, and whether they suffice.
+    """The records on which a stability certificate is based, and whether they suffice.
 
-    V is the energy function of the stability proof.
+    A site is the process that runs one arm, and stores a record in every tick of its control
+    loop.
 
     Attributes:
         coverage: Recorded ticks and expected ticks of every site.
-        functional_share: Fraction of the tick periods in which V rests on records, counted only
-            while no site was absent. None if V is not judged.
-        min_coverage: Least fraction, of the ticks and of the periods, that suffices.
+        functional_share: Fraction of the tick periods in which the energy of the stability
+            proof is known from records. Periods in which a site was absent do not count. None
+            if this energy is not judged.
+        min_coverage: Least fraction that suffices, for the ticks and for the periods.
         integrity: Whether the log is unchanged since it was written.
-        unmet: Sites whose records were taken over unchanged when the run was repeated, so that
-            they did not react to the other sites.
+        unmet: Sites that did not react to the other sites, because their motion was copied from
+            an earlier run when the run was repeated.
     """
 
     coverage: Coverage
@@ -838,9 +841,9 @@ class Evidence(NamedTuple):
 
     @property
     def reasons(self) -> list[str]:
-        """Sentences on every lack of evidence that leaves the judgement of the run open.
+        """Reasons why the records do not suffice to judge the run, a sentence for each.
 
-        Empty if the evidence suffices.
+        Empty if they suffice.
         """
         reasons = []
         if not self.integrity.passed:
@@ -857,11 +860,14 @@ class Evidence(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The coverage and the integrity of the log in one sentence."""
+        """A sentence for the user: how many records exist, and whether the log is unchanged."""
         return f"{self.coverage.describe(self.min_coverage)}; {self.integrity.text}"
 
     def to_json(self) -> dict[str, Any]:
-        """Returns the evidence as plain values, with the keys of `trilat certify --json`."""
+        """Returns how complete and how authentic the records are, as plain values.
+
+        The keys are those of the JSON output of `trilat certify`.
+        """
         return {
             "coverage": self.coverage.share,
             "functional_coverage": self.functional_share,
@@ -873,11 +879,13 @@ class Evidence(NamedTuple):
 
 
 def collect_evidence(run: RunFacts, min_coverage: float) -> Evidence:
-    """Collects on how many records a certificate rests, and whether the log is unchanged.
+    """Collects how complete the records of a run are, and whether its log is unchanged.
 
     Args:
-        run: Facts of the run, from `gather_facts`.
-        min_coverage: Least share, of the ticks and of the periods of V, that suffices.
+        run: Facts of the run, computed by `gather_facts`.
+        min_coverage: Least fraction of ticks that must be recorded, and of tick periods in
+            which the energy of the stability proof must be known, for a certificate. Between 0
+            and 1.
     """
     log = run.log
     facts = run.functional

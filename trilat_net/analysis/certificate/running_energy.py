@@ -1,18 +1,17 @@
-"""Computes the energy function V, and the work of operators, while a session runs.
+"""Computes the energy of all arms in the stability proof while a session runs.
 
-V is the energy function of the stability proof, see `energy_terms`. `certify` computes it from
-a whole log. A record is the result of one tick of an arm's control loop. This module receives
-the records as they arrive, keeps the newest ones of every arm in a window, and computes V with
-the same functions over these windows.
+The energy function V of the stability proof is defined in `energy_terms`. After a session,
+`trilat certify` computes V from the whole log. This module computes V, and the work of the
+operators, during the session with the same functions. It receives a record of each arm in every
+tick of its control loop, and keeps the newest records of every arm in a window.
 
 Invariant:
-    - V equals the result of `certify` at the same times, up to rounding, because the windows
-      reach back to the oldest sample in use.
+    - V equals the result of `trilat certify` at the same times, up to rounding. For this the
+      windows are long enough to contain all delayed states that the arms use.
     - Nothing is extrapolated. V at a time is computed when all records up to it have arrived,
       and is left out if records are lost.
     - The size of a window is bounded.
-    - A record may arrive late, out of order or twice. Ticks without a record are marked
-      unknown, as in `AlignedRecords`.
+    - A record may arrive late, out of order or twice. Ticks without a record are marked.
 """
 
 from collections.abc import Iterable, Mapping
@@ -172,7 +171,11 @@ class RecordWindow:
         self.first = first
 
     def has_record(self, tick: int) -> bool:
-        """Returns True if the window contains the record of a tick."""
+        """Returns True if the stored records contain the record of a tick.
+
+        Args:
+            tick: Number of the tick, a period of the control loop.
+        """
         if not self.first <= tick <= self.newest:
             return False
         return bool(self._known[tick - self.first])
@@ -266,14 +269,14 @@ class RunningEnergy:
         self._supplied = 0.0
 
     def add_changes(self, site: str, changes: Iterable[CoreChange]) -> None:
-        """Takes into account that a command changed a site's dominance factors.
+        """Takes into account that a command changed how strongly a site follows its peers.
 
-        These are the weights with which the site follows its peers. Other changes are ignored,
-        as they have no effect on V.
+        The weights with which a site follows its peers, other sites, are its dominance factors.
+        Other changes are ignored, because they have no effect on the energy.
 
         Args:
-            site: Name of the site.
-            changes: The changes.
+            site: Name of the site, the process that runs one arm.
+            changes: The changes that the site carried out.
         """
         _, ramps = self._dominance[site]
         for change in changes:
@@ -281,14 +284,18 @@ class RunningEnergy:
                 ramps.append(change.ramp)
 
     def compute_next(self, complete: Mapping[str, int]) -> EnergyCourse | None:
-        """Computes the energy function V over the time since the last call.
+        """Computes the energy V of all arms since the last call, if all records have arrived.
+
+        A site is the process that runs one arm. V is the energy function of the stability
+        proof.
 
         Args:
-            complete: For every site, the last tick up to which each record has arrived or is
-                lost.
+            complete: For every site, the number of the last tick for which nothing is missing
+                any more: each record up to this tick has arrived, or is known to be lost.
 
         Returns:
-            V over the next span. None if no further span is complete, or if V is unknown in it.
+            V over the new span of time. None if the span is too short yet, or if V cannot be
+            computed in it.
         """
         if self.reason or min(complete.values()) < 1:
             return None

@@ -95,7 +95,10 @@ class StabilityFinding(StrEnum):
 
 
 class FunctionalRise(NamedTuple):
-    """The largest rise of V that operators and environments did not supply.
+    """The largest rise of the arms' total energy that nobody supplied from outside.
+
+    The energy is the function V of the stability proof, less the work of operators and
+    environments. It must not rise by itself.
 
     Attributes:
         from_s: Time of the minimum of V before the rise, in s.
@@ -184,9 +187,10 @@ class Certificate(Result):
 
     @property
     def paper_weights_rise(self) -> FunctionalRise | None:
-        """The largest rise of V if all sites had the same weight in it, as in the paper.
+        """The largest rise that the total energy would have if all arms had the same weight.
 
-        None if V does not rise.
+        The paper on which the control law is based uses such equal weights in the energy
+        function of its stability proof. None if this energy does not rise, or was not computed.
         """
         if self.paper_balance is None:
             return None
@@ -194,12 +198,12 @@ class Certificate(Result):
 
     @property
     def bounded_by_v(self) -> bool:
-        """True if V bounds the motion of every site.
+        """True if the energy V of the stability proof limits the motion of every arm.
 
-        V must not have risen, and must depend on every site: no site has the weight zero. A
-        site with the weight zero is bounded as well if only the premise on the dominance
-        factors fails, because the site then converges after the sites that it follows
-        (docs/errata.md, 11).
+        V must not have risen, and every arm must have a positive weight in V. An arm has the
+        weight zero if the arms that it follows do not follow it. It is limited as well if only
+        the condition on the dominance factors, the weights with which arms follow each other,
+        fails, and these factors are constant. It then converges after the arms that it follows.
         """
         did_not_rise = (StabilityFinding.COVERED, StabilityFinding.DID_NOT_RISE)
         if self.balance is None or self.verdict.finding not in did_not_rise:
@@ -212,10 +216,12 @@ class Certificate(Result):
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Sentences on everything that prevents a stable judgement or refutes it.
+        """Reasons why the run cannot be called stable, a sentence for each.
 
-        They concern the end of the run, its twins, V, the roots at the end pose, the energies
-        that control laws declare, and the completeness of the log, in this order.
+        They come from these checks, in this order: the motion at the end of the run, repeated
+        runs with a small disturbance (twins), the energy of the stability proof, the
+        characteristic roots of the loop at the end pose, the energies that control laws
+        declare, and the completeness of the log.
         """
         reasons = [*self.end.reasons]
         twin_reason = self._twin_verdict.reason
@@ -310,7 +316,10 @@ class Certificate(Result):
         }
 
     def to_rows(self) -> list[JsonObject]:
-        """Returns the checked conditions of the theorem as a table of plain values."""
+        """Returns the conditions of the stability theorem as a table, with a row for each.
+
+        The values are plain, ready for JSON.
+        """
         return [premise._asdict() for premise in self.premises]
 
     def accepts(self, accepted: Collection[str]) -> bool:
@@ -341,13 +350,15 @@ def certify(
 ) -> Certificate:
     """Issues the stability certificate of a recorded run.
 
-    The log may be torn, short or empty. Twins and roots at the end pose are not computed.
+    The log may be incomplete or empty. The run is not repeated with small disturbances, and the
+    characteristic roots of its linearised loop are not computed. These checks can be added
+    later.
 
     Args:
         log: The log of the run.
-        min_coverage: Least share of the ticks of each site that must be recorded. With less, a
-            run that would be stable is left open.
-        own_laws: True to run the code of control laws that are not part of this program, which
+        min_coverage: Least fraction of the ticks of each site that must be recorded. With less,
+            a run that would be stable is left open.
+        own_laws: True to run the code of control laws that are not part of this program. This
             is necessary to check the energies that they declare.
 
     Raises:
@@ -565,14 +576,15 @@ def _find_largest_rise(balance: EnergyBalance, tolerance: float) -> FunctionalRi
 
 
 def describe_unsupplied_growth(balance: EnergyBalance, tolerance: float) -> list[str]:
-    """Returns sentences on a growth of V that contradicts a run that looks stable.
+    """Describes a growth of the energy V that nobody supplied, although the run looks stable.
 
-    The work of operators and environments is subtracted from V. The rest must not end above its
-    beginning. In the second half of the run it must not end higher above its minimum than half
-    of the amount by which it fell from the middle of the run to that minimum.
+    V is the energy function of the stability proof, from which the work of operators and
+    environments is subtracted here. Two rules are checked. First, V must not end above its
+    beginning. Second, only the second half of the run is regarded: the rise from the minimum to
+    the end must be at most half of the fall from the beginning of this half to the minimum.
 
     Args:
-        balance: Energy balance of all sites.
+        balance: Energy balance of all arms.
         tolerance: Size that a rise must exceed to count, in J.
 
     Returns:

@@ -1,11 +1,12 @@
 """Computes all metrics of a log, converts them to JSON, and compares several logs.
 
-`measures` explains what a metric, a quantity and a subject are. Every file of this folder
-declares some of them.
+A metric is the value of a quantity, such as the largest motor torque. It describes a subject:
+the whole run, a site (the process that runs one arm), a link between two sites, or a wall. The
+other modules of this folder define the quantities.
 
 Invariant:
-    - Each quantity is present for each subject (run, site, link or wall) to which it applies:
-      as a number, or with the reason why the number is missing.
+    - Each quantity is present for each subject to which it applies: as a number, or with the
+      reason why the number is missing.
     - In JSON a missing number is null, and the key `unknown` has the reason.
     - A comparison has a column for each log and a row for each quantity of the whole run.
 """
@@ -100,7 +101,10 @@ class LogMetrics(Result):
         return str(number)
 
     def unit(self, joint_unit: str, number: int) -> str:
-        """Returns the unit of a quantity at a joint or along an axis.
+        """Returns the unit of a quantity, which may belong to a joint or to an axis of space.
+
+        For arms whose end effectors follow each other, the first three numbers are axes of
+        space. A quantity in N m at a joint is then a force in N, for example.
 
         Args:
             joint_unit: Unit of the quantity at a joint.
@@ -468,7 +472,7 @@ class ComparisonRow(NamedTuple):
 
     @property
     def values(self) -> tuple[float | None, ...]:
-        """The numbers by column. Missing numbers are None."""
+        """The value of the quantity in each of the compared runs. None where it is missing."""
         return tuple(entry.value for entry in self.entries)
 
 
@@ -485,7 +489,10 @@ class MetricComparison(NamedTuple):
     rows: tuple[ComparisonRow, ...]
 
     def row(self, key: str) -> ComparisonRow:
-        """Returns the row of a quantity.
+        """Returns the row of this comparison that shows a quantity in all logs.
+
+        Args:
+            key: Key of the quantity, such as "rms_tau_nm".
 
         Raises:
             KeyError: No row has this key.

@@ -1,4 +1,4 @@
-"""Estimates from a recorded run what an operator feels: impedances and reflected wall forces.
+"""Estimates what an operator feels in a recorded run: impedances and reflected forces.
 
 An impedance is the ratio of the operator's torque to the velocity of the arm, as a function of
 frequency. A reflection is the ratio of the torque that an operator feels to the torque with
@@ -6,16 +6,16 @@ which the environment pushes another arm.
 
 In a closed loop, each of the two signals x and y depends on the other. Therefore a third signal
 d, the drive, is needed, which depends on nothing else, such as the operator's planned torque.
-The ratio is H = S_dy / S_dx, where S is a cross-spectrum. docs/metrics.md names the drives and
-the sources (Welch; Bendat and Piersol; Soderstrom and Stoica).
+The ratio y / x at a frequency is S_dy / S_dx, where S is a cross-spectrum. docs/metrics.md
+names the drives and the sources.
 
 Invariant:
-    - A response is given at the frequency with the strongest drive, and at all frequencies that
-      are driven nearly as much.
-    - A response is decided only if at least `MIN_SEGMENTS` independent segments of the run
-      excite the frequency, and if both signals have a coherence of at least `MIN_COHERENCE`
-      with the drive. Its random error is then at most 17.2 %.
-    - A response without sufficient excitation is undecided, with a reason.
+    - A ratio is given at the frequency with the strongest drive, and at all frequencies whose
+      drive is at least 0.55 times as strong.
+    - A ratio counts only if at least `MIN_SEGMENTS` independent segments of the run excite the
+      frequency, and if both signals have a coherence of at least `MIN_COHERENCE` with the
+      drive. These two limits keep its relative random error to at most 17.2 %.
+    - Otherwise the reason is given instead of the ratio.
 """
 
 import math
@@ -254,18 +254,18 @@ def _compute_spectra(signal: Array, starts: list[int], length: int) -> Complex:
 
 
 class ImpedanceEstimate(NamedTuple):
-    """An impedance or a reflection at one joint, over frequency.
+    """What an operator feels at one joint of an arm, as a function of frequency.
 
     Attributes:
-        kind: "impedance" for the operator's torque on its arm over the velocity of the joint,
-            in N m s/rad. It is the impedance of the site and of all sites behind it.
-            "reflection" for the torque that an operator feels over the environment's torque on
-            another arm.
-        at: Site of the operator.
+        kind: "impedance" or "reflection". An impedance is the operator's torque divided by the
+            joint velocity, in N m s/rad. It includes the effect of all coupled arms. A
+            reflection is the torque that an operator feels, divided by the torque of the
+            environment on another arm.
+        at: Site of the operator, the process that runs the operator's arm.
         of: Site of the environment, for a reflection. Empty for an impedance.
         joint: Number of the joint, from 1.
-        ratio: The response at the frequency with the strongest drive.
-        spectrum: The responses at all driven frequencies, by rising frequency.
+        ratio: The complex ratio at the frequency at which the arm is driven most.
+        spectrum: The ratios at all frequencies that are driven enough, by rising frequency.
     """
 
     kind: str
@@ -277,7 +277,7 @@ class ImpedanceEstimate(NamedTuple):
 
     @property
     def unit(self) -> str:
-        """Unit of the magnitude: "N m s/rad" for an impedance. A reflection has no unit."""
+        """Unit of the ratio: "N m s/rad" for an impedance, empty for a ratio of torques."""
         return "" if self.kind == "reflection" else "N m s/rad"
 
 

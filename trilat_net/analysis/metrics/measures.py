@@ -63,14 +63,17 @@ def unavailable(
     of: str = "",
     applies: bool = True,
 ) -> MetricValues:
-    """Returns metrics without numbers for all quantities of a group, with a common reason.
+    """Returns metrics without values for all quantities of a group, with a common reason.
 
     Args:
         group: Group of the quantities.
-        why: The reason why there are no numbers.
-        of: Kind of subject to which the quantities are limited, such as "site". Empty for every
-            kind.
+        why: The reason why there are no values.
+        of: If not empty, only quantities of this kind of subject are returned: "run", "site",
+            "link" or "wall".
         applies: False if the quantities cannot exist in any run of this scenario, see `Metric`.
+
+    Returns:
+        The metrics, by key of the quantity.
     """
     return {
         quantity.key: Metric(None, why, applies)
@@ -176,14 +179,17 @@ class Quantity(NamedTuple):
 
 
 def list_shared_quantities(names: Mapping[str, str]) -> list[Quantity]:
-    """Returns the definitions of quantities that exist for shared angles and shared positions.
+    """Defines quantities of the coordinates that arms share, for angles and for positions.
+
+    Arms share either their joint angles, in rad, or the positions of their end effectors, in m.
+    Each quantity is therefore defined twice.
 
     Args:
-        names: Names for people by key. The keys lack their unit, and "{0}" in a name stands for
-            the symbol q of angles or x of positions.
+        names: Names that the user reads, by key. The unit is appended to each key. "{0}" in a
+            name is replaced by the symbol q for angles or x for positions.
 
     Returns:
-        The quantities of angles, in rad, and then those of positions, in m.
+        The quantities of angles, and then the quantities of positions.
     """
     symbols = {"rad": "q", "m": "x"}
     return [
@@ -244,14 +250,15 @@ _GROUP_ORDER = (
 
 
 def measures(of: str, group: str, *quantities: Quantity) -> Callable[[Measuring], Measuring]:
-    """Registers the decorated function as the one that measures some quantities.
+    """Registers a function that measures some quantities. Use it as a decorator.
 
-    The function is called for every subject of the kind, and returns all of the quantities.
+    The function is called for each run, site (the process that runs one arm), link or wall,
+    depending on `of`. It must return a metric for each of the quantities.
 
     Args:
-        of: Kind of subject: "run", "site", "link" or "wall".
+        of: Kind of subject that the function measures: "run", "site", "link" or "wall".
         group: Heading under which the quantities are shown.
-        quantities: The quantities, without kind and group.
+        quantities: The quantities. Their attributes `of` and `group` are filled in.
 
     Raises:
         ValueError: Another function measures one of the quantities.

@@ -1,20 +1,20 @@
 """Computes metrics of motion, effort, contact forces, learning, links and control loops.
 
 A metric is a number that describes a recorded run or a part of it. A site is the process that
-runs one arm, as a master that a person moves or as a slave. Its error e, Eq. (9) of the paper,
-is the difference between its joint angles and the weighted mean of the angles of the arms that
-it follows, as they arrive over delayed links. docs/metrics.md and docs/definitions.md define
-every metric.
+runs one arm. The arm is a master, which a person moves, or a slave. The error of a site is the
+difference between the joint angles of its arm and the weighted mean of the angles of the arms
+that it follows, which arrive with a delay. docs/metrics.md and docs/definitions.md define every
+metric.
 
 Invariant:
-    - The error e includes the delay of the links, whereas the spread compares all arms at the
-      same instant. A slave is compared with its master at the time at which the sample that it
-      uses was sent.
+    - The error includes the delay of the links. The largest distance between the arms (spread)
+      is computed at the same instant. A slave is compared with its master at the time at which
+      the state that it uses was sent.
     - The effort is computed from the recorded motor torque, after the torque limit and with
       gravity compensation.
-    - The force of a wall is computed from the wall in the scenario and the recorded states.
-      Ticks without a record contribute nothing.
-    - The error of a parameter estimate is reported only if the control law adapts the parameter
+    - The force of a wall is computed from the scenario and the recorded motion. Ticks without a
+      record contribute nothing.
+    - The error of a parameter estimate is reported only if the control law changes the estimate
       and the true value is known. Otherwise only the estimate is reported.
 """
 
@@ -215,11 +215,14 @@ def measure_following(view: RunView, link: str) -> MetricValues:
     Quantity("chatter_nm", "chatter, mean change of tau a tick", "N m"),
 )
 def measure_effort(view: RunView, site: str) -> MetricValues:
-    """Measures the effort of a site's controller, and how often its torque is at the limit.
+    """Measures how much torque a site's controller applies, and how often it is at the limit.
 
     Args:
-        view: The run.
-        site: Name of the site.
+        view: The recorded run.
+        site: Name of the site, the process that runs one arm.
+
+    Returns:
+        The metrics, by key. Without records each contains the reason instead of a value.
     """
     part = view.log[site]
     if not len(part):
@@ -344,7 +347,7 @@ class ParameterEstimates(NamedTuple):
     base: BaseEstimates | None = None
 
     def to_json(self) -> JsonObject:
-        """Returns the estimates as plain values, with the keys of the JSON output."""
+        """Returns the parameter estimates of the arm as plain values, ready for JSON."""
         content = self._asdict()
         del content["base"]
         if self.base is not None:
@@ -353,13 +356,15 @@ class ParameterEstimates(NamedTuple):
 
 
 def read_parameter_estimates(scenario: Scenario, records: AlignedRecords) -> ParameterEstimates:
-    """Reads the parameter estimates of a site at the start and at the end of a run.
-
-    The slopes of straight lines fitted to the last seconds show whether they still change.
+    """Reads from the records what a site learnt about the dynamic parameters of its arm.
 
     Args:
         scenario: The description of the experiment.
-        records: Records of the site.
+        records: Records of the site, the process that runs one arm.
+
+    Returns:
+        The estimates in the first and the last record, and the rate at which they change in the
+        last 5 s.
     """
     spec = scenario.sites[records.site]
     arm = build_arm_rows(scenario, records.site)
@@ -447,15 +452,19 @@ def _estimate_base_parameters(
     Quantity("unphysical_links", "unphysical links, at last", "", "sum"),
 )
 def measure_parameter_error(view: RunView, site: str) -> MetricValues:
-    """Measures how far a site's parameter estimates are from the true values, and their drift.
+    """Measures how far a site's estimates of its arm's parameters are from the true values.
 
-    For a chain the distance and the energy of the errors are computed from base parameters, the
-    combinations of parameters that torques determine. Other errors of the estimates never
-    change, and have no effect on the torque.
+    For a chain of joints the errors are computed in base parameters, which are the combinations
+    of parameters that torques determine. Other errors have no effect on the torque.
 
     Args:
-        view: The run.
-        site: Name of the site.
+        view: The recorded run.
+        site: Name of the site, the process that runs one arm.
+
+    Returns:
+        The metrics, by key: the distance and the energy of the errors in the first and the last
+        record, the rate at which the estimates still change, and the number of links that no
+        rigid body can have. A metric without a value contains the reason.
     """
     scenario = view.scenario
     estimates = view.compute_once(read_all_estimates).get(site)
@@ -586,11 +595,13 @@ def measure_network(view: RunView, name: str) -> MetricValues:
 def measure_loop(view: RunView, site: str) -> MetricValues:
     """Measures the timing of a site's control loop, and counts its missing records.
 
-    In virtual time no clock is read, so that the timing does not apply.
-
     Args:
-        view: The run.
-        site: Name of the site.
+        view: The recorded run.
+        site: Name of the site, the process that runs one arm.
+
+    Returns:
+        The metrics, by key. In a simulation that reads no clock, only the number of missing
+        records has a value.
     """
     log = view.log
     missing = {"missing": metric(log.missing(site))}

@@ -1,20 +1,20 @@
-"""Computes the energy that enters each arm, and the energy that delays of the links inject.
+"""Computes the energy that enters each arm, and the energy that network delays inject.
 
 Energy enters an arm through its ports: the controller, the operator and the environment. The
-work of a torque tau during a motion dq of the joints is int tau' dq. If the torque tau_k is
-held during tick k, its work is exactly tau_k' (q_{k+1} - q_k), where q_k are the joint angles.
-If the torque follows the motion, the trapezoid rule is used, which is exact for springs. The
-sum over the ticks is known as a passivity observer (Hannaford and Ryu 2002).
+work of a torque tau during a small motion dq of the joints is tau'dq. If the torque tau_k is
+constant during tick k, its work is exactly tau_k' (q_{k+1} - q_k), where q_k are the joint
+angles. If the torque follows the motion, the trapezoid rule is used, which is exact for
+springs. The sum over the ticks is known as a passivity observer (Hannaford and Ryu 2002).
 
-The delay of a link injects energy as well. The control torque of a site, the process that runs
-one arm, equals the torque that the same law would compute without delay, plus a term for each
-link from a peer j to the site i. The energy of this term is
+A link carries the state of site j, the process that runs one arm, to site i with the delay
+T_ij. The control torque of site i is the torque without delay, plus a term for each link. The
+energy of this term is
 
-    E_ij = int qd_i' dtau_ij dt,   dtau_ij = S_i ( p_j(t - T_ij) - p_j(t) ),
+    E_ij = int qd_i' S_i ( p_j(t - T_ij) - p_j(t) ) dt
 
-where qd_i is the joint velocity of the site, p_j the signal that the link carries, T_ij its
-delay, and S_i the gain of the law. docs/metrics.md gives p_j and S_i for each law, and the
-sources.
+Here qd_i is the joint velocity of site i, p_j the signal that the law uses from site j, such as
+its position, and S_i the gain of the law for this signal. docs/metrics.md lists p_j and S_i for
+each law, and the sources.
 """
 
 import numpy as np
@@ -204,15 +204,20 @@ def measure_port_energy(view: RunView, site: str) -> MetricValues:
     Quantity("delay_most_j", "given by the delay at most", "J"),
 )
 def measure_delay_energy(view: RunView, link: str) -> MetricValues:
-    """Measures the energy that the delay of a link injects, at the end and at its maximum.
+    """Measures the energy that the delay of a link injects into the receiving arm, in J.
 
-    The delay makes a site follow an old position of its peer. The torque due to this difference
-    does work on the arm. It is the torque of the control law before it is limited. Only tick
-    periods count that rest on records alone, and in which the site follows its peers.
+    A site is the process that runs one arm. The delay makes it follow an old position of the
+    sending site (peer). The difference from the torque without delay does work on the arm. This
+    is the torque of the control law before it is limited. Only tick periods count that have a
+    record at both ends, and in which the site follows its peers.
 
     Args:
-        view: The run.
-        link: Name of the link, such as "m1->s".
+        view: The recorded run.
+        link: Name of the link, such as "m1->s" for the link from site m1 to site s.
+
+    Returns:
+        The energy at the end of the run and its maximum, by key. If they are unknown, each
+        contains the reason.
     """
     runs = view.sites
     peer = view.links[link].peer

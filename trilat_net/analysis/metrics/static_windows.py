@@ -1,23 +1,25 @@
-"""Computes what arms at rest reveal: the stiffness that users feel, and how forces are shared.
+"""Computes stiffness and force sharing from the times in which all arms rest.
 
-In a static window all arms rest under constant torques. A site is the process that runs one
-arm, and the dominance factors are the weights with which the sites follow each other. The
-torques tau_i on the arms then satisfy
+A site is the process that runs one arm. A static window is a time in which all arms rest under
+constant torques. The stiffness that a user feels follows from two windows: it is the ratio of
+the changes of torque and angle between them.
 
-    sum_i (pi_i / K_i) tau_i = 0   for every joint,
+Force sharing concerns an operator who holds an arm while a torque acts on another arm. The
+dominance factors are the weights with which the sites follow each other. At rest the torques
+tau_i on the arms satisfy
 
-where pi is the Perron vector of the matrix of dominance factors (its left eigenvector for the
-eigenvalue 1), and K_i is the stiffness with which site i holds its error, the difference from
-what it follows. If one operator pushes and another holds, the equation predicts the torque that
-the holder feels. This is called force sharing. docs/metrics.md defines and derives each metric.
+    sum_i (pi_i / K_i) tau_i = 0   for every joint
+
+Here pi is the left eigenvector of the matrix of dominance factors for the eigenvalue 1 (Perron
+vector). K_i is the stiffness, in N m/rad, with which the controller of site i pulls its arm to
+the position that it follows. The equation predicts the torque that the operator feels.
+docs/metrics.md derives each metric.
 
 Invariant:
-    - A stiffness is reported only if nothing but a single operator changed between two static
-      windows.
-    - A stiffness is the ratio of the changes of torque and angle between the windows. The other
-      joints of the arm may have moved as well.
+    - A stiffness is reported only if nothing but a single operator changed between the two
+      windows. Other joints of the arm may have moved as well.
     - No torque is predicted if a control law learns the gravity of its arm, because its
-      estimates then take up the load.
+      estimates then change under a load.
 """
 
 from collections.abc import Mapping
@@ -308,7 +310,10 @@ class SharingRatio(NamedTuple):
 
     @property
     def off(self) -> float | None:
-        """Relative deviation of the felt torque from the expected torque. None if unknown."""
+        """Relative difference between the felt torque and the expected torque, from 0.
+
+        None if the expected torque is unknown or zero.
+        """
         expected = self.expected_nm.value
         if expected is None or expected == 0.0:
             return None
@@ -342,13 +347,16 @@ class JointLoad(NamedTuple):
 
 
 def find_joint_loads(view: RunView) -> list[JointLoad]:
-    """Finds the loaded joints of every static window.
+    """Finds the joints that carry a torque while all arms rest, with these torques.
 
-    A site is loaded at a joint if its torque is neither small nor much smaller than that of
-    another site.
+    A time of rest is called a static window. At a joint, an arm counts as loaded if the
+    external torque on it is neither small nor much smaller than the torque on another arm.
 
     Args:
-        view: The run.
+        view: The recorded run.
+
+    Returns:
+        The loads, by window and joint. Joints without a load are left out.
     """
     loads = []
     for window in view.compute_once(find_static_windows):
@@ -366,13 +374,13 @@ def find_joint_loads(view: RunView) -> list[JointLoad]:
 
 
 def count_static_windows(view: RunView) -> Metric:
-    """Counts the static windows of a run, times in which all arms rest.
+    """Counts the times of a run in which all arms rest under constant torques.
 
     Args:
-        view: The run.
+        view: The recorded run.
 
     Returns:
-        The number. If there are no windows, the metric contains the reason.
+        The number. If it is zero or unknown, the metric has no number but the reason.
     """
     if view.absent:
         return Metric(None, f"no records of {', '.join(view.absent)}")
@@ -387,12 +395,17 @@ def count_static_windows(view: RunView) -> Metric:
     Quantity("sharing_off", "furthest from tau_s beta_s / beta_i"),
 )
 def measure_force_sharing(view: RunView, _run: str) -> MetricValues:
-    """Measures how far felt torques deviate from those that the dominance factors predict.
+    """Measures how well operators feel the torque that the sharing of forces predicts.
 
-    A dominance factor is the weight with which a site follows another site.
+    Operators feel the torques on other arms according to the dominance factors, which are the
+    weights with which the arms follow each other.
 
     Args:
-        view: The run.
+        view: The recorded run.
+
+    Returns:
+        The largest relative difference between the felt and the predicted torque, as a metric
+        by its key. Without a prediction the metric contains the reason.
     """
     ratios = view.compute_once(find_sharing_ratios)
     deviations = [ratio.off for ratio in ratios if ratio.off is not None]
@@ -451,13 +464,17 @@ def _weigh_load(
 
 
 def find_sharing_ratios(view: RunView) -> list[SharingRatio]:
-    """Finds the force sharing at every joint at which exactly two sites are loaded.
+    """Compares the torque that an operator feels with the torque that another arm receives.
 
-    The operator who feels the torque is the one who holds the arm like a spring. If both
-    operators or neither of them do so, the torque acts on the slave.
+    This is done at every joint at which exactly two arms carry a torque, while all arms rest.
+    The operator who feels the torque is the operator who holds an arm like a spring. If both do
+    so, or none, it is the operator of the master. The torque on the other arm is the cause.
 
     Args:
-        view: The run.
+        view: The recorded run.
+
+    Returns:
+        The comparisons by time. Empty if there is no joint of this kind.
     """
     static_windows = view.compute_once(find_static_windows)
     windows = {window.from_s: window for window in static_windows}

@@ -56,17 +56,18 @@ def _not_applicable(reason: str) -> Metric:
 
 
 def read_user_shares(view: RunView) -> UserShares | Metric:
-    """Reads how a slave divided its motion between its users, at the slave's ticks.
+    """Reads the weights with which the slave arm followed each of its users over time.
 
-    Each user moves a master, and the slave follows the masters with weights, the dominance
+    Each user moves a master arm, and the slave follows the masters with weights, the dominance
     factors.
 
     Args:
-        view: The run.
+        view: The recorded run.
 
     Returns:
-        The weights and the leading user. A metric with the reason if no users share a slave, or
-        if their records are missing.
+        The weights and the leading user at every tick of the slave. If no two users share a
+        slave, or records are missing, the result is a metric without a value, which contains
+        the reason.
     """
     slave, users = find_users(view.scenario)
     if not slave or len(users) < 2:
@@ -85,15 +86,19 @@ def read_user_shares(view: RunView) -> UserShares | Metric:
     Quantity("motion_share", "share in the slave's motion"),
 )
 def measure_authority(view: RunView, site: str) -> MetricValues:
-    """Measures a user's authority over a slave: weighted effort, and share of its motion.
+    """Measures how much a user determines the motion of the slave arm.
 
-    The effort is h sum_k a_k |tau_h,k|^2, with the tick period h, the user's dominance factor
-    a_k at tick k, which is the weight with which the slave follows the user's master, and the
-    torque tau_h,k with which the user pushes the master.
+    There are two metrics. The first is the weighted effort h sum_k a_k |tau_k|^2, in (N m)^2 s.
+    Here h is the tick period, a_k the weight with which the slave follows the user's master arm
+    at tick k, and tau_k the torque with which the user pushes the master. The second is the
+    user's share of the slave's motion, estimated from the recorded velocities.
 
     Args:
-        view: The run.
-        site: Name of the master that the user moves.
+        view: The recorded run.
+        site: Name of the site that runs the user's master arm.
+
+    Returns:
+        The metrics, by key. A metric without a value contains the reason.
     """
     shared = view.compute_once(read_user_shares)
     slave, users = find_users(view.scenario)
@@ -197,14 +202,17 @@ def _identify_shares(view: RunView) -> list[float] | Metric:
     Quantity("lead_jump", "largest step of q_id while shares change, to that of the rest"),
 )
 def measure_sharing(view: RunView, _run: str) -> MetricValues:
-    """Measures how the users of a slave disagree, intervene and take over.
+    """Measures how the users of a slave arm disagree, intervene and take over.
 
-    Each user moves a master, and the slave follows the masters with weights. The user with the
-    largest weight leads. A user intervenes while another user leads than the scenario plans. A
-    takeover is a change of the leader.
+    Each user moves a master arm, and the slave follows the masters with weights. The user with
+    the largest weight leads. A change of the leader is a takeover. In some experiments a
+    program moves the arm of the last user. While another user leads, this user intervenes.
 
     Args:
-        view: The run.
+        view: The recorded run.
+
+    Returns:
+        The metrics, by key. A metric without a value contains the reason.
     """
     shared = view.compute_once(read_user_shares)
     slave, users = find_users(view.scenario)
