@@ -431,14 +431,14 @@ def left_perron_vector(alpha: Array) -> Array:
 
 
 def find_kd_scales(Kd: Array) -> Array | None:
-    """Finds the factors by which the damping gains Kd of the arms differ from the first arm's.
+    """Finds the ratio of the damping gain Kd of each arm to the gain of the first arm.
 
     Args:
         Kd: Damping gains of the N arms along n axes, shape (N, n). NaN along an axis that an
             arm does not follow.
 
     Returns:
-        The factors, shape (N,). All are 1 if all gains are zero. None if the gains of the arms
+        The ratios, shape (N,). All are 1 if all gains are zero. None if the gains of the arms
         are not multiples of each other.
     """
     if not np.nan_to_num(Kd).any():

@@ -998,7 +998,7 @@ def find_last_change(scenario: Scenario, span_s: float) -> float:
 
     Args:
         scenario: The description of the experiment.
-        span_s: Length of the run. Changes that start later are ignored.
+        span_s: Length of the run, in s. Changes that start later are ignored.
 
     Returns:
         The time. 0 if there is no change.

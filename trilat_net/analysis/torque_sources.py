@@ -313,12 +313,15 @@ def split_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit:
     end_effector = arm.place_end_effector(records.q, records.qd)
 
     def add_torques(sources: Iterable[ActorBase], *, sampled: bool) -> Array:
-        """Returns the sum of the torques of some operators or environments, shape (K, n).
+        """Returns the sum of the torques of some operators or environments, in N m.
 
         Args:
             sources: The operators or environments.
             sampled: True to add only torques that are computed once per tick and then constant.
                 False to add only torques that follow the motion continuously.
+
+        Returns:
+            The sum in each of K records for each of n joints, shape (K, n).
         """
         total = np.zeros_like(records.q)
         for source in sources:

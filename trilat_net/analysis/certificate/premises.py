@@ -16,8 +16,8 @@ The module also collects how many records were available.
 
 Invariant:
     - A premise holds, fails, or cannot be decided, and always states its evidence.
-    - Missing information never makes a run stable. The run is not judged if records are missing
-      for too many ticks, or if some motion was copied from another log.
+    - Missing information never makes a run stable. The judgement stays open if too many records
+      are missing, or if the run was repeated with the recorded motion of some sites.
     - A log that was changed after it was written does not pass.
 """
 

@@ -115,7 +115,7 @@ class LogMetrics(Result):
         return joint_unit
 
     def headline(self) -> str:
-        """Returns one line for people: the log, the count of known numbers, and the sites."""
+        """Returns a line for the user: the log, its sites, and the number of known values."""
         known = 0
         for _, metric in self._list_values():
             known += metric.value is not None

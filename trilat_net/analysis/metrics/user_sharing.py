@@ -205,8 +205,8 @@ def measure_sharing(view: RunView, _run: str) -> MetricValues:
     """Measures how the users of a slave arm disagree, intervene and take over.
 
     Each user moves a master arm, and the slave follows the masters with weights. The user with
-    the largest weight leads. A change of the leader is a takeover. In some experiments a
-    program moves the arm of the last user. While another user leads, this user intervenes.
+    the largest weight leads. A change of the leader is a takeover. A program may move the arm
+    of the last user. Any other user who leads is then said to intervene.
 
     Args:
         view: The recorded run.
