@@ -492,7 +492,7 @@ class MetricComparison(NamedTuple):
         """Returns the row of this comparison that shows a quantity in all logs.
 
         Args:
-            key: Key of the quantity, such as "rms_tau_nm".
+            key: Key of the quantity, such as "sharing_off".
 
         Raises:
             KeyError: No row has this key.
