@@ -1,23 +1,23 @@
-"""Analyses what operators feel, and whether the arms stay stable with any passive operator.
+"""Analyses what operators feel in coupled arms, and whether the arms stay stable.
 
 A haptic port is where an operator or an environment touches an arm. It has two variables: the
-torque that acts on a joint, and the velocity of the joint. The coupled arms are passive at
-their ports if they never return more energy than they received. They are absolutely stable if
-they are stable with any passive operators. Transparency compares what an operator feels while
-another arm moves freely or is clamped.
+torque that acts on a joint, and the velocity of the joint. Three properties are examined:
 
-If the sites, the processes that each run one arm, follow in task space, the ports are at the
-end effectors, along the followed axes. The same loop is then described in other coordinates.
-The joint angles q are replaced by x = J q and z = N' q, where J is the Jacobian of the followed
-axes at rest, and N a basis of the joint motions that leave these axes unchanged. A force F on
-the end effector acts as the joint torque J' F, and the velocity of its port is x', the
-derivative of x. A port has the number of its coordinate: 1 to 3 for the position, 4 to 6 for
-rotations. The state of its position is called "q" with that number, as for a joint.
+- Passivity: the arms never return more energy at their ports than they received there.
+- Absolute stability: the arms are stable with any passive operators.
+- Transparency: what an operator feels while another arm moves freely or is clamped.
+
+If end effectors follow each other instead of joints, the ports are at the end effectors, along
+the followed axes. The joint angles q are then replaced by x = J q and z = N' q. J is the
+Jacobian of the followed axes at rest, and N a basis of the joint motions that leave these axes
+unchanged. The velocity of a port is the rate of change of x. A force F on the end effector acts
+as the joint torque J' F. Ports are numbered by their axis: 1 to 3 for the position, 4 to 6 for
+rotations. The position of port 2, for example, is called "q2", like the angle of a joint.
 
 Invariant:
-    - Operators and environments are removed from the loop. Their torque at the equilibrium
-      stays as a constant, so that a held pose can be analysed too.
-    - For an unstable loop only the instability is reported, because such a loop has no steady
+    - Operators and environments are removed from the loop. Their torque at rest stays as a
+      constant, so that a held pose can be analysed too.
+    - For an unstable loop only the instability is reported, because this loop has no steady
       oscillations.
     - Every result holds for the analysed band of frequencies.
 """
@@ -138,15 +138,16 @@ def build_proof_output(
 def compute_proof_weights(conditions: OperatingConditions) -> Array:
     """Computes the weights of the sites in the energy function of the stability proof.
 
-    They are beta_i = pi_i / c_i of docs/errata.md, where pi is the left eigenvector of the
-    dominance factors, and c_i are the factors between the gains of the sites. Their sum is N,
-    the number of sites.
+    A site is a process that runs one arm. The weight of site i is beta_i = pi_i / c_i. pi is
+    the left eigenvector of the matrix of dominance factors, the weights with which sites follow
+    each other. c_i is the gain of site i relative to gains that are common to all sites. The
+    proof is in docs/errata.md.
 
     Args:
-        conditions: The sites, gains and dominance factors of the loop.
+        conditions: The sites, gains and dominance factors.
 
     Returns:
-        The weights, shape (N,).
+        The weights beta, shape (N,), for N sites. Their sum is N.
     """
     Kd = np.full((len(conditions.sites), conditions.sites[0].layout.shared), np.nan)
     for site_Kd, site in zip(Kd, conditions.sites, strict=True):
@@ -230,18 +231,27 @@ class PortAnalysis(NamedTuple):
 
     @property
     def speed(self) -> str:
-        """The symbol of the velocities at the ports, for tables and figures."""
+        """Symbol of the velocities at which operators move the arms, for tables and figures.
+
+        It is "qd" for joints, and "xd" if end effectors follow each other.
+        """
         return "xd" if self.axes else "qd"
 
     def name_port(self, number: int) -> str:
-        """Returns the name of the ports with a number: "joint 2", or "axis y" in task space."""
+        """Returns the name of the place where an operator acts, such as "joint 2" or "axis y".
+
+        Args:
+            number: Number of the joint, or of the axis of the end effector if end effectors
+                follow each other, from 1.
+        """
         return f"{self.kind} {self.axes.get(number, number)}"
 
     def impedance_unit(self, number: int = 0) -> str:
-        """Returns the unit of an impedance at the ports with a number.
+        """Returns the unit of the impedance that an operator feels, for tables and figures.
 
         Args:
-            number: Number of the ports, from 1. 0 stands for all ports.
+            number: Number of a joint, or of an axis of the end effector if end effectors follow
+                each other, from 1. 0 stands for all of them together.
         """
         linear = "N s/m"
         angular = "N m s/rad"
@@ -260,21 +270,25 @@ def analyse_ports(
     band_hz: tuple[float, float] = (frequency_search.LOW_HZ, frequency_search.HIGH_HZ),
     hands: Sequence[HandMatrices] = (),
 ) -> PortAnalysis:
-    """Analyses what operators feel at the joints of a teleoperator, and whether it is passive.
+    """Analyses what operators feel when they hold arms, and whether the arms are passive.
 
-    The arms are linearised at an equilibrium. The joints at which operators act are the ports.
-    Their response is computed over a band of frequencies.
+    The coupled arms are linearised about a pose of rest. Their response to torques on the
+    joints is computed over a band of frequencies.
 
     Args:
-        scenario: The teleoperator.
-        rest: The equilibrium.
-        of: Site that is free and clamped for the transparency at the others. None for the
-            slave, or for the last site if there is no slave.
+        scenario: Description of the coupled arms.
+        rest: The pose of rest.
+        of: Site (process that runs one arm) whose arm is once free and once clamped, while
+            operators feel the other arms. None for the slave, or for the last site if there is
+            no slave.
         band_hz: Lower and upper end of the band, in Hz.
-        hands: Measured impedances of operators, any of which may hold any master.
+        hands: Measured impedances of operators. Any of them may hold the arm of any master.
+
+    Returns:
+        Passivity, absolute stability, and the impedances that the operators feel.
 
     Raises:
-        ScenarioError: The scenario has no linear loop.
+        ScenarioError: The scenario cannot be linearised.
         UsageError: There is no site of that name, or the band is empty.
     """
     low, high = band_hz
@@ -587,13 +601,14 @@ def list_followed_axes(site: SiteSetup) -> list[int]:
 
 
 def name_ports(conditions: OperatingConditions) -> dict[int, str]:
-    """Returns the names of the axes along which the ports of a loop in task space move.
+    """Returns the names of the axes along which operators move the end effectors.
 
     Args:
-        conditions: The sites of the loop.
+        conditions: The coupled arms.
 
     Returns:
-        The name of each axis, by the number of the port. Empty in joint space.
+        The name of each followed axis, such as "y", by its number from 1. Empty if joints
+        follow each other instead of end effectors.
     """
     if not conditions.sites[0].layout.task:
         return {}
@@ -606,18 +621,21 @@ def move_ports_to_end_effectors(
     rest: Equilibrium,
     loop: LinearLoop,
 ) -> LinearLoop:
-    """Moves the ports of a loop from the joints to the end effectors.
+    """Replaces joint angles by end effector coordinates in a linear model of coupled arms.
 
-    The states X change to T X. The block of a site in T is (J; N') for its positions and again
-    for its velocities, with J and N as in the module's docstring.
+    Operators then act on the end effectors. The joint angles q of a site (process that runs one
+    arm) become x = J q and z = N' q. J is the Jacobian of the followed axes at rest, and N a
+    basis of the joint motions that leave these axes unchanged. A force F becomes the joint
+    torque J' F.
 
     Args:
-        conditions: The numbers of the loop.
-        rest: The equilibrium.
-        loop: The loop with ports at the joints.
+        conditions: The sites, gains and delays of the coupled arms.
+        rest: The pose of rest about which the arms are linearised.
+        loop: Linear model with joint torques as inputs and joint velocities as outputs.
 
     Returns:
-        The loop with ports at the end effectors. In joint space the same loop.
+        The model with forces and velocities of the end effectors. If joints follow each other
+        instead of end effectors, the model is returned without a change.
     """
     if not conditions.sites[0].layout.task:
         return loop

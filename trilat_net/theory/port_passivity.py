@@ -1,27 +1,30 @@
-"""Checks whether the arms stay stable with every passive operator, at any frequency.
+"""Checks whether coupled arms stay stable with every passive operator, at any frequency.
 
 A port is where an operator touches an arm. The admittance Y of the ports is the matrix that
 maps their torques u to their velocities at one frequency. The torques u supply the mean power
-1/4 u^H (Y + Y^H) u to the control loop, where ^H is the conjugate transpose. A stable loop is
-passive if Y + Y^H has no negative eigenvalue at any frequency. A passive loop is stable with
-every passive environment, also with operators who are coupled to each other.
+1/4 u^H (Y + Y^H) u to the control loop, where ^H is the conjugate transpose.
 
-For independent operators a weaker condition suffices. The loop is absolutely stable if at each
-frequency there is a diagonal matrix D of positive weights, one per site (the process that
-runs one arm), for which D Y + Y^H D has no negative eigenvalue.
+There are two conditions for a stable loop:
+
+- The loop is passive if Y + Y^H has no negative eigenvalue at any frequency. It is then stable
+  with every passive environment, also with operators who are coupled to each other.
+- The loop is absolutely stable, that is, stable with independent passive operators, under a
+  weaker condition. At each frequency there is a diagonal matrix D of positive weights for which
+  D Y + Y^H D has no negative eigenvalue. D has one weight per site, the process that runs one
+  arm.
 
 Sources:
-    - Passive environments: Colgate and Hogan, "Robust control of dynamically interacting
-      systems", Int. J. Control 48 (1988).
-    - Two scalar ports: Llewellyn, "Some fundamental properties of transmission systems", Proc.
-      IRE 40 (1952). The stability parameter, which must not be below 1: Adams and Hannaford,
-      "Stable haptic interaction with virtual environments", IEEE Trans. Robotics and Automation
-      15 (1999).
-    - Several joints and sites, for some classes of systems: Li, Tavakoli and Huang, "Absolute
-      stability of multi-DOF multilateral haptic systems", IEEE Trans. Control Systems
+    - Passivity and passive environments: Colgate and Hogan, "Robust control of dynamically
+      interacting systems", Int. J. Control 48 (1988).
+    - Absolute stability for two ports with one variable each: Llewellyn, "Some fundamental
+      properties of transmission systems", Proc. IRE 40 (1952). The parameter that must be at
+      least 1 is from Adams and Hannaford, "Stable haptic interaction with virtual
+      environments", IEEE Trans. Robotics and Automation 15 (1999).
+    - Absolute stability for several joints and sites, in special cases: Li, Tavakoli and Huang,
+      "Absolute stability of multi-DOF multilateral haptic systems", IEEE Trans. Control Systems
       Technology (2014).
-    - Weights as in the structured singular value, which are exact for up to three blocks:
-      Packard and Doyle, "The complex structured singular value", Automatica 29 (1993).
+    - The weights D, as in the structured singular value: Packard and Doyle, "The complex
+      structured singular value", Automatica 29 (1993).
 
 Invariant:
     - Passivity with positive weights per site proves stability for passive operators that are
@@ -77,7 +80,11 @@ class Passivity(NamedTuple):
 
     @property
     def passive(self) -> bool:
-        """True if no frequency of the grid has a negative eigenvalue."""
+        """True if the loop is passive: if Y + Y^H has no negative eigenvalue.
+
+        Y^H is the conjugate transpose of the admittance Y. All analysed frequencies are
+        considered.
+        """
         return not self.minima.below
 
 
@@ -212,15 +219,21 @@ def find_least_eigenvalue(Y: Complex) -> Array:
 
 
 def find_lacking_damping(Y: Complex, w_rad_s: Array) -> float:
-    """Returns the least damping b >= 0 with which (Y^-1 + b)^-1 is passive, in N m s/rad.
+    """Returns the damping that must be added at operators' ports to make arms passive.
 
-    A damper b at every port adds b to the impedance Z = Y^-1, so that the condition is
-    Z + Z^H + 2 b >= 0. An integrator in the law can make Z ~ -K / w^2, a negative damping
-    without bound. Then no b suffices, and the result is infinite.
+    A port is where an operator acts on an arm. A damper b at every port adds b to the impedance
+    Z = Y^-1, the inverse of the admittance. The arms are then passive if Z + Z^H + 2 b has no
+    negative eigenvalue, where Z^H is the conjugate transpose. A control law with an integrator
+    can lack damping without bound towards low frequencies, so that no b suffices.
 
     Args:
-        Y: Admittance, shape (F, p, p), in rad/s per N m.
+        Y: Admittance (velocity per torque) of p ports at F frequencies, shape (F, p, p), in
+            rad/s per N m.
         w_rad_s: Frequencies, rising, shape (F,), in rad/s.
+
+    Returns:
+        The least sufficient b, in N m s/rad. It is 0 if the arms are passive already, and
+        infinite if no b suffices.
     """
     Z = np.linalg.inv(Y).astype(np.complex128)
     lacking = -0.5 * find_least_eigenvalue(Z)
@@ -239,13 +252,21 @@ def check_passivity(
     w_rad_s: Array,
     weights: Array | None = None,
 ) -> Passivity:
-    """Checks passivity at some ports, on a frequency grid that is refined at minima.
+    """Checks whether coupled arms are passive at the places (ports) where operators act.
+
+    They are passive if they never return more energy than they received. This is examined over
+    frequency, with additional frequencies near the minima.
 
     Args:
-        response: Velocities per torque, or another output with as many entries.
-        w_rad_s: Frequencies, rising, shape (F,), in rad/s.
-        weights: Positive weights of the ports, shape (p,). None if all are 1, so that the
-            quadratic form is energy.
+        response: Function that returns the response at given frequencies: usually the
+            admittance, the velocities at the p ports per torque. Another output with p entries
+            is allowed too.
+        w_rad_s: First frequencies, rising, shape (F,), in rad/s.
+        weights: Positive weights of the ports, shape (p,). None if all are 1. The examined sum
+            of torque times output is then a physical power, if the outputs are velocities.
+
+    Returns:
+        The least eigenvalue over frequency, which decides about passivity, and related numbers.
     """
 
     def evaluate_weighted(w: Array) -> Complex:
@@ -341,12 +362,17 @@ def clamp_ports(Y: Complex, keep: list[int], clamped: list[int]) -> Complex:
 
 
 class BestWeights(NamedTuple):
-    """The weights of the sites with the largest margin of absolute stability.
+    """Site weights that best prove the stability of coupled arms with passive operators.
+
+    The operators act at ports, whose admittance Y maps their torques to velocities. There are N
+    sites (processes that each run one arm).
 
     Attributes:
-        margin: Least eigenvalue of Y + Y^H with the best weights and each site's part scaled to
-            size 1, dimensionless, shape (F,). Negative if no weights suffice.
-        weights: The best weights, relative to the first site's, shape (F, N).
+        margin: Least eigenvalue of the weighted Y + Y^H, with the conjugate transpose Y^H, at
+            each of F frequencies, shape (F,). Y is scaled so that each site's own part has size
+            1, so that the margin has no unit. It is negative if no weights prove stability.
+        weights: The best weights at each frequency, relative to the weight of the first site,
+            shape (F, N).
     """
 
     margin: Array
@@ -354,15 +380,21 @@ class BestWeights(NamedTuple):
 
 
 def find_best_weights(Y: Complex, owner: NDArray[np.int64]) -> BestWeights:
-    """Finds the weights of the sites that maximise the least eigenvalue at each frequency.
+    """Finds the site weights that best prove absolute stability, at each frequency.
 
-    The least eigenvalue of D^1/2 Y D^-1/2 + its Hermitian is concave in ln D (a limit of the
-    result of Sezginer and Overton for norms, IEEE Trans. Automatic Control 35 (1990)). The
+    Each site (process that runs one arm) has one positive weight, which belongs to all its
+    ports (places where operators act). D is the diagonal matrix of these weights. The loop is
+    stable with any passive operators if the matrix H = D^1/2 Y D^-1/2 + (D^1/2 Y D^-1/2)^H has
+    no negative eigenvalue, where ^H is the conjugate transpose. The least eigenvalue of H is
+    concave in ln D (compare Sezginer and Overton, IEEE Trans. Automatic Control 35 (1990)). The
     ellipsoid method therefore finds its maximum.
 
     Args:
-        Y: Admittance, shape (F, p, p).
+        Y: Admittance (velocity per torque) of the p ports at F frequencies, shape (F, p, p).
         owner: Index of the site of each port, shape (p,).
+
+    Returns:
+        The largest least eigenvalue at each frequency, and the weights that give it.
     """
     scaled = _scale_sites(Y, owner)
     count = len(Y)

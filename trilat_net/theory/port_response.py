@@ -1,15 +1,14 @@
-"""Computes how the arms respond to an operator's torque at each frequency.
+"""Computes how coupled arms respond to an operator's torque at each frequency.
 
-A haptic port is where an operator touches an arm. The admittance of a port is the joint
-velocity per torque of the operator, as a function of frequency, and the impedance is its
-inverse. Both are computed from the linearised control loop of all sites (the processes that
-each run one arm), while the other arms are free or one of them is clamped.
+An operator touches an arm at a haptic port, for example a joint. The admittance of the port is
+the velocity of the joint per torque of the operator, as a function of frequency. The impedance
+is its inverse. Both are computed from the linear model of all arms.
 
-The transparency of the system is judged by the impedance that an operator feels at one site, in
-N m s/rad, while another site is free and while it is clamped. A large difference means that the
-operator feels the difference between free space and a rigid object. The impedance belongs to
-one joint, while the operator applies no torque to the other joints. Means over a band of
-frequencies are taken on a logarithmic axis.
+Transparency is how well an operator feels what happens at another arm. It is judged by the
+impedance at one joint of the operator's arm, in N m s/rad, once while the other arm is free and
+once while it is clamped. The operator applies no torque to the other joints. A large difference
+means that the operator can distinguish free space from a rigid object. Means over a band of
+frequencies are taken on a logarithmic axis, so that each decade has the same weight.
 
 Sources:
     - Impedance and admittance: Hogan, "Impedance control: an approach to manipulation", ASME J.
@@ -26,8 +25,8 @@ Sources:
 Invariant:
     - Torques act on the joint, so that torque times velocity is the power that the operator
       supplies.
-    - A control law that reflects external torques to the other sites also reflects the torque
-      of a clamp.
+    - A control law that reflects external torques to the other arms also reflects the torque of
+      a clamp.
     - Frequencies are in rad/s. Frequencies that are shown to people are in Hz, and their names
       end in _hz.
 """
@@ -103,16 +102,16 @@ def _evaluate_shift(s: Complex, delay_s: float) -> Complex:
 
 
 class PoleAtZero(NamedTuple):
-    """The pole of a loop's response Y(s) at zero frequency, if there is one.
+    """Response of coupled arms to constant torques, which may make velocities grow.
 
-    With a pole, a constant torque makes the velocity grow. Near s = 0 the response is Y(s) ~
-    residue / s + higher powers of 1 / s.
+    The response Y(s) gives p velocities per torque, for m torques. A pole at s = 0 means that a
+    constant torque makes a velocity grow, as for a mass without friction. Near s = 0 the
+    response is then about residue / s, and higher powers of 1 / s may be added.
 
     Attributes:
-        order: Highest power of 1 / s. With 0 there is no pole, and the velocity under a
-            constant torque stays bounded.
-        residue: Growth of the velocity under a constant torque, shape (p, m), in rad/s^2 per N
-            m.
+        order: Highest power of 1 / s. If it is 0, there is no pole, and velocities under a
+            constant torque stay bounded.
+        residue: Coefficient of 1 / s, shape (p, m), in rad/s^2 per N m.
     """
 
     order: int
@@ -120,10 +119,11 @@ class PoleAtZero(NamedTuple):
 
     @property
     def passive(self) -> bool:
-        """True if a passive network may have the pole.
+        """True if a passive system may behave like this at zero frequency.
 
-        A passive network has simple poles on the imaginary axis, with a residue that is
-        symmetric and has no negative eigenvalue.
+        A passive system never supplies more energy than it received. If its response has a pole
+        at zero, the pole is simple. Its residue is a symmetric matrix without negative
+        eigenvalues.
         """
         differences = np.abs(self.residue - self.residue.T)
         asymmetry = differences.max(initial=0.0)
@@ -140,20 +140,23 @@ def evaluate_transfer(
     s: Complex,
     output: LoopOutput | None = None,
 ) -> Complex:
-    """Computes the response of a loop to torques at complex frequencies.
+    """Computes the response of coupled arms to torques at complex frequencies s.
 
-    The transfer function is C(s) (s E - A - sum_k A_k e^{-s T_k})^{-1} (B + sum_k B_k e^{-s
-    T_k}), with the matrices of `LinearLoop`, and A_k and B_k those of the terms with the delay
-    T_k.
+    The arms obey E x' = A x + sum_k A_k x(t - T_k) + B u + sum_k B_k u(t - T_k), with the state
+    x, the torques u, the delays T_k, and the matrices of `LinearLoop`. The transfer function
+    from u to an output C(s) x is
+
+        C(s) (s E - A - sum_k A_k exp(-s T_k))^-1 (B + sum_k B_k exp(-s T_k)).
 
     Args:
-        loop: The loop.
+        loop: Linear model of the coupled arms.
         s: Complex frequencies, shape (F,), in 1/s.
-        output: The output C(s). None for the joint velocities, so that the result is the
-            admittance Y(s), in rad/s per N m.
+        output: The output matrix C(s). None for the joint velocities, so that the result is the
+            admittance, in rad/s per N m.
 
     Returns:
-        The response, shape (F, p, m), with a row for each output and a column for each torque.
+        The response, shape (F, p, m), with a row for each of p outputs and a column for each of
+        m torques.
     """
     output = LoopOutput(loop.C) if output is None else output
     outputs = len(output.C)
@@ -215,7 +218,14 @@ def parse_port_site(port: str) -> str:
 
 
 def list_port_sites(loop: LinearLoop) -> tuple[str, ...]:
-    """Returns the sites of a loop, in the order of its inputs."""
+    """Returns the names of the sites whose joints have inputs in a linear model.
+
+    A site is a process that runs one arm. The inputs are torques on joints, such as "m1.tau1"
+    for site m1. Each site is listed once, in the order of its first input.
+
+    Args:
+        loop: Linear model of the coupled arms.
+    """
     sites = [parse_port_site(name) for name in loop.inputs]
     # a dict keeps each site once, in order
     return tuple(dict.fromkeys(sites))
@@ -287,16 +297,19 @@ def find_longest_delay_s(loop: LinearLoop) -> float:
 
 
 def find_pole_at_zero(loop: LinearLoop) -> PoleAtZero:
-    """Finds how the response of a loop behaves at zero frequency.
+    """Finds whether constant torques make the velocities of coupled arms grow.
 
-    The response Y(s) is the velocity per torque. Its pole at zero is found by Cauchy's integral
-    along a small circle. Many roots of the loop are zero, because all arms can rest in other
-    shared poses too, or because nothing excites an estimate. Most of them are not poles of Y,
-    because a resting arm has no velocity. A loop of mass m without friction has a pole: Y(s) ~
-    1 / (m s). Roots within `ZERO_ROOT_RADIUS_PER_S` count as zero.
+    This is so if the response Y(s), velocity per torque, has a pole at zero. For example, a
+    free mass m has Y(s) = 1 / (m s). A characteristic root at zero alone is not sufficient. The
+    arms have many of these roots, because they can rest in several poses, and a resting arm has
+    no velocity. The pole is found by Cauchy's integral along a small circle around zero, with
+    the radius `ZERO_ROOT_RADIUS_PER_S`.
 
     Args:
-        loop: The loop.
+        loop: Linear model of the coupled arms.
+
+    Returns:
+        Order and residue of the pole. The order is 0 if there is no pole.
     """
     angles = 2j * math.pi * np.arange(_CIRCLE_POINTS) / _CIRCLE_POINTS
     unit_circle = np.exp(angles)
@@ -359,7 +372,15 @@ def clamp_site(loop: LinearLoop, site: str) -> LinearLoop:
     sums: dict[float, DelayedTerm] = {}
 
     def add_term(delay_s: float, A: Array, B: Array) -> None:
-        """Adds matrices to the term of a delay; sums of delays may differ by rounding."""
+        """Adds matrices to the part of the model that acts after a given delay.
+
+        Delays that differ only by rounding errors count as equal.
+
+        Args:
+            delay_s: The delay, in s.
+            A: Effect of the delayed states.
+            B: Effect of the delayed torques.
+        """
         key = round(delay_s, 12)
         if key in sums:
             A = sums[key].A + A
@@ -432,33 +453,40 @@ class Transparency(NamedTuple):
 
     @property
     def softest_nm_s_rad(self) -> float:
-        """Mean impedance that the operator feels when the other site is free, in N m s/rad.
+        """Mean impedance that the operator feels while the other arm is free, in N m s/rad.
 
-        It is the mean of the logarithm of the magnitude over the band, on a logarithmic axis of
-        frequency.
+        It is the geometric mean of the impedance's magnitude over the frequencies of `band_hz`,
+        which are weighted as on a logarithmic axis.
         """
         return self._average_magnitude(self.free)
 
     @property
     def stiffest_nm_s_rad(self) -> float:
-        """Mean impedance that the operator feels when the other site is clamped, in N m s/rad.
+        """Mean impedance that the operator feels while the other arm is clamped, in N m s/rad.
 
-        It is the mean of the logarithm of the magnitude over the band, on a logarithmic axis of
-        frequency.
+        It is the geometric mean of the impedance's magnitude over the frequencies of `band_hz`,
+        which are weighted as on a logarithmic axis.
         """
         return self._average_magnitude(self.clamped)
 
     @property
     def ratio_db(self) -> float:
-        """Mean of 20 log10(abs(Z_clamped) / abs(Z_free)) over the band, in dB."""
+        """Mean ratio of the impedances with a clamped and a free other arm, in dB.
+
+        It is the mean of 20 log10(abs(Z_clamped) / abs(Z_free)) over the frequencies of
+        `band_hz`, on a logarithmic axis. Z_clamped and Z_free are the impedances that the
+        operator feels while the other arm is clamped or free.
+        """
         ratio = self.stiffest_nm_s_rad / self.softest_nm_s_rad
         return 20.0 * float(np.log10(ratio))
 
     @property
     def difference_nm_s_rad(self) -> float:
-        """Mean magnitude of Z_clamped - Z_free over the band, on logarithmic axes.
+        """Mean difference of the impedances with a clamped and a free other arm, in N m s/rad.
 
-        The mean is zero if the two impedances are equal at some frequency.
+        It is the geometric mean of abs(Z_clamped - Z_free) over the frequencies of `band_hz`,
+        which are weighted as on a logarithmic axis. Z_clamped and Z_free are the impedances
+        that the operator feels. The mean is zero if they are equal at any frequency.
         """
         difference = self.clamped - self.free
         if not difference.all():
@@ -466,12 +494,16 @@ class Transparency(NamedTuple):
         return self._average_magnitude(difference)
 
     def interpolate_magnitudes(self, frequency_hz: float) -> tuple[float, float]:
-        """Returns the magnitudes of the free and the clamped impedance, in N m s/rad.
+        """Returns the magnitudes of the impedances that the operator feels at one frequency.
 
-        The magnitudes are interpolated on logarithmic axes.
+        They are interpolated between the computed frequencies on logarithmic axes.
 
         Args:
             frequency_hz: The frequency, in Hz.
+
+        Returns:
+            The magnitude while the other arm is free, and the magnitude while it is clamped,
+            both in N m s/rad.
         """
         log_w = np.log(self.w_rad_s)
         target = np.log(2.0 * np.pi * frequency_hz)
