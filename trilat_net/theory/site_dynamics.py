@@ -85,16 +85,25 @@ class ArgumentLayout:
         self.inputs = slice(self.states, self.external_torque.start)
 
     def peer_sample(self, index: int) -> slice:
-        """Returns the position of one peer's sample: pose x, velocity, and external torque."""
+        """Returns where the values received from one other site are stored in the vector.
+
+        The values are the pose of that site's arm, the velocity of the pose, and the external
+        torque, in this order.
+
+        Args:
+            index: Index of the other site, where the site itself is not counted.
+        """
         length = 3 * self.coordinates
         first = self.peer_torque.stop + length * index
         return slice(first, first + length)
 
 
 def lay_out_arguments(site: SiteSetup) -> ArgumentLayout:
-    """Returns the positions of states and inputs in the argument vector of a site's rates.
+    """Returns where each state and input of a site is stored in one vector.
 
-    The memory of an imported law takes the position of the parameter estimate.
+    A site is a process that runs one arm. The vector is the argument of the functions that
+    compute how fast the states change. If a user wrote the control law, the numbers that the
+    law stores take the place of the parameter estimates.
 
     Args:
         site: Setup of the site.
@@ -156,12 +165,20 @@ class SiteRates(NamedTuple):
 
 
 def compute_following(site: SiteSetup, arm: PlacedArm | PlacedChain, x: Numbers) -> Following:
-    """Returns how a site follows its reference, in joint space or in task space.
+    """Computes the errors and the reference motion with which a site follows other sites.
+
+    A site is a process that runs one arm. Either its joints or its end effector follow the
+    desired motion that is part of x.
 
     Args:
         site: Setup of the site.
-        arm: The arm in the pose of x.
-        x: Arguments of the site's rates, shape (arguments, ...).
+        arm: Model of the arm in the pose of x.
+        x: States and inputs of the site, in the order of `ArgumentLayout`, shape (arguments,
+            ...).
+
+    Returns:
+        The errors of position and velocity, the reference velocity and acceleration for the
+        joints, and the related Jacobian.
     """
     layout = lay_out_arguments(site)
     Lambda = _as_columns(site.gains.Lambda, x)
@@ -203,14 +220,16 @@ def compute_shared_pose(site: SiteSetup, q: Numbers) -> Numbers:
 
 
 def evaluate_site_rates(site: SiteSetup, x: Numbers) -> SiteRates:
-    """Computes how fast the states of a site change, with operators and environments in force.
+    """Computes how fast the states of a site change, and the torques that act on its arm.
 
-    The rates are those of Eq. (8)-(13) and (15) of the paper, or those of a law with known
-    gravity.
+    A site is a process that runs one arm. Its states are joint angles, joint velocities and
+    parameter estimates. Operators and environments, such as walls, act as they do in the setup.
+    The equations are those of the site's control law and of the dynamics of its arm
+    (docs/laws.md).
 
     Args:
         site: Setup of the site.
-        x: Arguments in the order of `lay_out_arguments`, shape (arguments, ...).
+        x: States and inputs in the order of `lay_out_arguments`, shape (arguments, ...).
     """
     layout = lay_out_arguments(site)
     arm = place_arm(site, x[layout.q])
@@ -247,14 +266,17 @@ def evaluate_site_rates(site: SiteSetup, x: Numbers) -> SiteRates:
 
 
 def differentiate_site_rates(site: SiteSetup, x: Array) -> SiteRates:
-    """Returns the derivatives of a site's rates with respect to its arguments.
+    """Computes the derivatives of a site's rates of change, for the linear model of its arm.
 
-    They are computed by a complex step, which is exact up to rounding. Each derivative has a
-    column per argument.
+    A site is a process that runs one arm. The rates are differentiated with respect to each of
+    the site's states and inputs, by a complex step, which is exact up to rounding.
 
     Args:
         site: Setup of the site.
-        x: Arguments in the order of `lay_out_arguments`, shape (arguments,).
+        x: States and inputs in the order of `lay_out_arguments`, shape (arguments,).
+
+    Returns:
+        The derivatives of each rate, torque and output, with a column for each entry of x.
     """
     steps = 1j * COMPLEX_STEP * np.eye(len(x))
     stepped = x[:, np.newaxis] + steps
@@ -264,9 +286,11 @@ def differentiate_site_rates(site: SiteSetup, x: Array) -> SiteRates:
 
 
 def has_estimate(site: SiteSetup) -> bool:
-    """Returns True if a site's state includes numbers besides angles and velocities.
+    """Returns whether the control law of a site changes numbers from tick to tick.
 
-    They are the estimates of the arm parameters, or the memory of an imported law.
+    A site is a process that runs one arm, and a tick is a period of its control loop. The
+    numbers are the parameter estimates of the adaptive law, or the memory of a law that a user
+    wrote. They belong to the site's state, in addition to angles and velocities.
 
     Args:
         site: Setup of the site.
@@ -461,14 +485,16 @@ def _evaluate_model(actor: TorqueSource, position: Numbers, velocity: Numbers) -
 
 
 def describe_switching_points(site: SiteSetup, x: Array) -> Iterator[str]:
-    """Yields sentences on everything that makes the linear model one-sided at a state.
+    """Yields a sentence for each point at which the linear model of a site is one-sided.
 
-    At a switching point, such as a limit that is just reached, a rate has different derivatives
-    on both sides.
+    A site is a process that runs one arm. Where its arm just touches a wall, or an estimate
+    just reaches its limit, the derivatives on both sides differ. The linear model contains only
+    one of them.
 
     Args:
         site: Setup of the site.
-        x: Arguments of the site's rates, shape (arguments,).
+        x: States and inputs of the site in the order of `lay_out_arguments`, shape
+            (arguments,).
     """
     layout = lay_out_arguments(site)
     arm = place_arm(site, x[layout.q])

@@ -1,36 +1,36 @@
 """Computes the dynamics of an arm from textbook equations, for the linear analysis.
 
-The arm is a chain of joints. The module also computes the motion that a site, the process that
-runs the arm, demands of it in order to follow other sites (its peers). All equations are
-written in plain NumPy and share no code with the compiled simulation kernel, so that both check
-each other. The planar arm with two joints is in `analysis.arm_rows.PlacedArm`. Vectors have
-their components on the first axis and any number of columns behind it.
+The arm is a chain of n joints. The module also computes the reference motion with which the arm
+follows other arms. All equations are written in plain NumPy and share no code with the compiled
+simulation, so that both check each other. The planar arm with two joints is in
+`analysis.arm_rows.PlacedArm`. Vectors have their components on the first axis and any number of
+columns behind it.
 
 The equations use spatial vectors, which join a linear and an angular half (Featherstone, "Rigid
-Body Dynamics Algorithms", 2008). The linear half comes first, at the origin of the link's own
-frame. Let q be the joint angles, qd their velocities, and v the reference velocity of the
-control law. Link i has the Jacobian J_i and the velocities V_i = J_i qd and W_i = J_i v. Its
-acceleration, which includes gravity, is
+Body Dynamics Algorithms", 2008). The linear half comes first and belongs to the origin of the
+link's own frame. The following symbols are used:
 
-    A_i = X A_p + S a + V_i x (S v)
+- q, qd: joint angles and their velocities.
+- v, a: reference velocities and accelerations of the joints, from the control law.
+- J_i, I_i: Jacobian and spatial inertia of link i. V_i = J_i qd and W_i = J_i v are velocities.
+- X, S: transformation from the frame of the link before, and axis of the joint.
+- x, x*: cross products of spatial motions and of spatial forces.
 
-with the acceleration A_p of the link before, the transformation X from that link's frame, the
-axis S of the joint, and the reference acceleration a. The force on link i, whose spatial
-inertia is I_i, is
+The acceleration of link i includes gravity and follows from the acceleration A_p of the link
+before. It gives the force f_i on the link:
 
+    A_i = X A_p + S a_i + V_i x (S v_i)
     f_i = I_i A_i + 1/2 (V_i x* I_i W_i + W_i x* I_i V_i - I_i (V_i x W_i))
 
-Here x and x* are the cross products of motions and of forces. The force is linear in the ten
-inertial parameters pi_i of the link: f_i = F_i pi_i. This gives the regressor
-Y = (J_1' F_1 ... J_n' F_n) of Eq. (12) of the paper, and the inertia matrix
-M = sum_i J_i' I_i J_i.
+The force is linear in the ten inertial parameters p_i of the link: f_i = F_i p_i. This gives
+the regressor Y = (J_1' F_1 ... J_n' F_n), the matrix that multiplies the parameters in the
+torque, and the inertia matrix M = sum_i J_i' I_i J_i.
 
-If sites follow in task space, where end effectors instead of joints follow each other, the
-reference is computed as in `analysis.following.find_task_reference`. docs/laws.md has the
-equations and sources.
+If end effectors instead of joints follow each other, the reference motion is computed as in
+`analysis.following.find_task_reference`. docs/laws.md has the equations and sources.
 
 Invariant:
-    - The arithmetic of the compiled kernel is not used.
+    - The arithmetic of the compiled simulation is not used.
     - Every function is analytic in every argument, so that a complex step gives derivatives
       that are exact to rounding. The only exception is a chain that meets a joint stop, where
       the real part of the argument decides.
@@ -127,19 +127,20 @@ def _add_axes(values: Numbers, shape: tuple[int, ...], count: int) -> Numbers:
 
 
 class PlacedLink(NamedTuple):
-    """Position and velocity map of one link of a chain, in some poses.
+    """Pose and Jacobian of one link of an arm, for one or several poses of the arm.
 
-    The trailing axes "..." stand for the poses. A spatial velocity has a linear half and an
-    angular half.
+    The arm has n joints. The axes "..." of the arrays stand for the poses. A spatial velocity
+    joins a linear and an angular velocity.
 
     Attributes:
         X: Transformation of spatial velocities from the frame of the link before into this
             link's frame, shape (6, 6, ...).
         S: Spatial velocity of the link's joint at speed 1, shape (6,).
-        J: Jacobian of the link, from joint velocities to its spatial velocity, shape (6, n,
+        J: Jacobian that maps joint velocities to the link's spatial velocity, shape (6, n,
             ...).
-        R_base: Orientation of the link in the base, shape (3, 3, ...).
-        place_m: Origin of the link's frame in the base, shape (3, ...), in m.
+        R_base: Orientation of the link relative to the base, as a rotation matrix, shape (3, 3,
+            ...).
+        place_m: Origin of the link's frame, relative to the base, shape (3, ...), in m.
     """
 
     X: Numbers
@@ -195,15 +196,19 @@ class PlacedChain:
         return _add_axes(values, (-1,), len(self._columns))
 
     def regressor_matrix(self, qd: Numbers, v: Numbers, a: Numbers) -> Numbers:
-        """Returns the regressor Y(q, qd, v, a) of the links, Eq. (12), shape (n, 10 n, ...).
+        """Computes the regressor Y, the matrix that multiplies the arm's parameters in its torque.
 
-        Y theta is the torque that the links require, with their parameters theta. Drives and
-        friction are not included.
+        Y theta is the torque that the n links require for a reference motion, with the ten
+        inertial parameters of each link in theta. Drives and friction are not included. The arm
+        is in the pose of this object.
 
         Args:
-            qd: Joint velocities, shape (n, ...).
-            v: Reference velocities of the joints, shape (n, ...).
-            a: Reference accelerations of the joints, shape (n, ...).
+            qd: Joint velocities, shape (n, ...), in rad/s.
+            v: Reference velocities of the joints, shape (n, ...), in rad/s.
+            a: Reference accelerations of the joints, shape (n, ...), in rad/s^2.
+
+        Returns:
+            The regressor, shape (n, 10 n, ...).
         """
         blocks = []
         gravity = np.array([*self._chain.gravity_m_s2, 0.0, 0.0, 0.0])
@@ -361,15 +366,16 @@ class PlacedChain:
         return self._move_to_tip(self._links[-1].J)
 
     def pose_jacobian_rate(self, qd: Numbers) -> Numbers:
-        """Returns the time derivative of the pose Jacobian along a motion, shape (6, n, ...).
+        """Returns the time derivative of the end effector's Jacobian during a motion.
 
-        In the frame of the last link, the derivative of column k is X (V_k x S_k) - V x (X
-        S_k). V_k is the velocity of link k, S_k the axis of its joint, X the transformation
-        into the last link's frame, and V the velocity of the last link. The rotation of the
-        frame adds to it.
+        The Jacobian maps n joint velocities to the linear and angular velocity of the end
+        effector, in the axes of the base.
 
         Args:
-            qd: Joint velocities, shape (n, ...).
+            qd: Joint velocities, shape (n, ...), in rad/s.
+
+        Returns:
+            The derivative, shape (6, n, ...).
         """
         last = self._links[-1]
         V_last = multiply_columns(last.J, qd)
@@ -569,13 +575,14 @@ def _find_quaternion(R: Numbers) -> Numbers:
 
 
 def relative_rotation_vector(other: Numbers, R: Numbers) -> Numbers:
-    """Returns the rotation from another orientation to R, as a rotation vector in base axes.
+    """Returns the rotation that turns one orientation into another, as a rotation vector.
 
-    It is Log(R other'), where Log maps a rotation matrix to axis times angle.
+    The rotation vector has the direction of the axis and the length of the angle. Its
+    components are those in the axes of the base.
 
     Args:
-        other: Rotation matrix of the other orientation, shape (3, 3, ...).
-        R: Rotation matrix, shape (3, 3, ...).
+        other: Rotation matrix of the orientation before the rotation, shape (3, 3, ...).
+        R: Rotation matrix of the orientation after the rotation, shape (3, 3, ...).
 
     Returns:
         Rotation vector, shape (3, ...), in rad.
@@ -585,16 +592,22 @@ def relative_rotation_vector(other: Numbers, R: Numbers) -> Numbers:
 
 
 def evaluate_reference(shares: Array, site_pose: Numbers, shared: Sequence[Numbers]) -> Numbers:
-    """Returns the pose that a site follows, in the coordinates of its shared pose, Eq. (6).
+    """Computes the pose that the end effector of a site follows, from the poses of all sites.
 
-    The position is the mean of the peers' positions, weighted with the dominance factors
-    alpha_ij. The orientation is Exp(-sum_j alpha_ij Log(R_i R_j')) R_i, with the orientations
-    R_j of the sites.
+    A site is a process that runs one arm. It follows site j with the weight alpha_j (dominance
+    factor). The position to follow is the weighted mean of the positions. For the orientation,
+    the rotation from each other site's orientation to the site's own orientation is written as
+    a rotation vector (axis times angle). The site's orientation is turned back by the weighted
+    sum of these vectors.
 
     Args:
-        shares: Row of the matrix of dominance factors, shape (N,).
-        site_pose: Shared pose of the site itself, shape (m, ...).
-        shared: Shared pose of each site, shape (m, ...).
+        shares: Weights alpha of all N sites, shape (N,).
+        site_pose: Pose of the site itself, shape (m, ...): the position and, if m is 6, a
+            rotation vector in rad.
+        shared: Pose of each site, shape (m, ...).
+
+    Returns:
+        The pose to follow, shape (m, ...).
     """
     pairs = zip(shares.tolist(), shared, strict=True)
     followed = [(share, pose) for share, pose in pairs if share]
@@ -615,20 +628,24 @@ def evaluate_reference(shares: Array, site_pose: Numbers, shared: Sequence[Numbe
 
 
 class Following(NamedTuple):
-    """How a site follows, in joint space or with its end effector along the followed axes.
+    """Errors and reference motion with which an arm follows other arms.
+
+    Either its n joints follow, or its end effector along m coordinates. In the first case m is
+    n.
 
     Attributes:
-        x: Shared pose, shape (m, ...).
-        xd: Its velocity, and the angular velocity for an orientation, shape (m, ...).
-        e: Error of the followed coordinates, shape (m, ...).
-        ed: Their velocity less the reference's, shape (m, ...).
-        v: Reference velocity of the joints, shape (n, ...).
-        a: Derivative of v, shape (n, ...).
-        J: Jacobian of the followed axes, shape (m, n, ...). None in joint space, where it is
-            the unit matrix.
-        A: J J' with its damping, shape (m, m, ...).
-        least: Lower bound of the square of the undamped Jacobian's least singular value.
-            Infinite in joint space.
+        x: Pose that other arms can follow, shape (m, ...).
+        xd: Velocity of x, with an angular velocity for the orientation, shape (m, ...).
+        e: Error of the followed coordinates, x less the desired pose, shape (m, ...).
+        ed: Error of the velocities, xd less the desired velocity, shape (m, ...).
+        v: Reference velocity of the joints, shape (n, ...), in rad/s.
+        a: Reference acceleration of the joints, the derivative of v, shape (n, ...), in
+            rad/s^2.
+        J: Jacobian of the followed axes, shape (m, n, ...). None if joints follow.
+        A: Product J J', with a damping near singular poses, shape (m, m, ...). None if joints
+            follow.
+        least: Lower bound of the squared least singular value of J before the damping. Infinite
+            if joints follow.
     """
 
     x: Numbers
@@ -642,20 +659,33 @@ class Following(NamedTuple):
     least: float = np.inf
 
     def to_joints(self, force: Numbers) -> Numbers:
-        """Returns the joint torque J'F that corresponds to a force F, shape (n, ...).
+        """Converts a force on the end effector to the corresponding joint torque.
+
+        The torque is J' F, with the force F and the Jacobian J of the m followed axes.
 
         Args:
-            force: Force on the followed coordinates, shape (m, ...).
+            force: Force F along the followed axes, shape (m, ...).
+
+        Returns:
+            Torque on the n joints, shape (n, ...). If joints follow instead of the end
+            effector, it is the argument itself.
         """
         if self.J is None:
             return force
         return multiply_columns(_transpose(self.J), force)
 
     def from_joints(self, torque: Numbers) -> Numbers:
-        """Returns the force A^-1 J tau that corresponds to a joint torque tau, shape (m, ...).
+        """Converts a joint torque to the corresponding force on the end effector.
+
+        The force is A^-1 J tau, with the joint torque tau, the Jacobian J of the m followed
+        axes, and A = J J' plus a damping near singular poses.
 
         Args:
-            torque: Joint torque, shape (n, ...), in N m.
+            torque: Torque tau on the n joints, shape (n, ...), in N m.
+
+        Returns:
+            The force, shape (m, ...). If joints follow instead of the end effector, it is the
+            torque.
         """
         if self.J is None or self.A is None:
             return torque
@@ -670,16 +700,17 @@ def follow_joints(
     q_des: Numbers,
     qd_des: Numbers,
 ) -> Following:
-    """Computes how a site follows its reference joint by joint, Eq. (9) and (10).
+    """Computes the errors and the reference motion with which n joints follow desired angles.
 
-    The reference velocity of the joints is v = -Lambda (q - q_des).
+    The reference velocity of the joints is v = -Lambda (q - q_des), and the reference
+    acceleration is its derivative.
 
     Args:
         Lambda: Gain of the error, shape (n,), in 1/s.
-        q: Joint angles, shape (n, ...).
-        qd: Joint velocities, shape (n, ...).
-        q_des: Reference of the angles, shape (n, ...).
-        qd_des: Reference of the velocities, shape (n, ...).
+        q: Joint angles, shape (n, ...), in rad.
+        qd: Joint velocities, shape (n, ...), in rad/s.
+        q_des: Desired angles, shape (n, ...), in rad.
+        qd_des: Desired velocities, shape (n, ...), in rad/s.
     """
     e = q - q_des
     ed = qd - qd_des
@@ -720,18 +751,22 @@ def follow_in_task(
     x_des: Numbers,
     xd_des: Numbers,
 ) -> Following:
-    """Returns how a site follows with its end effector.
+    """Computes the errors and the reference motion with which an end effector follows a pose.
 
-    In a singular pose A and everything computed from it is NaN.
+    The pose has m coordinates, and the arm has n joints.
 
     Args:
-        site: Setup of a site that follows in task space.
-        arm: The arm in the pose q.
-        Lambda: Gains of the followed coordinates, in 1/s.
-        q: Joint angles, shape (n, ...).
-        qd: Joint velocities, shape (n, ...).
-        x_des: Reference of the shared pose, shape (m, ...).
-        xd_des: Reference of its velocity, shape (m, ...).
+        site: Setup of the arm and its control law.
+        arm: Model of the arm in the pose q.
+        Lambda: Gains of the coordinates, in 1/s.
+        q: Joint angles, shape (n, ...), in rad.
+        qd: Joint velocities, shape (n, ...), in rad/s.
+        x_des: Pose to follow, shape (m, ...).
+        xd_des: Velocity of this pose, shape (m, ...).
+
+    Returns:
+        The errors of the end effector, and the reference velocity and acceleration for the
+        joints. In a singular pose, all numbers that need the inverse of the Jacobian are NaN.
     """
     assert site.chain is not None
     assert site.chain.task is not None
