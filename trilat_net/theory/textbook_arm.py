@@ -196,7 +196,7 @@ class PlacedChain:
         return _add_axes(values, (-1,), len(self._columns))
 
     def regressor_matrix(self, qd: Numbers, v: Numbers, a: Numbers) -> Numbers:
-        """Computes the regressor Y, the matrix that multiplies the arm's parameters in its torque.
+        """Computes the regressor Y, the matrix that multiplies an arm's parameters.
 
         Y theta is the torque that the n links require for a reference motion, with the ten
         inertial parameters of each link in theta. Drives and friction are not included. The arm
