@@ -1,19 +1,20 @@
-"""Executes runs of all sites of a scenario in one compiled loop, without writing a log.
+"""Simulates all arms of a scenario in one compiled loop, without writing a log.
 
-A scenario describes an experiment with several sites, each of which controls one arm. The loop
-runs about 1000 times faster than real time. In place of the result of every tick (period of the
-control loop), it stores the largest values of every interval of 50 ms, and sums over the run.
-It is used for parameter studies and for twins: repeated runs with a small disturbance.
+A scenario describes an experiment with several sites, processes that each run one arm. The
+simulation is about 1000 times faster than real time. It does not store every tick (period of
+the control loop). It stores the largest values of every interval of 50 ms, and sums over the
+run. It is used for parameter studies, and to repeat runs with a small disturbance.
 
 Invariant:
     - The results equal the results of `execution.virtual` with its default network, bit for
       bit. Scenarios that the compiled loop cannot execute are refused.
-    - A run with the inputs of a log equals the recorded run, bit for bit. A sample, the state
-      that a site sends to the others, may arrive before its own time stamp, because the clocks
-      of two computers may differ. It is then delivered in the first tick after the stamp,
-      because a site does not use it earlier (L2).
-    - `FusedRun.scale_difference` mixes only the floating-point numbers of two states. Counters,
-      times and modes are copied from the other run. Numbers that are equal in both runs keep
+    - A run with the inputs of a log (arrived states and applied changes) equals the recorded
+      run, bit for bit. The state that a site receives may carry a time stamp in the future,
+      because the clocks of two computers may differ. It is then delivered in the first tick
+      after the stamp, because a site does not use it earlier.
+    - `FusedRun.scale_difference` changes the state of a run so that its difference from a
+      second run is multiplied by a factor. This is done for floating-point numbers. Counters,
+      times and modes are copied from the second run. Numbers that are equal in both runs keep
       their bits.
 """
 
@@ -644,12 +645,16 @@ class FusedRun:
                 law.restore(mixed.tolist())
 
     def arrays(self, i: int) -> SiteArrays:
-        """Returns the state of a site before its next tick.
+        """Returns the numbers of a site's state before its next tick, as NumPy arrays.
 
-        The arrays are those of the run itself, and not copies. The caller must not change them.
+        A site simulates the process that runs one arm, and a tick is a period of its control
+        loop. The arrays belong to the simulation, so the caller must not change them.
 
         Args:
             i: Index of the site in the order of the scenario.
+
+        Returns:
+            Views of the arrays, without copies.
         """
         if i not in self._selected:
             self._selected[i] = select_site(self._tables, i, self._layouts[i])
@@ -753,7 +758,11 @@ class FusedRun:
 
     @property
     def totals(self) -> RunTotals:
-        """Errors, control effort and contact forces of the whole run so far."""
+        """Numbers that summarise the simulated run so far.
+
+        They are the largest mean error, the control effort, and the forces and work of walls
+        and other environments. See `RunTotals` for their definitions.
+        """
         sums = self._sums
         ticks = self._progress["tick"].astype(np.float64)
         joints = self._tables.site["joints"][:, 0]
@@ -797,9 +806,10 @@ class FusedRun:
 
     @property
     def memories(self) -> list[Array]:
-        """Numbers that each user's control law remembers after the last tick.
+        """Numbers that users' control laws keep from tick to tick, after the last tick.
 
-        There is one array per site. The array of a site with a built-in law is empty.
+        A tick is one period of the control loop. There is one array per site (simulated process
+        that runs one arm). The array of a site with a built-in law is empty.
         """
         memories = []
         for i in range(len(self._progress)):

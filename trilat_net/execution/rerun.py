@@ -60,13 +60,11 @@ from .virtual import SiteChannels, SiteEntry, render_accounts
 
 
 class LogAndRerun(NamedTuple):
-    """One figure of a site or link, in the log and in the rerun of the log.
-
-    A rerun executes sites of a log again, usually with changed settings.
+    """A measured number, such as an error, in a log and after executing the log again.
 
     Attributes:
-        before: Value of the figure in the log.
-        after: Value of the figure in the rerun.
+        before: Value in the log.
+        after: Value in the rerun, the repeated execution with possibly changed settings.
     """
 
     before: float
@@ -140,7 +138,11 @@ class LinkEffect(NamedTuple):
 
     @property
     def differs(self) -> bool:
-        """True if the samples of the link had other ages in the rerun than in the log."""
+        """True if the delays on the link differ between the log and the rerun.
+
+        The delay is measured as the age of the received data when they are used. Its mean and
+        its largest value are compared.
+        """
         return any(pair.before != pair.after for pair in (self.age_mean_ms, self.age_max_ms))
 
 
@@ -163,10 +165,14 @@ class _CommonRecords(NamedTuple):
     after_rows: Ints
 
     def compare(self, figure: Callable[[Array], float], field: str) -> LogAndRerun:
-        """Computes a figure from the paired records, in the log and in the rerun.
+        """Computes the same number from the records of the log and of the rerun.
+
+        A rerun executes a log again, and a record contains the values of one tick (period of
+        the control loop). Only ticks with a record in both are used.
 
         Args:
-            figure: Function that computes the figure from values of shape (K, n).
+            figure: Function that computes the number from values of shape (K, n), for K records
+                with n values each.
             field: Name of the field of the records that contains the values.
         """
         before = figure(getattr(self.before, field)[self.before_rows])
@@ -319,7 +325,11 @@ class Rerun(Result):
     links: dict[str, LinkEffect]
 
     def headline(self) -> str:
-        """Returns one line for the user with the kind of rerun, the sites and the changes."""
+        """Returns one line for the user that says what was executed again.
+
+        It names the log, the way of execution, the sites (processes that each run one arm) that
+        were executed, and the settings that were changed.
+        """
         changes = "; ".join(describe_rerun_changes(self.request)) or "nothing changed"
         executed = f"{self.request.mode}, {', '.join(self.request.replaced)} executed"
         return f"{self.before.source}: {executed}, {changes}"
@@ -433,7 +443,10 @@ class Rerun(Result):
         return list(_describe_limits(self))
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns the effect on each executed site as plain values, for tables and JSON."""
+        """Returns a table with a row for each site that was executed again, for JSON.
+
+        A site is a process that runs one arm. A row tells how its records differ from the log.
+        """
         return list(self.to_dict()["sites"].values())
 
     def to_dict(self) -> dict[str, Any]:

@@ -1,19 +1,21 @@
 """Checks the request for a rerun of a log, and executes the sites of the rerun.
 
-A site is a process that runs one arm. A rerun executes some or all sites of a log again,
-possibly with changed settings. Only executed sites can be changed: a setting that concerns only
-recorded sites is refused. A setting that concerns both kinds of sites changes only the executed
-ones, and the result reports this. Sites exchange samples, their states at each tick (period) of
-the control loop.
+A site is a process that runs one arm. In each tick (period of the control loop) it sends a
+sample, its state, to the other sites. The log has one record per tick and site. A rerun
+executes some or all sites of a log again, possibly with changed settings. Only sites that are
+executed can be changed, so a setting that concerns only other sites is refused. A setting that
+concerns both kinds of sites changes only the executed sites, and the result reports this.
 
 Invariant:
     - A site advances only by `Site.step`.
-    - A site receives the recorded samples of recorded peers, and the newly computed samples of
-      executed peers. Each sample arrives in the tick in which it arrived according to the log.
-    - Without changed settings, the execution stops at a gap of the log, and resumes after two
-      consecutive records. If the log does not contain enough to execute a tick, the recorded
-      result of the tick is copied.
-    - With changed settings, the ticks of a gap are executed with assumed arrivals.
+    - A site receives the recorded samples of sites that are not executed, and the new samples
+      of executed sites. Each sample arrives in the tick in which it arrived according to the
+      log.
+    - Without changed settings, no tick is executed whose inputs are unknown because records are
+      missing. After a gap, the execution resumes as soon as two consecutive records exist. The
+      recorded result is used for a tick that has a record, but cannot be executed.
+    - With changed settings, ticks without a record are executed too. The arrivals of samples in
+      these ticks are estimated.
 """
 
 import bisect
@@ -690,15 +692,19 @@ class RerunExecution:
         )
 
     def run(self, progress: Progress | None = None) -> Iterator[RerunTick]:
-        """Executes all requested sites, and yields every tick.
+        """Executes all ticks of the requested sites, and yields the result of each tick.
 
-        The ticks are in the order of time, except that a site waits for the samples that it
-        receives. A site whose arm leaves its limits executes no further ticks. If settings were
-        changed, all sites end at that time.
+        A site is a simulated process that runs one arm, and a tick is a period of its control
+        loop. Ticks are executed in the order of time, but a site waits for the data that it
+        receives. A site stops when its arm leaves its limits. If settings were changed, all
+        sites stop at this time.
 
         Args:
             progress: Function that is called now and then with the number of executed ticks,
-                and an upper bound of their total.
+                and an upper bound of their total. None for no calls.
+
+        Yields:
+            The result of each tick.
         """
         sites = list(self.sites.values())
         total = sum(site.deliveries.last + 1 - site.deliveries.first for site in sites)

@@ -1,15 +1,16 @@
 """Provides the recorded inputs of a site, and restores its state in the middle of a log.
 
-A site is a process that runs one arm. A log contains a record for each tick, a period of its
-control loop: the inputs and the results of this tick. If records are missing, the site cannot
-be executed through the gap, but it can be restored after the gap. A sample is the state that a
-site sends to the other sites in one tick.
+A site is a process that runs one arm. In each tick (period of its control loop) it sends a
+sample, its state, to the other sites. The log has a record for each tick, with the site's state
+and with the samples that arrived. If records are missing, the ticks of this gap cannot be
+executed again. The state of the site can be restored after the gap.
 
 Invariant (L3):
-    - Two consecutive records, and the samples in transit on the links, suffice to restore a
-      site.
-    - If records are missing, the arrivals of samples in their ticks are not known. Samples that
-      no record lists are assumed to have arrived in these ticks.
+    - Two consecutive records, and the samples that the site has received but not used yet,
+      suffice to restore the state of a site.
+    - If records are missing, it is not known which samples arrived in these ticks. A sample
+      that was sent, but is missing from all records of the receiver, is assumed to have arrived
+      there.
 """
 
 from bisect import bisect_left
@@ -41,14 +42,15 @@ ReceivedMotion = State | Arrival
 
 
 def read_output(state: State, peers: tuple[str, ...]) -> TickRecord:
-    """Converts a record of a log to the form in which `Site.step` returned it.
+    """Converts a record of a log to the object that an execution of the same tick returns.
 
-    A record is the stored result of one tick. The result of this function can be compared with
-    that of executing the tick again.
+    A tick is one period of the control loop, and a record is its stored result. The object can
+    be compared with the result of executing the tick again by `Site.step`.
 
     Args:
         state: Record of a tick, as the log contains it.
-        peers: Names of the other sites, in the order of the scenario.
+        peers: Names of the other sites (processes that each run one arm), in the order of the
+            scenario.
     """
     mode = MODES.get(state.mode, MODES["diverged"]).mode
     # A complete memory contains more numbers than the pose with which it begins.
@@ -136,10 +138,11 @@ def select_peer_channels(
 
 
 def find_recorded_hand(part: SiteLog, site: Site, k: int) -> list[float]:
-    """Returns what a live operator did in one tick, according to the log.
+    """Returns what an operator did with a site's arm in one tick, according to the log.
 
-    The newest record up to the time of the tick decides. The tick rate of the executed site may
-    differ from that in the log.
+    A site is a process that runs one arm, and a tick is a period of its control loop. The site
+    is executed again, possibly with another number of ticks per second. Therefore the newest
+    record up to the time of the tick is used.
 
     Args:
         part: Records of the site in the log.
@@ -147,7 +150,8 @@ def find_recorded_hand(part: SiteLog, site: Site, k: int) -> list[float]:
         k: Number of the tick of the executed site.
 
     Returns:
-        The action, in the form of `HandInForce`. Empty if the site has no live operator.
+        The operator's grip, target and velocity, in the order of `HandInForce`. Empty if the
+        site had no operator with a live connection.
     """
     if not part.layout.hand:
         return []
@@ -241,27 +245,30 @@ class RecordedInputs(Generic[Change]):
         return select_peer_channels(arrivals, self._links), missing
 
     def add_lacking(self, entries: Sequence[ArrivalEntry]) -> None:
-        """Remembers samples that arrived, but whose content is missing from the log.
+        """Remembers samples that arrived according to the log, but whose content is unknown.
 
-        A tick that uses such a sample cannot be computed with certainty.
+        A sample is the state that another site sent. The log does not contain the record of the
+        sender. A tick that uses the sample cannot be computed with certainty.
 
         Args:
-            entries: Arrived samples, in the form of the field `rx` of a record.
+            entries: The samples: index of the sender, number of the tick in which it sent the
+                sample, and latency.
         """
         for peer, tick, _ in entries:
             self.lacking[peer].add(tick)
 
     def can_resume(self, row: int, *, detached: bool = False) -> bool:
-        """True if the log contains enough to restore the site before the tick of a record.
+        """True if the log contains enough to restore a site's state before a given record.
 
-        The records of the two ticks before must exist, and the content of the samples in use
-        must be known. A site that rests at a reference of its own does not need these samples.
-        `resume` restores the site.
+        A site is a process that runs one arm, and a record contains the results of one tick
+        (period of its control loop). The records of the two ticks before must exist. The log
+        must also contain the received data that the site used, unless it rested at a position
+        of its own.
 
         Args:
-            row: Index of the record among the records of the site.
-            detached: True if the site rests at a reference of its own, and does not follow its
-                peers.
+            row: Index of the record, among the records of the site.
+            detached: True if the site, while it is at rest, holds a position of its own instead
+                of following other sites.
         """
         states = self._part.states
         if row < 2:
@@ -276,15 +283,17 @@ class RecordedInputs(Generic[Change]):
         return all(used < 0 or used in samples for used, samples in pairs)
 
     def resume(self, site: Site, row: int, changes: Sequence[CoreChange] = ()) -> None:
-        """Restores the state that a site had before the tick of a record.
+        """Restores the state that a site had at a given point of a log, after missing records.
 
-        The state follows from the two previous records, so `can_resume` must be true. It is
-        used after a gap of the log.
+        A site is a process that runs one arm, and a record contains the results of one tick
+        (period of its control loop). The state before a tick is restored from the records of
+        the two ticks before it. `can_resume` tells whether these and all other needed data
+        exist.
 
         Args:
-            site: The site. Its state is replaced.
-            row: Index of the record among the records of the site.
-            changes: Changes that took effect since the last executed tick of the site.
+            site: The site, executed again. Its state is replaced.
+            row: Index of the record of the next tick, among the records of the site.
+            changes: Changes of settings since the last executed tick of the site.
         """
         states = self._part.states
         peers = self._part.peers

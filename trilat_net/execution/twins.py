@@ -307,19 +307,22 @@ def run_twins(log: Log, pushes: Sequence[Push], *, own_laws: bool = False) -> Tw
 
 
 def run_virtual_twins(scenario: Scenario, pushes: Sequence[Push], duration_s: float) -> Twins:
-    """Simulates a scenario in virtual time, together with a twin for every push.
+    """Simulates an experiment, and repeats it with small pushes to see whether they grow.
 
-    A twin is a further execution of the run that receives a small push. The differences between
-    the twins and the run show whether small disturbances grow or die away.
+    A repetition with a push is called a twin. There is one twin for each push. The run and its
+    twins are simulated faster than real time.
 
     Args:
         scenario: Description of the experiment.
-        pushes: Small displacements of the state, one for each twin.
+        pushes: Small displacements of the state of the arms, one for each twin.
         duration_s: Duration of the run, in s.
 
+    Returns:
+        The difference between each twin and the run, over time.
+
     Raises:
-        ScenarioError: The scenario cannot run in virtual time.
-        NotRepeatable: The time of a push is not within the run.
+        ScenarioError: The scenario cannot be simulated.
+        NotRepeatable: A push is before the start or after the end of the run.
     """
     rates_hz = [scenario.sites[name].rate_hz for name in scenario.names]
     ticks = [max(1, round(duration_s * rate_hz)) for rate_hz in rates_hz]
@@ -378,7 +381,7 @@ class _TwinRuns:
         self._same = True
 
     def run(self) -> Twins:
-        """Executes the run and its twins, and returns the differences."""
+        """Simulates a run and its repetitions with a push, and returns the differences."""
         for n, push in enumerate(self._pushes):
             if push.at_s == 0.0:
                 self._push(n, 0.0)

@@ -103,10 +103,11 @@ def equal_to_tolerance(a: float, b: float) -> bool:
 
 
 def describe_law_failure(failure: LawFailed) -> RecordDifference:
-    """Describes a user's control law that fails now, although it did not fail in the log.
+    """Describes a user's control law that fails when a log is executed again.
 
-    The site of the law cannot be executed further. The failure is reported in the same form as
-    a record that differs.
+    In the log it did not fail. The site with the law (process that runs one arm) cannot be
+    executed further. The report treats the failure like a record of the log that the new
+    execution does not have.
 
     Args:
         failure: The error of the control law.
@@ -290,13 +291,14 @@ class VerifyResult:
         return self.agreed and enough and self.integrity.passed
 
     def add(self, other: "VerifyResult") -> None:
-        """Adds the counts and differences of other sites to this result.
+        """Adds the result for further sites of the same log to this result.
 
-        In the log of a rerun, some sites were copied from a source log. They are executed from
-        that log, and have a result of their own.
+        A site is a process that runs one arm. The log of a rerun (repeated execution of a log)
+        contains some sites that were copied from an older log. They are checked with that log,
+        which gives a separate result.
 
         Args:
-            other: Result for the other sites. It does not change.
+            other: Result for the further sites. It does not change.
         """
         self.records += other.records
         self.identical += other.identical
@@ -393,11 +395,15 @@ class SiteVerifier:
         )
 
     def run(self, report: Callable[[int], None] | None = None) -> None:
-        """Executes every record of the site again, and adds the findings to the result.
+        """Executes every recorded tick of a site again, and compares the results with the log.
+
+        A site is a process that runs one arm, and a tick is a period of its control loop. The
+        numbers of equal, different and missing records are added to the `VerifyResult` of this
+        object.
 
         Args:
-            report: Function that is called now and then with the number of records of all sites
-                so far. None if nobody wants to know.
+            report: Function that is called now and then with the number of examined records of
+                all sites. None for no calls.
         """
         result = self._result
         name = self._log.name

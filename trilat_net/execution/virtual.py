@@ -258,10 +258,12 @@ class SiteChannels:
         )
 
     def make_event_entry(self, event: Event, number: int) -> SiteEntry:
-        """Returns an event that a site published earlier as a message for the log.
+        """Converts an event of a site, such as a change of its mode, to a log entry.
+
+        A site is a process that runs one arm. It published the event in an earlier run.
 
         Args:
-            event: The event, for example a change of the site's mode.
+            event: The event.
             number: Number of the event. It is used only if the event itself has none.
         """
         numbered = event if event.n >= 0 else msgspec.structs.replace(event, n=number)
@@ -294,15 +296,16 @@ class SiteChannels:
 
 
 def render_accounts(sites: Iterable[SiteChannels]) -> dict[str, str]:
-    """Returns texts that state how many messages each channel of some sites contains.
+    """Returns a text for each channel of a log, with the number of its messages.
 
-    A log contains these texts, so that a reader notices missing messages.
+    A channel is a series of messages of one kind from one site (process that runs one arm). A
+    log contains these texts, so that a reader notices missing messages.
 
     Args:
         sites: Channels of the sites, after all their messages have been written.
 
     Returns:
-        One text for each channel, by topic.
+        The texts, by the topic of the channel.
     """
     return {
         f"/{site.keys[channel]}": f"{account.describe()}, overflowed 0"
@@ -359,11 +362,14 @@ def check_virtual(scenario: Scenario) -> None:
 
 
 def find_skips(commands: Mapping[int, Sequence[CoreChange]]) -> dict[int, int]:
-    """Returns the ranges of ticks that a site skipped because its control loop was too late.
+    """Finds the ticks that a site skipped because its control loop was too late.
+
+    A site is a process that runs one arm, and a tick is a period of its control loop. The
+    record of the next executed tick states the number of skipped ticks, in the form of a
+    change.
 
     Args:
-        commands: Changes of the site, by tick. A change states how many ticks were skipped just
-            before its tick.
+        commands: For each tick, the changes that the site applied before it.
 
     Returns:
         A mapping from the first skipped tick of each range to the first tick after the range.
@@ -499,7 +505,15 @@ class _VirtualChannels(SiteChannels):
         self._stats = LoopStats(site, boot)
 
     def write_tick(self, arrivals: list[Arrival], output: TickRecord) -> None:
-        """Writes the record of a tick, and the entries that follow it."""
+        """Writes the record of a tick to the log, and then its statistics and events.
+
+        A tick is one period of the control loop.
+
+        Args:
+            arrivals: States of other sites (processes that each run one arm) that arrived for
+                this tick.
+            output: Results of the tick.
+        """
         payload = encode_state(
             site=self._site,
             boot=self._boot,
@@ -520,10 +534,11 @@ class _VirtualChannels(SiteChannels):
             self.write(entry, self._writer)
 
     def write_hand_events(self, news: list[tuple[int, str]]) -> None:
-        """Writes the events of a live operator, and empties their list.
+        """Writes the reports of an operator's connection to the log, and empties their list.
 
         Args:
-            news: The events, as pairs of a tick and a sentence.
+            news: The reports, as pairs of a tick (number of a period of the control loop) and a
+                sentence.
         """
         for k, text in news:
             t_ns = k * NS_PER_S // self._rate_hz

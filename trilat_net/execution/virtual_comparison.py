@@ -1,16 +1,15 @@
-"""Compares a log with a simulation of it, and finds the samples that arrived late or were lost.
+"""Compares a log with a simulation of it, and finds late and lost samples.
 
-A site is a process that runs one arm. A sample is the state that a site sends to the others in
-one tick, a period of its control loop. The scenario gives each link between two sites a delay,
-and the receiver uses a sample when this delay has passed; then the sample is due. The log is
-compared with a run in virtual time, in which a counter replaces the clocks and a simulated
-network replaces the real one.
+A site is a process that runs one arm. In each tick (period of its control loop) it sends a
+sample, its state, to the other sites. The scenario describes the delay of each link between two
+sites. The receiver holds a sample until this delay has passed. Then the sample is due. The log
+is compared with a simulation that has no real clocks and no real network.
 
 Invariant (L2):
-    - If a run in virtual time receives the samples in the ticks in which they arrived according
-      to a log, it equals the log in every tick.
-    - A run in virtual time in which all samples arrive at once equals the log up to the first
-      sample that arrived after it was due, or was lost in the network.
+    - A simulation in which all samples arrive when they arrived in the log equals the log in
+      every tick.
+    - A simulation in which all samples arrive at once equals the log up to the first sample
+      that was late, or was lost in the network.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -125,19 +124,20 @@ def compare_records(
 
 
 def find_absent_samples(log: Log) -> list[LateSample]:
-    """Returns every sample that had not arrived at its receiver when it was due.
+    """Finds every sample that was late or lost in the network of a live session.
 
-    A sample is due after the delay that the scenario states for its link. The records do not
-    say whether a sample was lost, or arrived in a tick whose record is missing. A sample that
-    no record lists counts as lost if the first record from its due tick on still uses an older
-    sample.
+    A sample is the state that a site (process that runs one arm) sends in one tick (period of
+    its control loop). It is due at its receiver after the delay that the scenario describes.
+
+    If records of the receiver are missing, the log does not show whether a sample was lost or
+    arrived in these ticks. The sample counts as lost if the receiver still uses an older sample
+    in the first recorded tick from the due tick on.
 
     Args:
         log: Log of a live session.
 
     Returns:
-        The samples, in the order of the ticks in which they were due. Empty if all were in
-        time.
+        The samples, by the tick in which they were due. Empty if all were in time.
     """
     absent: list[LateSample] = []
     for name in log.sites:
@@ -214,18 +214,21 @@ def _uses_older(part: SiteLog, sender: str, tick: int, due_tick: int) -> bool:
 
 
 class VirtualComparison(NamedTuple):
-    """Comparison of the log of a live session with simulations of the same scenario.
+    """Comparison of the log of a live session with simulations of the same experiment.
 
-    It shows whether the network of the session influenced the result beyond the delays that the
-    scenario states.
+    It shows whether the real network changed the result beyond the delays and losses that the
+    scenario (description of the experiment) contains. A sample is the state that a site, the
+    process that runs one arm, sends to the other sites.
 
     Attributes:
-        fed: Comparison with the simulation in which samples arrive as in the log. All records
-            must be equal.
-        plain: Comparison with the simulation in which samples arrive at once. The records must
-            be equal up to the first late or lost sample. If an arm is external, no records are
-            compared, because its motion is known only for the recorded run.
-        absent: Samples that arrived late or never, in the order in which they were due.
+        fed: Comparison with a simulation in which each sample arrives when it arrived in the
+            session. All records must be equal.
+        plain: Comparison with a simulation of a perfect network, in which samples arrive at
+            once. The records must be equal up to the first late or lost sample. If an arm is
+            external, no records are compared, because its motion is known only for the recorded
+            run.
+        absent: Samples that arrived too late or never, by the tick in which they should have
+            been there.
     """
 
     fed: RecordComparison
@@ -234,20 +237,27 @@ class VirtualComparison(NamedTuple):
 
     @property
     def late(self) -> list[LateSample]:
-        """Samples that arrived, but later than the scenario states."""
+        """List of the samples that arrived later than the scenario describes.
+
+        A sample is the state that a site (process that runs one arm) sends.
+        """
         return [sample for sample in self.absent if sample.arrived_tick is not None]
 
     @property
     def lost(self) -> list[LateSample]:
-        """Samples that the network lost, although the scenario states that they arrive."""
+        """List of the samples that the network lost, although it should have delivered them.
+
+        A sample is the state that a site (process that runs one arm) sends. Losses that the
+        scenario itself describes do not count.
+        """
         return [sample for sample in self.absent if sample.arrived_tick is None]
 
     @property
     def excused_from(self) -> int | None:
-        """First tick from which the log may differ from a simulation with a perfect network.
+        """First tick of the log that may differ from a simulation with a perfect network.
 
-        It is the tick in which the first late or lost sample should have come into use. None if
-        no sample was late or lost.
+        In this tick (period of the control loop), a site needed a sample, the state of another
+        site, that was late or lost. None if no sample was late or lost.
         """
         return self.absent[0].due_tick if self.absent else None
 

@@ -1,18 +1,20 @@
 """Simulates the network between sites: in which tick of the receiver each sample arrives.
 
-A sample is the state that a site publishes in one tick of its control loop. `PromptNetwork`
-delivers it in the first tick after it was sent. `RecordedNetwork` delivers samples in the ticks
-that a log recorded (`read_deliveries`). If records are missing from the log, their arrivals are
-estimated (`complete_deliveries`). If the sites now have other tick rates, the arrivals are
-converted (`retime_deliveries`).
+A site is a process that runs one arm. In each tick (period of its control loop) it sends a
+sample, its state, to the other sites. There are two kinds of networks:
+
+- `PromptNetwork` delivers a sample in the first tick after it was sent.
+- `RecordedNetwork` delivers a sample in the tick in which it arrived according to a log. If
+  records are missing from the log, the arrivals in these ticks are estimated. If the number of
+  ticks per second was changed, the arrivals are converted.
 
 Invariant:
-    - The delay is a property of the link (L2): the receiver holds each sample until it is due.
-      A network only decides when a sample arrives. If it arrives before it is due, the results
-      do not depend on the tick of the arrival.
+    - The delay is a property of the link between two sites (L2): the receiver holds each sample
+      until its delay has passed. A network only decides when a sample arrives. An arrival
+      before that time has no effect on the results.
     - A recorded sample is delivered in the tick in which it arrived according to the log.
-    - A sample is never delivered in a tick in which it did not arrive according to the log. In
-      ticks without a record, arrivals are assumed, and the ticks are marked as unrecorded.
+    - A sample is never delivered in a tick in which it did not arrive according to the log.
+      Ticks without a record, whose arrivals are estimated, are marked.
 """
 
 from bisect import bisect_left
@@ -38,17 +40,21 @@ class Network(Protocol):
     """
 
     def send(self, sender: str, output: TickRecord) -> None:
-        """Accepts the sample of a tick, for delivery to the other sites.
+        """Accepts the state that a site sends, and delivers it to the other sites later.
+
+        A site is a simulated process that runs one arm. It sends its state after each tick
+        (period of its control loop).
 
         Args:
-            sender: Name of the site that has executed the tick.
-            output: Record of the tick, which contains the sample.
+            sender: Name of the site.
+            output: Results of the tick, which contain the state.
         """
 
     def is_ready(self, receiver: str, k: int) -> bool:
-        """True if a site can execute its next tick.
+        """True if everything that a site receives in its next tick has been sent already.
 
-        This requires that all samples that arrive in the tick have been sent.
+        A site is a simulated process that runs one arm, and a tick is a period of its control
+        loop. The next tick can only be executed then.
 
         Args:
             receiver: Name of the site.
@@ -168,14 +174,17 @@ class RecordedNetwork:
 
 
 class Deliveries(NamedTuple):
-    """Which samples of other sites arrived at one site, by tick of the site.
+    """Samples of other sites that one site received according to a log.
+
+    A site is a process that runs one arm. In each tick (period of its control loop) it sends a
+    sample, its state, to the other sites.
 
     Attributes:
-        entries: Arrivals of each tick, in the order in which they arrived.
-        unrecorded: Ticks between `first` and `last` without a record. Their arrivals are
-            assumed.
+        entries: For each tick, the samples that arrived for it, in the order of arrival.
+        unrecorded: Ticks between `first` and `last` whose record is missing from the log. Their
+            entries are estimated.
         first: First tick with a record.
-        last: Last tick with a record. -1 if there are no records.
+        last: Last tick with a record. It is -1 if there are no records.
     """
 
     entries: dict[int, Sequence[ArrivalEntry]]
