@@ -229,15 +229,16 @@ def _mark_twins(twins: TwinGrowth) -> str:
 
 
 def describe_balance(balance: EnergyBalance) -> str:
-    """Returns a sentence about how well the energy balance explains the changes of V.
+    """Returns a sentence about how well the energy balance of a run closes.
 
-    V is the energy function of the stability proof. The part that dissipation and work leave
-    unexplained is the residual. The controller acts only once per tick, which the proof
-    neglects. The sentence therefore also says how small the residual is if the work of this
-    sampling is accounted for.
+    V is the energy function of the stability proof, in J. Its change should equal the work that
+    was done on the arms less the dissipated energy. The difference is the residual. One cause
+    is that the controller acts only once per tick (period of the control loop), while the proof
+    assumes continuous time. The work of this sampling is computed. The sentence therefore also
+    says how small the residual is without it.
 
     Args:
-        balance: The energy balance.
+        balance: The energy balance of the run.
     """
     scale_j = balance.scale
     if scale_j <= ZERO_ENERGY_J:

@@ -44,9 +44,9 @@ class Conclusion(CheckReport):
 
     Attributes:
         verdict: Judgement whether the run was stable.
-        table: Table with a row per site (a process that runs one arm).
-        notes: Lines about users' control laws, arms, links, changes, modes and clocks, and
-            about the stability certificate.
+        table: Table with a row for each arm.
+        notes: Lines about notable facts of the run, such as changed settings or messages of a
+            user's control law, and about the proof of stability.
         findings: Results of the checks of the log, one per check.
         paths: Files of the log, and files that were written.
     """
@@ -75,12 +75,19 @@ class Conclusion(CheckReport):
 
     @property
     def page(self) -> Path:
-        """Path of the report's page. If no page was written, the first path."""
+        """Path of the HTML report of the run.
+
+        If no report was written, it is the path of the first log file.
+        """
         pages = [path for path in self.paths if path.suffix == ".html"]
         return pages[0] if pages else self.paths[0]
 
     def headline(self) -> str:
-        """Returns a sentence with the result of the checks and the path of the page."""
+        """Returns a line that says whether the log passed its checks, with the report's path.
+
+        Some checks may be incomplete, because they need the code of a user's control law that
+        may not run. The line then says that not all was judged.
+        """
         results = {0: "passed", CodeWithheld.exit_code: "not all was judged"}
         result = results.get(self.exit_code, "FAILED")
         return f"{result}; {self.page}"
@@ -150,7 +157,10 @@ def conclude(
             )
 
         def wait_for_findings() -> Iterator[Finding]:
-            """Yields the results of the checks, after the other process has finished them."""
+            """Yields the result of each check of the log.
+
+            It first waits until the other process, which executes the log again, has finished.
+            """
             try:
                 findings.extend(check.result())
             except BrokenProcessPool:

@@ -127,7 +127,11 @@ class Exporter:
         done = 0
 
         def report_written(records: int) -> None:
-            """Adds a number of records to those that are written, and reports the progress."""
+            """Reports the progress of the export after further records have been written.
+
+            Args:
+                records: Number of records that were written since the last call.
+            """
             nonlocal done
             done += records
             progress(done, total)
@@ -256,13 +260,16 @@ def describe_folder(log: Log, folder: Path, about: str) -> None:
 
 
 def name_inside(table: Table, name: str, separator: str) -> str:
-    """Returns the name of a table inside an exported file.
+    """Returns the name under which a table of a log is stored in an exported file.
+
+    A table with the records of a site (process that runs one arm) has the name of the site
+    alone. For further tables of the site, the kind of the table is added, as in "m1.link" for
+    the statistics of its links.
 
     Args:
-        table: Table of the log, such as the records of a site.
-        name: Name of the table's site, or of the table if it belongs to no site.
-        separator: Text between `name` and the kind of the table. It is not used for tables of
-            records, whose names have no kind.
+        table: Table of the log.
+        name: Name of the site, or of the table if it belongs to no site.
+        separator: Text between the name and the kind, such as ".".
     """
     return name if table.kind in ("", "state") else f"{name}{separator}{table.kind}"
 

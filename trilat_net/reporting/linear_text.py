@@ -103,12 +103,13 @@ def _list_numbers(values: Array) -> str:
 
 
 def describe_effective_delays(analysis: LinearAnalysis) -> Iterator[str]:
-    """Yields a line per link about the delay of the samples in use.
+    """Yields lines for the user about the delays with which arms follow each other.
 
-    If the delays vary, the lines have the means. If all delays are equal, there is one line.
+    There is a line for each link (one-way connection between two arms), or a single line if all
+    delays are equal. If a delay varies during a run, its mean is stated.
 
     Args:
-        analysis: The analysis.
+        analysis: Result of the linear stability analysis.
     """
     names = analysis.scenario.names
     age_s = analysis.conditions.age_s
@@ -182,12 +183,13 @@ def describe_zero_roots(analysis: LinearAnalysis) -> str:
 
 
 def describe_linear_verdict(analysis: LinearAnalysis) -> str:
-    """Returns whether small motions of the loop decay, in a sentence.
+    """Returns a sentence that says whether small motions of the coupled arms decay.
 
-    The sentence states the growth rate and the frequency of the rightmost root.
+    The sentence states the growth rate and the frequency of the slowest decaying, or fastest
+    growing, motion. They belong to the characteristic root with the largest real part.
 
     Args:
-        analysis: The analysis.
+        analysis: Result of the linear stability analysis.
     """
     rightmost = analysis.decisive.rightmost
     drifting = analysis.decisive.drifting
@@ -214,15 +216,20 @@ WEIGHTS_ALIKE = 1e-9
 
 
 def describe_ports(ports: PortAnalysis) -> list[str]:
-    """Returns lines about the ports, the places at which operators hold the arms.
+    """Returns lines for the user about what operators feel and whether arms stay stable.
 
-    The lines are about passivity (the loop cannot generate energy at the ports), absolute
-    stability (the loop is stable with any passive operators) and transparency (the impedance
-    that an operator feels). If the loop is unstable without operators, or with a site clamped,
-    the lines end there.
+    The lines are about three properties:
+
+    - passivity: the arms never supply energy to the operators,
+    - absolute stability: the arms are stable with any passive operators,
+    - transparency: the impedance that an operator feels while another arm is free or clamped.
+
+    If the arms are unstable without operators, the other properties are not defined and the
+    lines end there. If they are unstable while one of them is clamped, the lines about
+    transparency are left out.
 
     Args:
-        ports: Analysis of the ports.
+        ports: Results for the joints at which the operators act.
     """
     lines = _describe_conditions(ports)
     if ports.verdict == "unstable":

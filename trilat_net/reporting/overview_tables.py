@@ -1,10 +1,12 @@
-"""Composes the text of `trilat log info`, which describes the contents of log files.
+"""Composes the text of `trilat log info`, which describes what log files contain.
 
-A log is the MCAP file of a run. Its session is executed by sites, processes that each control
-one arm, and the recorder is the process that writes the log. The facts come from a
-`FileOverview`. If the files are a log of trilat-net, the text has the session, the sites and
-the links. Then follow the channels (the series of messages in the files), the recorder's counts
-of messages, and a line per file.
+A log is the record of a run in one or more MCAP files. The text has these parts:
+
+- The session, its sites (processes that each run one arm), and the links between them, if
+  trilat-net wrote the log.
+- The channels, which are the series of messages in the files.
+- The number of messages, as counted by the process that wrote the log.
+- A line for each file.
 
 Invariant:
     - Texts from a file pass `sanitize`, or are cells of a table, which `result_text` sanitizes.

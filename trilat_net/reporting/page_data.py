@@ -185,13 +185,13 @@ Chart = TimeChart | HistogramChart | DistributionChart
 
 
 class PlanarArm(msgspec.Struct, frozen=True, kw_only=True, tag="planar", tag_field="kind"):
-    """An arm of two links that moves in a plane.
+    """Data with which the report draws an arm of two links that moves in a plane.
 
     Attributes:
-        site: Name of the site.
-        colour: Index of the site, on which its colour depends.
-        table: Index of the table with the actual and the desired angles of both joints, in rad,
-            and with the edges of the bodies.
+        site: Name of the site, the process that runs the arm.
+        colour: Number that selects the colour of the arm.
+        table: Index of the table that the picture uses. It contains the actual and the desired
+            angles of both joints, in rad, and then the outlines of the bodies.
         bodies: Number of bodies that the arm can touch.
         links_m: Lengths of the links, in m.
     """
@@ -204,13 +204,14 @@ class PlanarArm(msgspec.Struct, frozen=True, kw_only=True, tag="planar", tag_fie
 
 
 class ChainArm(msgspec.Struct, frozen=True, kw_only=True, tag="chain", tag_field="kind"):
-    """An arm of any number of joints in space, given by its joint positions in the picture.
+    """Data with which the report draws an arm that moves in space, as a picture in a plane.
 
     Attributes:
-        site: Name of the site.
-        colour: Index of the site, on which its colour depends.
-        table: Index of the table with coordinates in the picture: of the points of the actual
-            arm, of the reference and of the shadow, and of the edges of the bodies.
+        site: Name of the site, the process that runs the arm.
+        colour: Number that selects the colour of the arm.
+        table: Index of the table with the coordinates to draw. It contains the points of the
+            actual arm, of the arm in the desired pose, and of the shadow on the floor, and then
+            the outlines of the bodies.
         bodies: Number of bodies that the arm can touch.
         points: Number of points of an arm: the joints without the base, and the end effector.
     """

@@ -1,11 +1,12 @@
-"""Represents the text of results as blocks, which become terminal output, plain text or HTML.
+"""Represents the text of a result as blocks, for the terminal, plain text and HTML.
 
-A result is what a command has computed, such as the measured numbers of a run.
+A result is what a command has computed, such as the measured numbers of a run. Its text
+consists of blocks. A block is a line, a line that begins with a mark such as a green "ok"
+(`MarkedText`), or a table (`TextTable`).
 
-A block is a line, a line behind a mark (`MarkedText`) or a table (`TextTable`). The results of
-`studies` return their blocks from a method `blocks`. Results of other packages must not depend
-on this package. For these, `_COMPOSERS` names the function in this folder that composes their
-blocks.
+A class of results may have a method `blocks` that returns its blocks. For other classes, a
+function in this folder composes the blocks, and `_COMPOSERS` lists these functions by the name
+of the class. These classes thus do not depend on this folder.
 
 Invariant:
     - Terminal, plain text and HTML have the same blocks in the same order.
@@ -46,9 +47,10 @@ A hash is kept on one line so that it can be copied.
 
 
 def escape_text(text: str) -> str:
-    """Converts a text to HTML, in which no line break can split a hash.
+    """Converts plain text to HTML, and keeps each hash on a single line.
 
-    A hash is a long hexadecimal number that identifies a file. A user must be able to copy it.
+    A hash is a long hexadecimal number that identifies a file. Without a line break, a user can
+    copy it.
 
     Args:
         text: Plain text.
@@ -217,14 +219,18 @@ class MarkedText(NamedTuple):
     failed: bool = False
 
     def lines(self) -> list[str]:
-        """Returns a list with the line, without colours."""
+        """Returns the mark and the text in one line, without colours.
+
+        Returns:
+            A list with this line, because other parts of a result have several lines.
+        """
         if not self.mark:
             return [self.text]
         mark = Text.from_markup(self.mark).plain
         return [f"{mark} {self.text}"]
 
     def html(self) -> str:
-        """Renders the line with its mark in HTML."""
+        """Renders the mark and the text as a line in HTML, without colours."""
         line = sanitize(self.lines()[0], MAX_LETTERS)
         text = escape_text(line)
         return f'<div style="white-space:pre-wrap">{text or "&nbsp;"}</div>'
@@ -253,13 +259,14 @@ _COMPOSERS = {
 
 
 def compose(result: Result) -> list[MarkedText | TextTable]:
-    """Collects the parts of the text that reports a result.
+    """Collects the blocks of a result's text: lines and tables.
 
     Args:
-        result: The result, such as that of a command.
+        result: What a command has computed, such as the measured numbers of a run.
 
     Returns:
-        Tables, and lines with or without a mark, in the order of the text.
+        The blocks in the order of the text. Each line is a `MarkedText`, whose mark, such as a
+        green "ok", may be empty.
     """
     compose_blocks = getattr(result, "blocks", None)
     if compose_blocks is None:

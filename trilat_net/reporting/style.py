@@ -168,15 +168,17 @@ _THINNER_PT = 1.2
 
 
 def site_line(log: Log, site: str, width: float | None = None) -> LineOptions:
-    """Returns colour, dashes and width with which the lines of a site are drawn.
+    """Returns the colour, dashes and width of the lines that belong to a site.
 
-    Lines are solid until every colour is used. Further sites have the same colours with dashes.
+    A site is a process that runs one arm. If there are more sites than colours, colours are
+    repeated with dashes.
 
     Args:
         log: Log with the site.
         site: Name of the site.
-        width: Width of the line, in pt. None for a panel that all sites share: later sites then
-            have thinner lines, so that lines that coincide all stay visible.
+        width: Width of the line, in pt. None if the lines of all sites are in one panel. Each
+            further site then has a thinner line, so that lines on top of one another stay
+            visible.
     """
     index = log.sites.index(site)
     last = len(log.sites) - 1
@@ -335,7 +337,7 @@ def title_joints(log: Log, row: Sequence[Axes], titles: Sequence[str] = ()) -> N
 
 
 def label_row(axes: Axes, text: str, form: FigureSize) -> None:
-    """Labels a row of panels that are not high.
+    """Writes a label beside a row of low panels, in several lines.
 
     Args:
         axes: First panel of the row, beside which the label is written.
@@ -390,7 +392,14 @@ def arrange_joints(joints: int, narrow: bool) -> list[list[str]]:
     """
 
     def count_cells(columns: int) -> tuple[int, int]:
-        """Returns the number of rows, and the number of empty cells in the last row."""
+        """Returns the size of the grid of panels for a given number of columns.
+
+        Args:
+            columns: Number of columns.
+
+        Returns:
+            The number of rows, and the number of cells in the last row that stay empty.
+        """
         rows = math.ceil(joints / columns)
         return rows, rows * columns - joints
 
@@ -513,7 +522,10 @@ def place_legend(figure: Figure, handles: Sequence[Any], **options: Any) -> None
 
 
 def site_legend_entries(log: Log, sites: Sequence[str]) -> list[LegendEntry]:
-    """Returns the entries of a legend of sites: the name with the role, and the line.
+    """Returns the entries of a legend that explains the lines of several sites.
+
+    A site is a process that runs one arm. An entry consists of a text, such as "m1 (master)",
+    and the colour, dashes and width of the site's line.
 
     Args:
         log: Log with the sites.
@@ -629,18 +641,34 @@ _CHANGE_NUMBER: dict[str, Any] = {
 
 
 def site_records(log: Log, values: Callable[[SiteLog], Array]) -> SiteSignal:
-    """Computes a signal of every site from its records, for `TimeFigure.joint_row`.
+    """Makes a function that reads the values to draw from the records of a site.
+
+    A site is a process that runs one arm. `TimeFigure.joint_row` draws what the function
+    returns.
 
     Args:
         log: Log with the records of the sites.
-        values: Function that computes values, shape (K, J), from the K records of a site.
+        values: Function that computes the values, shape (K, J), from the K records of a site. J
+            is the number of values per record.
 
     Returns:
-        The signal as a function of the site.
+        A function of the site's name that returns the ticks, times and values of its records.
     """
 
     def read_signal(site: str) -> tuple[Ints, Array, Array]:
-        """Returns ticks, times and values of a site."""
+        """Reads the values to draw from the K records of a site.
+
+        A site is a process that runs one arm, and a record contains the values of one tick
+        (period of its control loop).
+
+        Args:
+            site: Name of the site.
+
+        Returns:
+            The numbers of the ticks, shape (K,).
+            Their times, shape (K,), in s.
+            The values, shape (K, J), with J values per record.
+        """
         records = log[site]
         return records.tick, records.t_s, values(records)
 
@@ -700,12 +728,15 @@ class TimeFigure:
         plot_decimated(axes, records.tick, records.t_s, values, **line)
 
     def joint_row(self, row: Sequence[Axes], sites: Sequence[str], signal: SiteSignal) -> None:
-        """Draws a signal with a panel per joint and a line per site, and adds the markers.
+        """Draws a signal over time, with a panel per joint and a line per site.
+
+        A site is a process that runs one arm. Times in which a site does not follow other sites
+        are shaded, and changes of settings are marked.
 
         Args:
-            row: A panel per joint.
+            row: The panels, as Matplotlib axes.
             sites: Names of the sites.
-            signal: Function that returns the signal of a site.
+            signal: Function of a site's name that returns its ticks, times and values.
         """
         for site in sites:
             tick, t_s, values = signal(site)
@@ -780,14 +811,15 @@ class TimeFigure:
         links: bool = False,
         title: str = "",
     ) -> None:
-        """Completes the figure: adds the time axes, the legend, and the text about the markers.
+        """Completes the figure with time axes, a legend, and a text about marked changes.
 
-        A figure function calls this last.
+        A function that draws a figure calls this last.
 
         Args:
             lowest: Lowest panel of each column, which gets a time axis.
             entries: Entries of the legend.
-            links: True if only changes of links are marked in the panels.
+            links: False to explain all changes of settings below the panels. True to explain
+                only changes of network links, because the panels mark no others.
             title: Title of the legend. Empty for no title.
         """
         for axes in lowest:

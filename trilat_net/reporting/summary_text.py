@@ -1,21 +1,22 @@
-"""Composes the text that commands print about a run, a session and this machine.
+"""Composes the text that commands print about a run, a live session and this machine.
 
-A run is executed by processes that each control one robot arm, and a session is a run that
-takes place live over a network. Each `compose_...` function turns the result of one command
-into blocks, which are lines, marked lines and tables that `terminal_output` prints:
+A run is executed by processes that each control one robot arm. A live session is a run that
+takes place over a network. Each function `compose_...` turns the result of one command into
+blocks, which `terminal_output` prints. A block is a line, a line that begins with a mark such
+as "ok", or a table. The results are about:
 
-- results about a run: its summary, metrics, log checks, recovery and rerun;
-- measurements of a running session: `compose_ping`, `compose_topic_delays`;
-- measurements of this machine: `compose_doctor`, `compose_benchmark`.
+- a run: its summary, measured numbers, checks of its log, recovery of its log, and repeated
+  execution,
+- a live session: `compose_ping`, `compose_topic_delays`,
+- this machine: `compose_doctor`, `compose_benchmark`.
 
-`format_run_lines` lists the notable facts of a run: alarms, links, changes, modes, clocks, and
-messages of users' control laws and arms.
+`format_run_lines` lists the notable facts of a run, such as alarms, changed settings, and
+messages of users' control laws.
 
 Invariant:
-    - A link with one constant delay and no loss gets no line, because nothing about it is
-      notable.
-    - A dash stands for a missing number of a metric. If the metric applies to the run, the
-      reason why the number is missing is written below the tables.
+    - Links with a constant delay and no loss are not listed among the notable facts.
+    - A dash stands for a missing number. If the number makes sense for the run, the reason why
+      it is missing is written below the tables.
 """
 
 import math
@@ -204,11 +205,13 @@ def format_clock_lines(log: Log) -> list[str]:
 
 
 def format_stated_models(states: Sequence[StatedModel]) -> str:
-    """Describes the delay models that a scenario states for a link, in the order of time.
+    """Describes how a link between two arms delays and loses messages during a run.
+
+    The description follows the scenario (description of the experiment) and its changes.
 
     Args:
-        states: The models. If there are more than three, only the first and the last one are
-            described, with the number of changes between them.
+        states: Models of the link, in the order of time. If there are more than three, only the
+            first and the last are described, with the number of changes between them.
 
     Returns:
         The description, for a line of text.
@@ -633,14 +636,15 @@ def _judge_transport(transport: dict[str, Any], needs: dict[str, Any]) -> str:
 
 
 def compose_metrics(metrics: LogMetrics) -> Iterator[Block]:
-    """Yields the tables of a run's metrics, and then the reasons why numbers are missing.
+    """Yields the tables with the measured numbers of a run.
 
-    There is a table per group of quantities and kind of subject: the run, a site, a link or a
-    wall. Further tables have the forces that operators feel at sites at rest, and the stiffness
-    and impedance that they feel.
+    There is a table for each group of quantities. The numbers may belong to the run, a site
+    (process that runs one arm), a link between two sites, or a wall. Further tables describe
+    what operators feel: forces, stiffness and impedance. Last come the reasons why numbers are
+    missing.
 
     Args:
-        metrics: Metrics of the run.
+        metrics: The measured numbers.
     """
     reasons: dict[str, list[str]] = {}
     tables = groupby(quantities(), key=lambda quantity: (quantity.group, quantity.of))

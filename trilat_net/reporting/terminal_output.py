@@ -137,11 +137,11 @@ def print_error(text: object) -> None:
 
 
 def print_marked(mark: str, text: object) -> None:
-    """Prints a line behind a mark that states a result, such as a green "ok".
+    """Prints a mark, such as a green "ok" for a passed check, and a text in one line.
 
     Args:
         mark: The mark, which may have colours in Rich's markup.
-        text: The line.
+        text: The text of the line. It is made safe for the terminal.
     """
     out.print(f"{mark} {escape(sanitize(text, MAX_LETTERS))}", soft_wrap=True)
 

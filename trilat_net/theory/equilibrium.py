@@ -1,7 +1,7 @@
-"""Finds equilibria of the coupled arms: poses in which all arms and estimates rest.
+"""Finds poses in which all coupled arms and their parameter estimates are at rest.
 
-The linear stability analysis describes small motions about an equilibrium. It may use the
-equilibrium at the end of a run, the equilibrium nearest to a given pose, or the equilibrium
+The linear stability analysis describes small motions about one of these equilibria. It may be
+the equilibrium at the end of a run, the equilibrium nearest to a given pose, or the equilibrium
 that the arms reach from their start poses according to their linear model.
 
 Any pose on which all arms agree may be an equilibrium, so that there are infinitely many.

@@ -43,7 +43,13 @@ def _write(log: Log, path: Path, written: Written) -> None:
     variables: dict[str, Any] = {}
 
     def store(table: Table, table_name: str) -> None:
-        """Adds a table to the variables of the file under a name such as "m1" or "m1.link"."""
+        """Adds a table as a struct to the variables that the MATLAB file will contain.
+
+        Args:
+            table: Table of the log, such as the records of a site.
+            table_name: Name of the table: "m1" for the records of the site m1, and "m1.link"
+                for a further table of this site, which becomes a field of its struct.
+        """
         struct = _build_struct(table)
         site, _, kind = table_name.partition(".")
         if kind:

@@ -26,7 +26,12 @@ def _write(log: Log, path: Path, written: Written) -> None:
     arrays: dict[str, NDArray[Any]] = {}
 
     def store(table: Table, table_name: str) -> None:
-        """Adds the columns of a table to the arrays of the file."""
+        """Adds each column of a table to the arrays that the NumPy file (NPZ) will contain.
+
+        Args:
+            table: Table of the log, such as the records of a site.
+            table_name: Name of the table, with which the names of its arrays begin.
+        """
         for column in table.columns:
             arrays[f"{table_name}/{column.name}"] = _build_array(column)
 

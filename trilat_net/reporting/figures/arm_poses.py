@@ -104,10 +104,11 @@ class ArmPose(NamedTuple):
         )
 
     def list_points(self) -> Array:
-        """Returns all points of the pose in one array, from which a picture's bounds follow.
+        """Returns all points that are drawn for this pose, to find the bounds of the picture.
 
         Returns:
-            The points, shape (K, 2), in m.
+            The points of the arms, of their paths and of the touched bodies, shape (K, 2), in
+            m.
         """
         parts = [self.actual, self.desired, self.path, self.shadow, *self.bodies]
         return np.concatenate(parts)

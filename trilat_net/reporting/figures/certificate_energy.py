@@ -1,13 +1,14 @@
-"""Draws the energies with which the stability of a run is judged, in J over time.
+"""Draws the energies that show whether a run was stable, in J over time.
 
-There are two figures:
+V is the energy function with which the stability of the coupled arms is proved. It contains the
+energy of motion, of position errors, of errors of the parameter estimates, and of delayed
+signals (docs/certificate.md). A site is a process that runs one arm. There are two figures:
 
-- `draw_functional` draws V, the energy function of the stability proof. It also draws the parts
-  of V, the contributions of the sites (the processes that control the arms), the dissipated
-  energy, the work done on the loop, and the residual, which is the part of V that these do not
-  explain.
-- `draw_observed_energy` draws the energies that control laws declare to prove their passivity,
-  the property that they never supply more energy than they have received.
+- `draw_functional` draws V, its parts, and the contribution of each site. It also draws the
+  energy that was dissipated, the work that was done on the arms, and the residual: the change
+  of V that dissipation and work do not explain.
+- `draw_observed_energy` is for control laws that prove their passivity by bookkeeping: they
+  record how much energy they have received and supplied. The figure draws these energies.
 
 Invariant:
     - Times for which V is unknown, because records are missing, are shaded.

@@ -91,16 +91,16 @@ def draws(
 
 
 def unless(shows: Callable[[Log], object], reason: str) -> Absent:
-    """Makes a function that explains why the figure of a log would be empty.
+    """Returns a function that explains why a figure cannot be drawn from a log.
 
-    It is the argument `absent` of `draws`.
+    The decorator `draws` accepts this function, so that figures without content are left out.
 
     Args:
         shows: Function that returns a true value if a log has something to draw.
-        reason: Explanation for other logs.
+        reason: Explanation for all other logs.
 
     Returns:
-        Function that returns the explanation for a log. It returns an empty text if the log has
+        A function of a log. It returns the explanation, or an empty text if the log has
         something to draw.
     """
     return lambda log: "" if shows(log) else reason

@@ -1,17 +1,18 @@
-"""Draws the signals of the arms: torques, angles, errors, estimates, paths and contact forces.
+"""Draws the signals of the arms, such as torques, angles, errors and contact forces.
 
-The sites of a run are processes that each control one arm. An operator is the person or program
-that moves an arm. A dominance factor is the weight with which an arm follows the arm of another
-site. It is computed from the scenario and the recorded changes with Eq. (6) and (7) of the
-paper. Wall forces are computed from the walls of the scenario and the recorded states, with the
-equations of `analysis.torque_sources`. The settling time, after which an error stays small, is
-computed by `analysis.site_signals`.
+A site is a process that runs one arm, and an operator is the person or program that moves an
+arm. Each function with the decorator `draws` is one figure. Most signals are read from the
+records of the run. Some are computed:
 
-Each function with the decorator `draws` is one figure.
+- Weights with which an arm follows the other arms (dominance factors) are computed from the
+  scenario, the description of the experiment, and its recorded changes.
+- Contact forces are computed from the walls of the scenario and the recorded motion, by
+  `analysis.torque_sources`.
+- The settling time, after which an error stays small, is computed by `analysis.site_signals`.
 
 Invariant:
-    - Torques of operators are those that act on the arm. The records have the opposite sign,
-      because tau_x is the torque that the arm exerts.
+    - Torques of operators are drawn as they act on the arm. The records contain the opposite
+      sign, the torque that the arm exerts on the operator.
 """
 
 from collections.abc import Sequence
@@ -123,10 +124,10 @@ def draw_operator_displacement(
 
 @draws("control_torques", "torque of the controllers")
 def draw_control_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws the torques of every site's controller over time, in N m.
+    """Draws the torques that the controllers command at the joints of all arms, in N m.
 
-    They are tau of Eq. (13) of the paper. The torque limit of a site is drawn if the site
-    reached it.
+    They do not include the torques of operators and walls. If a controller reached its torque
+    limit, the limit is drawn too.
 
     Args:
         log: Log of the run.
@@ -706,7 +707,10 @@ def draw_authority(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
 
 def list_sites_with_walls(log: Log) -> list[str]:
-    """Lists the sites whose arm can touch a wall, in scenario order.
+    """Lists the names of those sites whose arm can touch a wall.
+
+    A site is a process that runs one arm. The sites have the order of the scenario, the
+    description of the experiment.
 
     Args:
         log: Log of the run.

@@ -1,20 +1,21 @@
 """Draws figures of computed results, which need no recorded run.
 
 A linear model describes small motions of the coupled arms around a pose of rest. A site is a
-process that controls one arm, and an operator is the person or program that moves it.
+process that runs one arm, and an operator is the person or program that moves it. An operator
+and an arm exchange force and velocity at a port, such as a joint.
 
-- `draw_port_impedance`, `draw_port_passivity`: a linear model of the coupled arms as seen by
-  the operators who hold them. A port is the place at which an operator and an arm exchange
-  force and velocity.
-- `draw_root_map`: characteristic roots of the linear model, continuous and sampled. A root with
-  a positive real part makes the loop unstable.
-- `draw_network_delays`: one-way delays of a network benchmark.
-- `draw_arm_gains`: largest stable gain of an arm over the delay of the links.
+- `draw_port_impedance` draws the impedance that operators feel at their ports, and
+  `draw_port_passivity` whether the arms could supply energy to operators.
+- `draw_root_map` draws the characteristic roots of the linear model, in continuous time and as
+  executed in ticks (periods of the control loop). A root with a positive real part means that
+  the arms are unstable.
+- `draw_network_delays` draws the measured one-way delays of a network.
+- `draw_arm_gains` draws the largest stable stiffness of an arm for different delays.
 
 Invariant:
-    - A line of a port has the colour of the operator's site. The line is solid if the arm of
-      the other operator can move freely, and dashed if that arm is clamped.
-    - Bands of frequency in which a criterion fails are shaded.
+    - Each line of a port has the colour of the site whose arm the operator holds. It is solid
+      if the other arm can move freely, and dashed if the other arm is clamped.
+    - Frequencies at which a criterion of passivity or stability fails are shaded.
 """
 
 from collections.abc import Mapping, Sequence
@@ -350,12 +351,13 @@ _TRANSPORT_STEP = 0.22
 
 
 def draw_network_delays(facts: Mapping[str, Any]) -> Figure:
-    """Draws the one-way delays of a network benchmark, in ms.
+    """Draws the measured one-way delays of a network, in ms, for several loads.
 
-    A case is a size and a rate of messages. The case of the benchmark's scenario is shaded.
+    A load is a size of messages in bytes, and a number of messages per second. The load that
+    the benchmarked experiment needs is shaded.
 
     Args:
-        facts: Values of `NetworkBenchmark.to_dict`.
+        facts: Results of the network benchmark, from `NetworkBenchmark.to_dict`.
     """
     rows = facts["rows"]
     needs = facts["needs"]
@@ -487,13 +489,14 @@ _RUN_MARKS = {
 
 
 def draw_arm_gains(facts: Mapping[str, Any]) -> Figure:
-    """Draws the largest stable gain of an arm over the delay of each link.
+    """Draws the largest stable stiffness of an arm that follows another arm over a delay.
 
-    The gain is k = K / inertia, in 1/s^2, with the stiffness K. Marks show the chosen gains,
-    and the simulated runs that checked them, at the delay of the study.
+    The horizontal axis is the delay. The vertical axis is the stiffness K of a joint divided by
+    its inertia, in 1/s^2. Marks show the gains that were chosen, and the simulated runs that
+    checked the largest stable stiffness.
 
     Args:
-        facts: Values of `ArmGains.to_dict`.
+        facts: Results of the search for gains, from `ArmGains.to_dict`.
     """
     edge = facts["edge"]
     margin = facts["margin"]

@@ -156,16 +156,15 @@ def write_report_figures(
     """Writes the figures of a run's report as PNG files.
 
     Figures for which the log has nothing to show are left out. Earlier files in the folder are
-    replaced.
+    replaced. An operator is a person or program that moves an arm.
 
     Args:
         log: Log of the run.
         folder: Folder of the files. It is created if it does not exist.
-        twin: The same run without operators, the people or programs that move the arms. None
-            leaves out the figure `hands_moved`.
+        twin: Log of the same run, repeated without operators. None to leave out the figure that
+            shows how far operators moved the arms.
         progress: Function that is called with the number of drawn figures and of all figures.
-        pushed: Growth of small pushes in repeated runs (pushed twins), if the caller has
-            computed it. None to compute it.
+        pushed: How small pushes grow in repetitions of the run. None to compute this here.
 
     Returns:
         The paths of the files.

@@ -131,7 +131,9 @@ def _compose_title(log: Log, form: FigureSize) -> str:
 
 
 def draw_overlay(logs: Mapping[str, Log], form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws several runs in the same four panels, with a line per run.
+    """Draws several runs over one another in one figure, to compare them.
+
+    The figure has the four panels of a run's overview. Each panel has a line for each run.
 
     Args:
         logs: Logs of the runs, by their names in the legend.

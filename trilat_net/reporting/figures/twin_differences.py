@@ -84,15 +84,15 @@ class _DifferenceLine(NamedTuple):
 
 
 def draw_twins(pushed: PushedTwins, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Draws how small pushes grow or decay in a run, above the speed of the run.
+    """Draws how small pushes grow or decay in repetitions of a run.
 
-    A pushed twin is the same run with a small push. The upper panel has the differences of
-    joint velocities between the twins and the run, in rad/s, with a line per push, or a line
-    per joint if there was a single push. Without twins the figure shows the reason why there
-    are none.
+    Each repetition, called a twin, equals the run except for a small push. The upper panel
+    shows the differences between the joint velocities of the twins and of the run, in rad/s. It
+    has a line for each push, or a line for each joint if there was a single push. The lower
+    panel shows the joint speeds of the run. If there are no twins, the figure shows the reason.
 
     Args:
-        pushed: A run and its pushed twins.
+        pushed: The run and its twins.
         form: Width, type sizes and resolution of the figure.
     """
     growth = pushed.growth
