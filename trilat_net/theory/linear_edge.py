@@ -6,9 +6,10 @@ rate of small motions is the real part of the rightmost characteristic root of t
 control loop. The loop is unstable if the growth rate is positive. It is evaluated for some
 values of the setting. Between two values with different signs, Brent's method finds its zero.
 
-The sampled loop, whose controllers compute once per tick, is analysed if the tick matters: if
-the integration scheme is `digital`, which holds each computed torque for a tick, or if walls or
-operators act once per tick. Otherwise the continuous loop is analysed.
+The sampled loop, whose controllers compute once per tick (period of the control loop), is
+analysed if the tick matters. This is so for the integration scheme `digital` (zero-order hold,
+as in a plain digital controller), and for walls or operators that act once per tick. Otherwise
+the continuous loop is analysed.
 
 Invariant:
     - The equilibrium, the pose of rest about which the arms are linearised, is determined once.

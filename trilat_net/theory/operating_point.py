@@ -165,9 +165,12 @@ class OperatingConditions(NamedTuple):
     def needs_sampled_loop(self) -> bool:
         """True if the controllers' ticks decide about stability, so that they must be modelled.
 
-        A tick is one period of the control loop. This is so in three cases: the integration
-        scheme `digital` is used, which holds each computed torque for a tick; a wall or an
-        operator acts once per tick; or the delays vary in a known way, and not at random.
+        A tick is one period of the control loop. This is so in three cases:
+
+        - The integration scheme is `digital`: zero-order hold, as in a plain digital
+          controller.
+        - A wall or an operator acts once per tick.
+        - The delays vary in a known way, and not at random.
         """
         has_random_link = any(link.random for link, _ in self.links.values())
         if self.varying and not has_random_link:
