@@ -1,21 +1,25 @@
 """Counts the messages of a session: which were received, and which are missing.
 
 The messages of a channel are numbered consecutively, so that a gap in the numbers shows that a
-message is missing. An account counts the messages of one channel, while they are recorded or
-from a log. The number of a record, the result of one tick of a site's control loop, is its
-tick. Statistics and events are numbered from 0. A site is a process that runs one arm.
+message is missing. An `Account` holds these counts for one channel. A recorder updates its
+accounts while it records, and a tool can compute them again later from the log.
+
+A site is a process that runs one arm. A tick is one period of its control loop, and a record is
+the message with the results of one tick. The number of a record is the number of its tick.
+Statistics and events are numbered from 0.
 
 Some numbers never had a message: a site that is late skips ticks, and a site that is killed and
-started again continues at a later tick. Such numbers count as unpublished instead of missing.
+started again continues at a later tick. These numbers count as unpublished instead of missing.
 
 Invariant:
     - In every account, the number of expected messages is the sum of the received and the
       missing messages.
     - Unpublished numbers are neither expected nor missing.
-    - The memory is bounded: an account stores at most `MAX_GAPS` gaps. The messages of lower
-      gaps are only counted.
+    - The memory is bounded: an account stores at most `MAX_GAPS` ranges of missing numbers. If
+      there are more ranges, those with the lowest numbers are forgotten, but their messages
+      still count as missing.
     - To count the messages of a file, only the events are decoded.
-    - A later part of a log is counted from its first message on.
+    - If a log is divided into several files, a later file is counted from its first message on.
 """
 
 import math
@@ -233,14 +237,13 @@ class Account:
         count as unpublished instead of missing.
 
         Args:
-            first: First number after the gap: of the sender's next start, or after skipped
-                numbers.
-            published: Number of messages that are known to exist nevertheless. Those that were
-                not received stay missing.
+            first: Number of the first message after the gap. It is the first message that the
+                sender published after its next start, or after the numbers that it skipped.
+            published: Number of messages that are known to exist nevertheless. Messages among
+                them that were not received stay missing.
 
         Returns:
-            The lowest number that now counts as unpublished, or `first` if there is no such
-            number.
+            The lowest number that now counts as unpublished. It is `first` if no number does.
         """
         self.add_expected(first)
         gap = self._gaps.find(first - 1)
@@ -399,12 +402,17 @@ class StartGap:
         self._next_first = -1
 
     def begin_next_start(self, first: int, published: int) -> None:
-        """States that the site was started again. Further calls have no effect.
+        """Evaluates the gap before the next start of the site, once that start is known.
+
+        The site was killed and has been started again. The missing messages before the next
+        start now count as unpublished, except the messages that the site is known to have
+        published. Only the first call has an effect.
 
         Args:
-            first: First number of the next start.
-            published: Number of messages that the earlier start itself stated to have
-                published. It is 0 if the site was killed before it could state the number.
+            first: Number of the first message after the next start.
+            published: Number of messages that the site itself stated to have published before
+                it was started again. It is 0 if the site was killed before it could state the
+                number.
         """
         if self._next_first < 0:
             self._next_first = first
@@ -413,14 +421,16 @@ class StartGap:
             self.note_published(self._reported)
 
     def note_published(self, published: int) -> None:
-        """Takes into account how many messages the earlier start published.
+        """Takes into account how many messages the site published before it was killed.
 
-        Other sites report this number, because they received samples of the earlier start. If
-        it exceeds the received messages by more than those that may have been in transit, the
-        messages in between count as missing instead of unpublished.
+        Other sites report this number, because they received samples, the states that a site
+        sends. Missing messages before the next start first count as unpublished, because they
+        may have been in transit when the site was killed. If the reported number shows that
+        more messages were lost than can have been in transit, the lost messages count as
+        missing instead.
 
         Args:
-            published: Number of messages that the earlier start published at least.
+            published: Number of messages that the site published at least.
         """
         self._reported = max(self._reported, published)
         published = min(published, self._next_first)
@@ -431,10 +441,13 @@ class StartGap:
 
 
 def describe_unknown_ends(sites: Sequence[str]) -> str:
-    """Returns the sentence about sites whose "end" event never arrived.
+    """Returns a sentence for the user about sites of which the end is unknown.
+
+    A site publishes an "end" event when it ends. Without this event, nobody knows whether the
+    site published further records after the last record that was received.
 
     Args:
-        sites: Names of the sites, at least one.
+        sites: Names of the sites whose "end" event was not received, at least one.
     """
     names = sites[0]
     if len(sites) > 1:
@@ -515,10 +528,11 @@ class Coverage(NamedTuple):
         return f"judged {self}{shortage}"
 
     def to_json(self) -> dict[str, list[int]]:
-        """Returns the coverage in the form that is written to JSON.
+        """Converts the numbers of recorded or checked ticks to plain values for JSON.
 
         Returns:
-            For each site the pair [recorded or checked ticks, all ticks].
+            For each site the pair [recorded or checked ticks, all ticks]. A tick is one period
+            of the control loop of the site.
         """
         return {
             site: [self.judged.get(site, 0), ticks] for site, ticks in self.expected.items()
@@ -587,12 +601,14 @@ class SessionAccounts:
         return "/" + topics.key(self._session, member, channel)
 
     def open_channel(self, topic: str) -> None:
-        """Creates an account for a topic before its first message, so that losses are noticed.
+        """Starts to count the messages of a channel, before its first message has arrived.
 
-        Nothing happens if the topic is not a numbered channel of the session.
+        If no message ever arrives, the losses are noticed nevertheless. Nothing happens if the
+        topic does not belong to the session, or if the messages of its channel are not
+        numbered.
 
         Args:
-            topic: Topic of the channel.
+            topic: Topic of the channel, such as "/trilat/paper/m1/state".
         """
         key = topics.parse_key(topic.removeprefix("/"))
         if key is None or key.session != self._session:
@@ -601,16 +617,17 @@ class SessionAccounts:
             self._accounts.setdefault(topic, Account())
 
     def receive(self, topic: str, sequence: int, payload: bytes = b"") -> None:
-        """Counts a message of a file.
+        """Counts one message of a log file.
 
-        A message of a topic without an account is ignored.
+        The message is ignored if its topic is not counted, because `open_channel` was not
+        called for the topic or the topic does not belong to the session.
 
         Args:
             topic: Topic of the message.
             sequence: Sequence number of the message in the file. For records and statistics, it
-                is the tick.
-            payload: Bytes of the message. Only those of events are used, because events state
-                how many ticks a site executed or skipped.
+                is the number of their tick, the period of the control loop.
+            payload: Bytes of the message. Only the bytes of events are used, because events
+                state how many ticks a site executed or skipped.
         """
         if topic not in self._accounts:
             return
@@ -712,11 +729,12 @@ class SessionAccounts:
     def mark_skipped_ticks(self, site: str, tick: int, skipped: int) -> None:
         """Counts the messages of skipped ticks as unpublished, so that they are not missing.
 
-        A site that is late skips ticks: it executes neither them nor publishes their messages.
+        A tick is one period of the control loop. A site that is late skips ticks. It does not
+        execute the skipped ticks, and publishes no messages for them.
 
         Args:
-            site: Name of the site.
-            tick: First tick after the skipped ones.
+            site: Name of the site, the process that runs one arm.
+            tick: First tick after the skipped ticks.
             skipped: Number of skipped ticks.
         """
         for channel in (topics.STATE, topics.LINK):
@@ -729,17 +747,20 @@ class SessionAccounts:
             account.mark_unpublished(first - base, published - base)
 
     def count_message(self, topic: str, number: int, account: Account | None = None) -> bool:
-        """Counts a message by its number in its channel.
+        """Counts a message as received, by its number in its channel.
 
-        In a later part of a log, messages with lower numbers than the first one are ignored.
+        If the log is divided into several files, a later file is counted from its first message
+        on. Messages with lower numbers than that message are ignored.
 
         Args:
             topic: Topic of the message.
-            number: Number of the message.
-            account: The account to use. None uses the account of the topic.
+            number: Number of the message in its channel.
+            account: Object that counts the message. None uses the object that counts the
+                messages of the topic.
 
         Returns:
-            False if the message had been received before.
+            False if a message with this number had been received before. True otherwise, also
+            for a message that is ignored.
         """
         base = self._bases.setdefault(topic, number if self._continued else 0)
         if number < base:
@@ -814,13 +835,14 @@ class SessionAccounts:
         return texts
 
     def list_starts(self, topic: str) -> list[Account]:
-        """Lists the accounts of a topic, one for each start of the sender if it counts events.
+        """Lists the message counts of a topic, separately for each start of its sender.
 
-        Events are numbered from 0 again whenever their sender is started. All other messages
-        continue their numbers, so that they have a single account.
+        An `Account` holds the numbers of received and missing messages. Events are numbered
+        from 0 again whenever their sender is started, so that each start has its own account.
+        All other messages continue their numbers, so that their topic has a single account.
 
         Args:
-            topic: Topic of the channel.
+            topic: Topic of the channel. It must be counted, see `open_channel`.
         """
         return list(self._starts.get(topic, {}).values()) or [self._accounts[topic]]
 
@@ -877,7 +899,11 @@ class SessionAccounts:
 
     @property
     def unknown_ends(self) -> list[str]:
-        """Names of the sites whose "end" event never arrived."""
+        """Names of the sites of which the end is unknown.
+
+        A site publishes an "end" event when it ends, which states how many ticks (periods of
+        the control loop) it executed. For these sites, no such event has been received.
+        """
         return [site for site in self._rates_hz if site not in self._end_ticks]
 
     def describe_unfinished_sites(self) -> Iterator[str]:

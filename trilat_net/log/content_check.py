@@ -107,19 +107,19 @@ def find_origins(data: bytes, most: int = _SAMPLED_MESSAGES) -> MessageOrigins:
 
 
 def has_foreign_boots(about: Mapping[str, str], boots: set[tuple[str, int]]) -> bool:
-    """Finds out whether all messages come from another run in virtual time than the session.
+    """Determines whether messages come from another simulated run than a log.
 
-    A boot is a number that identifies one start of a process. In virtual time it is computed
-    from the scenario, so that it shows to which run a message belongs. In a live session it is
-    random and shows nothing.
+    In a simulated run, which has virtual time, each process has a number (boot) that is
+    computed from the scenario, the description of the experiment. The numbers therefore show to
+    which run a message belongs. In a live session, the numbers are random and show nothing.
 
     Args:
-        about: Metadata of the session.
-        boots: Pairs of a sender and its boot, from the messages.
+        about: Metadata of the session in the log.
+        boots: For each sender in the messages, its name and its boot.
 
     Returns:
-        True if all messages come from another run. False in a live session, and if there are no
-        messages.
+        True if no boot agrees with the scenario of the log. False if a boot agrees, if there
+        are no messages, or if the log is from a live session.
     """
     if about.get("driver") != VIRTUAL_DRIVER:
         return False
@@ -319,15 +319,17 @@ class ContentCheck:
                 raise UnreadableRecord(f"number {number} of {topic} was sent at another time")
 
     def check_origin(self, data: bytes) -> None:
-        """Checks that a block of messages (chunk) is not from another run in virtual time.
+        """Checks that a block of messages (chunk) does not come from another simulated run.
 
-        A damaged file may contain blocks of another file.
+        A damaged file may contain blocks of another file. Only the first messages of the chunk
+        are examined. In a live session nothing is checked, because its messages do not show the
+        run.
 
         Args:
             data: The unpacked chunk.
 
         Raises:
-            UnreadableRecord: All examined messages are from another run.
+            UnreadableRecord: No examined message comes from the run of this log.
         """
         # The decoding of messages is slow, and the boots of live sessions prove nothing.
         if self._about.get("driver") != VIRTUAL_DRIVER:

@@ -734,14 +734,17 @@ def _make_entry_column(
 
 
 def build_events_table(timed: TimedMessages[Event], source: str) -> Table:
-    """Builds the table of the events, in the order of their arrival at the recorder.
+    """Builds a table of the events of a session, with one row per event.
+
+    An event is a message about something that happened once, for example that a site has
+    joined. The rows have the order in which the events arrived at the recorder.
 
     Args:
-        timed: The events, with their times.
+        timed: The events, with their times of sending and of arrival.
         source: Name of the file for error messages.
 
     Raises:
-        LogError: A number is out of range.
+        LogError: An integer of an event is too large for 64 bits.
     """
     events = timed.messages
     t_ns = to_int_array((event.t_ns for event in events), source, "t_ns")

@@ -86,14 +86,15 @@ class Finding:
         return f"{first}; and {self.wrong - 1} more" if self.wrong > 1 else first
 
     def conclude(self, sound: str) -> "Finding":
-        """Sets the text of the finding after all problems were added.
+        """Completes the finding with a text, after all problems were added.
+
+        If there are problems, the text summarises them.
 
         Args:
-            sound: The text to use if there is no problem. Otherwise the text summarises the
-                problems.
+            sound: Text of the finding if there is no problem.
 
         Returns:
-            This finding.
+            The finding itself, so that the caller can pass it on directly.
         """
         self.text = self.summary() if self.wrong else sound
         return self
@@ -114,7 +115,7 @@ class Finding:
 class Findings(dict[str, Finding]):
     """The results of several checks, by name of the check.
 
-    A result is created when it is used first.
+    When a name is read that does not exist yet, a result without problems is added for it.
     """
 
     def __missing__(self, check: str) -> Finding:
@@ -138,10 +139,12 @@ class CheckReport(Result):
 
     @property
     def exit_code(self) -> int:
-        """Exit code of a command that reports these checks.
+        """Exit code with which a command that reports these checks ends.
 
-        It is 1 if a check failed. If no check failed, but one was not possible because of code
-        that may not run, it is the exit code of `CodeWithheld`. Otherwise it is 0.
+        - 1 if a check failed.
+        - The exit code of `CodeWithheld` if no check failed, but a check could not be made.
+          Such a check would run code from outside that the user has not permitted.
+        - 0 if every check passed.
         """
         if any(finding.judged and not finding.passed for finding in self.findings):
             return 1

@@ -81,7 +81,10 @@ class DiskReserve:
             self.size = new_size
 
     def release(self) -> None:
-        """Makes the space available to other files. Nothing can be reserved afterwards."""
+        """Frees the reserved disk space, so that other files can use it.
+
+        Later calls of `grow` reserve nothing.
+        """
         self._is_possible = False
         self.size = 0
         if self._file is not None:
@@ -133,7 +136,11 @@ class FileSync:
         self._disk_error: OSError | None = None
 
     def sync_new(self) -> None:
-        """Syncs new data to the disk: at once, or in a thread if a period has passed.
+        """Forces the data that were written since the last call onto the disk.
+
+        If `durable` is set, the method waits until the data are on the disk. Otherwise a thread
+        forces them onto the disk. The thread is started only if its previous work has ended and
+        began at least a second ago.
 
         Raises:
             OSError: The disk refuses the data, or has refused earlier data.
@@ -158,7 +165,10 @@ class FileSync:
             self._disk_error = error
 
     def wait(self) -> None:
-        """Waits until the thread has ended. The file may be closed afterwards."""
+        """Waits until the thread that syncs the file has ended.
+
+        The file must not be closed before.
+        """
         if self._thread is not None:
             self._thread.join()
 
@@ -281,14 +291,15 @@ class LogFile:
         self._end_bytes = size
 
     def flush(self) -> None:
-        """Writes all stored data, in one piece if the operating system accepts that.
+        """Writes all stored data to the file.
 
-        If the disk is full, the reserved space is released and used for these data.
+        If the disk is full, the disk space that was reserved for the end of the file is used
+        for these data.
 
         Raises:
-            OSError: The disk refuses the data. When this happens for the first time, the data
-                have been written nevertheless if the reserved space was sufficient. Only the
-                end of the file may be written afterwards.
+            OSError: The disk refuses the data, now or in an earlier call. At the first refusal
+                the reserved space is used, and if it is sufficient, the data are in the file
+                nevertheless. Afterwards only the end of the file may be written.
         """
         if self._broken and self.disk_error:
             raise self.disk_error
@@ -336,7 +347,7 @@ class LogFile:
 
     @property
     def whole(self) -> bool:
-        """True if the file ends with the end mark."""
+        """True if the file is complete: it ends with the end mark of the MCAP format."""
         return self._tail == MAGIC and self.size > len(MAGIC) and not self._broken
 
     def close(self) -> None:
@@ -376,14 +387,14 @@ class LogFile:
         self.size = 0
 
     def end(self, error: BaseException | None = None) -> None:
-        """Closes the file, and turns an error of the disk into an explanation for the user.
+        """Closes the file, and explains an error of the disk to the user.
 
         Args:
-            error: The error that ended the writing. None if there was no error.
+            error: Exception that interrupted the writing. None if nothing interrupted it.
 
         Raises:
-            LogRefused: The disk refuses the data, or has refused them as `error` states. The
-                text states which data are saved, and where.
+            LogRefused: The disk refuses the last data, or `error` states that the disk has
+                refused data before. The text states which data are saved, and where.
         """
         try:
             self.close()

@@ -40,10 +40,13 @@ _CHUNK = re.compile(r"\*\*?|(?:\$\*|[^*$#?])+", re.DOTALL)
 
 
 def active_path(path: Path) -> Path:
-    """Returns the name of a log's file while the log is being recorded.
+    """Returns the name that the file of a log has while it is being recorded.
 
-    A path without a name, such as ".", is returned unchanged, because the caller refuses it as
-    a folder.
+    It is the final name with the suffix `ACTIVE_SUFFIX`. A path without a file name, such as
+    ".", is returned unchanged.
+
+    Args:
+        path: Final name of the file.
     """
     return path.with_name(path.name + ACTIVE_SUFFIX) if path.name else path
 
@@ -131,13 +134,13 @@ class ChannelFilter:
         return any(matches_key(expression, key) for expression in self.include)
 
     def facts(self) -> Mapping[str, str]:
-        """Returns the filter in the form that the metadata of a log contain.
+        """Converts the filter to texts, which the metadata of a log contain.
 
-        `parse_filter_facts` reads it again.
+        `parse_filter_facts` converts the texts to a filter again.
 
         Returns:
-            The key expressions, separated by spaces, under "include" and "exclude". Empty if
-            all channels are recorded.
+            The key expressions under "include" and "exclude", separated by spaces. Each entry
+            is left out if it has no expressions.
         """
         texts = {"include": " ".join(self.include), "exclude": " ".join(self.exclude)}
         return {name: text for name, text in texts.items() if text}
@@ -175,11 +178,13 @@ def parse_channel_filter(include: Collection[str], exclude: Collection[str]) -> 
 def parse_filter_facts(about: Mapping[str, str]) -> ChannelFilter:
     """Reads from the metadata of a log which channels were recorded.
 
+    The metadata contain the texts that `ChannelFilter.facts` returns.
+
     Args:
         about: Metadata of the session.
 
     Returns:
-        The filter. It accepts all channels if the metadata state none.
+        The filter of the channels. It accepts all channels if the metadata contain no filter.
     """
     return ChannelFilter(
         include=tuple(about.get("include", "").split()),

@@ -431,11 +431,14 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @cached_property
     def absences(self) -> dict[str, list[tuple[int, int]]]:
-        """Ranges of ticks, (first, last), that sites did not execute before their `starts`.
+        """Ticks that a site did not execute, because its process was not running.
 
-        A range begins after the last tick that the previous start is known to have executed.
-        The tick is known from a record, from the "end" event of that start, or because another
-        site received the sample of that tick.
+        A tick is one period of the control loop. A process may be killed and started again, or
+        may join a session late. For each start in `starts`, a range (first tick, last tick)
+        ends just before that start. The range begins after the last earlier tick that was
+        executed, as far as is known. Such a tick is known from a record, from the "end" event
+        of the earlier process, or because another site received the state that was sent in that
+        tick.
         """
         return {site: self._find_absences(site, starts) for site, starts in self.starts.items()}
 
@@ -667,14 +670,15 @@ class Log(Result, Mapping[str, SiteLog]):
         return self.timed_link_stats(site).messages
 
     def timed_link_stats(self, site: str) -> TimedMessages[LinkStats]:
-        """Decodes the statistics that a site published about its links, with their times.
+        """Decodes the statistics that a site published about its links to other sites.
 
         Args:
-            site: Name of the site.
+            site: Name of the site, the process that runs one arm.
 
         Returns:
-            The messages, with the time of arrival at the recorder and the time of sending of
-            each.
+            The statistics in the order of their ticks, the periods of the control loop. Each
+            message has the time at which it was sent, and the time at which it arrived at the
+            recorder.
         """
         topic = self._topic(site, topics.LINK)
         stats = self._decode(topic, LinkStats)

@@ -176,7 +176,11 @@ class LogWriter:
 
     @property
     def most_bytes(self) -> int:
-        """Upper bound of the file's length if it were finished now, without the accounts."""
+        """Largest size of the file if it were finished now, in bytes.
+
+        The numbers of received and missing messages, which `finish` also writes, are not
+        included.
+        """
         views = self._views.most_bytes if self._views is not None else 0
         return self._file.position + self._file.open_chunk_bytes + self._file.end_bytes + views
 
@@ -247,13 +251,14 @@ class LogWriter:
             self._file.flush()
 
     def finish(self, accounts: Mapping[str, str]) -> None:
-        """Completes the file with the accounts, the index and the end mark.
+        """Completes the file, so that other programs can read it.
 
+        The numbers of received and missing messages, the index and the end mark are written.
         The stream stays open. Further calls have no effect.
 
         Args:
-            accounts: Numbers of received and missing messages as a text, by topic, and other
-                counts by name. Those of excluded channels are left out.
+            accounts: For each topic a text with its numbers of received and missing messages,
+                and further counts by name. Topics that the log does not record are left out.
 
         Raises:
             LogRefused: The disk refused the data.
@@ -327,17 +332,21 @@ class LogStorage:
 
     @property
     def splits(self) -> bool:
-        """True if the log is divided into parts from the start."""
+        """True if a limit of size or duration divides the log into several files (parts).
+
+        Without a limit, a log has several parts only if an existing log was continued.
+        """
         return self.split_bytes is not None or self.split_ns is not None
 
     def find_first_part(self) -> tuple[int, str]:
-        """Decides which part of the log to write first, and checks that its name is free.
+        """Decides with which file the writing begins, and checks that its name is free.
 
-        The first part has a higher number if an existing log is continued.
+        A log may consist of several numbered files, its parts. If an existing log is continued,
+        the new part gets the number after the last part.
 
         Returns:
-            The number of the part, which is 0 for a log in a single file, and the name of the
-            previous part, which is empty if there is none.
+            The number of the part, and the name of the previous part. The number is 0 if the
+            log is a single file. The name is empty if there is no previous part.
 
         Raises:
             UsageError: A log of this name exists, and neither `force` nor `carry_on` is set.
@@ -494,7 +503,7 @@ class LogParts:
 
     @property
     def written_bytes(self) -> int:
-        """Number of bytes in all parts so far."""
+        """Number of bytes that were written to all files of the log so far."""
         return self._previous_bytes + self._writer.written_bytes
 
     def add(

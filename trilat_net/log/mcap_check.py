@@ -75,15 +75,16 @@ class FileCheck:
     def check_record(
         self, frame: mcap_records.RecordFrame, content: bytes, data: bytes
     ) -> None:
-        """Checks one record of the file, and notes what the index must state about it.
+        """Checks one record of the file, and notes how it must appear in the file's index.
 
-        Problems are added to `findings`.
+        The index, which is at the end of the file, is compared with these notes when the whole
+        file has been read. Problems are added to the findings.
 
         Args:
             frame: Kind and place of the record.
             content: Content of the record.
-            data: Unpacked records of a chunk. Empty for other records, and if the chunk cannot
-                be unpacked.
+            data: Unpacked records of a chunk (block of messages). Empty for other records, and
+                if the chunk cannot be unpacked.
         """
         self._end = frame.end + len(mcap_records.MAGIC)
         if frame.offset == len(mcap_records.MAGIC) and frame.opcode != Opcode.HEADER:

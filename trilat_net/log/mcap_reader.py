@@ -73,16 +73,19 @@ Only a chunk has unpacked records. They are empty if the chunk cannot be unpacke
 
 
 def shift_progress(progress: Progress | None, before: int, total: int) -> Progress | None:
-    """Makes a function that reports the progress in one file as that in several files.
+    """Converts the progress in one of several files to the progress in all of them.
+
+    Several files are read one after another. The returned function receives the progress in the
+    present file, adds the sizes of the earlier files, and calls `progress`.
 
     Args:
         progress: Function that receives the progress in all files, in bytes. None if nobody
-            needs it.
+            needs the progress.
         before: Size of the files that were read before, in bytes.
         total: Size of all files, in bytes.
 
     Returns:
-        A function that receives the progress in the present file. None if `progress` is None.
+        The function for the present file. None if `progress` is None.
     """
     if progress is None:
         return None
@@ -192,12 +195,20 @@ class McapReader:
 
     @property
     def damaged(self) -> list[mcap_records.Damage]:
-        """Parts that could not be read so far, and channels that were read only in part."""
+        """Parts of the file that could not be read, among the parts examined so far.
+
+        A channel is also listed if only some of its messages were read, which limits the
+        memory.
+        """
         return self.scanner.damaged + self._more_damage
 
     @property
     def torn(self) -> mcap_records.Damage | None:
-        """The missing end of the file. None if it is not missing, or was not reached yet."""
+        """Unreadable rest of a file whose end is missing, such as a record that is cut off.
+
+        The rest extends to the last byte of the file. None if the file ends properly, or if its
+        end has not been reached yet.
+        """
         return self.scanner.torn
 
     def messages(self) -> Iterator[McapMessage]:
@@ -357,7 +368,11 @@ class McapReader:
 
     @property
     def agrees_on_messages(self) -> bool:
-        """True if the messages and their order agree with the digests that the file states."""
+        """True if the messages have not been changed since the file was written.
+
+        The file contains digests, checksums of its contents. The digest of the messages, in
+        their order, and the number of messages are compared with those that were read.
+        """
         stated = self.metadata.get(DIGESTS, {})
         computed = self._chain.facts()
         return all(stated.get(key) == computed[key] for key in ("messages", "records"))
@@ -521,9 +536,9 @@ def read_contents(
         stream: The file, opened for reading.
         name: Name of the file for error messages.
         progress: Function that is called after every record of the file.
-        trusted: True if this program has just written the file. Then the memory of the messages
-            is not limited. A run of arms at rest can be compressed very well, but the file
-            contains no more than this program had in memory before.
+        trusted: True if this program has just written the file. The memory for the messages is
+            then not limited. The limit protects against files that were made to do harm, but a
+            file in which arms hardly move may exceed it, because it is compressed so well.
 
     Raises:
         LogError: The file is no MCAP file, or no log of trilat-net.

@@ -238,7 +238,7 @@ class RecordFrame(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Size of the record with its head, in bytes."""
+        """Size of the whole record in the file, in bytes: its kind, length and content."""
         return RECORD_HEAD_BYTES + self.length
 
     @property
@@ -307,9 +307,10 @@ class RecordScanner:
         return self._stream.read(max(0, min(length, self.size - offset)))
 
     def frames(self) -> Iterator[RecordFrame]:
-        """Yields the place of every record. Every call starts at the beginning of the file.
+        """Yields the kind and the position of every record of the file.
 
-        Parts that make no sense are skipped and added to `damaged`.
+        Bytes that cannot be a record are skipped and added to `damaged`. If the end of the file
+        is missing, `torn` is set. Every call starts at the beginning of the file.
         """
         self.damaged = []
         self.torn = None
@@ -407,21 +408,29 @@ class RecordScanner:
         return RecordFrame(offset, opcode, length)
 
     def content(self, frame: RecordFrame) -> bytes:
-        """Reads the content of a record, which follows its kind and its length.
+        """Reads the content of a record, without the fields for its kind and its length.
 
         Args:
             frame: Place of the record in the file.
+
+        Returns:
+            The content. It is shorter than `frame.length` if the file ends before.
         """
         return self.read(frame.offset + RECORD_HEAD_BYTES, frame.length)
 
     def head(self, frame: RecordFrame) -> ChunkHead:
-        """Reads the head of a chunk, without reading its compressed records.
+        """Reads the head of a chunk, a block of compressed messages in an MCAP file.
+
+        The compressed messages themselves are not read.
 
         Args:
             frame: Place of the chunk in the file.
 
+        Returns:
+            The head, which states the times, the size, the compression and the checksum.
+
         Raises:
-            UnreadableRecord: The head makes no sense.
+            UnreadableRecord: The head is incomplete, or contains impossible values.
         """
         content = self.read(frame.offset + RECORD_HEAD_BYTES, min(frame.length, MAX_HEAD_BYTES))
         return parse_chunk_head(content, frame.length)

@@ -59,7 +59,14 @@ class Sink(Protocol):
     """
 
     def write(self, data: bytes, /) -> int:
-        """Writes or stores bytes, and returns their number."""
+        """Accepts bytes. A file writes them at once, and a buffer stores them until `flush`.
+
+        Args:
+            data: The bytes.
+
+        Returns:
+            The number of bytes.
+        """
 
     def flush(self) -> None:
         """Writes all bytes that are stored in the buffer."""
@@ -163,16 +170,21 @@ class McapWriter:
 
     @property
     def end_bytes(self) -> int:
-        """Largest number of bytes that `finish` may write, without the open chunk.
+        """Largest number of bytes that the end of the file (summary and end mark) may need.
 
-        This much disk space must be reserved so that the file can be finished.
+        This much disk space must be reserved so that the file can be finished. The messages of
+        the chunk that is still open are not included, see `open_chunk_bytes`.
         """
         summary_bytes = sum(map(len, self._summary.values()))
         return summary_bytes + 10 * len(self._counts) + _FIXED_END_BYTES
 
     @property
     def open_chunk_bytes(self) -> int:
-        """Largest number of bytes that the chunk that is still open may need in the file."""
+        """Largest size of the messages that were added but not written yet, in bytes.
+
+        These messages form the open chunk. The size includes the index of the messages. It is 0
+        if there are no such messages.
+        """
         if not self._open_chunk:
             return 0
         messages = self.messages - self._chain.messages
@@ -185,20 +197,25 @@ class McapWriter:
 
     @property
     def duration_s(self) -> float:
-        """Time from the first to the last message in closed chunks by log time, in s."""
+        """Time from the first to the last message that was written to the file, in s.
+
+        The log times are used, at which the messages arrived at the recorder. Messages of the
+        chunk that is still open have not been written yet. The duration is 0 if nothing was
+        written.
+        """
         first_ns, last_ns = self._span_ns or (0, 0)
         return (last_ns - first_ns) * 1e-9
 
     def register_schema(self, name: str, encoding: str, data: bytes) -> int:
-        """Writes a schema, which describes the messages of a channel.
+        """Writes a schema to the file, which describes the fields of messages.
 
         Args:
             name: Name of the schema.
-            encoding: Encoding of the schema.
-            data: Content of the schema.
+            encoding: Language of the schema, such as "jsonschema".
+            data: Text of the schema, encoded.
 
         Returns:
-            The number of the schema.
+            The identifier of the schema in the file, which `register_channel` needs.
         """
         number = self._summary_counts[Opcode.SCHEMA] + 1
         body = struct.pack("<H", number) + pack_text(name) + pack_text(encoding)

@@ -1,15 +1,15 @@
 """Converts orientations to time series without jumps: unit quaternions, or six numbers.
 
-A record contains an orientation as a rotation vector, the axis times the angle, at most half a
-turn long. When the angle passes half a turn, as it does for a tool that points down, the vector
-jumps by a whole turn, although the orientation does not jump. Near half a turn, the vector
-moves up to pi / 2 times as far as the orientation. No rule that adds whole turns to the vector
-makes it continuous for every motion of several turns. Time series that leave the program
-therefore have one of these forms:
+A record contains an orientation as a rotation vector: the axis of a rotation times its angle,
+which is at most half a turn. When the angle passes half a turn, as it does for a tool that
+points down, the vector jumps by a whole turn, although the orientation changes smoothly. Adding
+whole turns to the vector cannot avoid these jumps for every motion. Near half a turn, the
+vector also changes by up to pi / 2 times the angle by which the orientation turns. Time series
+that leave the program therefore have one of these forms:
 
-- Unit quaternions w, x, y, z. A quaternion and its negative are the same orientation, and the
-  sign is chosen so that each quaternion is nearest to the previous one, and the first has
-  w >= 0. A turn by a small angle moves the quaternion by half of that angle.
+- Unit quaternions w, x, y, z. A quaternion and its negative are the same orientation. The sign
+  is chosen so that each quaternion is nearest to the previous one, and the first has w >= 0. A
+  turn by a small angle moves the quaternion by half of that angle.
 - Six numbers: the first and the second column of the rotation matrix. They depend only on the
   present orientation and not on the past, as observations and actions of a learned policy must
   (Y. Zhou et al., "On the continuity of rotation representations in neural networks", CVPR
@@ -211,10 +211,13 @@ class QuaternionSigns:
         self._last: tuple[float, ...] = ()
 
     def align(self, quaternion: Sequence[float]) -> tuple[float, ...]:
-        """Chooses the sign of the next quaternion.
+        """Chooses the sign of the next quaternion in a time series, so that it does not jump.
+
+        The sign is the one with which the quaternion is nearest to the quaternion of the
+        previous call. In the first call, it is the sign with w >= 0.
 
         Args:
-            quaternion: The four numbers of the unit quaternion.
+            quaternion: The four numbers of the next unit quaternion in the order of time.
 
         Returns:
             The quaternion or its negative, which is the same orientation.

@@ -192,7 +192,7 @@ def decode_arrivals(payloads: Sequence[bytes]) -> tuple[Ints, Ints]:
     counts = np.zeros(len(payloads), dtype=np.int64)
 
     def iterate_numbers() -> Iterator[int]:
-        """Yields the numbers of all arrivals, and counts the arrivals of each record."""
+        """Yields the three numbers of every arrival, and stores the arrivals per record."""
         for row, arrivals in enumerate(_decode_fields(payloads, "rx")):
             counts[row] = len(arrivals)
             for entry in arrivals:
