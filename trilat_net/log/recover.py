@@ -146,10 +146,10 @@ class Recovery(Result):
         self.lost_bytes += size
 
     def facts(self) -> dict[str, str]:
-        """Returns the result in the form that the metadata of the new file contain.
+        """Converts the result to texts by name, which the metadata of the new file contain.
 
-        They state the source file, the losses and the missing records, so that a recovered log
-        can be recognised as such.
+        The texts state the source file, the losses and the missing records. A reader of the new
+        file can thus recognise it as a recovered log.
         """
         losses = self.lost[:MAX_LISTED_LOSSES]
         unlisted = len(self.lost) - len(losses)
@@ -381,11 +381,12 @@ class _FileCopy:
                 self._open_channel(number)
 
     def run(self, restored: bytes) -> None:
-        """Copies everything that can be read, and finishes the new file.
+        """Copies everything that can be read from the damaged file, and finishes the new file.
 
         Args:
-            restored: Text of the scenario from the file beside the log, which is written first.
-                Empty if the log contains its scenario.
+            restored: Text of the scenario (the description of the experiment), from a file
+                beside the damaged log. It is written first. Empty if the log itself contains
+                its scenario.
 
         Raises:
             NothingSaved: Nothing could be copied.

@@ -1,20 +1,22 @@
-"""Surveys a damaged MCAP file before its recovery.
+"""Surveys a damaged MCAP file before its messages are recovered.
 
-The survey collects everything in the file except the messages: the session, the scenario, the
-definitions of the channels and the index. A damaged disk or a damaged copy may contain parts of
-other files, so that the survey also decides which of them belong together. It lists the chunks,
-the compressed blocks of messages, that are not in their original places.
+The survey collects everything in the file except the messages: the metadata of the session, the
+scenario (the description of the experiment), the definitions of the channels and the index. A
+damaged disk or a damaged copy may contain parts of other files. Therefore the survey also
+decides which parts belong together. It lists the chunks, the compressed blocks of messages,
+that are not in their original places.
 
 Invariant:
-    - If a schema or channel is defined twice with the same number, the definition that a valid
-      checksum covers counts. Without a checksum, the first one counts.
-    - If a file contains several sessions and scenarios, a session and a scenario count that
-      name each other. A session does not count if its start time contradicts all messages with
-      a checksum, because it belongs to another log. In simulated time all sessions start at 0.
-      There, the random numbers that identify the starts of the sites decide.
-    - A chunk with a valid checksum may still be old, of another file, or in the wrong place. In
-      a finished file, the index decides, which has its own checksum. In a log that was not
-      finished, the times of the chunks decide, which never decrease.
+    - If a schema or channel is defined twice with the same number, the definition with a valid
+      checksum is used. Without a checksum, the first definition is used.
+    - If a file contains several sessions and scenarios, the survey selects a session and a
+      scenario that refer to each other. A session whose start time contradicts all messages
+      with a checksum belongs to another log and is rejected. In simulated time all sessions
+      start at 0. There, the numbers that identify the starts of the sites are compared instead.
+    - A chunk with a valid checksum may still be outdated, from another file, or in the wrong
+      place. In a finished file, the index shows which chunks belong to it. In an unfinished
+      file, the times of the chunks show this, because they never decrease. The index has a
+      checksum of its own.
 """
 
 import hashlib

@@ -63,9 +63,9 @@ class Integrity(NamedTuple):
 
     @property
     def passed(self) -> bool:
-        """True unless something in the file was changed or removed.
+        """False only if something in the file was changed or removed.
 
-        It is also True if the file has no digests or was not finished.
+        A file without digests, or a file that was not finished, cannot be compared. It passes.
         """
         return self.state is not DigestState.CHANGED
 
@@ -87,19 +87,19 @@ class RunningDigest:
         self._descriptions: set[bytes] = set()
 
     def add_records(self, data: bytes | bytearray | memoryview, messages: int) -> None:
-        """Adds messages in the order of the file.
+        """Adds messages to the checksum of the messages, in the order of the file.
 
         Args:
-            data: The messages in the form of records of the file.
-            messages: Their number.
+            data: The messages with their headers, as in an unpacked chunk of the MCAP file.
+            messages: Number of messages in `data`.
         """
         self._records.update(data)
         self.messages += messages
 
     def add_entry(self, opcode: int, content: bytes) -> None:
-        """Adds a record that describes the messages, such as a schema.
+        """Adds a record that describes the messages, such as a schema, to the second checksum.
 
-        Repeated records count once.
+        The order of these records does not matter, and repeated records count once.
 
         Args:
             opcode: Number of the kind of record: header, metadata, attachment, schema or
@@ -109,11 +109,12 @@ class RunningDigest:
         self._descriptions.add(hashlib.sha256(bytes([opcode]) + content).digest())
 
     def facts(self) -> dict[str, str]:
-        """Returns the digests of everything added so far, as metadata for the end of the file.
+        """Computes the checksums of everything added so far, as metadata for the file.
 
         Returns:
-            The method, the number of messages, and the two digests in hexadecimal digits:
-            "records" of the messages, and "about" of what describes them.
+            Texts by name. "algorithm" is the method, "messages" the number of messages,
+            "records" the checksum of the messages, and "about" the checksum of the records that
+            describe them. The checksums are in hexadecimal digits.
         """
         about = hashlib.sha256(b"".join(sorted(self._descriptions))).hexdigest()
         digests = {"records": self._records.hexdigest(), "about": about}

@@ -203,9 +203,11 @@ class ChannelCheck:
         return f"{self.member}/{self.kind}"
 
     def begin(self, file: str, channel: ChannelInfo) -> None:
-        """Prepares the check of the channel's messages in a file.
+        """Starts the check of the channel in the next file of the log.
 
-        It also checks how the file describes the channel: its schema, encoding and metadata.
+        A log may be divided into several files. The description of the channel in the file
+        (schema, encoding and metadata) is checked at once. The messages of the file are passed
+        to `check_message` afterwards.
 
         Args:
             file: Name of the file.
@@ -582,8 +584,9 @@ class SessionCheck:
     def findings(self) -> Iterator[Finding]:
         """Completes all checks after the files were read, and yields their results.
 
-        If the files contain no session, the messages are not checked. Then only the digests may
-        show that the session was removed from the file.
+        If the files contain no session of trilat-net, only the checks of the file format are
+        yielded. If checksums show that the session was removed from the file, the result
+        "chain" is yielded too.
         """
         counts = self._counts
         findings = self._findings

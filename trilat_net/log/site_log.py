@@ -159,7 +159,7 @@ class LazyRecords(Sequence[State]):
 
         @lru_cache(maxsize=blocks)
         def get_block(number: int) -> list[State]:
-            """Decodes the block with a number. Blocks are numbered from 0."""
+            """Decodes and returns consecutive records: the block `number`, counted from 0."""
             first = number * size
             return decode_block(payloads[first : first + size])
 
@@ -599,7 +599,12 @@ class SiteLog:
 
     @cached_property
     def orientation_des(self) -> Array:
-        """Orientation of the reference as unit quaternions, see `orientation`."""
+        """Orientation of the reference as unit quaternions (w, x, y, z), shape (K, 4).
+
+        The reference is the motion that the end effector of the arm follows, and K is the
+        number of records. The shape is (K, 0) for sites that do not follow orientations. The
+        signs are chosen so that each quaternion is nearest to the previous one.
+        """
         return self._compute_orientation(self.q_des)
 
     def _compute_orientation(self, poses: Array) -> Array:
@@ -640,12 +645,12 @@ class SiteLog:
 
     @cached_property
     def sent(self) -> dict[str, Array]:
-        """Numbers that the site's control law sends to its peers with every sample.
+        """Numbers that the site's control law sends to the other sites in each control period.
 
-        A key is the name of the quantity, such as "E", if all peers receive the same numbers.
-        If the numbers are meant for one peer, the key also contains the peer, such as "u[m2]".
-        The value is an array of shape (K, length of the quantity). Empty if the law sends
-        nothing.
+        A key is the name of the quantity in the control law, such as "E", if all other sites
+        receive the same numbers. If the numbers are meant for one site, the key also contains
+        its name, such as "u[m2]". The value is an array of shape (K, w), with K records and w
+        numbers of the quantity. Empty if the control law sends nothing.
         """
         columns: dict[str, list[int]] = {}
         for column, entry in enumerate(self.channel.entries(self.peers)):
@@ -663,10 +668,11 @@ class SiteLog:
 
     @cached_property
     def used(self) -> dict[str, Ints]:
-        """Tick of the sample of each peer that the control law uses at each record.
+        """Number of the tick of each peer whose sample the control law used, in each record.
 
-        A peer is another site whose samples this site receives. The key is its name, and the
-        value has the shape (K,). It is -1 before the first sample of the peer.
+        A peer is another site, and a sample is the state that it sends in each tick (period of
+        its control loop). The key is the name of the peer. The value has the shape (K,), where
+        K is the number of records of this site. It is -1 before the first sample of the peer.
         """
         return self._read(record_columns.decode_per_peer, "used", self.peers, -1)
 

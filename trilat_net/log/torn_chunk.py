@@ -65,17 +65,18 @@ class TornChunk(NamedTuple):
 
     @classmethod
     def read(cls, scanner: RecordScanner, offset: int) -> "TornChunk":
-        """Reads a chunk that reaches beyond the end of a file, as far as it exists.
+        """Reads the existing part of a chunk (compressed block of messages) that is cut off.
 
         Args:
             scanner: Scanner of the file.
             offset: Offset of the chunk in the file.
 
         Returns:
-            The head of the chunk, and its compressed bytes up to the first doubtful page.
+            The head of the chunk, and its compressed bytes. The bytes end before the first page
+            of the file that was probably not written correctly, see `find_doubtful_page`.
 
         Raises:
-            UnreadableRecord: The head of the chunk makes no sense.
+            UnreadableRecord: The head of the chunk contains impossible values.
         """
         # Missing bytes are replaced by zeros, so that an incomplete head is refused below.
         record_head = scanner.read(offset, RECORD_HEAD_BYTES).ljust(RECORD_HEAD_BYTES, b"\0")

@@ -311,17 +311,18 @@ class OutsideClient(SiteClient):
         """Connects to a site over the network.
 
         Args:
-            session: Name of the session, by default that of the scenario.
-            site: Site of the arm.
+            session: Name of the session, by default the name of the scenario.
+            site: Name of the site, the process that runs the arm.
             connect: Endpoints of the site, which the site prints while it waits for its arm.
-            keys: Folder with keys, as for --keys. An arm uses the keys of its site, and a
-                switch those of the operator.
+            keys: Folder with the keys of one member, as `trilat keys new` creates it. The
+                program of an arm uses the keys of its site. The program of a dead-man switch
+                uses the keys of the operator. None connects without keys.
 
         Returns:
             The client.
 
         Raises:
-            UsageError: An endpoint cannot be used.
+            UsageError: An endpoint or the keys cannot be used.
         """
         connection = secure_connection(Connection((), list(connect)), keys, insecure=False)
         bus = connection.require(cls.member or site).open()
@@ -573,10 +574,10 @@ class Hand(SiteClient):
 
     @property
     def holds(self) -> bool:
-        """True if this program is the operator that moves the arm in the newest record.
+        """True if this program moves the arm, as its operator, in the newest record.
 
-        A record is the result of one period of the site's control loop. It is False if another
-        operator moves the arm, or none.
+        A record contains the state of the site in one period of its control loop. The value is
+        False if another operator or nobody moves the arm, or if there is no record yet.
         """
         hand = self.in_force
         return hand is not None and hand.source == self._sender.boot
@@ -597,8 +598,9 @@ class Hand(SiteClient):
     def in_force(self) -> HandInForce | None:
         """Operator who moves the arm in the newest record, with the present target or force.
 
-        The operator may be another program than this one. None before the first record, the
-        result of one period of the site's control loop.
+        A record contains the state of the site in one period of its control loop. The operator
+        may be this program or another program. None if nobody moves the arm, or if there is no
+        record yet.
         """
         record = self.record
         if record is None or not record.hand:

@@ -51,9 +51,10 @@ StampedInbox = PolledRing[tuple[Polled, int]]
 
 
 class Query(Protocol):
-    """Interface of a query that another member has sent, and that waits for a reply.
+    """Interface of a query that has arrived over the network, and that waits for a reply.
 
-    A query is a request under a key, to which each receiver can reply with one payload.
+    A member (process that takes part in a session) sends a query under a key, a text that names
+    the receivers. Each receiver can reply with one payload of bytes.
     """
 
     @property

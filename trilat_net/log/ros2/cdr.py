@@ -205,12 +205,15 @@ class TransformPacker:
         self._pack = struct.Struct(struct_format).pack
 
     def pack(self, stamp_ns: int, numbers: Sequence[float]) -> bytes:
-        """Encodes one message.
+        """Encodes one message of the type `tf2_msgs/msg/TFMessage`.
 
         Args:
             stamp_ns: Unix time of the message, in ns, 0 or more.
-            numbers: For each frame, x, y, z in m and the quaternion x, y, z, w, in one
-                sequence.
+            numbers: The poses of all frames, one after another: x, y, z in m and the quaternion
+                x, y, z, w.
+
+        Returns:
+            The message in CDR, the binary format of ROS 2.
         """
         seconds, rest_ns = _split_stamp(stamp_ns)
         fields: list[object] = []
@@ -382,7 +385,13 @@ class CdrReader:
         return struct.unpack_from(f"<{count}{code}", self._data, start)
 
     def count(self) -> int:
-        """Decodes the length of the next list, whose entries have at least one byte each."""
+        """Decodes the number of entries of a list, which precedes the entries in the message.
+
+        Each entry must have at least one byte.
+
+        Raises:
+            ValueError: Fewer bytes than entries remain, so that the number must be wrong.
+        """
         (count,) = self.numbers("I")
         # A wrong length would let the caller reserve memory for entries that do not exist.
         if count > len(self._data) - self._position:

@@ -190,17 +190,20 @@ class SiteMessages:
         shares: Sequence[float],
         is_wanted: IsWanted = lambda _topic: True,
     ) -> Iterator[tuple[str, bytes]]:
-        """Encodes a record, the result of one tick of the site's control loop.
+        """Converts a record of a site to ROS 2 messages.
+
+        A record contains the state of the site in one period of its control loop: motion,
+        reference, torques and mode.
 
         Args:
             record: The record. The records must be passed in the order of their times, because
                 the signs of quaternions depend on the previous record.
-            shares: Dominance factors at the time of the record, the weights with which the site
-                follows its peers.
+            shares: Dominance factors at the time of the record: the weights with which the site
+                follows each of the other sites.
             is_wanted: Function that returns False for topics whose messages are not needed.
 
         Yields:
-            The name of the topic in trilat-net, and the message, for each wanted topic.
+            For each wanted topic, its name in trilat-net, and the encoded message.
         """
         stamp_ns = self.stamp_ns(record)
         if is_wanted("joint_states"):

@@ -5,11 +5,11 @@ channels of standard ROS 2 messages, which viewers such as Foxglove and PlotJugg
 This module defines these channels with their units and names, and converts the messages.
 
 Invariant:
-    - Numbers are copied. Only times are converted, to the unit that the channel's metadata
-      state.
+    - Values are copied without a conversion. Only times are converted, to the unit that is
+      stated in the metadata of the channel.
     - A value that was not measured is NaN.
-    - Viewers find the name of each curve. The name of a joint is in the message, and any other
-      name is in the label of the array's dimension.
+    - Viewers find a name for each curve. Joint states contain the names of the joints. In an
+      array, the label of each dimension lists the names of its entries.
 """
 
 import math
@@ -62,9 +62,10 @@ class Ros2Channel(NamedTuple):
 
 
 class StandardChannels:
-    """Registers the channels for viewers in a file, each when it is needed for the first time.
+    """Registers ROS 2 channels for viewers in an MCAP file, each when it is first needed.
 
-    It maps the topic of a channel to its number in the file.
+    Indexing the object with the topic of a channel returns the number of the channel in the
+    file. If the channel is not registered yet, it is registered then.
 
     Args:
         file: The file.
@@ -124,14 +125,14 @@ _MODE_NUMBERS: dict[Mode | str, float] = {
 
 
 def pack_event(event: Event, stamp_ns: int) -> Iterator[tuple[str, bytes]]:
-    """Encodes an event of a member twice: as a string, and as a line for the log of ROS.
+    """Encodes an event for viewers in two forms: as a text, and as a line for the ROS log.
 
     Args:
-        event: The event.
+        event: The event, such as the loss of a connection.
         stamp_ns: Unix time of the event, in ns, 0 or more.
 
     Yields:
-        The name of the channel and the message.
+        For each form, the name of its channel (`EVENTS` or `LINES`) and the message.
     """
     text = describe_event(event.kind, event.text, event.command)
     level = _LEVELS.get(event.kind, cdr.RosLogLevel.INFO)
@@ -170,10 +171,13 @@ class ArrayChannel:
 
 
 class Ros2SiteChannels:
-    """The standard channels of one site, with its peers in the order of the scenario.
+    """Describes the ROS 2 channels of one site for viewers, and encodes arrays of numbers.
+
+    A site is a process that runs one arm. The other sites, its peers, have the order of the
+    scenario.
 
     Args:
-        scenario: Scenario of the session.
+        scenario: Scenario (description of the experiment) of the session.
         site: Name of the site.
 
     Attributes:
@@ -181,9 +185,10 @@ class Ros2SiteChannels:
         arrays: The array channels, by the last part of their topic.
         record_arrays: Names of the arrays that are computed from records. The others are
             computed from statistics.
-        error_row: Slice of the error e = q - q_des, Eq. (9), in a row of `stack_signals`.
-        slow_row: Slice of the remaining numbers of the row: tau_x, theta_hat, the vectors that
-            the control law sends, and the mode.
+        error_row: Slice of the error e = q - q_des, Eq. (9), in the numbers of a record from
+            `stack_signals`.
+        slow_row: Slice of the numbers that follow the error: the exogenous torque, the
+            estimated parameters, the vectors that the control law sends, and the mode.
         robot: Model of the arm for viewers. None for a planar arm.
     """
 
@@ -253,7 +258,11 @@ class Ros2SiteChannels:
 
     @property
     def channels(self) -> dict[str, Ros2Channel]:
-        """Channels of the arrays and of the robot, by the last part of their topic."""
+        """ROS 2 channels of this site for viewers, by the last part of their topic.
+
+        There is a channel for each array of numbers. If the arm has a robot model, there are
+        also channels for the model and for the poses of its links.
+        """
         arrays = {name: array.channel for name, array in self.arrays.items()}
         return arrays if self.robot is None else arrays | ROBOT_CHANNELS
 
@@ -280,16 +289,17 @@ class Ros2SiteChannels:
         return " or ".join(different_units)
 
     def pack_slow_arrays(self, row: Sequence[float]) -> Iterator[tuple[str, bytes]]:
-        """Encodes the quantities of a record that viewers show with fewer points.
+        """Encodes the quantities of a record that viewers receive at a reduced rate.
 
-        These are the exogenous torque, the estimated parameters, the numbers that the control
-        law sends, and the mode.
+        These are the exogenous torque of Eq. (8), the estimated parameters, the numbers that
+        the control law sends, and the mode.
 
         Args:
-            row: Their values, the slice `slow_row` of the numbers from `stack_signals`.
+            row: Values of these quantities: the slice `slow_row` of the numbers that
+                `stack_signals` returns for a record.
 
         Yields:
-            The name of each array and its message.
+            The name of each array, and the encoded message.
         """
         start = 0
         for name in self._slow_names:
@@ -299,15 +309,17 @@ class Ros2SiteChannels:
             start = end
 
     def pack_statistics(self, stats: LinkStats) -> Iterator[tuple[str, bytes]]:
-        """Encodes the statistics of a site's links as arrays.
+        """Encodes the statistics about the connections of a site to other sites as arrays.
 
-        Delays, clock offsets and timing exist only in a live session.
+        The age of the received states is always included. Delays, clock offsets and the timing
+        of the control loop are included only in a live session, because simulated time has
+        none. Nothing is yielded for a site that receives no other site.
 
         Args:
             stats: The statistics.
 
         Yields:
-            The name of each array and its message.
+            The name of each array, and the encoded message.
         """
         peers = self._peers
         if not peers:

@@ -123,10 +123,11 @@ def make_session_name(text: str) -> str:
 def read_topic_table(source: str) -> TopicTable:
     """Reads under which names the topics of a session shall appear in ROS 2.
 
-    The names are those of a convention, "crisp" or "crtk", or come from a TOML file. The file
-    states only the names that differ from those of CRISP. For example, the line
-    `joint_states = "arm/joint_states"` applies to all sites. A table `[sites.s]` applies only
-    to the site `s`, and may also contain the fields of a `RobotTable`.
+    The names follow a built-in convention, or come from a TOML file. The conventions are
+    "crisp" (a set of ROS 2 controllers) and "crtk" (the Collaborative Robotics Toolkit). The
+    file states only the names that differ from "crisp". For example, the line `joint_states =
+    "arm/joint_states"` applies to all sites. A table `[sites.s]` applies only to the site `s`.
+    It may also contain the settings of a real robot, which are the fields of `RobotTable`.
 
     Args:
         source: "crisp", "crtk" or the path of a file.

@@ -3,9 +3,10 @@
 A site publishes about 1000 records a second, more than a viewer such as Foxglove can draw
 smoothly. Therefore the records of a site are collected in buckets, intervals of equal length. A
 bucket becomes two messages of ROS 2, which contain the minimum and the maximum of each curve in
-the bucket, in the order in which the two occurred. Thus no peak is lost. The joints and their
-error have `views_hz` messages a second. The exogenous torque, the estimated parameters and the
-mode are reduced once more, to `SLOW_VIZ_HZ`.
+the bucket, in the order in which the two occurred. Thus no peak is lost.
+
+The joints and their error appear in `views_hz` messages a second. The exogenous torque, the
+estimated parameters and the mode appear in only `SLOW_VIZ_HZ` messages a second.
 
 Invariant:
     - The file contains the exact minimum and maximum of every curve in every bucket.
@@ -73,15 +74,15 @@ class _BucketOutput:
         self._waiting_rows: Sequence[StampedRow] = ()
 
     def add(self, rows: Sequence[StampedRow], log_ns: int) -> None:
-        """Writes the first row of a bucket at once, and keeps the second one for later.
+        """Writes the first row of a time interval at once, and keeps the second row for later.
 
-        A bucket is an interval of time. Its two rows contain the minimum and the maximum of
-        each curve. If the second row of the previous bucket is still kept, it is written
-        before.
+        A row contains one value of each curve. The two rows of an interval contain the minimum
+        and the maximum of each curve. If the second row of the previous interval is still kept,
+        that row is written first.
 
         Args:
             rows: The rows with their times, one or two.
-            log_ns: Arrival time to write, in Unix time, in ns.
+            log_ns: Arrival time that the log states for the messages, in Unix time, in ns.
         """
         self.flush(log_ns)
         stamp_ns, row = rows[0]
@@ -89,20 +90,23 @@ class _BucketOutput:
         self._waiting_rows = rows[1:]
 
     def flush(self, log_ns: int) -> None:
-        """Writes the second row of the bucket. Nothing happens if it was written already.
+        """Writes the row of curve values that `add` has kept, if it was not written yet.
 
         Args:
-            log_ns: Arrival time to write, in Unix time, in ns.
+            log_ns: Arrival time that the log states for the message, in Unix time, in ns.
         """
         self.write_all(self._waiting_rows, log_ns)
         self._waiting_rows = ()
 
     def write_all(self, rows: Sequence[StampedRow], log_ns: int) -> None:
-        """Writes all rows of a bucket at once, because the records of the bucket arrived late.
+        """Writes all rows of curve values of a time interval at once.
+
+        This is used for an interval whose records arrived late. Otherwise `add` spreads the
+        rows over time.
 
         Args:
             rows: The rows with their times.
-            log_ns: Arrival time to write, in Unix time, in ns.
+            log_ns: Arrival time that the log states for the messages, in Unix time, in ns.
         """
         for stamp_ns, row in rows:
             self._write(stamp_ns, row, log_ns)
@@ -238,7 +242,9 @@ class _SiteBuckets:
         self._late_records.append(record)
 
     def add_statistics(self, stats: LinkStats, log_ns: int) -> None:
-        """Writes link statistics of the site for viewers, all of them, since they are few.
+        """Writes statistics about the connections of the site as messages for viewers.
+
+        The statistics are not reduced, because a site publishes them only ten times a second.
 
         Args:
             stats: The statistics.
@@ -249,10 +255,12 @@ class _SiteBuckets:
             self._put(self._topics[name], data, stamp_ns, log_ns)
 
     def finish(self, log_ns: int) -> None:
-        """Writes the messages of the records that were not written yet, at the end of the log.
+        """Writes the messages for all records that were added but not written yet.
+
+        The method is called at the end of the log.
 
         Args:
-            log_ns: Arrival time to write, in Unix time, in ns.
+            log_ns: Arrival time that the log states for the messages, in Unix time, in ns.
         """
         # Two slow buckets further on, both the fast and the slow bucket are closed.
         self._close_bucket(self._bucket + 2 * self._slow_ratio, log_ns)
@@ -412,7 +420,10 @@ class VizChannels:
             self._put(f"{VIZ_ROOT}{name}", data, log_ns, log_ns)
 
     def finish(self, log_ns: int) -> None:
-        """Writes the messages for viewers that were not written yet, at the end of the log.
+        """Writes the remaining messages for viewers, at the end of the log.
+
+        Messages for viewers are otherwise written when the time interval that they cover is
+        over.
 
         Args:
             log_ns: Arrival time of the last message of the session, in Unix time, in ns.
@@ -422,7 +433,7 @@ class VizChannels:
 
     @property
     def most_bytes(self) -> int:
-        """Largest size of the messages that are not written yet, in bytes."""
+        """Upper bound for the size of the messages that are not written yet, in bytes."""
         return sum(buckets.max_pending_bytes for buckets in self._buckets)
 
 
