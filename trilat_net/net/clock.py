@@ -88,21 +88,21 @@ class SystemClock:
 
 
 class SkewedClock:
-    """A clock with an offset and a drift relative to another clock, for tests on one machine.
+    """A clock with an offset and a drift relative to a base clock, for tests on one machine.
 
     The clock behaves like the clock of another machine. It reads
 
         start + offset + (reading - start) (1 + drift),
 
-    where `reading` is the present reading of the other clock, and `start` was its reading when
+    where `reading` is the present reading of the base clock, and `start` was its reading when
     this object was created. The time of day is not changed. The identity of the clock is
     unique. It states the offset, the drift and the start, so that readers of a log can convert
     the readings.
 
     Args:
-        clock: The other clock.
-        offset_ns: Offset relative to the other clock, in ns.
-        drift_ppb: Drift relative to the other clock, in ns/s.
+        clock: The base clock.
+        offset_ns: Offset relative to the base clock, in ns.
+        drift_ppb: Drift relative to the base clock, in ns/s.
     """
 
     def __init__(self, clock: Clock, offset_ns: int, drift_ppb: int) -> None:
@@ -112,26 +112,26 @@ class SkewedClock:
         self._start_ns = clock.monotonic_ns()
 
     def monotonic_ns(self) -> int:
-        """Returns the reading of the skewed clock in ns, by the equation of the class."""
+        """Returns the monotonic time with the offset and the drift of this clock, in ns."""
         passed_ns = self._clock.monotonic_ns() - self._start_ns
         drift_ns = passed_ns * self._drift_ppb // NS_PER_S
         return self._start_ns + self._offset_ns + passed_ns + drift_ns
 
     def unix_ns(self) -> int:
-        """Returns the time of day of the other clock, in ns since 1970.
+        """Returns the time of day of the base clock, unchanged, in ns since 1970.
 
-        It is not skewed, because only the monotonic clock emulates another machine.
+        Only the monotonic time has an offset and a drift.
         """
         return self._clock.unix_ns()
 
     def sleep_until(self, deadline_ns: int) -> None:
-        """Sleeps until the skewed clock has reached a time.
+        """Sleeps until this clock has reached a time.
 
-        The equation of this clock is solved for the reading of the other clock at that time.
+        The time is converted to a time of the base clock, which then sleeps.
 
         Args:
-            deadline_ns: The time on the skewed clock, in ns. If it has passed already, the
-                method returns at once.
+            deadline_ns: The time on this clock, in ns. If it has passed already, the method
+                returns at once.
         """
         # Time from the start to the deadline, on this clock and on the other clock.
         passed_ns = deadline_ns - self._start_ns - self._offset_ns
@@ -140,10 +140,10 @@ class SkewedClock:
         self._clock.sleep_until(self._start_ns + other_passed_ns)
 
     def identity(self) -> str:
-        """Returns a text that identifies the skewed clock.
+        """Returns a text that identifies this clock, with its offset, its drift and its start.
 
-        The text contains the offset in ns, the drift in ns/s and the start in ns, so that
-        readers of a log can convert readings of this clock to those of the other clock.
+        From these numbers, readers of a log can convert readings of this clock to readings of
+        the base clock.
         """
         return (
             f"{self._clock.identity()}, skewed by {self._offset_ns} ns "

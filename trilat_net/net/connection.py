@@ -185,9 +185,10 @@ class Connection:
     keys_end: datetime | None = None
 
     def reach(self, endpoints: Sequence[Endpoint]) -> list[Endpoint]:
-        """Converts endpoints to the form in which this process opens them.
+        """Converts endpoints to encrypted endpoints, if this process has keys.
 
-        If the process has keys, its connections are encrypted: TLS replaces TCP.
+        An endpoint is an address such as "tcp/127.0.0.1:10241". With keys, all connections are
+        encrypted, so that TLS replaces TCP. Without keys, the endpoints are returned unchanged.
 
         Args:
             endpoints: Endpoints as text, or groups of endpoints from a user's Zenoh file. The
@@ -240,9 +241,13 @@ class Connection:
             )
 
     def describe_end(self) -> str:
-        """Returns a warning for the user if the validity of the keys ends within `ENDS_SOON`.
+        """Returns a warning for the user if the keys of this process will expire soon.
 
-        The warning is empty if the keys are valid for longer, or if there are no keys.
+        The keys encrypt its connections, and prove its identity.
+
+        Returns:
+            The warning. Empty if the keys stay valid for longer than `ENDS_SOON`, or if the
+            process has no keys.
         """
         if self.keys_end is None or self.keys_end - datetime.now(UTC) > ENDS_SOON:
             return ""

@@ -137,7 +137,10 @@ def connect_to_session(
     with ExitStack() as stack:
 
         def connect(target: Connection) -> Bus | None:
-            """Opens a connection until the end of the `with` block. None if stopped."""
+            """Opens a network connection, which is closed at the end of the `with` block.
+
+            Returns None if `stopped` has returned True.
+            """
             bus = open_bus(
                 connection=target, clock=clock, stopped=stopped, timeout_s=timeout_s, say=say
             )

@@ -218,16 +218,17 @@ def find_known_endpoints(session: str, connection: "Connection") -> list[Endpoin
 def stop_at_once(arguments: Sequence[str]) -> int | list[str]:
     """Stops arms immediately, as the command line of `trilat stop` requests.
 
-    Only the sites that run on this machine can be stopped in this way, because their endpoints
-    are known from files. Nothing else is loaded before, so that the arms stop without delay.
+    Only the sites that run on this machine can be stopped in this way, because files on this
+    machine state their endpoints. The other parts of the program are not loaded before, so that
+    the arms stop without delay.
 
     Args:
         arguments: Command line after `trilat stop`.
 
     Returns:
-        The exit code of the command, if all arms have been stopped or if the keys are missing.
-        Otherwise the arguments with which the full command has to continue, for example to
-        search the network for the remaining sites.
+        If all arms have been stopped, or if the keys are missing: the exit code of the command.
+        Otherwise: the arguments for the full command, which continues, for example by searching
+        the network for the remaining sites.
     """
     options, sites, is_simple = _parse_arguments(arguments)
     session = options["--session"]

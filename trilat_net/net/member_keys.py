@@ -71,12 +71,13 @@ MOST_LETTERS = 64
 
 
 class MemberKeys(NamedTuple):
-    """The keys of one member, ready for a network connection.
+    """The keys of one member of a session, ready for a network connection.
 
     Attributes:
-        member: Name of the member.
+        member: Name of the member, a process that takes part in the session.
         members: Names of all members of the session that the keys were created for.
-        ends: End of the keys, in UTC. The certificate is valid for `STOPPING_TIME` longer.
+        ends: Time at which the validity of the keys ends, in UTC. The certificate is valid for
+            `STOPPING_TIME` longer, so that the keys can still be used to stop arms.
         settings: Zenoh settings that use the keys, see `make_zenoh_config`.
     """
 
@@ -511,16 +512,16 @@ def read_member_keys(folder: str | Path, *, stops: bool = False) -> MemberKeys:
     'm'
 
     Args:
-        folder: Folder of one member.
+        folder: Folder of one member, a process that takes part in a session.
         stops: True if the keys are only used to stop arms. Keys whose validity has ended are
-            then accepted for a further time, as long as their certificate is valid.
+            then still accepted for `STOPPING_TIME`, until their certificate ends as well.
 
     Returns:
         The keys.
 
     Raises:
-        UsageError: A file is missing or damaged, the keys have ended, or the files do not
-            belong together.
+        UsageError: A file is missing or damaged, the validity of the keys has ended, or the
+            files do not belong together.
     """
     folder = Path(folder)
     if (folder / _AUTHORITY_FOLDER).is_dir():

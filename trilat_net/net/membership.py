@@ -261,14 +261,15 @@ class MemberQuery:
 
 
 class LateSites(NamedTuple):
-    """Rules of one site about joining a session while it runs.
+    """Settings of one site for joining a session that is already running.
 
     Attributes:
-        may_join_late: True if this site may join a running session. The caller sets it if
-            every site of the scenario waits for its peers and aligns with them.
+        may_join_late: True if this site may join a running session. The caller sets it only if
+            every site of the scenario waits for the other sites and aligns its arm with them
+            before it moves, because the arms would otherwise jump.
         not_awaited: Names of the sites that the session does not wait for at its start. Only
             the leader, the first site of the scenario, uses this field.
-        rate_hz: Tick rate of this site.
+        rate_hz: Tick rate of this site: periods of its control loop per second.
     """
 
     may_join_late: bool = False
@@ -473,8 +474,8 @@ class Membership:
             may_have_started: True if the session may have started already, see `poll`.
 
         Raises:
-            SessionError: This member cannot be part of the session, because it runs already,
-                has another scenario, or has another start of this member.
+            SessionError: This member cannot be part of the session. The session runs already,
+                has another scenario, or contains another process with the name of this member.
         """
         local = self.local_info
         is_recorder = info.member == topics.RECORDER

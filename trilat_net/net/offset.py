@@ -105,15 +105,15 @@ class OffsetEstimate(NamedTuple):
         return self.offset_ns + round((local_ns - self.local_ns) * self.drift / NS_PER_S)
 
     def widen(self, *limits: OffsetLimit | None) -> "OffsetEstimate":
-        """Returns the estimate with limits so wide that further limits do not contradict it.
+        """Extends the range of possible offsets, so that it includes further limits.
 
         Args:
-            *limits: Ceilings and floors that the true offset is known to satisfy. None is
-                ignored.
+            *limits: Upper and lower limits of the true offset, from the time stamps of
+                messages. None is ignored.
 
         Returns:
-            A new estimate. Its limits include all these limits at the times for which they
-            hold.
+            A new estimate with the same offset and drift. The range from `low_ns` to `high_ns`
+            includes the values of all given limits.
         """
         offsets = [limit.offset_ns for limit in limits if limit is not None]
         low_ns = min([self.low_ns, *offsets])
@@ -121,14 +121,15 @@ class OffsetEstimate(NamedTuple):
         return self._replace(low_ns=low_ns, high_ns=high_ns)
 
     def error_bound_ns(self, local_ns: int, offset_ns: int) -> int:
-        """Returns the largest possible error of a value that is used for the offset, in ns.
+        """Returns how far an assumed offset can be from the true offset at a time, in ns.
 
-        The true offset lies anywhere between the limits of this estimate, which become wider
-        with the distance from the time of the estimate.
+        The true offset lies between the limits of this estimate. The limits become wider with
+        the distance from the time of the estimate.
 
         Args:
-            local_ns: Time on the local clock, in ns.
-            offset_ns: Value that is used for the offset at that time, in ns.
+            local_ns: The time on the local clock, in ns.
+            offset_ns: Assumed offset at that time, the other clock minus the local clock, in
+                ns.
         """
         passed_s = (local_ns - self.local_ns) / NS_PER_S
         # Before the time of the estimate, a smaller drift gives a larger offset.
@@ -190,12 +191,17 @@ class OffsetEstimator:
         self._floors: deque[OffsetLimit] = deque(maxlen=WINDOWS_KEPT)
 
     def add(self, ceiling: OffsetLimit | None, floor: OffsetLimit | None) -> None:
-        """Adds the limits of one window.
+        """Adds the tightest limits of the offset from one window of time.
+
+        Each message in the window limits the offset between the clocks. A message from this
+        machine gives an upper limit (ceiling), and a message to this machine a lower limit
+        (floor).
 
         Args:
-            ceiling: Lowest ceiling of the window. None if the other machine acknowledged no
-                sample of this one.
-            floor: Highest floor of the window. None if no message of the other machine arrived.
+            ceiling: Lowest upper limit in the window. None if the other machine acknowledged no
+                message of this machine.
+            floor: Highest lower limit in the window. None if no message of the other machine
+                arrived.
         """
         if ceiling is not None:
             self._ceilings.append(ceiling)
@@ -285,7 +291,12 @@ class _AdmissibleLines:
         return times_s, np.array(offsets_ns, dtype=np.float64)
 
     def estimate(self) -> OffsetEstimate:
-        """Returns the middle line as the estimate, with the range of all lines as limits."""
+        """Estimates the offset from all straight lines that the time stamps permit.
+
+        A line describes the offset between the clocks over time. The most probable slope is
+        computed first. The estimated offset is in the middle of the permitted lines with that
+        slope. The limits of the estimate include all permitted lines.
+        """
         slope = min(max(self._estimate_slope(), self.flattest), self.steepest)
         # Values at present of the lines with this slope that touch the limits.
         lowest_ceiling = np.min(self._relaxed_ceilings - slope * self._ceiling_times_s)
@@ -383,15 +394,23 @@ class _SlewSegment:
         self.bound_ns = max(start_bound_ns, joined_bound_ns)
 
     def evaluate_ns(self, local_ns: int) -> int:
-        """Returns the smoothed offset at a time of the local clock, in ns."""
+        """Returns the smoothed offset, the other clock minus the local clock, at a time, in ns.
+
+        Args:
+            local_ns: The time on the local clock, in ns.
+        """
         passed_ns = local_ns - self._joined_ns
         rate = self._approach_rate if passed_ns < 0 else self._drift_per_ns
         return self._joined_offset_ns + int(passed_ns * rate)
 
     def error_bound_ns(self, local_ns: int) -> int:
-        """Returns the largest possible error of `evaluate_ns` at the same time, in ns.
+        """Returns the largest possible error of the smoothed offset at a time, in ns.
 
-        On the line towards the estimate, this is the bound for the whole line.
+        While the offset still approaches the estimate, this is `bound_ns`, the largest error in
+        that phase. Afterwards, it is the error that the estimate permits.
+
+        Args:
+            local_ns: The time on the local clock, in ns.
         """
         if self.start_ns <= local_ns <= self._joined_ns:
             return self.bound_ns
@@ -405,8 +424,8 @@ class SlewedOffset:
     differs from the previous one by a small step, which would appear as a step of all delays.
     The smoothed offset instead approaches each estimate along a straight line.
 
-    Two segments are stored, that of the latest estimate and the one before. The offset is
-    therefore defined from the start of the segment before on.
+    Two segments are stored: for the latest estimate, and for the estimate before. The offset is
+    therefore defined only from the start of the earlier segment on.
 
     Args:
         estimate: First estimate. The smoothed offset equals it from the beginning.
@@ -424,18 +443,21 @@ class SlewedOffset:
 
     @property
     def bound_ns(self) -> int:
-        """Largest error of the smoothed offset until it has reached the estimate, in ns.
+        """Largest error of the smoothed offset while it approaches the latest estimate, in ns.
 
-        Afterwards the possible error grows with the age of the estimate, see `error_bound_ns`.
+        Afterwards, the possible error grows with the age of the estimate. `error_bound_ns`
+        returns the error bound at any time.
         """
         return self._segment.bound_ns
 
     def slew_to(self, local_ns: int, estimate: OffsetEstimate) -> None:
-        """Makes the smoothed offset approach a new estimate from a given time on.
+        """Lets the offset approach a new estimate gradually, instead of jumping to it.
+
+        The offset reaches the estimate after the time SLEW_NS, and then follows its drift.
 
         Args:
-            local_ns: Time on the local clock from which on it approaches the estimate, in ns.
-            estimate: The estimate.
+            local_ns: Time on the local clock at which the approach begins, in ns.
+            estimate: The new estimate.
         """
         segment = _SlewSegment(local_ns, self.evaluate_ns(local_ns), estimate)
         self._previous_segment = self._segment
@@ -445,9 +467,8 @@ class SlewedOffset:
         """Returns the smoothed offset between the two clocks at a time.
 
         Args:
-            local_ns: Time on the local clock, in ns. It must not be earlier than the start of
-                the stored segments, which is the start of the approach to the last estimate
-                but one.
+            local_ns: The time on the local clock, in ns. It must not be earlier than the time
+                at which the offset began to approach the estimate before the latest one.
 
         Returns:
             The other clock minus the local clock, in ns.
@@ -455,14 +476,11 @@ class SlewedOffset:
         return self._select_segment(local_ns).evaluate_ns(local_ns)
 
     def error_bound_ns(self, local_ns: int) -> int:
-        """Returns the largest possible error of the smoothed offset at a time.
+        """Returns how far the smoothed offset can be from the true offset at a time, in ns.
 
         Args:
-            local_ns: Time on the local clock, in ns, with the same condition as for
-                `evaluate_ns`.
-
-        Returns:
-            The largest possible difference between `evaluate_ns` and the true offset, in ns.
+            local_ns: The time on the local clock, in ns. It must be a time that `evaluate_ns`
+                accepts.
         """
         return self._select_segment(local_ns).error_bound_ns(local_ns)
 

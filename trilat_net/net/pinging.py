@@ -114,7 +114,7 @@ def answer_pings(
     """
 
     def answer(_: bytes) -> bytes:
-        """Returns the reply to a ping, whose payload is empty."""
+        """Returns the reply to a ping: the times at which the ping came and the reply left."""
         received_ns = clock.monotonic_ns()
         sent_ns = clock.monotonic_ns()
         pong = Pong(
@@ -168,21 +168,21 @@ def answer_backfill(
 
 
 class RoundTrips:
-    """Collects the round trips of pings to one member, and estimates its clock offset.
+    """Estimates the clock offset of one member from round trips: pings and their replies.
 
-    `Pinger` creates one object for each start of a member.
+    A member is a process that takes part in a session. It replies to a ping at once, with the
+    readings of its clock. `Pinger` creates one object of this class for each start of a member.
 
     Args:
-        required: Number of round trips after which the offset of the clock counts as known, if
-            they do not contradict each other.
+        required: Number of round trips after which the clock offset counts as known. The count
+            starts again when round trips contradict each other.
 
     Attributes:
         rtts_ns: The latest round trip times in ns, without the time that the member took to
             reply.
         shortest_ns: The shortest round trip time in ns. 0 before the first round trip.
-        estimator: Estimator of the offset of the member's clock, which stores the limits from
-            all round trips.
-        latest: Latest estimate of that offset. None before the first estimate.
+        estimator: Estimator of the clock offset, with the limits from all round trips so far.
+        latest: Latest estimate of the clock offset. None before the first estimate.
     """
 
     def __init__(self, required: int) -> None:
@@ -234,7 +234,7 @@ class RoundTrips:
         drift_per_ns = self.latest.drift / NS_PER_S if self.latest else 0.0
 
         def extrapolate_limit(limit: OffsetLimit) -> float:
-            """Returns the limit at the present time, in ns."""
+            """Returns the value of a limit of the clock offset at the present time, in ns."""
             return limit.offset_ns - drift_per_ns * (limit.local_ns - now_ns)
 
         ceilings, floors = zip(*self._window, strict=True)
@@ -281,11 +281,14 @@ class Pinger:
         self._reply_expected_until_ns = 0
 
     def poll(self, boots: Collection[int]) -> None:
-        """Sends a ping if it is due, and evaluates the replies that have arrived.
+        """Sends a ping to the other members if it is due, and evaluates the replies to pings.
+
+        A ping is a query to which a member replies with the readings of its clock. The method
+        does not wait for replies.
 
         Args:
-            boots: Boots of the members whose replies are accepted. A boot is a number that
-                identifies one start of a process.
+            boots: Members whose replies are evaluated, given by their boots. A boot is a number
+                that identifies one start of a process. If there are none, no ping is sent.
         """
         period_ns = PING_REST_NS if self.knows_clocks(boots) else PING_PACE_NS
         if boots and self._query.repeat(period_ns):
@@ -328,12 +331,15 @@ class Pinger:
         return trips.latest
 
     def estimator(self, boot: int) -> OffsetEstimator | None:
-        """Returns the estimator of a member's clock offset, with all limits from pings.
+        """Returns the object that estimates the clock offset of a member.
 
-        The result is None if the member has not replied to any ping.
+        It contains the limits of the offset from all pings to this member so far.
 
         Args:
             boot: Boot of the member, the number that identifies the start of its process.
+
+        Returns:
+            The estimator. None if the member has not replied to any ping.
         """
         trips = self.trips.get(boot)
         return None if trips is None else trips.estimator

@@ -250,11 +250,11 @@ class PeerSeen(Request, frozen=True, kw_only=True):
 
 
 class HandViewMessage(Request, frozen=True, kw_only=True):
-    """State of a site in one period of its control loop, for an operator in another process.
+    """State of a site in one control period, for the program that acts as its operator.
 
-    The fields other than `site` and `boot` are those of `HandView`, which the program receives.
-
-    The operator is a program of the user that decides how the arm of the site moves.
+    The operator program of the user runs in another process, and decides how the arm of the
+    site moves. It receives the fields except `site` and `boot` as a `HandView`, which explains
+    them. A site is a process that runs one arm.
 
     Attributes:
         site: Name of the site whose arm the operator moves.

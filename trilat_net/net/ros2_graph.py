@@ -174,12 +174,14 @@ def find_type_hash(kind: str, distro: str) -> str:
 
 
 def name_dds_type(kind: str) -> str:
-    """Returns the name of a message type as it is written in keys and tokens.
+    """Returns the name of a ROS message type in the notation of DDS.
 
-    For "std_msgs/msg/String" it is "std_msgs::msg::dds_::String_".
+    Over Zenoh, ROS uses this notation in the keys of messages, and in the tokens that announce
+    publishers and subscriptions. For "std_msgs/msg/String" it is
+    "std_msgs::msg::dds_::String_".
 
     Args:
-        kind: Name of the type.
+        kind: Name of the message type in ROS.
     """
     package, group, name = kind.split("/")
     return f"{package}::{group}::dds_::{name}_"
@@ -342,15 +344,20 @@ class Refusals:
             self._report(f"refused: {reason}")
 
     def guard(self, topic: str, act: Callable[P, None]) -> Callable[P, None]:
-        """Returns a function like `act` that counts errors as refusals instead of raising them.
+        """Wraps a function that processes messages, so that its errors count as refusals.
 
         Args:
-            topic: Name of the topic, which the reason mentions.
-            act: Function that processes a message. It raises an error to refuse the message.
+            topic: Name of the topic of the messages, with which each reason for a refusal
+                begins.
+            act: Function that processes a message. It raises ValueError or TrilatError to
+                refuse the message.
+
+        Returns:
+            A function with the same arguments, which does not raise these errors.
         """
 
         def guarded(*args: P.args, **named: P.kwargs) -> None:
-            """Calls `act`, and counts a refusal if it raises an error."""
+            """Calls `act`. If it raises an error, counts the message as refused."""
             try:
                 act(*args, **named)
             except (ValueError, TrilatError) as error:
@@ -550,7 +557,7 @@ class Ros2Graph:
         """
 
         def check_publisher(token: zenoh.Sample) -> None:
-            """Reports a publisher whose token has appeared, if it does not match."""
+            """Reports a publisher that has appeared, if its messages cannot be received."""
             has_appeared = token.kind == zenoh.SampleKind.PUT
             mismatch = describe_mismatch(str(token.key_expr), self._node.domain, kind)
             if has_appeared and mismatch:
@@ -563,9 +570,9 @@ class Ros2Graph:
         )
 
     def tap(self, topic: str, receive: Callable[[str, Attachment], None]) -> None:
-        """Receives the messages of a topic of any type, without announcing a subscription.
+        """Receives the messages of a topic, of any type, without being listed as a subscriber.
 
-        ROS tools do not list such a subscription.
+        The subscription is not announced to ROS, so that ROS tools do not show it.
 
         Args:
             topic: Name of the topic.
@@ -591,7 +598,7 @@ class Ros2Graph:
         """
 
         def receive_sample(sample: zenoh.Sample) -> None:
-            """Passes on a message of a ROS program, and counts other messages as refused."""
+            """Passes a message of a ROS program to `receive`. Refuses any other message."""
             attachment = parse_attachment(sample.attachment)
             if attachment is None:
                 self.refusals.add(f"{topic}: a message without an attachment of ROS")
@@ -616,7 +623,7 @@ class Ros2Graph:
         key, _ = self._declare(EndpointKind.SERVER, service, kind, QualityOfService())
 
         def reply(query: zenoh.Query) -> None:
-            """Computes the response to one request, and sends it."""
+            """Computes the response to a request of a ROS program, and sends the response."""
             # A query ends for its sender only when the query object is dropped.
             with query:
                 request = parse_attachment(query.attachment)

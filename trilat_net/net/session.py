@@ -1,18 +1,20 @@
-"""Starts a session: its members find each other and agree on the epoch, the time of tick 0.
+"""Starts a session: its members find each other and agree on a common start time.
 
 A member is a process that takes part in the session: a site, which runs one arm and its control
-loop, or a recorder. The first site of the scenario is the leader. A normal start has three
-steps, each of which is an event that a member publishes:
+loop, or a recorder. A tick is one period of the control loop. The first site of the scenario is
+the leader. A normal start has three steps, each of which is an event that a member publishes:
 
-1. `epoch`: Once all members are known, the leader proposes an epoch about half a second ahead,
-   with the list of the members.
+1. `epoch`: Once all members are known, the leader proposes an epoch, the time of tick 0, about
+   half a second ahead. The event also lists the members.
 2. `ready`: Each member agrees.
 3. `start`: If all members have agreed in time, the leader confirms the epoch. Otherwise it
    proposes another one.
 
-A session may also be joined while it runs. A recorder reads the epoch from the running sites. A
-site publishes `coming` with its first tick, and joins if every running site replies with
-`admit` before that tick. The running sites do so once the previous start of the site is gone.
+A member may also join a session that is already running. A recorder only reads the epoch from
+the running sites. A site first asks for permission: it publishes the event `coming`, which
+states its first tick. It joins if every running site replies with the event `admit` before that
+tick. If an earlier process of the same site exists, the running sites wait until it has
+disappeared.
 
 The epoch is a time on the leader's monotonic clock. A member on another machine converts it to
 its own clock. It measures the offset between the clocks by pings, with an error of at most half
@@ -152,9 +154,10 @@ class SessionJoin:
     def poll(self) -> Epoch | None:
         """Receives messages, replies to them, and takes the next step towards the start.
 
-        A running session is joined if the rules permit it. Otherwise the leader, the first site
-        of the scenario, proposes and confirms an epoch (the common start time), and the other
-        members wait for the events in which it does so.
+        If the session runs already and this member may join late, it joins the session.
+        Otherwise the leader, the first site of the scenario, proposes and confirms the epoch,
+        the common start time. The other members agree to the proposal, and wait for the
+        confirmation.
 
         Returns:
             The epoch once it is fixed. None until then.
@@ -259,7 +262,7 @@ class SessionJoin:
         indices = {name: index for index, name in enumerate(self._sites)}
 
         def rank(info: Info) -> tuple[bool, int]:
-            """Returns the sort key: first sites on this machine, then by index."""
+            """Returns the sort key: sites on this machine first, then the scenario's order."""
             return info.clock != local_clock, indices.get(info.member, -1)
 
         for info in sorted(running, key=rank):

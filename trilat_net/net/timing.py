@@ -1,21 +1,22 @@
-"""Keeps the time of a running site: when ticks are due, and how far peers' clocks are off.
+"""Schedules the ticks of a running site, and measures the clocks of other sites.
 
 A site is a process that controls one arm. It executes one tick per period of its control loop.
-Tick k is due k * 10^9 // rate_hz ns after the epoch, the common start time of the session.
-Sites on one machine wake up one after another within the period (`find_turn_ns`).
+Tick k is due k * 10^9 // rate_hz ns after the epoch, the common start time of the session. If
+several sites run on one machine, they wake up at different times in the period, so that they do
+not compete for the processors (`find_turn_ns`).
 
-Each site measures the link from each of its peers, with four time stamps:
+The peers of a site are the other sites whose samples it receives. A sample is the state that a
+site publishes in each tick. The site measures the connection from each peer with four times:
 
     t1: this site sends a sample           (this site's clock)
     t2: the peer receives that sample      (the peer's clock)
     t3: the peer sends a sample of its own (the peer's clock)
     t4: this site receives that sample     (this site's clock)
 
-A sample is the state that a site publishes in each tick. It carries t3 as its sending time, and
-t2 as an "echo": the confirmation that a sample of the other site has arrived, with the time of
-its arrival. No message can arrive before it was sent. Therefore the offset of the peer's clock
-(peer minus local) is at most t2 - t1 and at least t3 - t4. `offset` computes an estimate from
-the tightest of these limits.
+The sample of the peer contains t3, its own sending time. It also contains t2, as the
+confirmation (echo) that the sample of this site has arrived. No message can arrive before it
+was sent. Therefore the offset of the peer's clock (peer minus local) is at most t2 - t1 and at
+least t3 - t4. `offset` computes an estimate from the tightest of these limits.
 
 Invariant:
     - Ticks are due on the leader's clock, to the nanosecond (law L1 of docs/design.md). The
@@ -217,9 +218,9 @@ class LinkTimingMonitor:
         self.admit(peer)
 
     def admit(self, peer: PeerClock) -> None:
-        """Discards all measurements because the peer has been restarted.
+        """Restarts the measurements, after the peer (the site that sends) was restarted.
 
-        The new process of the peer may run on another machine, and therefore on another clock.
+        The new process may run on another machine, and therefore on another clock.
 
         Args:
             peer: Clock of the new process.
@@ -336,20 +337,21 @@ class LinkTimingMonitor:
         return unconfirmed_ns <= UNHEARD_NS
 
     def close_window(self, now_ns: int, slew_ns: int) -> OffsetEstimate | None:
-        """Estimates the clock offset from the present window of time stamps, once it is full.
+        """Estimates the clock offset from the present window of time, once it is long enough.
 
-        The offset with which delays are computed is not replaced at once: it approaches the new
-        estimate gradually. Another window starts. If the window contradicts earlier windows, a
-        clock has stepped, and the estimation starts again with wide bounds and short windows.
+        Afterwards the next window begins. The offset with which delays are computed approaches
+        the new estimate gradually. If the window contradicts earlier windows, a clock has
+        stepped, and the event is counted as a fault. If no estimate is possible, the bounds of
+        the offset are widened, and the next windows are short.
 
         Args:
             now_ns: Present time on the local clock, in ns.
-            slew_ns: Time from which on the offset approaches the estimate, on the local clock,
-                in ns.
+            slew_ns: Time on the local clock at which the offset begins to approach the
+                estimate, in ns.
 
         Returns:
-            The new estimate. None if the window is not long enough yet. Also None if the peer
-            runs on this machine, where both sites use the same clock.
+            The new estimate. None if the window is not long enough yet. Also None if the peer,
+            the site that sends, runs on this machine, where both sites use the same clock.
         """
         estimator = self.peer.estimator
         if estimator is None:
@@ -666,14 +668,16 @@ class SiteTiming:
         return notices
 
     def pop_measurements(self, now_ns: int) -> dict[str, Any]:
-        """Returns the state of the schedule, and the delays measured since the last call.
+        """Returns the timing statistics of the site, and discards the measured delays.
 
         Args:
             now_ns: Present time on the local clock, in ns.
 
         Returns:
-            The timing fields of `LinkStats`: the error and the rate of the schedule, and for
-            each measured quantity of the links a dictionary by the name of the peer.
+            The timing fields of `LinkStats`. The first fields are the lateness of this site
+            compared with the leader's schedule of ticks, and the correction of its own rate.
+            Each other field is a dictionary of a measured quantity, by the name of the site at
+            the other end of the link.
         """
         stats: dict[str, Any] = {
             "grid_error_us": self.schedule.error_ns // 1000,

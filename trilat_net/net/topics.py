@@ -117,13 +117,17 @@ def key(session: str, member: str, channel: str) -> str:
 
 
 def parse_key(key: str) -> KeyParts | None:
-    """Splits a key into the names of the session, the member and the channel, and the boot.
+    """Splits a key, the name under which a message is published, into its parts.
+
+    A liveliness token is a key by which a process shows that it is present. It also contains
+    the boot, a number that identifies one start of the process.
 
     Args:
-        key: The key under which a message has arrived, or that of a liveliness token.
+        key: The key of a message or of a liveliness token.
 
     Returns:
-        The parts. None if the key belongs to another program.
+        The names of the session, the member and the channel, and the boot of a token. None if
+        the key belongs to another program.
     """
     root, _, rest = key.partition("/")
     parts = rest.split("/")
@@ -159,12 +163,15 @@ def number_message(channel: str, tick: int, rate_hz: int) -> int:
 
 
 def count_messages(channel: str, ticks: int, rate_hz: int) -> int:
-    """Returns how many records, or statistics, a site publishes in its first ticks.
+    """Returns how many messages of a channel a site publishes in its first `ticks` ticks.
+
+    A tick is one period of the control loop. A site publishes a record in each tick, and
+    statistics ten times a second.
 
     Args:
-        channel: `STATE` for records, or `LINK` for statistics.
-        ticks: Number of ticks, periods of the control loop.
-        rate_hz: Tick rate of the site.
+        channel: `STATE` for the records, or `LINK` for the statistics.
+        ticks: Number of ticks, from tick 0 on.
+        rate_hz: Tick rate of the site: periods of its control loop per second.
     """
     if channel != LINK:
         return ticks
@@ -178,8 +185,9 @@ def count_under_way(channel: str, rate_hz: int) -> int:
     These are the messages of the last 20 ms, which may not have left the machine yet.
 
     Args:
-        channel: `STATE` for records, or `LINK` for statistics.
-        rate_hz: Tick rate of the site.
+        channel: `STATE` for the records, of which a site publishes one in each tick. `LINK` for
+            its statistics, which it publishes ten times a second.
+        rate_hz: Tick rate of the site: periods of its control loop per second.
     """
     ticks_in_20_ms = rate_hz // 50
     return 1 if channel == LINK else ticks_in_20_ms

@@ -413,7 +413,7 @@ def make_reader(
     decoder = make_decoder(kind, layout=layout)
 
     def read(payload: bytes) -> Any | WireError:
-        """Returns the message in a payload, or the error."""
+        """Returns the decoded message, or a `WireError` if the payload is not valid."""
         try:
             return decoder(payload)
         except WireError as error:

@@ -124,7 +124,11 @@ def _make_sample_handler(receive: Callable[[Any], None]) -> Any:
     thread_locals = threading.local()
 
     def handle(sample: Any) -> None:
-        """Passes a message on, and keeps the data structure of the thread."""
+        """Calls `receive` with a message, and makes further calls in this thread cheaper.
+
+        In its first call in a thread, it enters the interpreter once more without leaving it.
+        CPython then keeps its data structure for the thread.
+        """
         receive(sample)
         is_first_call_in_thread = not hasattr(thread_locals, "kept_state")
         if is_first_call_in_thread:
@@ -335,7 +339,7 @@ class ZenohBus:
         """
 
         def answer_at_once(query: zenoh.Query) -> None:
-            """Replies to a query, if there is a reply."""
+            """Calls `answer` with a query, and sends the result as reply unless it is None."""
             # A query ends for its sender only when the query object is dropped.
             with query:
                 payload = answer(_ZenohQuery(query, key).payload)
@@ -391,7 +395,12 @@ class ZenohBus:
         """
 
         def read(sample: zenoh.Sample) -> tuple[str, bool] | None:
-            """Returns a token's key and whether it has appeared. None for own tokens."""
+            """Reads whether a liveliness token has appeared or disappeared.
+
+            Returns:
+                The key of the token, and True if it has appeared. None for a token of this
+                connection.
+            """
             token = str(sample.key_expr)
             # Liveliness has no locality setting: tokens of this session arrive, too.
             if token in self._tokens:

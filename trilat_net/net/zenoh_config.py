@@ -195,7 +195,10 @@ def _require_value(required: object, text: str) -> _Requirement:
     """
 
     def is_required_value(value: Any) -> bool:
-        """Returns True for the required value. The type matters, as 0 == False in Python."""
+        """Returns True if a setting has the required value and the type of this value.
+
+        The type matters, because 0 == False in Python.
+        """
         return value == required and isinstance(value, type(required))
 
     return is_required_value, text
@@ -224,7 +227,10 @@ def _require_session_value(session_values: Mapping[str, Any]) -> _Requirement:
     """
 
     def equals_session_value(mode: str, value: Any) -> bool:
-        """Returns True if a session sets this value, of the same type, in a mode."""
+        """Returns True if the session uses the same value in a mode, with the same type.
+
+        The result is False for a mode in which the session sets no value.
+        """
         if mode not in session_values:
             return False
         session_value = session_values[mode]
@@ -232,7 +238,10 @@ def _require_session_value(session_values: Mapping[str, Any]) -> _Requirement:
         return is_equal and type(value) is type(session_value)
 
     def are_session_values(values: Any) -> bool:
-        """Returns True if a session sets the values of all modes in a dictionary."""
+        """Returns True if a dictionary of values by mode agrees with the values of the session.
+
+        A mode is "peer", "client" or "router".
+        """
         if not isinstance(values, dict):
             return False
         return all(equals_session_value(mode, value) for mode, value in values.items())
@@ -674,7 +683,15 @@ def _derive_rules(member: str, role: _Role) -> Iterator[dict[str, Any]]:
     """
 
     def keys(owner: str, channels: Sequence[str]) -> list[str]:
-        """Returns the keys of a member's channels in any session; "*" is any member."""
+        """Returns the keys under which a member publishes messages, for some of its channels.
+
+        A member is a process that takes part in a session, and a channel is a kind of message.
+        The keys apply to any session.
+
+        Args:
+            owner: Name of the member. "*" stands for any member.
+            channels: Names of the channels.
+        """
         return [topics.key("*", owner, channel) for channel in channels]
 
     published = keys(member, role.publishes) + keys("*", role.publishes_to)
