@@ -91,7 +91,7 @@ class TrialResult(NamedTuple):
 
     @property
     def held(self) -> bool:
-        """True if the run has a result and met all expectations."""
+        """True if the run was completed and met all expectations of its scenario."""
         return not self.error and all(outcome.held for outcome in self.outcomes)
 
     @property
@@ -131,14 +131,14 @@ class Trial(NamedTuple):
 
     @property
     def again(self) -> str:
-        """The command that repeats the trial, for the user to copy."""
+        """Shell command that repeats this trial, for the user to copy."""
         live = ["--live"] if self.live else []
         seeds = ["--seeds", str(self.scenario.seed)]
         return format_command("test", self.source, *live, *seeds, *set_options(self.overrides))
 
     @property
     def look(self) -> str:
-        """The command that simulates the same run and records its log, for inspection."""
+        """Shell command that simulates this trial and records its log, for inspection."""
         arguments = ["--seed", str(self.scenario.seed), "-o", f"{self}.mcap"]
         return format_command("sim", self.source, *arguments, *set_options(self.overrides))
 
@@ -359,9 +359,10 @@ class ExpectationRow(NamedTuple):
     mean: MeanInterval | None = None
 
     def cells(self) -> tuple[str, ...]:
-        """Returns the texts of the row in the printed table.
+        """Returns the texts of this expectation's row in the printed table.
 
-        There is one text for each of `TRIAL_COLUMNS`.
+        There is one text for each of `TRIAL_COLUMNS`, such as the limit, the worst measured
+        value, and the number of runs that met the expectation.
         """
         mark = "ok" if self.held == self.runs else "FAIL"
         worst = self.worst
@@ -451,10 +452,10 @@ class TrialReport(Result):
         return lines
 
     def remarks(self) -> list[str]:
-        """Returns lines that help to interpret the results.
+        """Returns lines that help to interpret the results of the trials.
 
-        They name the overrides, the scenarios that ran once because nothing in them is random,
-        and the duration and speed of all runs.
+        The lines name the scenario keys that were changed for all trials, the scenarios that
+        ran only once because nothing in them is random, and the duration and speed of all runs.
         """
         remarks = []
         overrides = self.results[0].trial.overrides if self.results else ()
@@ -493,7 +494,11 @@ class TrialReport(Result):
         return TextTable((*TRIAL_COLUMNS, "mean, 95 %"), cells, align="lllllrrr").lines()
 
     def blocks(self) -> Iterator[Block]:
-        """Yields the parts of the printed text: the table, the failures and the remarks."""
+        """Yields the parts of the text that `trilat test` prints.
+
+        The parts are a table of the expectations and how well the runs met them, the failures,
+        and remarks such as the duration of all runs.
+        """
         header, *lines = self.table()
         yield header
         for line in lines:
@@ -555,13 +560,19 @@ def run_trials(
 ) -> TrialReport:
     """Runs trials in virtual time and collects their results.
 
-    A single trial, or a single job, runs in this process.
+    A trial is a run of a scenario with one random seed, whose result is compared with the
+    expectations of the scenario. If there is a single trial, or `jobs` is 1, no worker process
+    is started.
 
     Args:
         batch: The trials.
         jobs: Number of worker processes. None uses all cores.
         done: Function that is called with each result as it arrives.
-        on: Workers to use instead of processes of this machine, as for `check`.
+        on: Address of a Dask scheduler, or an executor, whose workers run the trials. None uses
+            processes of this machine.
+
+    Returns:
+        The results, in the order of the trials.
     """
     clock = SystemClock()
     start_ns = clock.monotonic_ns()

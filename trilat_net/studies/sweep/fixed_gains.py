@@ -1,10 +1,12 @@
-"""Describes the gains of control laws that a sweep did not vary.
+"""Lists the gains of control laws that stay the same in all runs of a parameter sweep.
 
-A stability map also depends on the gains that are the same in all of its cells. Therefore the
-page of the map names them.
+A sweep runs a scenario with many combinations of parameters. Its result is often shown as a
+stability map, which marks the combinations with which the arms are stable. These results also
+depend on the gains that the sweep did not vary, so reports and figures of a sweep state them.
 
 Invariant:
-    - A gain is named unless an axis of the sweep changes it at every site.
+    - A gain is named unless an axis of the sweep changes it at every site, which is the process
+      that runs one arm.
 """
 
 from collections.abc import Iterator

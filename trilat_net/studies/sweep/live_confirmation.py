@@ -50,16 +50,17 @@ GridIndex = tuple[Any, ...]
 
 
 class ConfirmedCell(NamedTuple):
-    """A cell of a sweep that was run again over a real network, with both results.
+    """A combination of parameters that was simulated, and then run over a real network.
 
-    The comparison shows whether the results in virtual time also hold for a live session.
+    The combination is part of a sweep over parameters. The comparison shows whether the
+    stability in the simulation also holds over a real network.
 
     Attributes:
-        row: Run of the cell in the results of the sweep.
-        virtual: Class in virtual time.
-        live: Class of the log of the live session. None if the session failed.
-        text: Numbers from the log, or the problems of the session.
-        log: Path of the log. None if the session left no log.
+        row: The simulated run in the results of the sweep.
+        virtual: How the simulated run ended, for example converged or diverged.
+        live: How the run over the network ended. None if this run failed.
+        text: Numbers from the log of the run over the network, or its problems.
+        log: Path of this log. None if there is no log.
     """
 
     row: ResultRow
@@ -70,7 +71,10 @@ class ConfirmedCell(NamedTuple):
 
     @property
     def same(self) -> bool:
-        """True if the classes of virtual time and of the live session agree."""
+        """True if the simulated run and the run over the network ended in the same way.
+
+        For example, both converged.
+        """
         return self.virtual is self.live
 
 

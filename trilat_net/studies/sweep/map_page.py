@@ -1,17 +1,22 @@
 """Draws a stability map and writes its page: map.png, map.svg, map.pdf and map.md.
 
 A stability map shows for which parameters a scenario is stable. The figure has a coloured cell
-per grid point of two parameters, and lines from theory on top. With one seed the colour is the
-class of the run. With several seeds it is the fraction of the decided runs that are stable. If
-the sweep measured growth exponents, the rates at which small disturbances grow, the colour is
-the exponent, and white stands for zero.
+for each combination of two parameters. Limits of stability from theory are drawn as lines. The
+colour of a cell depends on the runs of the sweep:
+
+- With one run per cell, the colour shows how the run ended, for example converged or diverged.
+- With several random seeds per cell, it shows the fraction of runs that are stable. Undecided
+  runs are left out.
+- If growth exponents were measured, which are the rates at which small disturbances grow, it
+  shows the exponent. White stands for zero.
 
 Invariant:
     - The page contains only results, lines and commands. Equal results give equal bytes.
     - The colour of a cell depends on its own results alone.
     - A cell is hatched if half or more of its runs are undecided, or if it should have an
       exponent and has none.
-    - Cells stay pixels in vector output, because viewers show seams between touching shapes.
+    - Vector files contain the cells as an image, because viewers show seams between adjacent
+      shapes.
     - The colours of the classes differ in lightness, for grey print and colour-blind readers.
 """
 
@@ -121,13 +126,17 @@ def draw_stability_map(
     form: FigureSize,
     fixed: Sequence[str] = (),
 ) -> Figure:
-    """Draws the figure of a stability map.
+    """Draws a stability map, which shows with which parameters a scenario is stable.
+
+    The map is a coloured grid. A sweep with more than two parameters has several panels, each
+    with the same two axes.
 
     Args:
-        plane: Measured part of the map.
-        lines: Lines of each panel, in the order of the panels.
+        plane: Axes of the map, and the results of the runs in each panel.
+        lines: For each panel, the lines that separate stable from unstable parameters, such as
+            limits from theory.
         form: Width, type sizes and resolution of the figure.
-        fixed: Gains that were not swept, one text per control law, for the caption.
+        fixed: Gains that all runs have in common, one text per control law, for the caption.
     """
     count = len(plane.panels)
     columns = _count_columns(count, form)
@@ -603,16 +612,19 @@ _DPI = 300
 def write_map(chart: StabilityMap, folder: Path, width_in: float = COLUMN_IN) -> list[Path]:
     """Writes the figure and the Markdown page of a stability map into an existing folder.
 
+    A stability map shows with which parameters a scenario is stable.
+
     Args:
-        chart: The map.
+        chart: The results of the runs, the lines from theory, and the texts of the map.
         folder: The folder.
         width_in: Width of the figure, in inches.
 
     Returns:
-        The paths of the files.
+        The paths of the three picture files and of the page.
 
     Raises:
-        UsageError: The width is not that of one or two columns of a printed page.
+        UsageError: A figure in print cannot have this width. It must be as wide as one or two
+            columns of a page.
     """
     form = make_print_size(width_in)
     figure = draw_stability_map(chart.plane, chart.lines, form, chart.fixed)
@@ -665,10 +677,10 @@ def _list_notes(chart: StabilityMap) -> list[str]:
 
 
 def tabulate_classes(plane: MapPlane) -> TextTable:
-    """Returns a table with the number of runs of each class, such as stable or diverged.
+    """Returns a table of how many runs of a stability map ended stable, diverged, and so on.
 
     Args:
-        plane: The measured part of the map. Each of its panels has a row.
+        plane: Axes of the map, and the results of the runs in each panel. Each panel has a row.
     """
     rows = []
     for panel in plane.panels:

@@ -58,17 +58,16 @@ False if it is not stable, and None if it is undecided.
 
 
 class KeyMargin(NamedTuple):
-    """The edges of stability along one key: where its values change to not stable or back.
+    """Limits of stability along one scenario key, found by running selected values of the key.
 
-    `search_key_margin` creates this object from runs at selected values of the key.
+    An edge is where neighbouring values change from stable to not stable or back.
 
     Attributes:
-        spans: The edges in rising order. There are several if stable values lie between values
-            that are not stable, or the other way round.
-        stable: If there are no edges, True if all decided values are stable, and False if all
-            are not stable. None if there are edges, or if no value was decided.
-        undecided: Number of values whose runs show neither that they are stable nor that they
-            are not.
+        spans: The edges in rising order. There may be several, for example if stability is lost
+            at one value and regained at a larger value.
+        stable: If there are no edges, True if all decided values are stable, and False if none
+            is stable. None if there are edges, or if no value was decided.
+        undecided: Number of values at which it remained open whether the run is stable.
         runs: Number of values that were run.
     """
 
@@ -86,22 +85,32 @@ def search_key_margin(
     *,
     whole: bool = False,
 ) -> KeyMargin:
-    """Searches the edges of stability between two values of a key.
+    """Searches the limits of stability between two values of a scenario key.
+
+    The function runs a number of evenly spaced values, and then narrows each interval in which
+    stability changes by bisection.
 
     Args:
-        stable: Function that runs and classifies one value. Each value is run once.
+        stable: Function that runs the scenario at a value of the key. It returns True if the
+            run is stable, False if it is not stable, and None if it is undecided.
         low: Lower end of the range.
         high: Upper end of the range.
-        tolerance: Largest width of an edge, as a fraction of its value.
-        whole: True if only whole numbers can be run.
+        tolerance: Width of an interval, as a fraction of the value, at which the bisection
+            stops.
+        whole: True if the key accepts only whole numbers.
 
     Returns:
-        The edges. If there are none, the result states whether all values are stable.
+        The intervals that contain the limits. If there are none, the result states whether all
+        values are stable.
     """
     results: dict[float, bool | None] = {}
 
     def classify(value: float) -> bool | None:
-        """Returns the result at a value, which is run only the first time."""
+        """Returns whether the scenario is stable at a value of the searched key.
+
+        The scenario is run only if the value has not been run before. None means that the run
+        is undecided.
+        """
         if value not in results:
             results[value] = stable(value)
         return results[value]
@@ -200,15 +209,15 @@ class SearchRange(NamedTuple):
 
 
 class MarginItem(NamedTuple):
-    """The search at one grid point of a sweep, as an item for a worker process.
+    """Task for a worker process: find the limits of stability at one grid point of a sweep.
 
     The object can be pickled.
 
     Attributes:
         plan: The sweep: its scenario, axes, control laws and seeds.
-        cell: The grid point.
+        cell: The grid point, a combination of the values of the other swept parameters.
         seed: Seed of the runs.
-        range: Key and range of the search.
+        range: Scenario key along which the limits are searched, and its range.
     """
 
     plan: SweepPlan
@@ -222,17 +231,20 @@ class MarginItem(NamedTuple):
 
 
 class GridPointMargin(NamedTuple):
-    """The edges of stability at one grid point of a sweep, from runs and from theory.
+    """Limits of stability along one scenario key, at one grid point of a sweep.
 
-    An edge is a value of the searched key at which runs change between stable and not stable.
+    A grid point is a combination of the other swept parameters. A limit is a value of the key
+    at which the arms change from stable to not stable or back.
 
     Attributes:
-        cell: The grid point, with its values along the axes of the sweep.
+        cell: The grid point.
         seed: Seed of its runs.
-        margin: The edges from runs.
-        linear: The edges of the linear analysis within the range, in rising order.
+        margin: The limits that were found by runs.
+        linear: The limits within the range at which the linearised loop becomes unstable, in
+            rising order.
         remark: Remark on the linear analysis. Empty if there is none.
-        closed: The edge of the closed-form criterion within the range, or None.
+        closed: The limit within the range according to a stability criterion in closed form.
+            None if no criterion applies, or if its limit lies outside.
     """
 
     cell: SweepCell
@@ -273,12 +285,15 @@ def parse_search_range(text: str, tolerance: float = MARGIN_TOLERANCE) -> Search
 
 
 def format_range_axis(search_range: SearchRange) -> str:
-    """Returns the text of a sweep axis that consists of the two ends of a range.
+    """Returns the text of a sweep axis with two values: the ends of the searched range.
 
-    If a sweep is planned with this axis, the scenario is checked at both ends.
+    If a sweep is planned with this axis, the scenario is checked at both ends before any run.
 
     Args:
-        search_range: Key and range of a search.
+        search_range: Scenario key along which limits of stability are searched, and its range.
+
+    Returns:
+        The text, as in "control.d=1,20".
     """
     low = format_override_value(search_range.low)
     high = format_override_value(search_range.high)
@@ -292,17 +307,22 @@ def search_margins(
     progress: Progress = ignore_progress,
     on: Workers = None,
 ) -> list[GridPointMargin]:
-    """Searches the edges of stability at each grid point of a sweep, for each seed.
+    """Searches the limits of stability along one scenario key, at each grid point of a sweep.
+
+    A grid point is a combination of the other swept parameters. A limit, called edge, is a
+    value of the key at which runs change from stable to not stable or back.
 
     Args:
-        plan: The sweep. Its last axis consists of the two ends of the range.
-        within: Key and range of the search.
+        plan: The sweep. Its last axis must be the searched key with two values, the ends of the
+            range, as from `format_range_axis`.
+        within: The searched key and its range.
         jobs: Number of worker processes. None uses all cores.
-        progress: Function that is called with the number of finished and of all searches.
+        progress: Function that is called with the number of finished grid points and of all
+            grid points.
         on: Workers to use instead of processes of this computer.
 
     Returns:
-        The edges of each grid point and seed, in the order of the grid.
+        The edges of each grid point and random seed, in the order of the grid.
 
     Raises:
         ScenarioError: The scenario is not valid at a value of the range.
@@ -322,12 +342,16 @@ def search_margins(
 
 
 def search_margin_task(task: MarginItem) -> GridPointMargin:
-    """Searches the edges of stability at one grid point, by runs and by theory.
+    """Finds the limits of stability at one grid point of a sweep, by runs and by theory.
 
     The function needs nothing but its argument, so that any worker process can call it.
 
     Args:
-        task: The grid point, the seed and the range.
+        task: The grid point (a combination of swept parameters), the seed of the runs, and the
+            scenario key along which the limits are searched, with its range.
+
+    Returns:
+        The limits from runs, from the linear analysis, and from a closed-form criterion.
 
     Raises:
         ScenarioError: The scenario is not valid at a value of the range.
@@ -335,12 +359,19 @@ def search_margin_task(task: MarginItem) -> GridPointMargin:
     key, low, high, tolerance = task.range
 
     def load(value: float) -> Scenario:
-        """Returns the scenario at a value of the key."""
+        """Returns the scenario with a value of the searched key.
+
+        Args:
+            value: Value of the scenario key along which the limit of stability is searched.
+        """
         override = format_override(key, value)
         return task.plan.scenario(*task.cell.overrides, override, f"seed={task.seed}")
 
     def is_stable(value: float) -> bool | None:
-        """Runs the scenario at a value of the key, and returns whether the run is stable."""
+        """Runs the scenario with a value of the searched key, and returns whether it is stable.
+
+        None means that the run is undecided.
+        """
         scenario = load(value)
         longest_s = max(task.plan.longest_s, scenario.duration_s)
         return sweep_cell.classify_cell(scenario.text, longest_s).verdict.stable
@@ -370,14 +401,16 @@ def _find_nearest(value: float, edges: Sequence[float]) -> float | None:
 
 @dataclass(frozen=True, repr=False)
 class SweepMargins(Result):
-    """Result of a margin search: the edges of stability along one key.
+    """Result of a search for the limits of stability along one scenario key.
 
-    The edges are searched at each grid point of a sweep and for each seed.
+    The search is repeated at each grid point of a sweep, which is a combination of other
+    parameters, and for each random seed.
 
     Attributes:
-        plan: The sweep. Its last axis consists of the two ends of the range.
-        within: Key and range of the search.
-        found: The edges of each grid point and seed.
+        plan: The sweep. Its last axis is the searched key with two values, the ends of the
+            range.
+        within: The searched key and its range.
+        found: The limits at each grid point and for each seed.
     """
 
     plan: SweepPlan
@@ -386,7 +419,10 @@ class SweepMargins(Result):
 
     @property
     def command(self) -> str:
-        """The command that repeats the search, for the page of results."""
+        """Shell command that repeats this search for limits of stability.
+
+        The page with the results shows it.
+        """
         low = format_override_value(self.within.low)
         high = format_override_value(self.within.high)
         tolerance = format_override_value(self.within.tolerance)
@@ -395,11 +431,12 @@ class SweepMargins(Result):
         return build_sweep_command(plan, "--margin", search_range, "--tolerance", tolerance)
 
     def table(self) -> TextTable:
-        """Returns a table with one row per edge. A grid point without edges has one row too.
+        """Returns a table of the limits of stability along the searched key, one row per limit.
 
-        The columns are the values of the grid point, the measured edge, and the edges from the
-        linear analysis and from the closed-form criterion, each with its difference from the
-        measured edge.
+        The columns are the values of the other swept parameters, the limit from runs, and the
+        limits from the linear analysis and from a closed-form stability criterion. Each limit
+        from theory also has its difference from the limit of the runs. If a combination of the
+        other parameters has no limit, it has a single row.
         """
         plan = self.plan
         several_seeds = len({point.seed for point in self.found}) > 1
@@ -437,11 +474,11 @@ class SweepMargins(Result):
         return TextTable(tuple(heads), rows)
 
     def blocks(self) -> Iterator[TextTable]:
-        """Yields the text that the command prints, which is the table of the edges."""
+        """Yields the table of the limits of stability, which is the printed text."""
         yield self.table()
 
     def headline(self) -> str:
-        """Returns a sentence that states how many edges were found, and in which range."""
+        """Returns a sentence with the number of limits of stability, and the searched range."""
         edges = sum(len(point.margin.spans) for point in self.found)
         low = self.within.low
         high = self.within.high
@@ -479,9 +516,9 @@ class SweepMargins(Result):
         }
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Converts the result to a table of plain values, one row per edge.
+        """Returns a table of plain values, one row per limit of stability.
 
-        A grid point without edges has one row, too.
+        A combination of the other swept parameters without a limit has one row, too.
         """
         rows = list[dict[str, Any]]()
         for point in self.to_dict()["places"]:
@@ -493,10 +530,10 @@ class SweepMargins(Result):
         return rows
 
     def page(self) -> str:
-        """Returns the margins as a page in Markdown.
+        """Returns a Markdown page that reports the limits of stability along the searched key.
 
-        The page has the command, the table, the remarks of the linear analysis, and the gains
-        that were not swept, on which the margins depend too.
+        The page contains the command that repeats the search, a table of the limits, remarks of
+        the linear analysis, and the gains that the runs have in common.
         """
         base = self.plan.base
         parts = [f"# {base.title or base.name}: margin", f"```sh\n{self.command}\n```"]

@@ -1,25 +1,27 @@
 """Builds a stability map, which shows for which parameters a scenario is stable.
 
-A scenario is the description of a run, and a sweep runs one scenario at every point of a grid
-of parameters, usually with several seeds of the random numbers. The map draws the first two
-numeric parameters as axes x and y. Every other swept parameter, and the control law, has one
-panel per setting. Each grid point of a panel shows how many of its runs were stable. A column
-is the set of grid points with the same x.
+A sweep runs one scenario, the description of an experiment, at every point of a grid of
+parameters, usually with several random seeds. The map draws the first two numeric parameters as
+axes x and y. Each combination of the other parameters and of the control law gets a panel. Each
+grid point of a panel shows how many of its runs were stable. A column is the set of grid points
+with the same x.
 
-On top of these measurements the map draws limits from theory as lines. One kind of limit is a
-stability criterion in closed form. It is used only if all of its hypotheses hold. The other
-kind consists of the values at which the rightmost characteristic root of the linearised loop
-crosses the imaginary axis. The criterion of the law P+d accounts for the computation in ticks.
-The line of the roots does so only under the integration scheme `digital`.
+Limits from theory are drawn as lines:
+
+- The closed-form line is where a stability criterion in closed form is just met. It is used
+  only if all assumptions of the criterion hold. For the proportional law with damping, P+d, the
+  line accounts for sampling.
+- The linear line is where the rightmost characteristic root of the linearised loop crosses the
+  imaginary axis. It accounts for sampling only with the integration scheme `digital`.
 
 Invariant:
     - The measurements come from the results alone, and the lines from the plan alone.
-    - Every run is counted at exactly one grid point of one panel. The majority of the decided
-      runs decides whether a grid point is stable, and a draw leaves it undecided.
+    - Every run is counted at exactly one grid point. The majority of the decided runs decides
+      whether a grid point is stable. A draw leaves the point undecided.
     - A measured edge lies between two decided grid points of a column, one of them stable and
       the other not. If undecided grid points lie between the two, the edge is wider.
-    - A line from theory crosses a column between two neighbouring grid points, of which the
-      theory calls exactly one stable.
+    - A line crosses a column between two neighbouring grid points, of which the theory calls
+      exactly one stable.
     - The label of an axis names the scenario key with its unit. A gain has the unit that its
       control law states.
 """
@@ -142,9 +144,10 @@ class MapPanel(NamedTuple):
 
     @property
     def share(self) -> Array:
-        """Fraction of the decided runs at each grid point that are stable, shape (y, x).
+        """Fraction of runs that are stable at each grid point of the panel.
 
-        It is NaN at grid points at which all runs are undecided.
+        Undecided runs, for example too short ones, are left out. NaN if all runs of a grid
+        point are undecided. The shape is (number of y values, number of x values).
         """
         stable = self.stable
         decided = self.decided
@@ -189,17 +192,24 @@ class MapPlane(NamedTuple):
 def build_plane(
     rows: Sequence[Mapping[str, Any]], axes: Sequence[str], scenario: Scenario
 ) -> MapPlane:
-    """Arranges the runs of a sweep on panels over the first two numeric axes.
+    """Arranges the runs of a sweep for a map over two of the swept parameters.
+
+    The axes are the first two swept keys with numeric values. Each combination of the other
+    keys gets a panel of its own.
 
     Args:
-        rows: One mapping per run, with a value for each axis, the class of the run under the
-            key "verdict", and possibly the growth exponent under "exponent_per_s".
-        axes: Keys of the swept axes, in the order of the sweep. The key "law" stands for the
-            control law, if several laws were swept.
+        rows: One mapping per run. It has a value for each swept key, the result of the run
+            under the key "verdict", such as "converged", and possibly the rate at which a
+            disturbance grows under "exponent_per_s".
+        axes: The swept keys, in the order of the sweep. The key "law" stands for the control
+            law, if several laws were swept.
         scenario: The swept scenario, from which the labels are taken.
 
+    Returns:
+        The axes and the panels.
+
     Raises:
-        UsageError: There are no runs, no axis is numeric, or there would be more than
+        UsageError: There are no runs, no key is numeric, or there would be more than
             `MAX_PANELS` panels.
     """
     if not rows:
@@ -308,23 +318,27 @@ class StabilityEdge(NamedTuple):
 
     @property
     def middle(self) -> float:
-        """Centre of the interval that contains the edge, in the unit of the parameter."""
+        """Centre of the interval in which the limit of stability lies.
+
+        It has the unit of the parameter along which the limit was searched.
+        """
         return 0.5 * (self.low + self.high)
 
 
 def find_map_edges(plane: MapPlane, panel: MapPanel) -> list[tuple[float, StabilityEdge]]:
-    """Finds the measured edges of stability in each column of a panel.
+    """Finds the measured limits of stability along the vertical axis of a stability map.
 
-    A column has an edge wherever the majority of the runs changes between stable and not
-    stable from one decided grid point to the next.
+    In each column, which is a value of x, the grid points are compared in the order of y. A
+    limit lies between two grid points if the majority of the runs is stable at one of them and
+    not stable at the other. Grid points without a majority are skipped.
 
     Args:
-        plane: The measured part of the map.
-        panel: Panel of the map, a grid of runs over x and y.
+        plane: The two axes of the map.
+        panel: Part of the map with the counts of stable runs at each grid point.
 
     Returns:
-        Pairs of the x value of a column and an edge along y. The edges of a column are in
-        rising order.
+        Pairs of the x value of a column and an interval of y that contains a limit. The limits
+        of a column are in rising order.
     """
     edges = []
     y = plane.y.values
@@ -636,18 +650,18 @@ _ABOUT_ROOTS = "where the rightmost root of the linearised loop crosses the imag
 
 
 class MapLine(NamedTuple):
-    """A line on a panel that separates stable from unstable parameters.
+    """A line on a stability map that separates stable from unstable parameters.
 
-    The line is the zero set of a quantity that is known at the grid points and interpolated
-    linearly between the grid points of a column.
+    The line is where a quantity is zero. The quantity is given at the grid points, and is
+    interpolated linearly between neighbouring grid points with the same x.
 
     Attributes:
         label: Name of the line for a legend, possibly with TeX.
         text: The same name as plain text.
         about: Explanation of the origin of the line.
-        excess: The quantity at the grid points, shape (y, x). It is positive on the stable side
-            of the line, and NaN where the theory makes no statement.
-        rank: Index of the line style. The style -1 is that of measured lines.
+        excess: The quantity at the grid points, shape (number of y values, number of x values).
+            It is positive on the stable side, and NaN where it is not known.
+        rank: Index of the line style. -1 is the style of measured lines.
     """
 
     label: str
@@ -658,10 +672,10 @@ class MapLine(NamedTuple):
 
     @property
     def crosses_map(self) -> bool:
-        """True if the line passes between grid points, so that it is visible on the map.
+        """True if this line lies between grid points of the map, so that it is visible.
 
-        This is so if four neighbouring grid points all have a value, and only some of them are
-        on the stable side of the line.
+        This is so if somewhere four neighbouring grid points all have a value, and only some of
+        them are on the stable side of the line.
         """
         excess = self.excess
         lower = excess[:-1]
@@ -673,11 +687,13 @@ class MapLine(NamedTuple):
         return bool(crossed.any())
 
     def crossings(self, column: int, y: PlaneAxis) -> list[float]:
-        """Finds the values of y at which the line crosses a column of grid points.
+        """Finds the values of y at which this line crosses a column of the map.
+
+        A column is the set of grid points with the same value of x.
 
         Args:
-            column: Index of the column, which is the index of its value of x.
-            y: Vertical axis.
+            column: Index of the column, from 0.
+            y: Vertical axis of the map.
 
         Returns:
             The values in rising order. Empty if the line does not cross the column.
@@ -701,15 +717,16 @@ _ABOUT_TWINS = (
 
 
 def trace_zero_exponent(panel: MapPanel) -> MapLine | None:
-    """Finds the measured line on which small disturbances neither grow nor die away.
+    """Finds the measured line on a map on which small disturbances neither grow nor die away.
 
-    There the growth exponent is zero, the rate at which a small disturbance grows.
+    On this line, the growth exponent is zero. The exponent is the rate, in 1/s, at which a
+    small disturbance grows.
 
     Args:
-        panel: The panel with its measured exponents.
+        panel: Part of the map with the measured exponent at each grid point.
 
     Returns:
-        The line of zero growth exponents. None if it does not cross the panel.
+        The line. None if it does not cross this part of the map.
     """
     line = MapLine(
         label=ZERO_EXPONENT,
@@ -722,19 +739,20 @@ def trace_zero_exponent(panel: MapPanel) -> MapLine | None:
 
 
 def trace_closed_form(load: PanelLoader, x: PlaneAxis, y: PlaneAxis) -> MapLine | None:
-    """Finds the line on which the stability condition of a panel is just met.
+    """Finds the line on a map on which a closed-form stability condition is just met.
 
-    The condition is one in closed form, from theory, see `evaluate_criterion`. Between two grid
-    points of a column on different sides of the line, the crossing is located with Brent's
-    method, because the condition may be nonlinear in y.
+    The condition comes from theory, see `evaluate_criterion`. Where it changes between two grid
+    points with the same x, the crossing in y is located with Brent's method, because the
+    condition may be nonlinear.
 
     Args:
-        load: Function that returns the scenario of the panel at values of x and y.
-        x: Horizontal axis.
-        y: Vertical axis.
+        load: Function that returns the scenario at values of x and y.
+        x: Horizontal axis of the map.
+        y: Vertical axis of the map.
 
     Returns:
-        The line. None if no condition is known for the panel, or if the line does not cross it.
+        The line. None if no condition is known for the scenario, or if the line does not cross
+        the map.
     """
     first_criterion: StabilityCriterion | None = None
     columns = []
@@ -915,16 +933,18 @@ def build_stability_map(
     linearly: bool = True,
     on: Workers = None,
 ) -> StabilityMap:
-    """Builds the stability map of a sweep: its measurements and the lines from theory.
+    """Builds the stability map of a sweep: the results of its runs, and limits from theory.
 
-    Lines are computed only if the map has two numeric axes.
+    The map shows with which values of two parameters a scenario is stable. Limits from theory
+    are drawn as lines. They are computed only if the map has two numeric axes.
 
     Args:
         results: Results of the sweep: its plan and one row per run.
-        commands: Commands that make the map, which its page shows.
+        commands: Commands that make the map. The page of the map shows them.
         jobs: Number of worker processes for the linear analysis. None uses all cores.
         progress: Function that is called while the linear analysis runs.
-        linearly: True to add the line of the linear analysis, which takes longest.
+        linearly: True to add the line on which the linearised loop becomes unstable. This line
+            takes most of the time.
         on: Workers that compute the linear analysis. None starts processes on this computer.
 
     Returns:
@@ -1011,11 +1031,14 @@ def make_panel_loader(plan: SweepPlan, panel: MapPanel, x: str, y: str) -> Panel
 def load_grid_scenario(
     plan: SweepPlan, fixed: Sequence[str], x: str, y: str, x_value: float, y_value: float
 ) -> Scenario:
-    """Returns the scenario at a point of a panel, which may lie between the swept grid points.
+    """Returns the scenario of a sweep with given values of the two parameters on a map's axes.
+
+    The values may lie between the values that were swept, to locate a limit of stability more
+    precisely.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
-        fixed: Overrides KEY=VALUE that all points of the panel have in common.
+        fixed: Overrides KEY=VALUE of all other parameters.
         x: Scenario key of the horizontal axis.
         y: Scenario key of the vertical axis.
         x_value: Value of the key `x`.

@@ -1,4 +1,4 @@
-"""Runs one cell of a sweep in virtual time and classifies the end of the run.
+"""Runs one cell of a sweep in virtual time, and classifies how the run ends.
 
 A sweep runs one scenario, the description of an experiment, on a grid of parameters. A cell is
 one combination of these parameters. Its run is classified as converged, oscillating, diverged
@@ -7,10 +7,10 @@ again.
 
 Invariant:
     - A result is a function of the cell's scenario and of the longest allowed duration.
-    - The class follows from the same numbers as the stability certificate, so that the log of a
-      run has the same class.
-    - A run stores only the differences of its scenario from the scenario of the sweep.
-      `apply_diff(diff_lines(text, base), base) == text` holds for all texts.
+    - A log of the same run gets the same class, because the class uses the same numbers as the
+      judgement of a log.
+    - To save space, a run stores only how the text of its scenario differs from the text of the
+      sweep's scenario. The stored difference restores every text exactly.
 """
 
 import math
@@ -44,7 +44,7 @@ class CellClass(StrEnum):
 
     @property
     def stable(self) -> bool | None:
-        """Whether the class means that the run is stable. None if the run is undecided."""
+        """True if a run with this result is stable. False if it is not. None if undecided."""
         if self is CellClass.UNDECIDED:
             return None
         return self is CellClass.CONVERGED
@@ -269,19 +269,21 @@ def _advance_in_contact(scenario: Scenario, run: FusedRun) -> float:
 
 
 def is_conclusive(outcome: CellResult) -> bool:
-    """Returns True if a longer run would very probably have the same class.
+    """Returns True if a longer run would very probably end in the same way.
 
-    A run is conclusive if
-    - a site left its limits,
-    - it came to rest,
-    - it drifts,
-    - it grows, and the trend over the second half is pronounced: the largest speed doubled, or
-      error and speed both halved, or
-    - it is bounded, and neither the largest error nor the largest speed changed its logarithm
-      by more than `FLAT_LOG_CHANGE` over the second half.
+    This is so in each of the following cases:
 
-    Decay is not conclusive: near the edge of stability a finite run looks steady whatever its
-    later course, and a decaying motion may hide a slowly growing one until it has vanished.
+    - An arm left its limits, the arms came to rest, or they drift.
+    - The motion grows with a pronounced trend: over the second half of the run, the largest
+      speed doubled, or error and speed both halved.
+    - The motion is bounded and steady: over the second half of the run, the logarithms of the
+      largest error and of the largest speed changed by at most `FLAT_LOG_CHANGE`.
+
+    Decay is not conclusive. Near the limit of stability, a slowly growing motion can be hidden
+    by a decaying motion until the decaying motion has vanished.
+
+    Args:
+        outcome: Result of the run, with the largest errors and speeds of its two halves.
     """
     if outcome.motion is EndBehaviour.BOUNDED:
         error_change, speed_change = _log_changes(outcome)

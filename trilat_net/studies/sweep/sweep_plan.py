@@ -89,7 +89,7 @@ class SweepAxis(NamedTuple):
     texts: tuple[str, ...] | _Steps
 
     def value(self, number: int) -> float | str:
-        """Returns one of the values along the axis.
+        """Returns one of the values that the sweep gives to the key of this axis.
 
         Args:
             number: Index of the value, from 0.
@@ -109,7 +109,7 @@ class SweepAxis(NamedTuple):
         return all(is_number(_parse_value(text)) for text in self.texts)
 
     def override(self, number: int) -> str:
-        """Returns the text KEY=VALUE that sets the scenario key to one of the values.
+        """Returns the text KEY=VALUE that sets the key of this axis to one of its values.
 
         Args:
             number: Index of the value, from 0.
@@ -353,10 +353,11 @@ class SweepPlan(NamedTuple):
 
     @property
     def default_longest_s(self) -> float:
-        """Default of `longest_s`, the longest duration to which a run is extended, in s.
+        """Default of the longest duration to which an undecided run is extended, in s.
 
-        Runs that are judged by growth exponents are not extended, so that the default is then
-        the duration of the scenario.
+        It is the duration of the scenario times `MAX_EXTENSION`, but at most `MAX_SCENARIO_S`.
+        If runs are judged by how fast small disturbances grow, they are never extended, so it
+        is the duration of the scenario.
         """
         extension = 1.0 if self.judge == "twins" else MAX_EXTENSION
         return min(MAX_SCENARIO_S, extension * self.base.duration_s)
@@ -375,13 +376,14 @@ class SweepPlan(NamedTuple):
         return math.prod(self.shape)
 
     def cell(self, number: int) -> SweepCell:
-        """Returns one cell of the grid, with its values and overrides.
+        """Returns one combination of the swept parameters and the control law.
 
         Args:
-            number: Number of the cell, from 0.
+            number: Number of the combination, from 0, counted row by row in the grid of the
+                sweep.
 
         Raises:
-            UsageError: The grid has no cell with this number.
+            UsageError: The grid has no combination with this number.
         """
         if not 0 <= number < self.cells:
             raise UsageError(
@@ -419,10 +421,11 @@ class SweepPlan(NamedTuple):
         return self.written.load([*self.overrides, *more])
 
     def facts(self) -> dict[str, Any]:
-        """Returns the plan as plain values for a JSON file, from which it can be restored.
+        """Returns the plan of the sweep as plain values for a JSON file.
 
-        `plan_from_json` restores it. The keys for the judge and the metrics are stored only if
-        they differ from the default, so that the files of older versions keep their content.
+        `plan_from_json` restores the plan from them. The keys "judge" (how runs are judged) and
+        "metrics" (which further metrics are measured) are left out if they have their defaults,
+        so that plans of older versions give the same file.
         """
         plan: dict[str, Any] = {
             "source": self.written.label,
@@ -454,13 +457,16 @@ def plan_sweep(
     judge: str = "verdict",
     metrics: Sequence[str] = (),
 ) -> SweepPlan:
-    """Plans a sweep and checks that it can run.
+    """Plans a sweep, which runs a scenario with many parameters, and checks that it can run.
 
-    If all sites of the scenario already have a swept law, that law keeps the gains of the
-    scenario. Any other swept law replaces the law of every site and has its default gains.
-    Overrides of gains apply in both cases.
+    Each law in `laws` is used at all sites, the processes that run one arm each. If all sites
+    use the law in the scenario already, it keeps the gains of the scenario. Otherwise it gets
+    its default gains. Overrides of gains apply in both cases.
 
-    The arguments are those of `trilat_net.sweep`. Overrides are texts KEY=VALUE.
+    The arguments are explained at `trilat_net.sweep`. Overrides are texts KEY=VALUE.
+
+    Returns:
+        The checked plan.
 
     Raises:
         ScenarioError: The scenario, an axis or a value of an axis is not valid or cannot run.

@@ -399,13 +399,15 @@ def list_totals(plan: SweepPlan) -> list[str]:
 
 
 def collect_grid_points(results: SweepResults) -> list[GridPoint]:
-    """Combines the runs of each cell, which differ only in their seeds, to one grid point.
+    """Combines the runs of a sweep that differ only in their random seeds.
 
     Args:
         results: Results of the sweep: its plan and one row per run.
 
     Returns:
-        The grid points in the order of the cells.
+        A summary for each combination of swept parameters and control law (a grid point). It
+        has the number of runs with each result, and the means of the measured totals. The order
+        is the order in which the combinations first occur in the results.
     """
     rows_of_cell: dict[tuple[int, str], list[ResultRow]] = {}
     for row in results.rows:

@@ -472,7 +472,12 @@ def _run_cells(
     first_seed, *other_seeds = plan.seeds
 
     def run_pending(runs: Iterable[tuple[int, int]], count: int) -> None:
-        """Executes those of some runs that the journal does not contain yet."""
+        """Executes runs of the sweep, except runs that the journal contains already.
+
+        Args:
+            runs: Pairs of the number of a cell, a combination of parameters, and a seed.
+            count: Number of all runs, for the progress.
+        """
         tasks = (
             CellItem(plan, plan.cell(number), seed)
             for number, seed in runs

@@ -1,31 +1,31 @@
-"""Runs and scores one candidate of a tuning: a control law with a choice of gains.
+"""Runs and scores a candidate of a tuning: a control law with chosen gains.
 
-The score contains the error of the run, its effort and its class. The error is the distance of
-the arms from the pose q* on which weightless arms would agree. Site i is the process that runs
-arm i, q_i(0) are the arm's joint angles at the start, and alpha_ij is the dominance factor, the
-weight with which site i follows site j. The left Perron vector beta of the matrix alpha
-satisfies beta' alpha = beta'.
+The score contains the error, the effort of the motors, and a class that states how well the
+arms behaved. The error is the distance of the arms from the consensus pose q*, on which the
+arms would agree if gravity did not act on them:
 
-- Before any operator acts, q* = sum_i beta_i q_i(0). This is the limit of the consensus
-  x_i' = sum_j alpha_ij x_j - x_i that starts at x_i = q_i(0).
-- While operators pull at arms like springs, q* = sum_i beta_i K_i x_i / sum_i beta_i K_i per
-  joint. The operator at site i has the target x_i and the stiffness K_i. The equation follows
-  from sum_i beta_i tau_i = 0 at rest, where tau_i is the torque of the operator.
-- After the operators have released the arms, q* stays.
+- Before any operator acts, q* = sum_i beta_i q_i(0), where q_i(0) are the joint angles of arm i
+  at the start, in rad.
+- While operators pull at arms like springs, q* = sum_i beta_i K_i x_i / sum_i beta_i K_i for
+  each joint. The operator at arm i has the target x_i, in rad, and the stiffness K_i, in N
+  m/rad.
+- After the operators have released the arms, q* keeps its value.
 
-Other torques and walls determine no pose. A scenario with such torques or walls is judged by
-its twin, which in this module means the same scenario without them.
+Here beta_i is the influence of arm i. It follows from the dominance factors alpha_ij, the
+weights with which arm i follows arm j, by beta' alpha = beta' with sum_i beta_i = 1.
+
+Walls, and operators who push without a target, do not determine a pose. If a scenario has them,
+its twin is run too, which is the same scenario without them.
 
 Invariant:
     - A score is a function of the scenario alone. The errors of a run that does not reach its
       end are None.
-    - Neither gains nor control laws enter the pose q*.
-    - Only a settled run may be part of a Pareto front. A run is settled if it is stable by the
-      general judgement (`analysis.run_end`) and ends at the pose q*.
-    - An arm counts as strayed if both of its links point down at the end and did not at the
-      start, even if all arms hang close to each other.
-    - The arms of a log have fallen if their mean pose ends more than 0.2 rad from q* although
-      no operator or wall could explain the distance.
+    - Neither gains nor control laws enter q*.
+    - Only settled runs, which are stable and end at q*, may be part of a Pareto front.
+    - The end of a log is reported if an arm hangs down (both of its links point down) and did
+      not hang at the start, even if all arms are close to each other. It is also reported if
+      the mean pose of the arms is more than 0.2 rad from q*, although no operator or wall can
+      explain the distance.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -136,17 +136,20 @@ def build_twin(scenario: Scenario) -> Scenario | None:
 
 
 def compute_consensus_pose(scenario: Scenario, t_s: Array) -> Array:
-    """Computes q*, the pose at which weightless arms would agree.
+    """Computes q*, the pose on which the arms would agree if gravity did not act on them.
 
-    The head of this module derives it from the springs of the operators and the dominance
-    factors.
+    While operators pull the arms like springs towards target poses, q* is the average of the
+    targets for each joint. It is weighted with the stiffness of the operators and the influence
+    of their arms. Before that, q* is the weighted average of the start poses. Afterwards, q*
+    keeps its last value.
 
     Args:
-        scenario: Scenario in which the laws are compared.
+        scenario: Scenario with the arms, their operators and the dominance factors, which are
+            the weights with which the arms follow one another.
         t_s: Times, shape (K,), in s.
 
     Returns:
-        The pose at these times, shape (K, n), in rad.
+        The pose at the K times, shape (K, n), in rad, for n joints.
     """
     beta = left_perron_vector(scenario.alpha)
     weights = dict(zip(scenario.names, beta, strict=True))
@@ -220,10 +223,10 @@ TOGETHER_RAD = 0.02
 
 
 class CandidateClass(StrEnum):
-    """How well the arms behaved in the runs of a candidate, from the worst to the best class.
+    """How well the arms behaved with a control law and chosen gains, from worst to best.
 
-    A candidate is a control law with one choice of gains. The values are the texts in JSON. If
-    several classes apply to a run, the first one counts, see `CLASS_MEANINGS`.
+    If several classes apply to a run, the first one counts. `CLASS_MEANINGS` explains each
+    class. JSON files contain the values.
     """
 
     DIVERGED = "diverged"
@@ -235,7 +238,10 @@ class CandidateClass(StrEnum):
 
     @property
     def word(self) -> str:
-        """Name of the class for people, as in the stability certificate where possible."""
+        """Word for this class in printed text, such as "stable" for a candidate that settled.
+
+        Where possible, it is the word that the judgement of a single run uses.
+        """
         if self is CandidateClass.OSCILLATED:
             return Stability.NOT_STABLE.value
         if self is CandidateClass.SETTLED:
@@ -260,21 +266,22 @@ CLASS_MEANINGS = {
 def classify_candidate(
     ends: Sequence[RunEnd], fall_rad: float, apart_rad: float
 ) -> CandidateClass:
-    """Determines the class of a candidate from the end of its runs.
+    """Classifies how well the arms behaved with a control law and chosen gains.
 
-    The twin is a second run without walls and without operators that have no target pose. It
-    shows whether the arms agree on the pose q* that the operators ask for.
+    The scenario may have walls, and operators who push without a target pose. Then a second run
+    without them shows at which pose the arms would come to rest undisturbed. The arms should
+    rest near the consensus pose q*, which follows from the targets of the other operators.
 
     Args:
-        ends: Judgements of the candidate's run and of its twin's run. Without a twin, the same
-            judgement twice.
-        fall_rad: Predicted distance of the twin's mean pose from q*, the largest over the
-            joints, in rad, see `_predict_fall_rad`.
-        apart_rad: Largest distance of a joint from the mean of the sites in the last second, in
+        ends: Judgements of the end of the run and of the second run. Without a second run, the
+            judgement of the run is given twice.
+        fall_rad: Predicted distance, in rad, between the mean pose of the arms and q* at the
+            end of a run twice as long. The largest distance over the joints counts.
+        apart_rad: Largest distance of a joint from the mean of all arms in the last second, in
             rad.
 
     Returns:
-        The class. The worst class that applies to one of the runs.
+        The worst class that applies to one of the runs.
     """
     stabilities = {end.stability for end in ends}
     if any(end.behaviour is EndBehaviour.DIVERGED for end in ends):
@@ -674,20 +681,21 @@ class TuningScenario(NamedTuple):
     def with_gains(
         self, space: SearchSpace, knowledge: ModelInformation, gains: GainValues
     ) -> "TuningScenario":
-        """Returns the scenario under a control law with a choice of gains.
+        """Returns this scenario with a given control law and given values of its gains.
 
         Args:
-            space: The law and the ranges of its gains.
-            knowledge: Information about the arm's model that the law gets.
+            space: The control law.
+            knowledge: What the law is told about the arm, such as its gravity parameters.
             gains: Values of the gains, by their names.
         """
         return self.with_controls(space.controls(self.scenario, knowledge, gains))
 
     @property
     def texts(self) -> tuple[str, str | None]:
-        """Canonical texts of the scenario and of its twin, from which workers restore both.
+        """Texts of the scenario and of its twin, which a worker process reads.
 
-        The second text is None if the scenario has no twin, see `build_twin`.
+        The twin is the same scenario without walls and without operators who push the arms
+        without a target pose. Its text is None if the scenario has no such parts.
         """
         twin = build_twin(self.scenario)
         return self.scenario.text, None if twin is None else twin.text
@@ -699,11 +707,13 @@ class TuningScenario(NamedTuple):
 
 
 class CandidateItem(NamedTuple):
-    """The runs of one candidate (a control law with chosen gains), as an item for a worker.
+    """The runs of a control law with chosen gains, as they are sent to a worker process.
 
     Attributes:
-        runs: For each seed, the canonical texts of the scenario and of its twin.
-        name: Name of the candidate in error messages.
+        runs: For each random seed, the text of the scenario, and the text of the same scenario
+            without walls and without operators who push the arms without a target pose. The
+            second text is None if the scenario has no such parts.
+        name: Name of the law and its gains in error messages.
     """
 
     runs: tuple[tuple[str, str | None], ...]
@@ -714,10 +724,10 @@ class CandidateItem(NamedTuple):
 
 
 def build_candidate_item(seeds: Sequence[TuningScenario]) -> CandidateItem:
-    """Packs the runs of a candidate into an item that can be sent to a worker process.
+    """Packs the runs of a control law with chosen gains for a worker process.
 
     Args:
-        seeds: Scenario of the candidate with each seed.
+        seeds: The scenario with the law and its gains, once for each random seed. At least one.
     """
     name = ", ".join(seeds[0].overrides) or seeds[0].source
     return CandidateItem(tuple(seed.texts for seed in seeds), name)

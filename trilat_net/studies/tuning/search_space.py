@@ -1,20 +1,20 @@
 """Defines which gains of each control law are tuned, and within which ranges.
 
 A search space lists the gains of a law, each with its unit and range. `SearchSpace.controls`
-turns a choice of gains into the table [control] of every site, the process that runs one arm.
-Gains are searched uniformly in their logarithms. To be fair, a quantity has the same range in
-every law: the stiffness, which is called K or Kp Lambda, and the damping, which is called d or
-Kp.
+turns chosen values into the table [control] of every arm in a scenario. Gains are searched
+uniformly in their logarithms. For a fair comparison, a quantity has the same range in every
+law. For example, the stiffness is called K in some laws, and is the product of Kp and Lambda in
+others. The damping is called d or Kp.
 
 Invariant:
-    - A gain is a single number for both joints of an arm, and for all sites with the same role,
+    - A gain is a single number for both joints of an arm, and for all arms with the same role,
       such as the masters.
-    - For a chain of joints, the number is the gain of the joint with the largest inertia. The
-      gains of the other joints are fractions of it, see `weigh_joints`.
-    - All laws get the same parameters of gravity, which are the true ones times a common
-      factor.
-    - No law except `known` gets the inertia of the arm. A law that estimates the inertia starts
-      at zero.
+    - For an arm with a chain of joints, the number is the gain of the joint with the largest
+      inertia. The gains of the other joints are fractions of it, see `weigh_joints`.
+    - All laws get the same gravity parameters. They are the true values times a common factor,
+      which tests how robust the laws are.
+    - Laws do not get the inertia of the arm. The only exception is `known`, the adaptive law
+      without adaptation. A law that estimates the inertia starts at zero.
 """
 
 import inspect
@@ -66,11 +66,12 @@ class ModelInformation(NamedTuple):
 
     @property
     def box(self) -> float:
-        """Half width of the interval to which parameter estimates are limited, as a fraction.
+        """Half width of the interval in which an adaptive law keeps an estimate, as a fraction.
 
-        Some adaptive laws keep each estimate within an interval around the first estimate,
-        which is the box. Its half width relative to the parameter is twice the relative error
-        of the gravity parameters, but at least `MIN_BOX`.
+        The fraction refers to the first estimate of the parameter, which is the centre of the
+        interval. The first estimates of gravity are wrong by the factor `gravity`. The interval
+        is twice as wide as needed to contain the true value, and has at least the half width
+        `MIN_BOX`.
         """
         return max(MIN_BOX, 2.0 * abs(1.0 / self.gravity - 1.0))
 
@@ -92,14 +93,15 @@ class ModelInformation(NamedTuple):
     def box_sides(self, scenario: Scenario, site: str) -> tuple[list[float], list[float]]:
         """Returns the limits within which an adaptive law keeps its parameter estimates.
 
-        The parameters of inertia are not limited, because nothing is known about them.
+        The P parameters of an arm describe its inertia and its gravity torque. Estimates of
+        inertia are practically not limited, because nothing is known about the inertia.
 
         Args:
-            scenario: Scenario in which the laws are compared.
-            site: Name of the site that runs the arm.
+            scenario: Scenario with the arm.
+            site: Name of the arm in the scenario.
 
         Returns:
-            Lower and upper limits of the P parameters, shape (P,) each.
+            Lower and upper limits of the parameters, P numbers each.
         """
         is_gravity = build_arm_rows(scenario, site).gravity_parameters.tolist()
         estimate = self.prior(scenario, site)
@@ -117,7 +119,7 @@ class ModelInformation(NamedTuple):
 
     @property
     def text(self) -> str:
-        """Description of the information for the user, as a clause of a sentence."""
+        """Clause for the user that states what the control laws are told about the arms."""
         if self.gravity == 1.0:
             gravity = "the exact gravity parameters"
         else:
@@ -126,12 +128,12 @@ class ModelInformation(NamedTuple):
 
 
 def build_model_information(gravity_percent: float) -> ModelInformation:
-    """Returns the information that laws get about the arms, with a chosen error of gravity.
+    """Returns what all compared control laws are told about the arms.
 
-    Wrong gravity parameters test how robust a law is.
+    The gravity parameters may be wrong on purpose, to test how robust the laws are.
 
     Args:
-        gravity_percent: Gravity parameters that laws get, in per cent of the true ones.
+        gravity_percent: Gravity parameters that the laws get, in per cent of the true values.
 
     Raises:
         UsageError: The number is not from 50 to 150.
@@ -169,10 +171,10 @@ class SearchSpace(NamedTuple):
     """A control law with the ranges in which its gains are searched.
 
     Attributes:
-        law: Name of the law. The law `known` is `adaptive` without adaptation (Gamma = 0) and
-            with the true inertia.
-        knobs: Gains that are searched.
-        known_facts: Part of the common model information that the law uses, in words.
+        law: Name of the law. The name "known" stands for the law `adaptive` without adaptation,
+            which gets the true inertia of the arm.
+        knobs: Gains that are searched, with their units and ranges.
+        known_facts: What the law is told about the arm, in words for tables.
         kind: Class of a built-in law. None for a user's law.
     """
 
@@ -184,15 +186,19 @@ class SearchSpace(NamedTuple):
     def controls(
         self, scenario: Scenario, knowledge: ModelInformation, gains: GainValues
     ) -> SiteControls:
-        """Returns the control settings of every site for chosen values of the gains.
+        """Returns the control settings of every arm for chosen values of the gains.
 
-        The settings are the table [control] of a scenario. For chains of joints, a gain that
-        produces a torque becomes a list with one value per joint, see `weigh_joints`.
+        The settings are the table [control] of a scenario. For any arm except the planar arm
+        with two joints, a gain that produces a torque becomes a list with a value per joint,
+        because the joints have different inertias, see `weigh_joints`.
 
         Args:
             scenario: Scenario in which the laws are compared.
-            knowledge: Information about the arm's model that the law gets.
+            knowledge: What the law is told about the arm.
             gains: Values of the gains, by their names.
+
+        Returns:
+            The settings, by the name of the arm.
         """
         longest_ms = 0.5 * _find_longest_round_trip_ms(scenario)
         tables = {}
@@ -395,14 +401,17 @@ def select_search_spaces(laws: Sequence[str], scenario: Scenario) -> list[Search
 
 
 def build_user_search_space(code: str) -> SearchSpace:
-    """Returns the search space of a user's law, from the attribute `tune` of its class.
+    """Reads the search space of a user's control law from the attribute `tune` of its class.
 
     The attribute contains (low, high) or (low, high, unit) for each gain, as in
-    `tune = {"K": (10.0, 300.0)}`. If the class has an argument `gravity`, it gets the factor of
-    the gravity parameters that all laws get.
+    `tune = {"K": (10.0, 300.0)}`. If the constructor of the class has an argument `gravity`, it
+    gets the factor by which all laws over- or underestimate gravity.
 
     Args:
         code: Module and class, as in "mylaws:Spring".
+
+    Returns:
+        The law with the ranges of its gains.
 
     Raises:
         ScenarioError: The class does not exist.

@@ -202,23 +202,31 @@ class CandidateSearch:
 
     @property
     def points(self) -> list[ObjectivePoint | None]:
-        """Objective and effort of each candidate that has run, in order.
+        """Objective and effort of each tried choice of gains, in the order of the runs.
 
-        None stands for a candidate that may not be part of a front, see `Objective.point`.
+        The objective is the error, in rad, or the settling time, in s. The effort is the RMS
+        motor torque without gravity, in N m. None stands for gains that do not compete, because
+        the arms were not stable or did not end at the common pose.
         """
         return [self._objective.point(score) for score in self.scores]
 
     @property
     def front(self) -> list[int]:
-        """Indices of the candidates on the law's Pareto front, in the order of rising effort.
+        """Indices of the gains that are the best compromises, in order of rising effort.
 
-        They are the best compromises between the objective and the effort.
+        An index refers to `tried`. These gains are the Pareto front of the law: no other tried
+        gains are at least as good in both objective and effort. The objective is the error or
+        the settling time, and the effort is the RMS motor torque without gravity.
         """
         return find_pareto_front(self.points)
 
     @property
     def front_points(self) -> list[ObjectivePoint]:
-        """Objective and effort of the candidates on the front, by rising effort."""
+        """Objective and effort of the best compromises that the search has found for this law.
+
+        The objective is the error, in rad, or the settling time, in s. The effort is the RMS
+        motor torque without gravity, in N m. The pairs are in the order of rising effort.
+        """
         points = self.points
         front_points = []
         for index in self.front:
@@ -229,7 +237,10 @@ class CandidateSearch:
 
     @property
     def outcomes(self) -> dict[CandidateClass, int]:
-        """Number of candidates that have run, by their class."""
+        """Number of tried choices of gains in each class, such as settled or diverged.
+
+        The class states how well the arms behaved, see `CandidateClass`.
+        """
         counts = Counter(score.outcome for score in self.scores)
         return {outcome: counts[outcome] for outcome in CandidateClass}
 
@@ -353,14 +364,15 @@ _PROBE_S = 2.0
 
 
 class PaperGainsResult(NamedTuple):
-    """Result of running the comparison's scenario with the gains that the paper prints.
+    """Score of the published gains of the adaptive law, in the scenario of a comparison.
 
-    It shows what tuning improves over the published gains.
+    The gains are printed in the paper from which the law comes. The score shows what tuning
+    improves over them.
 
     Attributes:
         name: Name of the variant, such as "as printed".
         candidate: Scenario with these gains.
-        score: Score of the candidate.
+        score: Error, effort and class of the run.
     """
 
     name: str
@@ -396,8 +408,8 @@ class TuningPlan(NamedTuple):
     def runs(self) -> int:
         """Number of all simulated runs of the comparison.
 
-        It includes the runs with the gains that the paper prints, and the twins that measure
-        the final pose of each candidate.
+        It includes the runs with the published gains, and the second runs that are needed to
+        measure the final pose of the arms in some scenarios.
         """
         paper_candidates = len(self.build_paper_scenarios(self.base))
         candidates = len(self.spaces) * self.budget + paper_candidates
@@ -407,20 +419,26 @@ class TuningPlan(NamedTuple):
 
     @property
     def twin(self) -> bool:
-        """True if the final pose is measured in a twin, so that every candidate takes two runs.
+        """True if every choice of gains needs a second run, which measures the final pose.
 
-        A twin is the scenario without walls and without operators that have no target pose.
+        This is so if the scenario has walls, or operators who push the arms without a target
+        pose. They keep the arms away from the pose at which the arms would rest undisturbed, so
+        the second run leaves them out.
         """
         return build_twin(self.base.scenario) is not None
 
     def build_paper_scenarios(self, base: TuningScenario) -> dict[str, TuningScenario]:
-        """Returns the scenario with the gains that the paper prints, in two variants by name.
+        """Returns the scenario with the published gains of the adaptive law, in two variants.
 
-        In the first variant the law gets the same model information as all laws. In the second
-        it gets no information.
+        The gains are printed in the paper from which the law comes. In the first variant, the
+        law is told the same gravity parameters as all compared laws. In the second variant, the
+        law is told nothing about the arm.
 
         Args:
             base: The scenario.
+
+        Returns:
+            The scenarios, by the name of the variant.
         """
         space = SEARCH_SPACES["adaptive"]
         informed = space.controls(base.scenario, self.knowledge, PAPER_GAINS)
@@ -534,9 +552,10 @@ class TuningResult(Result):
     """Result of a comparison of control laws, each with the best gains that a search found.
 
     Attributes:
-        plan: The comparison.
-        found: Search of each law, in the order of the plan.
-        printed: Results of the gains that the paper prints.
+        plan: The comparison: its scenario, the laws and the ranges of their gains.
+        found: For each law in the order of the plan, all tried gains and their scores.
+        printed: Scores of the published gains of the adaptive law, for comparison. They are
+            printed in the paper from which the law comes.
     """
 
     plan: TuningPlan
@@ -681,13 +700,16 @@ class TuningResult(Result):
         return names
 
     def list_overall_front(self, search: CandidateSearch) -> list[int]:
-        """Lists the candidates of a law that no candidate of any law beats in both objectives.
+        """Lists the gains of a law that are on the common Pareto front of all compared laws.
+
+        No tried gains of any law are at least as good in both objective (error or settling
+        time) and effort (motor torque).
 
         Args:
-            search: Search of the law.
+            search: Tried gains of the law, with their scores.
 
         Returns:
-            Indices of the candidates in this search. Empty if other laws are better everywhere.
+            Indices of the gains in `search.tried`. Empty if other laws are better everywhere.
         """
         points = []
         owners = []
@@ -711,10 +733,13 @@ def plan_tuning(
     gravity_percent: float = 100.0,
     seeds: int = 1,
 ) -> TuningPlan:
-    """Plans a comparison of tuned control laws, and checks that it can run.
+    """Plans a comparison of control laws with tuned gains, and checks that it can run.
 
-    The arguments are those of `trilat_net.tune`. Overrides are texts KEY=VALUE. If `seeds` is
-    larger than 1, the seeds count up from the scenario's own seed.
+    The arguments are explained at `trilat_net.tune`. Overrides are texts KEY=VALUE. With
+    several seeds, the first is the seed of the scenario, and each further seed is larger by 1.
+
+    Returns:
+        The checked plan.
 
     Raises:
         ScenarioError: The scenario is not valid, or laws cannot be compared in it.

@@ -1,15 +1,18 @@
-"""Presents a comparison of tuned control laws as tables, a Markdown page, JSON and a figure.
+"""Reports a comparison of control laws as tables, a Markdown page, JSON and a figure.
 
-The Pareto front of a law consists of the gains for which no other gains of the law are better
-in both error and effort. The figure shows error against effort. `write_tuning` writes the files
-front.json, front.md, front.png and front.pdf.
+The gains of each law were tuned by a search. The Pareto front of a law consists of the gains
+for which no other gains of the law are better in both error and effort, which is the RMS motor
+torque. The figure shows error against effort. `write_tuning` writes the files front.json,
+front.md, front.png and front.pdf.
 
 Invariant:
-    - The files are a function of the result alone. Equal plans give equal bytes.
+    - The files are a function of the result alone. Repeating the same comparison gives equal
+      bytes.
     - The JSON contains the complete result. The other files are views of it.
     - The headers of the tables contain the units. Each run is counted in exactly one class.
-    - The figure shows every stable run that ends at the common pose, on a front or not. The
-      gains that the paper prints are stars and belong to no front.
+    - The figure shows every stable run in which the arms end at the pose that the operators ask
+      for, on a front or not. Stars mark the published gains of the adaptive law, which belong
+      to no front.
 """
 
 import json
@@ -37,10 +40,11 @@ _MAX_FRONT_ROWS = 8
 
 
 def compose_tuning(tuned: TuningResult) -> Iterator[Block]:
-    """Yields the text that reports a comparison of control laws on the terminal.
+    """Yields the text that reports a comparison of tuned control laws on the terminal.
 
-    The text contains a table of the laws, the meanings of the classes, the fronts, the gains
-    that the paper prints, notes, and commands that repeat the best runs.
+    The text contains a table of the laws, explanations of the classes of behaviour, and the
+    best compromises between error and effort (the Pareto front) of each law. The scores of the
+    published gains, notes, and commands that repeat the best runs follow.
 
     Args:
         tuned: Result of the comparison of control laws.
@@ -175,9 +179,11 @@ def tabulate_front(
 
 
 def tabulate_paper_gains(tuned: TuningResult) -> TextTable:
-    """Returns a table that shows how the gains perform that the paper prints.
+    """Returns a table of the scores of the adaptive law with its published gains.
 
-    It has one row per variant of these gains, with and without information about the model.
+    The gains are printed in the paper from which the law comes. The scores are the error, the
+    effort and the class of behaviour. The table has a row for each variant: with and without
+    information about the arm.
 
     Args:
         tuned: Result of the comparison of control laws.
@@ -266,9 +272,9 @@ def describe_procedure(plan: TuningPlan) -> list[str]:
 
 
 def list_class_meanings() -> list[str]:
-    """Returns the meaning of each class of candidates, as one line per class.
+    """Returns a line for each class of behaviour, such as stable, with its meaning.
 
-    The classes state how a run ended, such as stable or diverged. A run belongs to the first
+    The report prints these lines below the table of control laws. A run belongs to the first
     class that applies.
     """
     return [f"{outcome.word}: {text}" for outcome, text in CLASS_MEANINGS.items()]
