@@ -302,20 +302,20 @@ def _compute_hand_torque(scenario: Scenario, name: str, record: RecordBatch) -> 
 def find_least_energy(records: dict[str, RecordBatch]) -> float:
     """Computes the minimum over time of the net energy that the arms received from outside.
 
-    The net energy that the arms received until time t is the integral of
-    -sum_i tau_x_i' qd_i from the start to t. Here tau_x_i is the recorded torque from outside
-    on arm i, in N m, with the sign of the record, and qd_i its joint velocity, in rad/s. The
-    integral is computed with the trapezoidal rule and is 0 at the start.
+    The net energy that the arms received until time t is the integral of -sum_i tau_x_i' qd_i
+    from the start to t, computed with the trapezoidal rule. Here -tau_x_i is the torque from
+    outside on arm i, in N m, which the records contain with the opposite sign. qd_i is the
+    joint velocity of the arm, in rad/s.
 
     All arms start at rest. If network and controllers are passive, the arms cannot return more
-    energy than they received, so the minimum is 0 apart from numerical errors. A negative
-    result shows that energy was generated.
+    energy than they received, so the net energy never falls below 0, apart from numerical
+    errors. A negative result shows that energy was generated.
 
     Args:
         records: All records of the run, by the name of the arm.
 
     Returns:
-        The minimum, in J. At most 0.
+        The minimum, in J. It is at most 0, because the net energy is 0 at the start.
     """
     power = sum(-np.sum(record.tau_x * record.qd, axis=1) for record in records.values())
     h_s = 1e-9 * np.diff(records[SLAVE].t_ns[:2])[0]
@@ -426,8 +426,8 @@ def prepare_bench_folder(plan: BenchPlan, path: Path | None = None) -> BenchFold
 
     Args:
         plan: Plan of the benchmark.
-        path: The folder. None uses the folder `bench-` in `runs`, followed by the name of the
-            study.
+        path: The folder. None uses a folder that is named after the study, as in
+            runs/bench-full.
 
     Raises:
         UsageError: The folder cannot be made, or has other content. The same error is raised
