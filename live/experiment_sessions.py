@@ -252,7 +252,10 @@ class ExperimentSessions:
         has_begun = False
 
         def begins() -> bool:
-            """Returns True once all users are ready. The pages then show the trial."""
+            """Returns True once all participants have said on their pages that they are ready.
+
+            At that moment the pages change to the picture of the trial.
+            """
             nonlocal has_begun
             if not has_begun and request.replies.keys() >= set(self.stage.users):
                 has_begun = True
@@ -366,7 +369,19 @@ def run_with_people(
             def run_session(
                 watch: TrialWatch, folder: Path, begins: Callable[[], bool]
             ) -> SessionResult:
-                """Runs the session of a trial. A signal to it also ends the experiment."""
+                """Runs the session of one trial, and shows it on the experiment's web pages.
+
+                A trial is one execution of the experiment's task. If the user interrupts the
+                session, for example with Ctrl-C, the whole experiment ends too.
+
+                Args:
+                    watch: The trial and its present state.
+                    folder: Folder for the log and for the output of the processes.
+                    begins: Function that returns True once the session may begin.
+
+                Returns:
+                    The result of the session, which contains the path of its log.
+                """
                 attend = partial(_show_session, page, idle, watch)
                 result = run_demo(
                     scenario=watch.trial.scenario,

@@ -80,17 +80,20 @@ class TrialWatch:
         return has_outcome and self._clock.monotonic_ns() - self._ended_ns > END_DELAY_NS
 
     def poll(self, view: SessionView, absent: Collection[str]) -> list[str]:
-        """Evaluates the new records of the slave arm, unless the trial must be repeated.
+        """Judges the trial by new records of the slave arm, and finds reasons to repeat it.
 
-        A trial must be repeated if an arm was stopped, or if the page of a user is gone.
+        A record contains what the process of an arm measured and computed in one control
+        period. The trial must be repeated if an arm was stopped, or if the web page of a
+        participant has disappeared. The records are then not judged.
 
         Args:
             view: Present state of the session.
-            absent: Sites of the users whose page has been absent for too long.
+            absent: Sites (processes, one per arm) whose participant's page has been missing for
+                too long.
 
         Returns:
-            Texts that the log should keep as marks of this moment. Empty if nothing has
-            happened, or if the trial is over.
+            Texts to write into the log as events at the present time. Empty if nothing has
+            happened, or if the trial has ended.
         """
         if self.over or self.judge.outcome is not None or not view.running:
             return []
@@ -188,20 +191,23 @@ class StepRequest:
 
 
 class Stage:
-    """Controls what the pages show in an experiment, before, during and after its sessions.
+    """Decides what the web pages of an experiment show before, during and after each trial.
 
-    The experiment requests steps, such as a questionnaire, and states which part of a trial
-    runs. The server of the pages, in another thread, calls `poll`, `accept` and `describe`.
+    In an experiment, people move robot arms over a network. Each trial is a session of its own.
+    Between trials, the participants complete steps on their pages, such as a questionnaire. The
+    program that conducts the experiment calls `request_step` and `show_trial`. The server of
+    the pages runs in another thread. It calls `describe` for the content of a page, `accept`
+    for a reply of a participant, and `poll` regularly.
 
     Args:
         plan: Plan of the experiment.
         clock: Clock of this process.
 
     Attributes:
-        users: Names of the sites of the participants.
-        shows_ages: True if the pages first show how old the poses of the other arms are. It is
-            False in a staircase, a procedure that asks participants for differences, because
-            the ages could reveal the answer.
+        users: Names of the sites (processes, one per arm) whose arms the participants hold.
+        shows_ages: True if the pages first show how old the displayed poses of the other arms
+            are. It is False in a staircase, a procedure that asks participants for differences,
+            because the ages could reveal the answer.
     """
 
     def __init__(self, plan: ExperimentPlan, clock: Clock) -> None:

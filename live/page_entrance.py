@@ -1,16 +1,18 @@
-"""Limits the number of connections that the page's server keeps open.
+"""Limits the number of connections that the server of the web pages keeps open.
 
-A new connection is a stranger until the server knows its role. Then it is a page of an
-experimenter, a user or a watcher. Both kinds are limited in number, so that nobody can keep
-others out by opening many connections.
+People watch and control the robot arms of a session on web pages. A new connection is called a
+stranger until the server knows the role of its user: experimenter, user of one arm, or watcher.
+Then the connection is called a page. The server limits the number of strangers and the number
+of pages, so that nobody can keep others out by opening many connections.
 
 Invariant:
-    - The number of strangers is limited. Silent or slow connections and downloads are
-      strangers. The oldest one is closed for a new connection.
-    - The number of pages is limited for each role. Watchers do not use up the places of other
-      roles.
-    - A page of an experimenter or a user is always accepted. If there are too many, the oldest
-      page of that role is closed. An experimenter's page that takes part is closed last.
+    - Silent or slow connections and downloads count as strangers. If there are too many
+      strangers, the oldest one is closed for a new connection.
+    - The number of pages is limited for each role separately, so that many watchers do not take
+      the places of other roles.
+    - A new page of an experimenter or a user is always accepted. If there are too many, the
+      oldest page with the same role is closed. A page on which an experimenter controls the
+      session is closed only if all experimenters' pages control it.
 """
 
 from collections import Counter
@@ -52,19 +54,19 @@ class Strangers:
         self._connections[connection] = None
 
     def remove(self, connection: ServerConnection) -> None:
-        """Removes a connection that was closed, or whose role is known now."""
+        """Removes a connection that was closed, or that has become a page with a known role."""
         self._connections.pop(connection, None)
 
 
 class SeatedPage(Protocol):
-    """Describes the fields of an open page that are needed to limit the number of pages.
+    """Describes the fields of an open web page by which the server limits the number of pages.
 
-    `page_server.Page` is such a page.
+    The class `page_server.Page` has these fields.
 
     Attributes:
-        role: Role of the page's user: experimenter, user or watcher.
-        number: Number of the page. Newer pages have larger numbers.
-        takes_part: True if the page may hold arms and give orders.
+        role: Role of the person at the page: experimenter, user of one arm, or watcher.
+        number: Number of the page. A page that was opened later has a larger number.
+        takes_part: True if the person may move arms and change settings of the session.
     """
 
     role: Role

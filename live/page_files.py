@@ -42,11 +42,14 @@ _POLICY = (
 
 
 class PageFiles:
-    """The files that one server sends: those of the page, and results of the session.
+    """Provides the files that a server sends to browsers: the web page and the results.
+
+    The results are the report and the log of the session. They are available only after the
+    session, at addresses that nobody can guess.
 
     Attributes:
-        results: Paths of the report and the log after the session, by their addresses. Empty
-            while the session runs.
+        results: Path of each result on the disk, by the path in its web address. Empty while
+            the session runs.
     """
 
     def __init__(self) -> None:

@@ -41,10 +41,10 @@ class BrowserOpening:
             webbrowser.open(self.write().as_uri())
 
     def write(self) -> Path:
-        """Writes the file that redirects to the link.
+        """Writes an HTML file that redirects a browser to the secret link of the page.
 
-        The file is in a folder of the home directory, because browsers that run confined (as a
-        snap) can read neither /tmp nor hidden folders.
+        Only the user can read the file. It is in a new folder in the home directory, because a
+        browser that was installed as a snap can read neither /tmp nor hidden folders.
 
         Returns:
             The path of the file.

@@ -1,23 +1,25 @@
-"""Defines the messages that a page may send, the roles of users, and the orders to the sites.
+"""Defines the requests of the web pages of a session, and passes them to the robot arms.
 
-A session is a run in which several processes ("sites") each control one robot arm. Its page is
-shown in a browser. Its user may be an experimenter, a user who holds one arm, or a watcher. The
-page's server reads each message with `read_page_message`, and checks with `Role.may` that the
-user has the right to send it. Then `PageHands` moves the arms that a page holds, and
-`OrderDesk` sends other orders to the sites and receives their replies. The sites decide whether
-they accept an order.
+A session is a run in which several processes, called sites, each control one robot arm. People
+watch and control it on web pages. The role of a person is experimenter, user of one arm, or
+watcher.
+
+The server of the pages reads each message of a page with `read_page_message`, and checks with
+`Role.may` that the role permits it. `PageHands` then moves the arms that the person holds.
+`OrderDesk` sends other requests to the sites and receives their replies. A site may refuse a
+request.
 
 Invariant:
-    - A valid message has one of the types below, finite numbers in range, and names of the
-      session. Messages of a kind may not arrive more often than its rate allows. Any other
-      message is counted and dropped.
-    - Of several orders for the same link, or for the dominance factors (the weights with which
-      an arm follows its peers) of the same site, only the newest one waits to be sent.
-    - Only one query at a time waits for the reply of a site. The query that stops the arm of
-      the site is an exception, and is sent at once.
-    - A token grants a role and, to a user, a site. The rest of a link may lower the role, but
-      never raise it. Every link has a token, also on this machine, because other users of the
-      machine can connect there too.
+    - A valid message has one of the types below, finite numbers in range, and names that the
+      session contains. A type of message may not arrive more often than its rate allows. Any
+      other message is counted and dropped.
+    - Of several requests that wait and change the same network link, only the newest is sent.
+      The same holds for the weights with which a site follows the other arms.
+    - Only one request at a time waits for the reply of a site. A request to stop the arm does
+      not wait for this, but is sent at once.
+    - The address of a page contains a secret token, which grants a role and, to a user, a site.
+      The rest of the address may lower the role, but never raise it. A token is needed on this
+      machine too, because other users of the machine can connect.
     - Every role may stop the arms.
 """
 
@@ -71,10 +73,12 @@ class PageMessage(
 
 
 class Seen(PageMessage, frozen=True, kw_only=True, tag="seen"):
-    """The page states that it has drawn a frame, so that the next frame may be sent to it.
+    """Message of a page that it has drawn a frame and can receive another one.
+
+    A frame is a message of the server that describes the present state of the session.
 
     Attributes:
-        n: Number of the frame.
+        n: Number of the frame that was drawn.
     """
 
     n: Count
@@ -91,11 +95,14 @@ class TakePart(PageMessage, frozen=True, kw_only=True, tag="control"):
 
 
 class AnswerPage(PageMessage, frozen=True, kw_only=True, tag="answer"):
-    """A page that holds an arm allows another page to take part, or refuses.
+    """Reply of a page to another page that asks for control of the session.
+
+    A page with control may move arms and change settings. The pages that hold an arm at present
+    must allow another page to take part.
 
     Attributes:
-        page: Number of the other page.
-        yes: True to allow it.
+        page: Number of the page that asks.
+        yes: True to allow it, False to refuse.
     """
 
     page: Count
@@ -103,15 +110,15 @@ class AnswerPage(PageMessage, frozen=True, kw_only=True, tag="answer"):
 
 
 class StopArms(PageMessage, frozen=True, kw_only=True, tag="stop"):
-    """The page orders all arms to stop at once. The session goes on."""
+    """Request of a page to stop all arms at once. The session continues."""
 
 
 class ReleaseArms(PageMessage, frozen=True, kw_only=True, tag="release"):
-    """Stopped arms must follow their peers again, or the faults of arms must end.
+    """Request of a page to let stopped arms move again, or to reset arms after a fault.
 
     Attributes:
-        order: "enable" for stopped arms, "reset" for arms with a fault.
-        sites: Names of the sites of these arms.
+        order: "enable" to let stopped arms follow the other arms again, "reset" to end faults.
+        sites: Names of the processes ("sites") that control these arms.
     """
 
     order: Literal["enable", "reset"]
@@ -119,13 +126,14 @@ class ReleaseArms(PageMessage, frozen=True, kw_only=True, tag="release"):
 
 
 class SetLink(PageMessage, frozen=True, kw_only=True, tag="link"):
-    """The delay or other settings of a link between two sites must change.
+    """Request of a page to change the delay or other settings of a network link.
 
-    The settings are those of the command `trilat set`.
+    A link is the connection in one direction between two sites, the processes that each control
+    one arm. The command `trilat set` changes the same settings.
 
     Attributes:
-        link: Name of the directed link, such as "m1->s" from site m1 to site s.
-        to: The new values by the names of the settings.
+        link: Name of the link, such as "m1->s" from site m1 to site s.
+        to: New value of each setting, by the name of the setting.
     """
 
     link: Name
@@ -145,7 +153,7 @@ class SetShares(PageMessage, frozen=True, kw_only=True, tag="shares"):
 
 
 class MarkMoment(PageMessage, frozen=True, kw_only=True, tag="mark"):
-    """The page orders that the log keeps a text as an event of this moment.
+    """Request of a page to write a text into the log as an event at the present time.
 
     Attributes:
         text: The text.
@@ -155,16 +163,22 @@ class MarkMoment(PageMessage, frozen=True, kw_only=True, tag="mark"):
 
 
 class ShowAges(PageMessage, frozen=True, kw_only=True, tag="ages"):
-    """The pages of users must show the age of their peers' poses, or no longer show it."""
+    """Request of a page to show or hide the age of displayed poses on the pages of users.
+
+    The network delays what users see of the other arms. The age is this delay.
+
+    Attributes:
+        shown: True to show the ages, False to hide them.
+    """
 
     shown: bool
 
 
 class MoveHand(PageMessage, frozen=True, kw_only=True, tag="hand"):
-    """The page takes hold of an arm, moves it, or releases it.
+    """Request of a page to take hold of an arm, to move it, or to release it.
 
     Attributes:
-        site: Name of the site that runs the arm.
+        site: Name of the process ("site") that controls the arm.
         grip: True to hold the arm, False to release it.
         to: Where the arm is pulled: the position of the end effector in m, or the joint
             positions in rad. For an arm that is pushed instead, the force in N.
@@ -176,7 +190,7 @@ class MoveHand(PageMessage, frozen=True, kw_only=True, tag="hand"):
 
 
 class EndSession(PageMessage, frozen=True, kw_only=True, tag="end"):
-    """The page orders the session to end in an orderly way, so that its log is complete."""
+    """Request of a page to end the session in an orderly way, so that its log is complete."""
 
 
 class DoStep(PageMessage, frozen=True, kw_only=True, tag="step"):
@@ -310,10 +324,13 @@ class Role:
     site: str = ""
 
     def may(self, message: PageMessage) -> bool:
-        """Finds out whether the user of a page with this role has the right to send a message.
+        """Returns True if a person with this role has the right to send a message.
+
+        An experimenter may send every message. A user may move the own arm and reply in an
+        experiment. Everybody may stop the arms.
 
         Args:
-            message: The message.
+            message: The message of the person's web page.
         """
         if isinstance(message, Seen | StopArms) or self.kind == "experimenter":
             return True
@@ -325,7 +342,7 @@ class Role:
 
     @property
     def noun(self) -> str:
-        """Words for the user of the page in the text of an event, such as "the user of m1"."""
+        """Name of the person at the page for event texts, such as "the user of m1"."""
         if self.kind == "experimenter":
             return "the experimenter"
         if self.kind == "user":
@@ -334,7 +351,11 @@ class Role:
 
     @property
     def query(self) -> str:
-        """Part of a link that states the role, such as "as=m1" for the user of site m1."""
+        """Part of a page's web address that states the role, such as "as=m1" or "watch".
+
+        The text "as=m1" stands for the view of the user of site m1. It is empty for an
+        experimenter.
+        """
         parts = ["watch"] if self.kind == "watcher" else []
         if self.site:
             parts.append(f"as={self.site}")
@@ -420,12 +441,14 @@ class PageHands:
         self._held_sites: set[str] = set()
 
     def move(self, order: MoveHand, *, pushes: bool) -> None:
-        """Tells a site where the page pulls its arm, or that the page releases it.
+        """Sends a site the target or the force with which the person at the page moves its arm.
+
+        If the person has released the arm, the site is told that instead.
 
         Args:
-            order: Message of the page.
-            pushes: True if the page applies a force to the arm, False if it pulls the arm to a
-                target.
+            order: Message of the page, with the name of the site and the target or force.
+            pushes: True if the numbers are a force on the arm in N. False if they are a target
+                to which the arm is pulled, in m or rad.
         """
         site = order.site
         if site not in self._senders:
@@ -549,14 +572,14 @@ class OrderDesk:
             self._send_request(site, topics.STOP, request)
 
     def release(self, order: ReleaseArms, sites: Collection[str], source: str = "") -> None:
-        """Queues orders to stopped arms to follow again, or to arms with a fault to end it.
+        """Queues requests to let stopped arms move again, or to reset arms after a fault.
 
-        An order to a site that does not exist is refused and counted.
+        A request that names a site outside the session is refused and counted.
 
         Args:
-            order: The order, and the names of the sites of the arms.
-            sites: Names of the sites of the session.
-            source: Who sends the order, for the sites' events.
+            order: The request, with the names of the sites of these arms.
+            sites: Names of all sites (processes, one per arm) of the session.
+            source: Name of the person or program that requests it, for the events in the log.
         """
         request = _add_source(ChangeRequest(order=order.order), source)
         for site in order.sites:
@@ -591,10 +614,11 @@ class OrderDesk:
         self._enqueue(site, f"mark {text}", ChangeRequest(mark=text))
 
     def poll(self) -> None:
-        """Receives the replies of the sites to earlier orders, and sends the orders that wait.
+        """Receives the replies of the sites to earlier requests, and sends requests that wait.
 
-        Each site gets one order at a time, and the next one after its reply. If a site does not
-        reply in time, this is noted as its reply.
+        The requests are changes of the session, for example a new delay. A site receives one
+        request at a time, and the next one after its reply. If a site does not reply in time,
+        `replies` receives an entry that says so.
         """
         now_ns = self._clock.monotonic_ns()
         for (site, channel), query in list(self._open_queries.items()):

@@ -123,14 +123,14 @@ _NO_HTTP = b"HTTP/1.1 400 Bad Request\r\nContent-Length: 0\r\nConnection: close\
 
 
 class Visitor(ServerConnection):
-    """A connection to the server, before and after it becomes that of a page.
+    """Connection of a browser to the server, from its beginning until it is closed.
 
-    Any program can connect. Data that are not a request of a browser are counted, and answered
-    with the HTTP status 400.
+    Any program can connect. Data that are not a valid request of a browser are counted, and
+    answered with the HTTP status 400.
 
     Attributes:
-        refused: Numbers of refusals by reason.
-        strangers: The connections for which it is not known yet what they want.
+        refused: Numbers of refused connections and messages, by reason.
+        strangers: Connections that are open but do not belong to a web page yet.
     """
 
     refused: Counter[str]
@@ -139,7 +139,7 @@ class Visitor(ServerConnection):
     _is_counted = False
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Notes a new connection, for which it is not known yet what it wants.
+        """Adds a new connection to the connections that do not belong to a web page yet.
 
         Args:
             transport: The connection.
@@ -172,8 +172,9 @@ class Visitor(ServerConnection):
     def send_data(self) -> None:
         """Sends the waiting data to the browser.
 
-        If the WebSocket could not be opened because of what the connection sent, this is
-        counted as a refusal before.
+        Browsers talk to the server over a WebSocket. If the browser's data were not a valid
+        request to open one, the connection is first counted as refused. If the data were not
+        even HTTP, the reply has the HTTP status 400.
         """
         problem = self.protocol.handshake_exc
         if problem is not None and self._has_received and not self._is_counted:
@@ -259,10 +260,14 @@ class PageOptions:
     tls: Path | None = None
 
     def make_context(self) -> ssl.SSLContext | None:
-        """Returns the settings of the encryption. Returns None if the page is not encrypted.
+        """Returns the TLS settings with which the server encrypts its connections to browsers.
+
+        Returns:
+            The settings, with the certificate and the private key from the folder `tls`. None
+            if the connections are not encrypted.
 
         Raises:
-            UsageError: The keys cannot be used.
+            UsageError: The keys cannot be used, for example because they have expired.
         """
         if self.tls is None:
             return None
@@ -971,7 +976,10 @@ class PageAttendant(ExitStack):
     def attend(
         self, session: str, endpoints: Sequence[str], say: Callable[[str], None]
     ) -> Iterator[Callable[[], bool]]:
-        """Serves the page of a session, in the form of a `SessionAttendant`.
+        """Serves the web page of a session while the session runs, as a context manager.
+
+        The function that runs the session, such as `run_demo`, accepts this method as its
+        `SessionAttendant`, the function that watches the session and may end it.
 
         Args:
             session: Name of the session.
@@ -1012,9 +1020,9 @@ class PageAttendant(ExitStack):
 def show_on_page(
     options: PageOptions, clock: Clock, session: str, say: Callable[[str], None], bus: Bus
 ) -> Iterator[tuple[SessionView, Callable[[], None]]]:
-    """Serves a page of a session that other processes run, for `trilat watch --page`.
+    """Serves a web page that shows a session of other processes, as a context manager.
 
-    The function has the form of a `SessionOnlooker`.
+    The command `trilat watch --page` uses it as the argument `show` of `watch_session`.
 
     Args:
         options: How the page is served.
@@ -1024,8 +1032,8 @@ def show_on_page(
         bus: Network connection that reaches the session.
 
     Yields:
-        The state of the session, and a function that does nothing, because the server updates
-        the page by itself.
+        The state of the session, and a function to update the display. This function does
+        nothing, because the server updates the page by itself.
     """
     with PageServer(bus, clock, session, options, say=say) as page:
         yield page.view, lambda: None

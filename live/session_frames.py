@@ -1,21 +1,22 @@
-"""Composes the messages with which the pages of a running session are drawn, as JSON objects.
+"""Composes the JSON messages from which the web pages of a running session are drawn.
 
-A session is a run in which several processes ("sites") each control one robot arm. A record is
-the result of one tick, a period of a site's control loop. A page first receives the constants
-of the session, such as the shapes of the arms. Then it receives about 30 frames a second. A
-frame has the present state of each arm and link, and the new points of the plots.
+A session is a run in which several processes ("sites") each control one robot arm. A record
+contains what a site measured and computed in one tick, a period of its control loop. A page
+first receives the constants of the session, such as the shapes of the arms. Then it receives
+about 30 frames a second. A frame is a message with the present state of each arm and network
+link, and with new points of the plots.
 
 Invariant:
     - A frame is computed from the records since the previous frame. It describes the whole
       state, so that a page may miss frames.
-    - The plots have the extremes of the records between two frames, so that short peaks are
+    - The plots show the extremes of the records between two frames, so that short peaks are
       visible.
-    - Forces are those that act on the arm, in N. The forces of people and of the control law
-      follow from their torque: torque = J^T force, with the Jacobian J of the end effector.
-      Near a singular pose the force is the smallest one that explains the torque.
-    - The frame for the user of a site contains the pose of each peer, another site, at one tick
-      only: the tick of the sample in use, or of the delayed picture
-      (`SessionView.find_peer_ticks`).
+    - Forces act on the arm and are in N. The forces of people and of the control law follow
+      from their torques: torque = J^T force, where J is the Jacobian of the end effector. Near
+      a singular pose, the force is the smallest one that explains the torque.
+    - The frame for the user of one site shows every other arm as that user sees it: with the
+      delay of the network, and with the further delay of the picture if the scenario has one
+      (`SessionView.find_peer_ticks`). It contains no newer pose of these arms.
 """
 
 import math
@@ -280,15 +281,20 @@ class ArmFrames:
 
 
 class SessionFrames:
-    """Composes the messages (frames) from which the pages draw a session, about 30 a second.
+    """Composes the messages from which web pages draw a running session.
+
+    About 30 times a second, a page receives a frame: a message with the present state of all
+    arms and network links.
 
     Args:
         view: Present state of the session.
 
     Attributes:
-        points: Values of the plots at the times of the frames. `describe` names them.
-        energies: Points of the energy plot: time in s, the energy function V of the stability
-            proof in J, and the energy that operators and environment have supplied, in J.
+        points: Points of the plots over time. Each point is a list of values, and `describe`
+            states their names.
+        energies: Points of the energy plot: time in s, energy function V of the stability proof
+            in J, and energy that people and walls have supplied in J. V must not rise by more
+            than the supplied energy.
     """
 
     def __init__(self, view: SessionView) -> None:
@@ -420,18 +426,18 @@ class SessionFrames:
         return {**constants, **hidden}
 
     def describe_as(self, frame: Json, site: str, *, ages: bool) -> Json:
-        """Changes a frame so that it shows what the user of a site sees.
+        """Makes the frame for the user of one arm from the frame that shows all arms.
 
-        The user sees the other arms with their delay, where the user's site last knew them to
-        be.
+        A frame is a message from which a web page draws the session. The user sees the other
+        arms with their delay, in the poses that the site (process) of the user's arm last knew.
 
         Args:
-            frame: Newest frame of `make_frame`.
+            frame: Newest frame of `make_frame`. It is not changed.
             site: Name of the user's site.
             ages: True to add how old the pose of each other arm is, in ms.
 
         Returns:
-            The frame for this user. The given frame is not changed.
+            The frame for this user.
         """
         local = frame["sites"][site]
         ticks = self._view.find_peer_ticks(site, local["tick"], local["used"])

@@ -1,14 +1,14 @@
-"""Keeps the present state of a running session, as an observer learns it from its messages.
+"""Keeps the state of a running session, as an observer learns it from its messages.
 
 A session is a run in which several processes ("sites") each control one robot arm. Every site
-publishes a record per tick of its control loop, statistics of its links, and events. An
-observer receives the same messages as the recorder, and sends nothing to the sites except
-requests for missing messages. The pages of a session and `trilat watch` show this state.
+publishes a record per tick (period of its control loop), statistics of its network links, and
+events. An observer receives the same messages as the recorder. It sends nothing to the sites
+except requests for missing messages. Web pages and the command `trilat watch` show this state.
 
 Invariant:
-    - The observer receives every record. It requests missing records from the buffers of the
-      sites, as a recorder does, so that the energies equal those of the log. Pages show fewer
-      records, always the newest.
+    - The observer receives every record, and requests missing records from the buffers of the
+      sites, as the recorder does. Therefore the energy of the arms that it computes equals the
+      energy computed from the log. Pages show only the newest record of each site.
     - An observer that joins late does not request earlier records. It requests all events,
       because they contain the changes that were made.
     - A site has ended if its `end` event says so, never because it is silent. On a busy machine
@@ -184,7 +184,11 @@ class SiteView:
 
     @property
     def complete(self) -> int:
-        """Last tick up to which all records have arrived or are lost; -1 before the first."""
+        """Number of the last tick up to which no record of the site can still arrive.
+
+        A record is the result of one tick, a period of the site's control loop. Every record up
+        to this tick has arrived or is lost for good. The value is -1 before the first record.
+        """
         account = self.reception.accounts[topics.STATE]
         gap = account.find_requestable_gap()
         if gap is None:
@@ -304,12 +308,14 @@ class SessionView:
         self.links.advance_to(max(times_ns, default=0))
 
     def advance_energy(self) -> EnergyCourse | None:
-        """Computes the energy function V of the stability proof at the new ticks.
+        """Computes the energy of the session at the new ticks, with which stability is checked.
 
-        A tick is new if the records of all sites have arrived for it since the last call.
+        The energy function V of the stability proof must not rise by more than people and walls
+        supply. A tick is a period of the control loop. It is new if, since the last call, the
+        records of all sites have arrived for it.
 
         Returns:
-            The energies over time, in J. None if there is no new tick.
+            V and the supplied energy over time, in J. None if there is no new tick.
         """
         if self.energy is None:
             return None

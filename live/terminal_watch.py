@@ -109,10 +109,11 @@ class SessionWatch:
         self._as_site = as_site
 
     def update(self) -> None:
-        """Receives the messages that have arrived, and checks the energy V of the session.
+        """Receives the messages that have arrived, and checks the stability of the session.
 
-        V is the energy function of the stability proof. It must not rise, except by the energy
-        that people and walls supply. The next `title` states the result.
+        The check uses V, the energy function of the stability proof. V must not rise by more
+        than people and walls supply. The line `title` above the table then contains the newest
+        V.
         """
         view = self.view
         view.poll()
@@ -129,9 +130,12 @@ class SessionWatch:
 
     @property
     def title(self) -> str:
-        """Line above the table: name of the session, and its state.
+        """Line above the table, with the name of the session and its present state.
 
-        The state is the energy V, the end of the session, or for how long it has been silent.
+        The state says whether the session waits for members, has ended, or is silent, and for
+        how long. For a running session, the line also contains V, the energy with which
+        stability is checked. If only the view of one user is shown, the line names the user's
+        site instead of V.
         """
         view = self.view
         silence_s = view.session_silence_s
@@ -161,13 +165,14 @@ class SessionWatch:
         return alarms
 
     def rows(self) -> list[SiteRow]:
-        """Composes the table of the sites, with one row per site.
+        """Composes the table of the sites (processes, one per arm), with one row per site.
 
-        If the view of a user is shown (`as_site`), the row of another site contains only the
-        angles of its arm and the time of the pose, as that user sees them.
+        If only the view of one user is shown, the user's own site has a complete row. The row
+        of another site contains the time and the joint angles of the pose that this user sees.
 
         Returns:
-            The texts of each row, by the heads of the columns. Empty until the sites run.
+            The rows. Each row is a dictionary of texts, by the heads of the columns. Empty
+            until the sites run.
         """
         view = self.view
         scenario = view.scenario
@@ -200,12 +205,14 @@ class SessionWatch:
 def show_in_terminal(
     clock: Clock, session: str, as_site: str, console: Console, bus: Bus
 ) -> Iterator[tuple[SessionView, Callable[[], None]]]:
-    """Shows a session in the terminal, in the form of a `SessionOnlooker`.
+    """Shows a running session as a table in the terminal, as a context manager.
+
+    The command `trilat watch` uses it as the argument `show` of `watch_session`.
 
     Args:
         clock: Clock of this process.
         session: Name of the session.
-        as_site: Site whose user's view is shown. Empty to show all sites.
+        as_site: Name of the site whose user's view is shown. Empty to show all sites.
         console: Console of the terminal.
         bus: Network connection that reaches the session.
 
@@ -219,7 +226,7 @@ def show_in_terminal(
             display.say("S or space: stop every arm")
 
         def update_display() -> None:
-            """Updates the display, and stops every arm if the key was pressed."""
+            """Updates the display. Stops every arm if the user has pressed S or space."""
             watch.update()
             if read_keys is not None and STOP_KEYS.intersection(read_keys()):
                 display.say(
