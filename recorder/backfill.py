@@ -110,10 +110,10 @@ class GapRepair:
         self._ended_ns: int | None = None
 
     def probe(self) -> None:
-        """Lets `poll` request the newest messages of every channel of the site.
+        """Makes `poll` request the newest messages of every channel of the site.
 
-        This reveals losses at the end of a channel, which no later message can reveal by its
-        number.
+        The messages of a channel are numbered, so that a message reveals whether earlier ones
+        were lost. The loss of the last messages is revealed only by this request.
         """
         self._probes = set(SITE_CHANNELS)
 

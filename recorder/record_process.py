@@ -141,7 +141,12 @@ class Recorder:
         scenario = self._find_scenario(epoch)
 
         def open_part(stream: Sink, part: Mapping[str, str]) -> LogWriter:
-            """Returns the writer of one file of the log."""
+            """Creates the writer for one of the files into which a long log is divided.
+
+            Args:
+                stream: The open file.
+                part: Description of the part of the log that the file contains.
+            """
             return LogWriter(
                 stream=stream,
                 scenario=scenario,

@@ -172,15 +172,15 @@ class Recording:
         self._gone = set(self._sites)
 
     def write(self, queue: InboundQueue, now_ns: int) -> None:
-        """Writes the messages that have arrived, and requests those that are missing.
+        """Writes the messages that have arrived into the log, and requests missing messages.
 
-        If the recorder has every message of a site that has ended, it publishes the event
-        "stored", for which the site waits.
+        A site that has ended waits until the recorder has all its messages. As soon as this is
+        the case, the recorder publishes the event "stored" for the site.
 
         Args:
             queue: Queue of the received messages.
-            now_ns: Present time on the monotonic clock, in ns. Later messages stay in the
-                queue.
+            now_ns: Present time on the monotonic clock, in ns. Messages that arrived later stay
+                in the queue.
         """
         self._drain(queue, now_ns)
         self._admit_starts()
@@ -496,8 +496,9 @@ class Recording:
     def is_up_to_date(self, ending_ns: int, now_ns: int) -> bool:
         """Returns True if the recorder has every message that the sites have sent so far.
 
-        This is used if the recorder is to end while the session runs. A site that still runs
-        must lack no message `SETTLE_NS` after the recorder was told to end.
+        The recorder calls this method after it was told to end during a running session. It
+        waits for `SETTLE_NS`, because messages may still be in transit. After this time, every
+        site that still runs must have no missing message.
 
         Args:
             ending_ns: Time at which the recorder was told to end, on the monotonic clock, in
@@ -645,7 +646,11 @@ class RecorderReport:
         self._flush_max_ns = max(self._flush_max_ns, duration_ns)
 
     def poll(self) -> None:
-        """Publishes the statistics if a second has passed since the last ones."""
+        """Publishes the statistics of the recording if they are due, once a second.
+
+        The statistics state, for example, the size of the log and the numbers of missing
+        messages.
+        """
         now_ns = self._clock.monotonic_ns()
         if now_ns >= self._due_ns:
             # After a long delay, the missed statistics are not published later.
@@ -654,7 +659,7 @@ class RecorderReport:
             self.publish()
 
     def publish(self) -> None:
-        """Publishes the statistics now, and adds them to the messages that are recorded."""
+        """Publishes the statistics of the recording now, and also writes them into the log."""
         payload = encode(self._make_stats())
         self._flush_max_ns = 0
         self._queue.receive(self._key, payload)

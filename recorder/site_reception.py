@@ -1,19 +1,20 @@
-"""Receives the messages of a session, and finds out which messages of each site are missing.
+"""Receives the messages of a session, and finds out which messages are missing.
 
-`InboundQueue` holds the messages between the threads of the network and the thread that writes.
-`SiteReception` decodes and checks the messages of one site, a process that runs one arm, and
-counts them.
+A site is a process that runs one robot arm. `InboundQueue` holds the messages between the
+threads of the network and the thread that writes the log. `SiteReception` decodes, checks and
+counts the messages of one site.
 
-Invariant (L6):
-    - The queue is bounded in messages and in bytes. The bytes of each key are bounded as well,
-      so that a flood of messages from one member does not displace the messages of the others.
-      Messages for which there is no room are counted and reported.
-    - A message counts only if it can be decoded, is of this site and of this start of the site,
-      and has a number that the scenario and the clock allow.
-    - A message may show that other messages exist. The records and statistics that follow from
-      it are limited to the ticks of the scenario. A message of a tick in the future is refused.
-    - Events are accepted up to a number of bytes. The first "end" event is accepted even beyond
-      that limit.
+Invariant:
+    - The queue is bounded in messages and in bytes. The bytes of each sender's channel are
+      bounded as well, so that one sender with too many messages does not displace the messages
+      of the others. Messages for which there is no room are counted and reported.
+    - A message is accepted only if it can be decoded, states the right site and the right start
+      of its process, and has a number that the site can have reached by now.
+    - A message may imply that earlier messages exist. The number of records and statistics that
+      are therefore expected is limited by the duration of the scenario. A message from the
+      future is refused.
+    - The events of a site are accepted up to a number of bytes. The first event "end", with
+      which a site states that it has ended, is accepted even beyond that limit.
 """
 
 import math
@@ -398,27 +399,28 @@ class SiteReception:
         return is_new
 
     def refill(self, channel: str, message: SiteMessage) -> bool:
-        """Counts a message that the site sent again from its buffer, because it was requested.
+        """Counts a message that the site sent again from its buffer after a request.
 
         Args:
             channel: Name of the channel.
-            message: The message, decoded and checked by `read`.
+            message: The message, as `read` has decoded and checked it.
 
         Returns:
-            True if the message is new. False if it was received before.
+            True if the message fills a gap. False if it was received before.
         """
         is_new = self.accounts[channel].refill(message.number)
         self._count_implied(message.content)
         return is_new
 
     def check_sender(self, reply: Backfill) -> None:
-        """Checks that a reply with missing messages comes from this start of the site.
+        """Checks that a reply with missing messages comes from the right process of this site.
 
         Args:
-            reply: The reply of the site.
+            reply: The reply.
 
         Raises:
-            WireError: The reply comes from another site, or from another start.
+            WireError: The reply comes from another site, or from an earlier or later start of
+                this site's process.
         """
         if reply.member != self.name or reply.boot != self._boot:
             raise WireError(
@@ -426,14 +428,15 @@ class SiteReception:
             )
 
     def add_expected(self, channel: str, count: int) -> None:
-        """Takes into account how many messages of a channel the site published at least.
+        """Takes into account that the site has published at least a given number of messages.
 
-        Those that have not been received count as missing. A count that is impossible in the
-        scenario by now is reduced, since a faulty site could state any number.
+        Expected messages that have not been received count as missing. Since a faulty site
+        could state any number, the number is limited to what is possible in the scenario by
+        now.
 
         Args:
             channel: Name of the channel.
-            count: Number of messages, numbered from 0.
+            count: Number of messages that the site has published on this channel.
         """
         largest = self._largest_counts[channel]
         if channel != topics.EVENT:

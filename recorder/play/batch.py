@@ -113,7 +113,7 @@ class MessageBatch:
 
     @property
     def end_ns(self) -> int:
-        """Deadline of the last message after the start of the session, in ns."""
+        """Time at which the last message is due, in ns after the start of the session."""
         return int(self.times_ns[-1])
 
     @property
@@ -123,7 +123,11 @@ class MessageBatch:
 
     @property
     def numbers(self) -> Ints:
-        """Number of each message in its channel, shape (K,)."""
+        """Number of each of the K messages in its channel, shape (K,).
+
+        A channel contains the messages of one kind from one site. They are played in the order
+        of their numbers. The meaning of a number is described at `PlayedMessage`.
+        """
         return self.rows[:, _NUMBER]
 
     @property
@@ -132,16 +136,21 @@ class MessageBatch:
         return self.rows[:, _END] - self.rows[:, _START]
 
     def payload(self, index: int) -> bytes:
-        """Returns the bytes of one message, as the site published them.
+        """Returns the encoded content of one message, exactly as it was published originally.
 
         Args:
-            index: Index of the message in this batch.
+            index: Index of the message in this batch, 0 for the first one.
         """
         start, end = self.rows[index, _START:].tolist()
         return bytes(self.data[start:end])
 
     def messages(self) -> Iterator[PlayedMessage]:
-        """Yields the messages in the order of this batch, as objects."""
+        """Yields each recorded message of this batch as a tuple, in the order of playing.
+
+        The tuple `PlayedMessage` contains the time in ns after the start of the session, the
+        number of the channel, the number of the message in the channel, and the encoded
+        content.
+        """
         view = memoryview(self.data)
         for t_ns, channel, number, start, end in self.rows.tolist():
             yield t_ns, channel, number, bytes(view[start:end])
@@ -191,11 +200,13 @@ class MessageBatch:
 
 
 class BatchBuilder:
-    """Collects messages in the order of a file, and sorts them into the order of playing.
+    """Collects messages in the order of a log file, and sorts them into the order of playing.
+
+    To play a log means to publish its messages again, each at its original time.
 
     Args:
-        kept: Messages that were sorted before but not played yet. They count as if they had
-            been added first.
+        kept: Messages that were sorted in an earlier step but have not been played yet. They
+            count as if they had been added first. None if there are no such messages.
     """
 
     def __init__(self, kept: MessageBatch | None = None) -> None:
@@ -228,12 +239,13 @@ class BatchBuilder:
         self._rows.extend((t_ns, channel, number, start, end))
 
     def ordered(self) -> MessageBatch:
-        """Sorts the messages into the order in which they are played.
+        """Sorts the messages that were added into the order in which they are played.
 
-        A message that was added repeatedly, because two files contain it, is kept once.
+        If two files contain the same message, it is included only once.
 
         Returns:
-            The messages, with their deadlines as times.
+            The sorted messages. The time of each message is its deadline: the time at which it
+            is due, so that no message is later than the next one of its channel.
         """
         rows = np.array(self._rows, dtype=np.int64).reshape(-1, _COLUMNS)
         repeats = self._find_repeats(rows)

@@ -1,16 +1,16 @@
 """Supplies the player of a log with messages in the order in which they are played.
 
-To play a log means to publish its messages again, at the times of the original session. Short
-logs are loaded into memory before. For long logs, a second process reads ahead and sends the
-messages through a pipe, so that the player never waits for the disk.
+To play a log means to publish its messages again, at the times of the original session. A short
+log is loaded into memory before. A long log is read by a second process, the reader. It reads
+ahead and sends the messages through a pipe, so that the player never waits for the disk.
 
 Invariant:
-    - To ask the source for the next messages never waits.
-    - The memory of the reader process is bounded (L6), by two constants. `LIMIT_BYTES` limits
-      the bytes of the stored messages. `HORIZON_NS` limits, as a duration of the log, how far a
-      message may be in the file from its place in the order of playing.
-    - The reader process waits if the player does not read from the pipe. The two processes
-      share nothing except this pipe.
+    - The method that returns the next messages never waits. If none are available yet, it says
+      so.
+    - The memory of the reader is bounded by two constants. `LIMIT_BYTES` is the largest size of
+      the messages that it stores for sorting. `HORIZON_NS` is the largest delay of a message in
+      the file, measured in the log, that the reader can correct.
+    - The reader waits while the pipe is full. The two processes share nothing except this pipe.
 """
 
 import multiprocessing
@@ -77,17 +77,21 @@ class ReadPiece(NamedTuple):
 
 
 class MessageSource:
-    """Messages of a log in the order in which they are played, round after round.
+    """Supplies the messages of a log in the order in which they are played.
+
+    A log that is played in a loop has several rounds, passes through the log. Its messages are
+    supplied round after round.
 
     Args:
-        header: Description of the files. The topics and damages that the reader process finds
+        header: Description of the files. The topics and damages that are found during reading
             are added to it.
-        batch: All messages. None if they are too many. Then `start_reader` must be called.
+        batch: All messages of the log. None if they are too many for the memory. In this case
+            `start_reader` must be called.
 
     Attributes:
         ended: True if `poll` has returned all messages of this round.
         whole: True if all messages are in memory.
-        strays: Number of messages that were too far from their turn in the file to be played in
+        strays: Number of messages that were so late in the file that they are played out of
             order.
     """
 
@@ -106,7 +110,7 @@ class MessageSource:
     def start_reader(
         self, paths: Sequence[Path], selection: PlaySelection, *, loop: bool
     ) -> None:
-        """Starts the second process, which reads a long log while it is played.
+        """Starts the process that reads a long log from the disk while the log is played.
 
         Args:
             paths: The files of the log.
@@ -149,13 +153,16 @@ class MessageSource:
         return None
 
     def fill(self) -> bool:
-        """Reads some bytes from the pipe of the reader process, without waiting for them.
+        """Fetches messages in advance from the process that reads the log, without waiting.
+
+        The bytes are read from the pipe and decoded. `poll` then returns the messages.
 
         Returns:
-            False if there is nothing to read now, or if enough has been read in advance.
+            True if bytes were read. False if none are available now, or if enough messages have
+            been fetched in advance.
 
         Raises:
-            RuntimeFault: The reader process failed.
+            RuntimeFault: The process that reads the log has failed.
         """
         if self._process is None or self._ahead_bytes > AHEAD_BYTES:
             return False
@@ -207,18 +214,21 @@ def sort_messages(
     step_ns: int = STEP_NS,
     limit_bytes: int = LIMIT_BYTES,
 ) -> Iterator[tuple[MessageBatch, int]]:
-    """Sorts messages into the order in which they are played, with bounded memory.
+    """Sorts the messages of a log into the order in which they are played.
 
-    A message may be late in the file, because a site has sent it again on request.
+    A message may be late in the file, because a site sent it again after a loss. Therefore
+    messages are stored for some time before they are yielded. The memory for this is limited.
 
     Args:
         messages: The messages, in the order of the file.
-        horizon_ns: Largest distance between a message's place in the file and its turn, in ns.
-        step_ns: Duration of the part that is sorted at a time, in ns.
-        limit_bytes: Largest memory. If it is exceeded, messages are released earlier.
+        horizon_ns: Largest delay of a message in the file that is corrected, in ns of the log.
+        step_ns: Duration of the part of the log that is sorted at a time, in ns.
+        limit_bytes: Largest memory of the stored messages, in bytes. If it is exceeded, the
+            earlier half is yielded at once.
 
     Yields:
-        Messages in play order, and the number of them that were too far from their turn.
+        Messages in the order of playing, and the number of messages among them that were too
+        late in the file to be put in order.
     """
     sorter = _MessageSorter()
     newest_ns = -(2**62)
@@ -254,7 +264,7 @@ class _MessageSorter:
         return self._waiting.memory
 
     def add(self, message: PlayedMessage) -> None:
-        """Adds a message to those that wait for their turn.
+        """Stores a message until it can be sorted and released to the player.
 
         Args:
             message: The next message in the order of the file.

@@ -65,13 +65,15 @@ class Pace:
         return self.origin_ns + round((t_ns - self.start_ns) / self.rate)
 
     def later(self, length_ns: int) -> "Pace":
-        """Computes the deadlines of the next round, when a log is played in a loop.
+        """Computes the deadlines for the next round, when a log is played in a loop.
 
         Args:
-            length_ns: Duration of the log from one round to the next, in ns.
+            length_ns: Time in the log after which the next round begins, counted from the
+                beginning of this round, in ns.
 
         Returns:
-            The pace of a round that begins `length_ns` of the log after this one.
+            The conversion from times in the log to deadlines for the next round. It has the
+            same speed.
         """
         return Pace(self.due_ns(self.start_ns + length_ns), self.start_ns, self.rate)
 
@@ -148,7 +150,7 @@ class LatenessHistogram:
         self._counts = [0] * (LATENESS_LIMIT_US + 1)
 
     def add(self, late_ns: int) -> None:
-        """Counts one message.
+        """Adds the lateness of one published message to the histogram.
 
         Args:
             late_ns: Time from the deadline of the message to its publication, in ns.
@@ -276,9 +278,9 @@ class Player:
         """Plays all messages, until the end of the log or until the playback is stopped.
 
         Args:
-            pace: Deadlines of the first round.
-            loop: True if the messages are played round after round, until the playback is
-                stopped.
+            pace: Start time and speed of the playback, from which the deadlines of the messages
+                follow.
+            loop: True to play the log again and again, until the playback is stopped.
         """
         while not self._stopped():
             self.rounds += 1

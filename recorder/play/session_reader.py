@@ -80,10 +80,10 @@ class PlaySelection:
         return is_candidate and self.channels.accepts(key)
 
     def contains(self, t_ns: int) -> bool:
-        """Finds out whether messages of a time are played.
+        """Returns True if a time is in the part of the session that is played.
 
         Args:
-            t_ns: Time of the messages, in ns after the start of the session.
+            t_ns: The time, for example of a message, in ns after the start of the session.
         """
         is_before = self.start_ns is not None and t_ns < self.start_ns
         is_after = self.stop_ns is not None and t_ns > self.stop_ns
@@ -235,14 +235,18 @@ class _PlayedChannel:
         self._starts: dict[int, int] = {}
 
     def find_number(self, item: McapMessage, t_ns: int) -> int:
-        """Finds the number of a message in its channel, see `PlayedMessage`.
+        """Finds the number by which a message is ordered among the messages of its channel.
+
+        For a record of a site, it is the number of the control period (tick). The statistics
+        and the events of a site are counted. For other messages, it is the time. The messages
+        of a channel are played in the order of their numbers.
 
         Args:
             item: The message, as the file contains it.
-            t_ns: Time of the message after the start of the session, in ns.
+            t_ns: Time of the message, in ns after the start of the session.
 
         Returns:
-            The number. The messages of a channel are played in the order of their numbers.
+            The number, as `PlayedMessage` defines it.
         """
         if self.kind in (topics.STATE, topics.LINK):
             return number_message(self.kind, item.sequence, self.rate_hz)

@@ -1,17 +1,20 @@
-"""Stands in for the sites of a session while its log is played.
+"""Replies to other programs in place of the original sites while a log is played.
 
-A site is a process that runs one arm and publishes messages; a log contains these messages. To
-other programs, a log that is played looks like a running session. The stand-ins announce the
-sites on the network, reply to queries for their identities and to pings, and send messages
-again to recorders that missed them (backfill). `PlayedHistory` keeps the messages for this.
+A site is a process that runs one robot arm and publishes messages. A log contains the messages
+of a session. When it is played, the messages are published again, but the sites no longer
+exist. This module announces the sites on the network, replies to queries for their identities
+and to pings, and sends messages again to recorders that missed them. `PlayedHistory` stores the
+messages for this purpose. To other programs, a log that is played therefore looks like a
+running session.
 
 Invariant:
-    - Recorders, viewers and pings see everything that a running session shows to a member that
-      joins late.
-    - Except for identities, no message is published in the name of a site that is not in the
-      log.
-    - The messages that were played can be requested again: those of the last minute if the log
-      is read while it is played (L6), and all of them if it is in memory.
+    - Recorders, viewers and pings receive everything that they would receive from a running
+      session that they join late.
+    - Identities are sent for all sites. Other messages of a site are sent only if the log
+      contains them.
+    - Recorders can request messages again that were played. If the log is in memory, these are
+      all messages of the present round. If it is read while it is played, they are those of the
+      last minute, which bounds the memory.
 """
 
 from bisect import bisect_left
@@ -57,14 +60,15 @@ class _ChannelMessages(NamedTuple):
     batch: MessageBatch
 
     def list_from(self, number: int) -> list[tuple[int, int]]:
-        """Lists the messages of a channel that are kept, beginning with a number.
+        """Lists the stored messages from a given number on, for one reply to a recorder.
 
         Args:
             number: Smallest number of a message in the list.
 
         Returns:
-            The number and the index of each message, in ascending order. There are at most as
-            many as one reply contains, and one more.
+            The number of each message in its channel, and its index in the batch, in ascending
+            order. The list has at most one entry more than a reply may contain, so that the
+            caller notices if the reply is full.
         """
         start = int(np.searchsorted(self.numbers, number))
         selected = slice(start, start + BACKFILL_MESSAGES + 1)
@@ -92,7 +96,9 @@ class PlayedHistory:
         self._messages: dict[int, deque[_ChannelMessages]] = {}
 
     def add(self, batch: MessageBatch) -> None:
-        """Stores messages that will be played next, and removes those that are no longer kept.
+        """Stores messages that will be played next, so that recorders can request them again.
+
+        Messages that are older than the limit `kept_ns` are removed.
 
         Args:
             batch: The messages, in the order in which they are played.
@@ -108,7 +114,10 @@ class PlayedHistory:
                     parts.popleft()
 
     def clear(self) -> None:
-        """Removes all messages before the next round. `next_numbers` stays."""
+        """Removes all stored messages, before a log is played again from its beginning.
+
+        The attribute `next_numbers` is not changed.
+        """
         self._messages.clear()
 
     def find_messages(self, channel: int, first: int, last: int) -> tuple[int, list[bytes]]:
@@ -252,12 +261,14 @@ class SiteStandIns:
         self._encoded.clear()
 
     def serve_queries(self) -> bool:
-        """Replies to all queries for identities and to one request of a recorder.
+        """Replies to waiting requests of other programs in the name of the original sites.
 
-        Also receives the presence and the events of recorders.
+        It replies to all queries for identities, but to at most one request of a recorder for
+        missing messages, so that the call is short. It also notes which recorders are present,
+        and what they report.
 
         Returns:
-            True if there was a request of a recorder.
+            True if a request of a recorder was processed. More requests may be waiting then.
         """
         for site, queries in self._identity_queries.items():
             while (query := queries.poll()) is not None:
@@ -304,13 +315,11 @@ class SiteStandIns:
         return not self.recorders - self._listening
 
     def have_stored(self, recorders: Collection[str]) -> bool:
-        """Finds out whether recorders have stored all messages of every site.
+        """Returns True if recorders have reported that they stored all messages of every site.
 
         Args:
-            recorders: Identifiers of the recorders' starts, as text.
-
-        Returns:
-            True if each of them has reported that.
+            recorders: The recorders. Each is identified by the random number of its start, as
+                text.
         """
         for boot in recorders:
             stored_sites = self._stored.get(boot, set())
@@ -355,7 +364,15 @@ class SiteStandIns:
         start, boot = self._find_start(site)
 
         def find_requested(request: BackfillRequest) -> tuple[int, list[bytes], int]:
-            """Returns the first number, the payloads, and the number of played messages."""
+            """Finds the messages that a recorder requests because it has missed them.
+
+            Args:
+                request: The channel, and the numbers of the first and last requested message.
+
+            Returns:
+                The number of the first message in the reply, the encoded messages, and the
+                number of messages that the site has published on this channel so far.
+            """
             channel = self._find_channel(site, request.channel)
             offset = 0
             if request.channel == topics.EVENT:
