@@ -233,10 +233,11 @@ class ProcessStarter:
             self._pipe.send((name, arguments, number, output))
 
     def poll(self) -> None:
-        """Receives the starter's reports, and updates the processes.
+        """Receives news from the starter, the process that starts the processes of the session.
 
-        If the starter itself has failed, its processes are sent a signal to end, and count as
-        ended with the exit code of the starter.
+        Each process object is updated with its process number or its exit code. If the starter
+        itself has failed, its processes are told to end. They then count as ended with the exit
+        code of the starter.
         """
         try:
             while self._pipe.poll():
@@ -488,9 +489,10 @@ def _end_all(
     sites_ended_ns = clock.monotonic_ns()
 
     def must_end_now() -> bool:
-        """Returns True if the user insists, or if the recorder has had enough time.
+        """Returns True if the recorder must end at once, by a second signal.
 
-        After the end of the sites, the recorder has no more messages to wait for.
+        This is the case if the user has pressed Ctrl-C a second time, or if the recorder has
+        not ended within `RECORDER_NS` after the sites.
         """
         return interrupt.is_repeated() or clock.monotonic_ns() - sites_ended_ns > RECORDER_NS
 
@@ -586,11 +588,15 @@ class _StarterProcess:
         self._running: dict[str, int] = {}
 
     def serve(self) -> list[str] | None:
-        """Executes the requests to start or signal processes, and reports their ends.
+        """Executes requests to start processes or to signal them, and reports when they end.
+
+        Each new process is a copy of this starter process, made by `os.fork`. Therefore the
+        method returns in every copy and, at the end, in the starter.
 
         Returns:
-            In a copy, the arguments of the copy. In the starter, None, once the requesting
-            process is gone and all copies have ended.
+            The command and its arguments, if the method returns in a copy, which must now
+            execute the command. None, if it returns in the starter, after the requesting
+            process has disappeared and all copies have ended.
         """
         arguments: list[str]
         while True:

@@ -111,12 +111,13 @@ class DeviceHand:
         self._sent.clear()
 
     def serve(self) -> None:
-        """Reads a state of the device, moves the target, and applies a force to the person.
+        """Performs one period of the device: reads its motion and applies a force.
 
-        The call takes one period of the device.
+        The method reads the position of the device, sends the site of the arm a new target, and
+        lets the device apply a force to the person. It takes one period of the device.
 
         Raises:
-            OSError: The device is silent or gone.
+            OSError: The device is silent, or its connection is lost.
         """
         state = self._device.read()
         now_ns = self._clock.monotonic_ns()

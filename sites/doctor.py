@@ -547,24 +547,29 @@ class Rehearsal(LoopStats):
         self._late_us.append(late_us)
 
     def step(self, k: int, arrivals: Sequence[Arrival]) -> TickRecord:
-        """Computes one tick of the site as if no samples of peers had arrived.
+        """Computes one tick of the site without samples from other sites, to test its timing.
 
-        The loop calls the method in place of `RunningSite.step`.
+        A tick is one period of the control loop. The loop calls this method in place of
+        `RunningSite.step`.
 
         Args:
-            k: Number of the tick (period of the control loop).
-            arrivals: Samples that have arrived, which is none.
+            k: Number of the tick.
+            arrivals: Samples (states of other sites) that have arrived. Always empty in this
+                test.
 
         Returns:
-            The record of the tick.
+            The record of the tick: what the site measured and computed.
         """
         return self._site.step(TickInput(k, arrivals))
 
     def run_housekeeping(self, *_: object) -> bool:
-        """Does nothing, in place of the method of `RunningSite` that works for the network.
+        """Does nothing, because this test of the control loop has no network.
+
+        The loop calls this method after a tick, in the place where a site of a session sends
+        and receives messages.
 
         Returns:
-            False, which lets the loop continue.
+            False, so that the loop continues.
         """
         return False
 
@@ -695,7 +700,7 @@ def examine_room(folder: Path) -> Iterator[DoctorFinding]:
 
 @dataclass(frozen=True, repr=False)
 class DoctorReport(Result):
-    """Results of all checks of this machine, whether it is ready for a session.
+    """Results of the checks whether this machine is ready for a session.
 
     Attributes:
         findings: Result of each check, in the order of the checks.

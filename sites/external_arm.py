@@ -156,17 +156,18 @@ class ExternalArm:
         return SessionError(f"{text}; see {find_page('external-arm.md')}")
 
     def bind(self, q0_rad: Sequence[float]) -> str:
-        """Accepts only measurements of the present driver from now on.
+        """Accepts measurements only from the present driver from now on. Checks the pose.
 
-        The site calls this method at the start of the session. If another program sends
-        measurements during the run, they are dropped.
+        The driver is the program that sends the joint angles of an arm outside of this program.
+        The site that controls the arm calls this method at the start of the session.
+        Measurements that another program sends later are dropped.
 
         Args:
-            q0_rad: Joint angles in rad from which the arm starts according to the scenario, and
-                which the peers assume.
+            q0_rad: Joint angles in rad at which the arm starts according to the scenario. The
+                other sites assume this pose.
 
         Returns:
-            A warning if the arm is elsewhere. Empty if it is there.
+            A warning if the arm is not at this pose. Empty if it is.
         """
         self.poll()
         self._is_bound = True
@@ -344,9 +345,10 @@ class DeadManSwitch:
 
     @property
     def held(self) -> bool:
-        """True if the switch counts as held: at least one program reports that it is held.
+        """True if the dead-man switch is held, so that the arm may move.
 
-        It is False if any program that holds the switch has been silent for too long.
+        At least one program must report that a person holds the switch, and no program that
+        reports so may have been silent for longer than `SWITCH_SILENCE_NS`.
         """
         holders = self._list_holders()
         return bool(holders) and not any(map(self._is_silent, holders))
@@ -363,17 +365,17 @@ class DeadManSwitch:
         self._release([holder for holder in self._list_holders() if self._is_silent(holder)])
 
     def pop_order(self, mode: Mode, reason: LifeReason) -> SiteOrder:
-        """Returns the order to the site that follows from the state of the switch.
+        """Returns what the site must do because of the state of the dead-man switch.
 
-        While the switch is released, the order is repeated until the arm is at rest.
+        The order to stop is returned at every call until the arm is at rest.
 
         Args:
-            mode: Present mode of the site.
-            reason: Reason of that mode.
+            mode: Present mode of the site, for example stopped.
+            reason: Reason why the site is in this mode.
 
         Returns:
-            "released" if the arm has to stop, "held" if it may move again. Empty if nothing
-            changes.
+            "released" if the arm must stop. "held" if it may move again. Empty if the site need
+            not do anything.
         """
         was_released = self._was_released
         self._was_released = False

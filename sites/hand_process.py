@@ -87,15 +87,15 @@ class HandProcess(SiteClient):
         self._max_waiting = max(1, int(hand_site.delay_s * hand_site.rate_hz))
 
     def serve(self) -> None:
-        """Lets the user's class decide about one state of the site, and sends the decision.
+        """Lets the user's operator class decide how to move the arm, and sends the decision.
 
-        Until the first view has arrived, this process is announced to the site regularly.
-
-        The site regularly sends a view, its present state. The oldest waiting view that is not
-        too old is used. If no view is waiting, nothing is decided.
+        The site of the arm regularly sends a view, which describes its present state. The
+        oldest waiting view that is not too old is used. If no view is waiting, nothing is
+        decided. Until the first view arrives, the method regularly tells the site that this
+        process exists.
 
         Raises:
-            RunFailed: The class failed. The arm has been released.
+            RunFailed: The user's class failed. The arm has been released.
         """
         views = self._waiting_views
         views.extend(read_messages(self._views, HandViewMessage))
@@ -146,17 +146,28 @@ class HandProcess(SiteClient):
 
 
 def read_view(message: HandViewMessage) -> HandView:
-    """Converts a message of the site to the view that the user's class receives.
+    """Converts a message about the state of a site to the object that a user's class receives.
 
     Args:
-        message: The message. Its lists of numbers become arrays.
+        message: The message, which the site sends so that the user's operator class can decide
+            how to move the arm.
 
     Returns:
-        The view.
+        The state of the site. Its lists of numbers are arrays.
     """
 
     def read_fields(source: Any, names: tuple[str, ...]) -> Any:
-        """Returns the fields of a message or of a peer by name, except that of the peers."""
+        """Reads fields of a message by their names, and converts lists of numbers to arrays.
+
+        The field "peers" is left out, because it is converted separately.
+
+        Args:
+            source: The message, or its part that describes one peer (another site).
+            names: Names of the fields.
+
+        Returns:
+            The values by the names of the fields.
+        """
         fields = {}
         for name in names:
             if name != "peers":
@@ -177,21 +188,21 @@ def run_hand(
     say: Callable[[str], None],
     timeout_s: float,
 ) -> None:
-    """Runs a user's operator class for a site until the session ends.
+    """Runs a user's operator class, which moves the arm of one site, until the session ends.
 
     Args:
-        scenario: Scenario of the session.
-        name: Name of the site.
+        scenario: Scenario (description) of the session. It names the operator class.
+        name: Name of the site, the process that controls the arm.
         session: Name of the session.
-        connection: Endpoints of the session, and keys.
+        connection: Network addresses of the session, and keys.
         interrupt: Handler of the signals of this process.
         say: Function that prints a line for the user.
-        timeout_s: Longest wait for the first view, in s.
+        timeout_s: Longest wait for the first message with the state of the site, in s.
 
     Raises:
         UsageError: The scenario has no operator class for this site that runs in a process of
             its own.
-        SessionError: The site does not send a view in time.
+        SessionError: The site does not send its state in time.
         RunFailed: The class failed.
     """
     hand_site = find_own_hand(scenario, name)

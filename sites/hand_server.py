@@ -76,19 +76,20 @@ def _read_messages(
 class HandServer:
     """Moves the arm of a site as requested by people and programs that connect to the session.
 
-    Such a person or program is an operator. Only one operator moves the arm at a time.
+    A site is the process that controls one arm. Each of these people and programs is an
+    operator. Only one operator moves the arm at a time.
 
     Args:
-        site: The site in the simulation kernel.
-        hand: Settings of the live operator in the scenario.
+        site: Object that computes the ticks (control periods) of the site.
+        hand: Settings in the scenario for operators that connect during the session.
         arm: Arm of the site.
-        inbox: Queue of the operator's messages.
+        inbox: Queue of the operators' messages.
         dropped: Number of dropped messages by reason. The counts are increased in place.
         limits: Limits of the motion of the site. None if there are none.
 
     Attributes:
-        news: Pairs of a tick and a sentence, for each operator who has started or ended to move
-            the arm. The site publishes them as events and empties the list.
+        news: Pairs of a tick number and a sentence. A pair is added when an operator takes hold
+            of the arm or releases it. The site publishes them as events and empties the list.
     """
 
     def __init__(
@@ -115,14 +116,14 @@ class HandServer:
         self.news: list[tuple[int, str]] = []
 
     def track(self, _site: Site, k: int) -> list[float]:
-        """Applies the waiting messages of operators, and returns their influence on a tick.
+        """Reads the waiting messages of operators, and returns how to move the arm now.
 
         Args:
             k: Number of the tick, a period of the control loop.
 
         Returns:
-            Who moves the arm, and with which target or force, as the vector of numbers that
-            `HandInForce` describes. It is an input of the simulation kernel.
+            The operator who moves the arm, and the target or force, as a list of numbers for
+            the computation of the tick. `HandInForce.read` describes the numbers.
         """
         messages = _read_messages(self._inbox, self._site, self._dropped)
         parsed = [self._parse_command(message) for message in messages]
@@ -226,25 +227,28 @@ class RemoteHand(HandPlayer):
         self._source = hand_site.source
 
     def track(self, site: Site, k: int) -> list[float]:
-        """Applies the waiting decisions of the user's class, and returns their influence.
+        """Reads the waiting decisions of the user's class, and returns how to move the arm.
 
         Args:
-            site: The site in the simulation kernel.
+            site: Object that computes the ticks of the site.
             k: Number of the tick, a period of the control loop.
 
         Returns:
-            The vector of numbers that `HandInForce` describes.
+            The target or force on the arm, as a list of numbers for the computation of the
+            tick. `HandInForce.read` describes the numbers.
         """
         for message in self._read_decisions():
             self._decide(k, message)
         return super().track(site, k)
 
     def request_action(self, k: int, arrays: SiteArrays) -> None:
-        """Sends the operator's process the view of a tick, to request a decision.
+        """Sends the present state of the site to the user's process, to request a decision.
+
+        The decision says how the user's class moves the arm.
 
         Args:
-            k: Number of the tick, a period of the control loop.
-            arrays: State of the site in the simulation kernel.
+            k: Number of the present tick, a period of the control loop.
+            arrays: State of the site in this tick, from which the message is composed.
         """
         view = self.view(k, arrays)
         fields = _list_numbers(view)

@@ -184,13 +184,16 @@ def describe_row(row: SiteRow) -> str:
 
 
 def frame_alarms(alarms: Sequence[tuple[str, LifeAlarm]]) -> list[Panel]:
-    """Returns a coloured panel for each alarm of a site.
+    """Composes a coloured panel for the terminal for each arm that needs attention.
 
     A panel is red if the arm stays stopped until a user acts. It is yellow if the arm continues
     by itself.
 
     Args:
-        alarms: For each alarm, the name of the site and the alarm.
+        alarms: Pairs of the name of a site (the process that controls an arm) and its alarm.
+
+    Returns:
+        The panels in the order of the alarms. Each contains the reason, and advice to the user.
     """
     blocks = []
     for name, alarm in alarms:
@@ -239,7 +242,7 @@ class SessionDisplay:
         return self._clock.monotonic_ns() - self._updated_ns >= period_ns
 
     def say(self, text: str) -> None:
-        """Prints a line for the user above the table, where it stays.
+        """Prints a line that stays in the terminal, above the table of the sites.
 
         Args:
             text: The line.

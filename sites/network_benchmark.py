@@ -144,7 +144,7 @@ class NearEnd:
                     yield number, arrived_ns - sent_ns
 
     def wait_for_far_end(self) -> bool:
-        """Waits until messages reach the far end and come back.
+        """Waits until the far end, the process that sends messages back, can be reached.
 
         Messages are sent repeatedly, because the connection may not be complete yet.
 
@@ -177,7 +177,11 @@ class NearEnd:
         first = self._number
 
         def count_missing() -> int:
-            """Stores the round trips of new replies, and returns how many are missing."""
+            """Stores the round trip times of messages that have come back meanwhile.
+
+            Returns:
+                The number of messages of this measurement that have not come back yet.
+            """
             for number, trip_ns in self._read_replies():
                 if number >= first:
                     trips_s[number - first] = trip_ns / 1e9

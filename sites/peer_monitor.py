@@ -1,16 +1,18 @@
-"""Follows during a run which other members of the session join, leave and end.
+"""Follows during a run which other processes join the session, leave it, and end.
 
-A member is a process that takes part in the session: a site, which runs one arm, or a recorder.
-Each start of a process has a boot, a random number that distinguishes it from earlier and later
-starts. A site learns about the others in two ways: from the events that a process publishes,
-and from the Zenoh liveliness token of a process, which disappears when the process ends or its
+A process that takes part in the session is called a member. It is a site, which controls one
+robot arm, or a recorder. A process draws a random number at its start. It distinguishes the
+process from earlier and later processes with the same name.
+
+A site learns about the other members in two ways. They publish events. In addition, each has a
+liveliness token in the network (Zenoh), which disappears when the process ends or its
 connection is lost.
 
 Invariant:
     - Two processes never act as the same site. The processes with which the session started are
-      members. If the scenario allows sites to leave and come back (rule `glide`), a new process
-      of a site is admitted, but only after the previous one has disappeared or has published
-      its end.
+      members. If the scenario allows sites to leave and come back (value `glide` of its rule
+      for missing samples), a new process of a site is admitted, but only after the previous
+      process has disappeared or has published its end.
     - A recorder may join at any time.
 """
 

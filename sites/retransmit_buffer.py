@@ -68,10 +68,13 @@ class ChannelBuffer:
         self._head = 0
 
     def start_at(self, number: int) -> None:
-        """Sets the number that the first message will have.
+        """Sets the number of the first message that will be stored.
+
+        The first message of a site that joins a running session does not have the number 0. The
+        method may be called only while the buffer is empty.
 
         Args:
-            number: The number. No message must have been stored before.
+            number: The number of the first message.
         """
         self.next_number = number
         self.oldest = number

@@ -147,15 +147,18 @@ class TargetTopic:
         self._received_ns: int | None = None
 
     def receive(self, data: bytes, attachment: Attachment) -> None:
-        """Sends the target in a message to the site. It is called in a thread of Zenoh.
+        """Receives a message on the topic, and sends its target to the arm's site (process).
+
+        The method is called in a thread of the network library Zenoh.
 
         Args:
             data: The message, encoded in CDR, the binary format of ROS 2.
-            attachment: Attachment of the message, which identifies the publisher.
+            attachment: Additional data of the message, which identify the program that
+                published it.
 
         Raises:
-            ValueError: The message cannot be read, or two programs publish. In the second case,
-                the arm is released.
+            ValueError: The message cannot be read, or two programs publish on the topic. In the
+                second case, the site is told that nobody holds the arm.
             TrilatError: The target is refused.
         """
         with self._lock:
@@ -212,14 +215,19 @@ class DominanceTopic:
         self._sent_request: dict[str, float] | None = None
 
     def receive(self, data: bytes, attachment: Attachment) -> None:
-        """Stores the weights in a message. It is called in a thread of Zenoh.
+        """Receives a message with the weights with which an arm follows the other arms.
+
+        The weights are stored until `send_request` sends them to the site. The method is called
+        in a thread of the network library Zenoh.
 
         Args:
-            data: The message, encoded in CDR, the binary format of ROS 2.
-            attachment: Attachment of the message, which identifies the publisher.
+            data: The message, encoded in CDR, the binary format of ROS 2. It has one weight per
+                peer.
+            attachment: Additional data of the message, which identify the program that
+                published it.
 
         Raises:
-            ValueError: The message cannot be read, or two programs publish.
+            ValueError: The message cannot be read, or two programs publish on the topic.
         """
         shares = _check_finite(cdr.read_float_array(data))
         if len(shares) != len(self._peers):
@@ -231,9 +239,10 @@ class DominanceTopic:
         self._requested = dict(zip(self._peers, shares, strict=True))
 
     def send_request(self) -> None:
-        """Requests the newest weights that have arrived from the site, and waits for its reply.
+        """Asks the site to use the newest weights with which its arm follows the other arms.
 
-        Nothing is requested if no new weights have arrived.
+        The method waits for the reply of the site. If no new weights have arrived since the
+        last call, it does nothing.
 
         Raises:
             TrilatError: The site refuses the weights.
@@ -727,7 +736,13 @@ def serve_orders(graph: Ros2Graph, running: RunningSession, sites: Sequence[str]
     """
 
     def serve(order: Callable[..., list[str]], *site: str) -> None:
-        """Offers an order to one site, or to all sites, as a service."""
+        """Offers a ROS service that sends an order to one site or to all sites.
+
+        Args:
+            order: Method of `RunningSession` that sends the order. The service has its name.
+            *site: Name of the site, the process that controls one arm. All sites if it is
+                missing.
+        """
         name = "/".join([running.name, *site, order.__name__])
         graph.serve(name, TRIGGER, lambda _request: _send_order(order, *site))
 

@@ -88,12 +88,12 @@ class ShareHistory:
         self._shares_before = self._ramp.alpha
 
     def add_change(self, change: str) -> None:
-        """Adds a change that an event of the site reports.
+        """Adds a change of the weights to the history, as an event of the site reports it.
 
         Changes of other settings are ignored, and so are texts that do not describe a change.
 
         Args:
-            change: Text of the change, as the field `command` of the event contains it.
+            change: Text of the change, from the field `command` of the event.
         """
         with suppress(ScenarioError):  # raised if the text is not a change
             ramp = parse_core_change(self._scenario, self._site, change).ramp
@@ -102,11 +102,17 @@ class ShareHistory:
                 self._later_ramps.append(ramp)
 
     def advance_to(self, t_ns: int) -> tuple[float, ...]:
-        """Returns the dominance factors at a time, in the order of the site's peers.
+        """Computes the dominance factors of the site at a time.
+
+        A dominance factor is the weight with which a site follows one of its peers, the other
+        sites.
 
         Args:
-            t_ns: The time, in ns since the epoch (the start of the session). It must not be
-                earlier than in the previous call.
+            t_ns: The time, in ns after the start of the session. It must not be earlier than in
+                the previous call.
+
+        Returns:
+            One factor per peer, in the order of the site's peers.
         """
         started_ramps = sorted(ramp for ramp in self._later_ramps if ramp.start_ns <= t_ns)
         # A ramp starts from the factors that the previous one had reached by then.
@@ -194,14 +200,17 @@ class RunningSession:
 
     @contextmanager
     def reach_site(self, site: str, timeout_s: float) -> Iterator[tuple[Bus, Scenario]]:
-        """Waits until a site runs, and opens a connection to its session, as a context manager.
+        """Waits until a site runs, and connects to its session, as a context manager.
+
+        A site is the process that controls one robot arm. The connection is closed at the end
+        of the `with` block.
 
         Args:
             site: Name of the site.
             timeout_s: Longest wait, in s.
 
         Yields:
-            The connection, and the scenario of the session.
+            The network connection, and the scenario (description) of the session.
 
         Raises:
             SessionError: The session has no such site, or the site does not run in time.
@@ -231,16 +240,16 @@ class RunningSession:
         The command `trilat hand --device` does the same.
 
         Args:
-            site: Site of the arm. The live operator of its scenario contains the settings of
-                the device.
+            site: Name of the site, the process that controls the arm. The scenario contains the
+                settings of the device for this site.
             device: The input device.
             stopped: Function that returns True to end the call earlier.
-            say: Function that prints a line for the user.
+            say: Function that receives each line of text for the user.
             timeout_s: Longest wait until the session runs, in s.
 
         Raises:
-            SessionError: There is no such session, or it does not begin.
-            UsageError: No input device can move that arm.
+            SessionError: The session does not exist, or does not begin in time.
+            UsageError: The scenario does not allow an input device to move that arm.
         """
         with (
             self.reach_site(site, timeout_s) as (bus, scenario),
@@ -283,15 +292,16 @@ class RunningSession:
         return _read_replies(self.send_order(sites, "stop"))
 
     def enable(self, *sites: str) -> list[str]:
-        """Lets stopped arms follow their peers again, the other sites of the session.
+        """Lets arms that were stopped follow the other arms of the session again.
 
         The command `trilat enable` does the same.
 
         Args:
-            *sites: Names of the sites. All sites if no name is given.
+            *sites: Names of the sites, the processes that each control one arm. All sites if no
+                name is given.
 
         Returns:
-            One sentence per site: its reply, in the order of the sites.
+            The reply of each site as a sentence, in the order of the sites.
         """
         return _read_replies(self.send_order(sites, "enable"))
 
@@ -536,7 +546,11 @@ class RunningSession:
             ]
 
             def receive() -> list[State]:
-                """Returns the records that have arrived since the last call."""
+                """Returns the records of the sites that have arrived since the last call.
+
+                A record contains what a site measured and computed in one period of its control
+                loop. The list is empty if none has arrived.
+                """
                 return [record for inbox in inboxes for record in read_records(inbox)]
 
             yield receive
@@ -567,7 +581,12 @@ class RunningSession:
             picture_delay: PictureDelay | None = None  # created when the first record arrives
 
             def find() -> dict[str, State]:
-                """Returns one record of each site, the newest or the one that the user sees."""
+                """Returns one record of each site, by the name of the site.
+
+                Without `as_site`, it is the newest record that has arrived. With `as_site`, it
+                is the record of the pose that the user of that site sees. The dictionary is
+                empty until the first record has arrived.
+                """
                 nonlocal picture_delay
                 for record in read_records(inbox):
                     if record.site not in latest_records:
@@ -666,7 +685,11 @@ class RunningSession:
                 history.add_change(event.command)
 
             def find() -> dict[str, float]:
-                """Returns the dominance factors at the time of the newest record."""
+                """Returns the present weight with which the site follows each other site.
+
+                The keys are the names of the other sites. The present time is the time of the
+                newest record that has arrived from the site.
+                """
                 nonlocal now_ns
                 for event in read_messages(events, Event):
                     history.add_change(event.command)

@@ -142,10 +142,11 @@ class SessionPing:
         return elapsed_ns > GATHERING_NS and is_complete
 
     def report(self) -> PingReport:
-        """Returns the results of the measurement up to the present time.
+        """Returns the delays and clock offsets that have been measured up to the present time.
 
-        The rows of the members have the order of their names, and those of the links that of
-        the receiving sites. A delay of -1 was not measured.
+        The rows of the members (processes of the session) are sorted by name. The rows of the
+        links (one-way connections between two sites) are sorted by the name of the receiving
+        site. A value of -1 means that a delay was not measured.
         """
         members = [self._describe_member(info) for _, info in sorted(self.infos.items())]
 
@@ -284,7 +285,10 @@ class TopicDelays(Result):
     publishers: list[dict[str, Any]]
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns the rows of the publishers, for a table or a data frame."""
+        """Returns one row per program that publishes on the topic, for a table or a data frame.
+
+        A row contains the number of messages of the program, and their delays.
+        """
         return self.publishers
 
 
@@ -312,7 +316,14 @@ def ping_topic(
     types: dict[bytes, str] = {}
 
     def receive(kind: str, attachment: Attachment) -> None:
-        """Stores the number and the delay of a message, in a thread of Zenoh."""
+        """Stores the number and the delay of a ROS 2 message for the program that sent it.
+
+        The function is called in a thread of the network library Zenoh.
+
+        Args:
+            kind: Type of the message.
+            attachment: Additional data of the message: its publisher, number and sending time.
+        """
         delay_ns = clock.unix_ns() - attachment.sent_unix_ns
         types[attachment.gid] = kind
         samples.setdefault(attachment.gid, []).append((attachment.number, delay_ns))

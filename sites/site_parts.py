@@ -310,7 +310,11 @@ class SiteParts:
         publish = self.bus.publisher(self._key(channel))
 
         def store_and_publish(payloads: list[bytes]) -> None:
-            """Stores each message, and publishes the messages joined into blocks."""
+            """Stores messages for retransmission, and publishes them in larger blocks.
+
+            Args:
+                payloads: The encoded messages.
+            """
             for payload in payloads:
                 store(payload)
             for block in join_states(payloads):
@@ -319,10 +323,12 @@ class SiteParts:
         return store_and_publish
 
     def pop_changes(self, k: int) -> list[CoreChange]:
-        """Returns the changes that the site applies in a tick, a period of its control loop.
+        """Returns the changes of settings or mode that the site applies in the next tick.
 
-        They are the accepted requests, and changes that follow from the state of an external
-        arm: skipped ticks, silence of the arm, and a released or held dead-man switch.
+        Some changes were requested by users. Others follow from an external arm, a robot or
+        simulator outside of this program. They report that ticks (periods of the control loop)
+        were skipped, that the arm has become silent, or that its dead-man switch was released
+        or is held again.
 
         Args:
             k: Number of the tick.

@@ -733,15 +733,14 @@ class RunningSite:
         )
 
     def report_tick(self, output: TickRecord) -> None:
-        """Publishes events about the changes that took effect in a tick.
+        """Publishes an event for each change that took effect in a tick, such as a new delay.
 
-        If ticks were skipped before this tick, they are only stored here. `run_housekeeping`
-        publishes the skipped ticks of several reports together.
-
-        Examples are a new delay of a link, and a new mode of the site, such as "fault".
+        A new mode of the site, such as "fault", is also a change. Skipped ticks are only stored
+        here, because `run_housekeeping` later publishes them together in one event. A tick is a
+        period of the control loop.
 
         Args:
-            output: Record (stored result) of the tick.
+            output: Record of the tick: what the site measured and computed.
         """
         parts = self._parts
         skipped = count_skipped_ticks(output.cmd)

@@ -179,9 +179,9 @@ def certify(
     own_laws: bool = False,
     twins: int = TWINS,
 ) -> Certificate:
-    """Judges if a run is stable; the command is `trilat certify`.
+    """Judges if a recorded run is stable; the command is `trilat certify`.
 
-    The judgement is "stable", "not stable", or "open" if neither can be shown, and has reasons.
+    The judgement is "stable", "not stable", or "open" if neither can be shown.
 
     >>> print(tn.certify(tn.simulate("free")).stability)
     stable
@@ -189,11 +189,11 @@ def certify(
     Args:
         log: The log, or its path.
         min_coverage: Smallest fraction of the ticks (control periods) of each site that must be
-            judged for a stable run.
-        own_laws: True if the code of a user's control laws may be executed, for the energies
-            that they declare and for twins.
-        twins: Number of twins, which are repetitions of the run with a small disturbance. They
-            show whether disturbances grow.
+            judged, so that the run can be called stable.
+        own_laws: True if the code of a user's control laws may be executed. It is needed to
+            check the energies that a law reports, and to repeat the run.
+        twins: Number of repetitions of the run with a small disturbance ("twins"). They show
+            whether disturbances grow.
 
     Returns:
         The judgement with its reasons.

@@ -162,7 +162,7 @@ class NotRepeatable(LogError):  # noqa: N818 - it names an outcome
 
 
 class NothingSaved(LogError):  # noqa: N818 - it names an outcome
-    """Recovery of a damaged file that has found no data that could be saved."""
+    """Error if no data could be recovered from a damaged log file."""
 
     exit_code = 1
 

@@ -113,10 +113,10 @@ class VectorCounts(NamedTuple):
 
     @classmethod
     def of_chain(cls, joints: int, shared: int = 0) -> "VectorCounts":
-        """Returns the counts of an arm that is a serial chain of links and joints in space.
+        """Returns the lengths of the vectors for an arm that is a serial chain in space.
 
         Args:
-            joints: Number of its joints.
+            joints: Number of joints of the arm.
             shared: Number of coordinates that the sites exchange. 0 stands for the number of
                 joints.
         """
@@ -247,13 +247,15 @@ def is_distribution(value: Any) -> bool:
 
 
 def split_refusal(error: msgspec.ValidationError) -> tuple[str, str]:
-    """Splits the message with which the library msgspec refuses a value of a scenario.
+    """Splits an error message about an invalid scenario into the problem and its place.
+
+    The library msgspec raises the error when it converts the tables of the scenario file.
 
     Args:
-        error: The error, as in "Expected `float` - at `$.sites.m1`".
+        error: The error, with a message such as "Expected `float` - at `$.sites.m1`".
 
     Returns:
-        The problem, and the path of the wrong key below the whole value.
+        The problem and the path of the wrong value, such as "Expected `float`" and ".sites.m1".
     """
     problem, _, path = str(error).partition(" - at ")
     return problem, path.strip("`$")

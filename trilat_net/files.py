@@ -356,22 +356,21 @@ def extend_file(path: Path) -> BinaryIO:
 
 
 def make_results_folder(folder: Path | None, name: str, *, force: bool | None) -> Path:
-    """Makes a folder for results.
+    """Makes a folder for the results of a command, or uses an existing one.
 
-    Commands write their results only into a folder without other content, unless the user
-    permits it.
+    An existing folder must be empty, unless the user permits other files in it.
 
     Args:
         folder: The folder. None uses the next free folder `runs/NAME-N`.
-        name: NAME of that folder.
-        force: True if the folder may have content. None, like False, refuses content, but the
-            error does not advise --force because the command lacks that option.
+        name: The text for NAME in this path.
+        force: True permits files in the folder. False refuses them, and the error advises the
+            option --force. None also refuses them, for a command that has no option --force.
 
     Returns:
         The folder.
 
     Raises:
-        UsageError: The folder has content and `force` is not set, or cannot be made.
+        UsageError: The folder contains files that are not permitted, or cannot be made.
     """
     if folder is None:
         return _make_next_folder(name)

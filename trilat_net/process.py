@@ -128,18 +128,18 @@ class Interrupt:
     """Records signals that request the end of the program, as a context manager.
 
     The first signal requests an orderly end, which may take seconds. A second signal requests
-    the end at once, see `is_repeated`. A process that ignores the closing of its terminal, as
-    under `nohup`, continues to ignore it.
+    the end at once (`is_repeated`). A process that ignores the closing of its terminal, for
+    example one started by `nohup`, continues to ignore it.
 
     Args:
-        compiles: True if a signal may end the process at once while the compiler runs, because
-            the process then has nothing else to finish.
+        compiles: True if a signal may end the process at once during a compilation. This is
+            allowed if the process has nothing to finish then.
 
     Attributes:
         number: Number of the first signal. 0 if no signal has arrived.
-        compiles: True if a signal may end the process while the compiler runs, as in the
-            arguments.
-        raises: True inside `raising`, where a signal raises KeyboardInterrupt.
+        compiles: The value of the argument.
+        raises: True within a `with` block of `raising`, where a signal raises
+            KeyboardInterrupt.
     """
 
     def __init__(self, *, compiles: bool = False) -> None:
@@ -185,10 +185,11 @@ class Interrupt:
 
     @contextmanager
     def raising(self) -> Iterator[None]:
-        """Makes a signal raise KeyboardInterrupt in the block, for work that does not poll.
+        """Lets a signal raise KeyboardInterrupt in a `with` block, to interrupt long work.
 
-        If the signal arrives while Python runs a `__del__`, Python discards the exception. In
-        this case it is raised again at the end of the block.
+        It is meant for work that does not regularly check whether a signal has arrived. Python
+        discards an exception that is raised within a `__del__` method. If this happens, the
+        exception is raised again at the end of the block.
         """
         self.raises = True
         try:
@@ -211,7 +212,7 @@ class Interrupt:
 
     @property
     def exit_code(self) -> int:
-        """Exit code of this process if the first signal ends it, as shells define it.
+        """Exit code of a process that was ended by the first signal, according to shell rules.
 
         It is 128 plus the number of the signal.
         """
@@ -276,7 +277,11 @@ def _watch_signals() -> Callable[[], None]:
     previous_descriptor = signal.set_wakeup_fd(writer)
 
     def wait() -> None:
-        """Reads the numbers of arriving signals until the pipe is closed."""
+        """Ends the process as soon as a signal arrives that requests its end.
+
+        The function runs in a thread of its own. Python writes the number of each signal into a
+        pipe, which the function reads until `unwatch` closes the pipe.
+        """
         with os.fdopen(reader, "rb", 0) as pipe:
             while data := pipe.read(1):  # a byte with the number of the signal
                 number = data[0]

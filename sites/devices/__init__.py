@@ -38,13 +38,14 @@ class DeviceState(NamedTuple):
 
 
 class Device(Protocol):
-    """Interface of an input device, which is read `rate_hz` times a second.
+    """Interface of an input device with which a person moves a robot arm.
+
+    An example is a haptic device. Its motion moves the target that the arm follows. The device
+    is read `rate_hz` times a second. To support another device, a user writes a class with
+    these methods.
 
     A device is a context manager. If the connection to the device is lost, the `with` block is
     left and entered again.
-
-    An input device, such as a haptic device, is moved by a person, and moves the target of an
-    arm. To support another device, a user writes a class with these methods.
 
     >>> tn.session("play").lead("m1", MyDevice())  # doctest: +SKIP
     """

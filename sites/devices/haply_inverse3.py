@@ -1,11 +1,11 @@
-"""Uses an Inverse3 of Haply as an input device, through the service of its maker.
+"""Connects to the haptic device Inverse3 of Haply, through the service of its maker.
 
-The service runs on the same machine and exchanges JSON messages over a WebSocket. It replies to
-each message, which contains a force, with one state of the device. This program therefore
-determines the rate, and must reply to each state with a force, even if the force is zero.
+The service is a program on the same machine. It exchanges JSON messages with this program over
+a WebSocket. This program sends a force, and the service replies with one state of the device. A
+new state therefore arrives only after the next force was sent, even if the force is zero.
 
 If a message of the service cannot be parsed, the state is returned with a position that is not
-finite, which `DeviceHand` ignores.
+finite. The class `DeviceHand`, which moves the arm, ignores such a state.
 """
 
 import math

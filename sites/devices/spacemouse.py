@@ -78,10 +78,14 @@ class SpaceMouse:
         os.close(self._file)
 
     def read(self) -> DeviceState:
-        """Reads the new reports of the device, and integrates the deflection of its cap.
+        """Returns the present state of the device, whose cap a person pushes by hand.
+
+        The deflection of the cap is a velocity. The method integrates the velocity to a
+        position.
 
         Returns:
-            Position since the device was connected, present velocity, and buttons.
+            The position relative to the position at the time of connection, the velocity, and
+            the state of the buttons.
         """
         now_ns = self._clock.monotonic_ns()
         while self._read_report(now_ns):

@@ -314,7 +314,7 @@ def record_command(
             terminal.print_note(warning)
 
     def conclude() -> None:
-        """Verifies the finished log and writes its report, if --conclude requests it."""
+        """Checks the finished log and writes its report, if the option --conclude was given."""
         if concluded:
             _conclude(list(find_parts(path).values()), png=png)
 

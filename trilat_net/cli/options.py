@@ -43,7 +43,15 @@ def check_range(
     """
 
     def check(param: typer.CallbackParam, value: float | None) -> float | None:
-        """Returns the number of the option. Raises UsageError if it is out of range."""
+        """Returns the number that the user gave for an option, after checking its range.
+
+        Args:
+            param: Declaration of the option, which contains its name.
+            value: The number. None if the option was not given.
+
+        Raises:
+            UsageError: The number is less than `low` or greater than `high`.
+        """
         if value is not None and not low <= value <= high:
             raise UsageError(
                 f"{param.opts[0]} is {noun} from {low:.7g} to {high:.7g}, not {value:g}"
@@ -77,10 +85,10 @@ def flag(names: str, text: str = "", **settings: Any) -> Any:
 
 
 def seconds(name: str, text: str = "") -> Any:
-    """Declares an option that takes a waiting time of up to a day, in s.
+    """Declares a command line option with a time to wait, from 0 s to one day.
 
     Args:
-        name: Name of the option.
+        name: Name of the option, such as "--timeout".
         text: Help of the option.
     """
     return value(name, "S", text, callback=check_range(0.0, 86_400.0, "a number of seconds"))
@@ -102,7 +110,17 @@ def command(*examples: str) -> Callable[[Runs], Runs]:
     """
 
     def declare(run: Runs) -> Runs:
-        """Stores the examples, and moves the help of options to their declarations."""
+        """Stores the help of a command where Typer, the command line library, expects it.
+
+        The entries in the section `Options` of the docstring become the help texts of the
+        options. The rest of the docstring is the help of the command.
+
+        Args:
+            run: Function that executes the command.
+
+        Returns:
+            The same function, with the examples in its attribute `examples`.
+        """
         run.examples = examples  # type: ignore[attr-defined]
         docstring = inspect.getdoc(run) or ""
         command_help, _, option_entries = docstring.partition("\n\nOptions:\n")
@@ -132,7 +150,11 @@ def complete_scenarios(incomplete: str) -> list[str]:
 
 
 def complete_figures(incomplete: str) -> list[str]:
-    """Lists the figures with which a shell may complete a word."""
+    """Lists the names of plots that begin with the letters that the user has typed in a shell.
+
+    Args:
+        incomplete: The letters before the completion.
+    """
     from ..reporting.figures.registry import FIGURES
 
     return [name for name in FIGURES if name.startswith(incomplete)]
@@ -412,11 +434,11 @@ class MemberOptions(NamedTuple):
     def find_endpoints(
         self, listen_else: Sequence[str] = (), connect_else: Sequence[str] | None = None
     ) -> "Connection":
-        """Returns the connection that the options describe, without its keys.
+        """Returns the network addresses that the options state, without encryption keys.
 
         Args:
-            listen_else: Endpoints at which to listen if the options name none.
-            connect_else: Endpoints to which to connect if the options name none.
+            listen_else: Addresses at which to listen if the options state none.
+            connect_else: Addresses to which to connect if the options state none.
         """
         from ..net.connection import resolve_member_connection
         from ..net.zenoh_bus import read_zenoh_file
@@ -465,7 +487,10 @@ class MemberOptions(NamedTuple):
 
 
 class Reach(NamedTuple):
-    """The options by which a command reaches a session without being one of its members."""
+    """Command line options with which a command connects to a running session from outside.
+
+    The command only observes or changes the session. It is not one of its sites or recorders.
+    """
 
     connect: ConnectOption = None
     router: RouterOption = None
@@ -473,12 +498,14 @@ class Reach(NamedTuple):
     keys: KeysOption = None
 
     def resolve(self, *, operates: bool = True, stops: bool = False) -> "Connection":
-        """Returns the connection that the options describe.
+        """Returns the connection to the session that the command line options describe.
+
+        If the session is encrypted, the option --keys names the keys of the command.
 
         Args:
-            operates: True if the keys must be those of the operator.
-            stops: True if the connection only serves to stop arms, so that expired keys are
-                accepted.
+            operates: True if only the keys of the operator permit what the command does. Then
+                other keys are refused.
+            stops: True if the command only stops arms. Then expired keys are accepted too.
         """
         from ..net.zenoh_config import OPERATOR
 
@@ -510,12 +537,14 @@ class LawFiles(NamedTuple):
     ] = False
 
     def open(self, *files: Path, runs_them: bool = True) -> "Log":
-        """Opens a log, and warns of code from outside that the command will execute.
+        """Opens a log, and warns the user if code from another person will be executed.
+
+        A log may name files with control laws. They are executed if the run is repeated.
 
         Args:
-            files: The log, or its parts.
-            runs_them: True if the command executes the laws of the log, so that a warning is
-                due.
+            *files: The log, or the files into which it is divided.
+            runs_them: True if the command executes the control laws that the log names. Only
+                then the user is warned.
         """
         allowed: dict[str, Any] = {**self._asdict(), "law": self.law or ()}
         log = terminal.open_with_progress(*files, **allowed)
@@ -578,14 +607,17 @@ _OPTION_TUPLES = (MemberOptions, Reach, LawFiles, RunOptions, PageServing)
 
 
 def expand_option_tuples(run: Callable[..., Any]) -> Callable[..., Any]:
-    """Returns a command in which each option tuple is replaced by its options.
+    """Makes a command for Typer from a function whose parameters are groups of options.
 
-    Typer makes one option of each parameter. A parameter whose type is a tuple such as `Reach`
-    becomes one parameter per field. When the command runs, the values of the fields are put
-    together again.
+    Typer, the command line library, makes one option of each parameter. A group is a named
+    tuple such as `Reach`, with one field per option. The returned function has one parameter
+    per field instead. When it is called, it puts the fields together again.
 
     Args:
-        run: Function of the command.
+        run: Function that executes the command, with groups of options as parameters.
+
+    Returns:
+        The function with one parameter per option.
     """
     declared = inspect.signature(run).parameters
     tuples = {
@@ -603,7 +635,11 @@ def expand_option_tuples(run: Callable[..., Any]) -> Callable[..., Any]:
 
     @wraps(run)
     def run_with_tuples(**arguments: Any) -> Any:
-        """Puts the option tuples together, and runs the command."""
+        """Executes the command, after it has put the options into their groups again.
+
+        Args:
+            **arguments: Value of each option, by the name of its parameter.
+        """
         for name, option_tuple in tuples.items():
             values = [arguments.pop(field) for field in option_tuple._fields]
             arguments[name] = option_tuple(*values)

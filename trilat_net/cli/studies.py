@@ -165,7 +165,14 @@ def _run_virtual(trials: "list[Trial]", jobs: int | None, on: str | None) -> "Tr
     with terminal.progress_bar("runs") as show:
 
         def report_done(result: "TrialResult") -> None:
-            """Counts a finished trial, and reports a scenario after its last trial."""
+            """Updates the progress that the user sees after one run of a scenario has finished.
+
+            Without a terminal, a line is printed when all runs of the same scenario have
+            finished.
+
+            Args:
+                result: Result of the finished run.
+            """
             source = result.trial.source
             remaining[source] -= 1
             done = len(trials) - remaining.total()

@@ -157,7 +157,15 @@ def _confirm_cells(results: "SweepResults", count: int) -> None:
     name = f"confirm-{results.plan.base.name}"
 
     def run_live(scenario: "Scenario", cell: str) -> "tuple[Path, Sequence[str]]":
-        """Runs a cell live, and returns its log and the problems of its session."""
+        """Runs one point of a parameter study in real time, with one process per robot arm.
+
+        Args:
+            scenario: Scenario with the parameters of this point.
+            cell: Name of the point, which is part of the name of its folder.
+
+        Returns:
+            The path of the log, and a sentence for each problem of the run.
+        """
         outcome = run_in_own_folder(scenario, cell, f"{name}-{cell}")
         return outcome.log, outcome.problems
 
