@@ -85,7 +85,7 @@ class Seen(PageMessage, frozen=True, kw_only=True, tag="seen"):
 
 
 class TakePart(PageMessage, frozen=True, kw_only=True, tag="control"):
-    """The page asks for the right to hold arms and give orders, or returns this right.
+    """Request of a page to receive or return the right to move arms and change settings.
 
     Attributes:
         want: True to ask for the right, False to return it.
@@ -141,11 +141,13 @@ class SetLink(PageMessage, frozen=True, kw_only=True, tag="link"):
 
 
 class SetShares(PageMessage, frozen=True, kw_only=True, tag="shares"):
-    """New dominance factors of a site, which are the weights with which it follows its peers.
+    """Request of a page to change the weights with which an arm follows the other arms.
+
+    These weights are called dominance factors.
 
     Attributes:
-        site: Name of the site.
-        to: The factor of each peer by name.
+        site: Name of the process ("site") that controls the arm.
+        to: New weight of each other site (peer), by its name.
     """
 
     site: Name
@@ -194,7 +196,9 @@ class EndSession(PageMessage, frozen=True, kw_only=True, tag="end"):
 
 
 class DoStep(PageMessage, frozen=True, kw_only=True, tag="step"):
-    """A user has completed a step of an experiment: has agreed, is ready, or has answered.
+    """Message of a page that its user has completed a step of an experiment.
+
+    The user has agreed, is ready, or has answered a questionnaire.
 
     Attributes:
         key: Key of the step, as the server sent it to the page.
@@ -207,7 +211,7 @@ class DoStep(PageMessage, frozen=True, kw_only=True, tag="step"):
 
 
 class AbortTrial(PageMessage, frozen=True, kw_only=True, tag="abort"):
-    """The running trial must end, and be repeated later.
+    """Request of a page to end the running trial of an experiment, and to repeat it later.
 
     Attributes:
         why: The reason, for the journal of the experiment.

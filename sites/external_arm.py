@@ -367,7 +367,8 @@ class DeadManSwitch:
     def pop_order(self, mode: Mode, reason: LifeReason) -> SiteOrder:
         """Returns what the site must do because of the state of the dead-man switch.
 
-        The order to stop is returned at every call until the arm is at rest.
+        While the switch is released, every call returns the order to stop, until the arm has
+        stopped or its site reports a fault.
 
         Args:
             mode: Present mode of the site, for example stopped.
