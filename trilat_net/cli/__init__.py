@@ -63,7 +63,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
-    help="Dual-user teleoperation over a network, in virtual time, and again from the log.",
+    help="Dual-user teleoperation: runs sessions over a network, simulates them in virtual "
+    "time, and repeats them from their logs.",
     epilog="Start with: trilat demo paper",
 )
 
@@ -97,7 +98,7 @@ _GROUPS: dict[str, dict[str, Any]] = {
     "log": {"help": "Inspects, checks, signs, recovers, exports or views a log."},
     "scenario": {"help": "Lists, shows, checks and creates scenarios."},
     "new": {"help": "Creates a control law, a hand or a plant of your own, with a test."},
-    "identify": {"help": "Identifies the hand that holds an arm."},
+    "identify": {"help": "Identifies the dynamics of the hand that holds an arm."},
     "trace": {"help": "Imports delays that another program measured."},
     "experiment": {
         "help": "Runs experiments with participants, from the protocol to the tables."

@@ -38,12 +38,13 @@ def site_command(
         str, typer.Option("--scenario", "-s", autocompletion=options.complete_scenarios)
     ],
     session: Annotated[
-        str | None, value("--session", "ID", "Default: the scenario's name.")
+        str | None,
+        value("--session", "ID", "Name of the session; default: the name of the scenario."),
     ] = None,
     *,
     ways: options.MemberOptions,
     join_timeout: Annotated[
-        float, seconds("--join-timeout", "Longest wait for the others, s.")
+        float, seconds("--join-timeout", "Longest wait for the other sites, s.")
     ] = 60.0,
     needs_recorder: options.NeedsRecorderOption = False,
     cpu: Annotated[
@@ -58,19 +59,20 @@ def site_command(
     seed: options.SeedOption = None,
     overrides: options.SetOption = None,
 ) -> None:
-    """Runs one site as one process, for separate terminals or machines.
+    """Runs one site of a session as its own process, for separate terminals or machines.
 
-    Without endpoints, the sites of a session find each other on this machine: each listens at a
-    loopback port derived from session and site, and connects to the sites that precede it in
-    the scenario.
+    Without endpoints, the sites of a session find each other on this machine: each site listens
+    on a loopback port derived from the names of the session and the site, and connects to the
+    sites that precede it in the scenario.
 
     Options:
         name: Name of the site in the scenario.
         scenario: Name of a shipped scenario, or path of a TOML file.
-        stay: At the end, wait at most this long until the recorder has left, s.
-        without: Option of the first site: begin without SITE, which may join later; repeatable.
-        leave_timeout: Under glide: time to continue without a site that has left, s; default:
-            to the end.
+        stay: Longest wait at the end for the recorder to leave the session, s.
+        without: Begin without SITE, which may join later; repeatable. Only the first site
+            accepts this option.
+        leave_timeout: Longest time to continue after another site has left, if the arms then
+            glide (on_stale.action = "glide"), s; default: until the end of the run.
     """
     from sites.site_parts import SiteOptions
     from sites.site_process import run_site
@@ -110,9 +112,7 @@ def hand_command(
     scenario: Annotated[
         str, typer.Option("--scenario", "-s", autocompletion=options.complete_scenarios)
     ] = "",
-    session: Annotated[
-        str | None, value("--session", "ID", "Default: the scenario's name.")
-    ] = None,
+    session: Annotated[str | None, value("--session", "ID")] = None,
     join_timeout: Annotated[
         float, seconds("--join-timeout", "Longest wait for the site, s.")
     ] = 60.0,
@@ -123,18 +123,21 @@ def hand_command(
     *,
     reach: options.Reach,
 ) -> None:
-    """Runs a hand at a site: your own class in a separate process, or a device that you hold.
+    """Runs a hand, which acts as the user of a site: your own class, or a device that you hold.
 
-    The class (kind = "own", process = true) reads the state of the site and decides; the site
-    applies each decision after the hand's delay_ms. A device (kind = "live") leads the arm of a
-    session that runs already.
+    The class (kind = "own", process = true) runs in this process: it reads the state of the
+    site and decides how to move the arm, and the site applies each decision after the hand's
+    delay_ms. A device (kind = "live")
+    leads an arm of a session that is already running.
 
     Options:
         name: Name of the site in the scenario.
-        scenario: For a class: the scenario that the site runs: a shipped name, or path of a
-            TOML file.
-        device: haply_inverse3 or spacemouse; the scenario of the session defines how it leads
-            the arm.
+        scenario: For a class: scenario that the site runs, as the name of a shipped scenario or
+            the path of a TOML file.
+        session: Name of the session; required with --device, otherwise the default is the name
+            of the scenario.
+        device: Device in your hand: haply_inverse3 or spacemouse. The scenario of the session
+            defines how the device leads the arm.
     """
     if device is not None:
         scenario_options = {"--scenario", "--duration", "--seed", "--set"}
@@ -252,25 +255,26 @@ def record_command(
     split_size: Annotated[float | None, value("--split-size", "MIB")] = None,
     split_duration: Annotated[float | None, value("--split-duration", "S")] = None,
     carry_on: Annotated[
-        bool, flag("--continue", "If the log exists, write its next part.")
+        bool, flag("--continue", "If the log exists, continue it in a new part.")
     ] = False,
     durable: Annotated[bool, flag("--durable")] = False,
     views: options.ViewsOption = "100",
     force: options.ForceOption = False,
     png: options.PngOption = False,
 ) -> None:
-    """Records a session into an MCAP log, from its epoch to its end or to Ctrl-C.
+    """Records a session into an MCAP log, from its start until its end or Ctrl-C.
 
-    Without endpoints the recorder asks the first site, at its loopback port, for the others.
-    Parts are named FILE-001.mcap and so on. The name of a file ends in .active until the file
-    is finished.
+    Without endpoints, the recorder connects to the loopback port of the first site and asks for
+    the other sites. If the log is split, its parts are named FILE-001.mcap and so on. The name
+    of a file ends in .active until the file is finished.
 
     Options:
-        output: Default: SESSION.mcap; with --conclude run.mcap in the next free folder.
+        output: File of the log; default: SESSION.mcap, or runs/SESSION-N/run.mcap if --conclude
+            is used.
         join_timeout: Longest wait for the session to begin, s; default: no limit.
         concluded: Verify the log at the end, and write a report into its folder.
-        include: Record only these channels, as in '**/m1/**'; repeatable.
-        exclude: Leave these channels out, as in '**/link'; repeatable.
+        include: Record only these channels, for example '**/m1/**'; repeatable.
+        exclude: Leave out these channels, for example '**/link'; repeatable.
         split_size: Split the log into parts of at most this size, MiB.
         split_duration: Split the log into parts of this duration, s.
         durable: Sync to the disk at every flush instead of every second.
@@ -394,7 +398,8 @@ def replay_command(
     exclude: Annotated[list[str] | None, value("--exclude", "KEYEXPR")] = None,
     prefix: Annotated[str, value("--prefix", "WORD")] = "replay",
     session: Annotated[
-        str | None, value("--session", "ID", "Name of the session, without a prefix.")
+        str | None,
+        value("--session", "ID", "Name of the replayed session, to which no prefix is added."),
     ] = None,
     time: Annotated[str, value("--time", "publish|log")] = "publish",
     low_cpu: Annotated[bool, flag("--low-cpu")] = False,
@@ -409,23 +414,26 @@ def replay_command(
 ) -> None:
     """Publishes a log over Zenoh with its original timing, as a separate session.
 
-    For recorders, viewers and `trilat ping` the replay is like a running session. It replies in
-    place of the sites of the log, and publishes their messages, byte for byte. Without
-    endpoints it listens at the port of the session's first site.
+    To recorders, viewers and `trilat ping`, the replay looks like a running session. It answers
+    for the recorded sites, and publishes their messages byte for byte. Without endpoints, the
+    replay listens on the loopback port of the first site of the replayed session.
 
     Options:
-        files: An MCAP log, or all parts of a log in their order.
-        rate: Speed relative to the recording, or max: as fast as possible.
+        files: An MCAP log, or all parts of a log in order.
+        rate: Speed relative to the recording, or max for as fast as possible.
         start: Start of the part to play, s since tick 0.
         duration: Duration of the part to play, s, instead of --stop.
-        include: Play only these channels, as in '**/m1/*'; repeatable. Default: all channels of
-            the sites.
-        exclude: Leave these channels out, as in '**/link'; repeatable.
-        prefix: Name the session WORD-NAME; with '' NAME, as recorded.
-        time: Play messages at the times at which they were sent, or logged.
-        low_cpu: Sleep until every deadline, which is about 0.1 ms less exact.
-        preload: Largest log that is held in memory; a separate process reads larger logs during
-            the replay.
+        include: Play only these channels, for example '**/m1/*'; repeatable. Default: all
+            channels of the sites.
+        exclude: Leave out these channels, for example '**/link'; repeatable.
+        prefix: Name the replayed session WORD-NAME, where NAME is the recorded name; '' keeps
+            the recorded name.
+        time: Times at which messages are played: the times at which they were sent (publish),
+            or at which they arrived (log).
+        low_cpu: Sleep until each deadline to save processor time; the timing is then about
+            0.1 ms less exact.
+        preload: Largest log that is held in memory, MiB; a separate process reads larger logs
+            during the replay.
     """
     from recorder.play.play_process import PlayOptions, play_log
     from recorder.play.player import parse_rate
@@ -672,8 +680,8 @@ def router_command(
         value(
             "--listen",
             "EP",
-            "Endpoint to listen at; repeatable; "
-            f"default: with --keys {ANY_ADDRESS}, else {LOOPBACK}.",
+            "Endpoint to listen on; repeatable. "
+            f"Default: {ANY_ADDRESS} with --keys, otherwise {LOOPBACK}.",
         ),
     ] = None,
     connect: options.ConnectOption = None,
@@ -690,9 +698,9 @@ def router_command(
 ) -> None:
     """Connects sites that cannot reach each other directly, for example behind NAT.
 
-    Sites and the recorder name the router with --router and start in any order. The router runs
-    until Ctrl-C; a session continues when it is restarted. Routers that --connect to each other
-    act as one router.
+    Start the sites and the recorder with --router, in any order. The router runs until Ctrl-C,
+    and a session continues after its router is restarted. Routers that are connected to each
+    other with --connect act as one router.
     """
     from ..net.connection import (
         open_bus,
@@ -751,7 +759,7 @@ def _print_router_line(text: str) -> None:
 
 @options.command("--session paper", "--session paper --ros tcp/192.0.2.7:7447 --domain 3")
 def ros2_command(
-    session: Annotated[str, value("--session", "ID", "Session to show.")],
+    session: Annotated[str, value("--session", "ID", "Session to bridge.")],
     ros: options.RosRouterOption = None,
     domain: options.RosDomainOption = 0,
     distro: Annotated[str, value("--ros-distro", "humble|jazzy|kilted|lyrical")] = "jazzy",
@@ -763,16 +771,17 @@ def ros2_command(
     *,
     reach: options.Reach,
 ) -> None:
-    """Bridges a session to ROS 2: its programs can hold arms, and its robots can be arms.
+    """Bridges a session to ROS 2: ROS programs can hold arms, ROS robots can serve as arms.
 
-    ROS needs RMW_IMPLEMENTATION=rmw_zenoh_cpp and its router. Nothing of ROS is needed on this
-    machine. The bridge waits for the router, and ends with the session. docs/ros2.md has all
-    topics and services.
+    ROS must use RMW_IMPLEMENTATION=rmw_zenoh_cpp, and its Zenoh router must run. This machine
+    needs no ROS installation. The bridge waits for the router, and ends with the session.
+    docs/ros2.md lists all topics and services.
 
     Options:
-        distro: Distribution of ROS 2 whose message format is written.
+        distro: ROS 2 distribution whose message format the bridge writes.
         rate: Rate of each topic, Hz.
-        names: Names of topics: crisp, crtk, or a TOML file of topics and robots.
+        names: Naming scheme of the topics: crisp, crtk, or a TOML file that lists topics and
+            robots.
     """
     from sites.ros2_bridge import serve_ros2
     from sites.running_session import RunningSession

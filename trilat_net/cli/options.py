@@ -198,16 +198,22 @@ ScenarioArgument = Annotated[
 ]
 SetOption = Annotated[
     list[str] | None,
-    value("--set", "KEY=VALUE", "Override a key, as in control.Kd=5; repeatable."),
+    value(
+        "--set",
+        "KEY=VALUE",
+        "Override a scenario key, for example control.Kd=5; repeatable.",
+    ),
 ]
-SeedOption = Annotated[int | None, typer.Option("--seed", help="Override the scenario's seed.")]
+SeedOption = Annotated[
+    int | None, typer.Option("--seed", help="Override the seed of the scenario.")
+]
 DurationOption = Annotated[
     float | None, value("--duration", "S", "Override the duration of the run, s.")
 ]
 ForceOption = Annotated[bool, flag("--force", "Replace existing files.")]
 ListenOption = Annotated[
     list[str] | None,
-    value("--listen", "EP", "Endpoint to listen at, as in tcp/192.0.2.1:7447."),
+    value("--listen", "EP", "Endpoint to listen on, for example tcp/192.0.2.1:7447."),
 ]
 ConnectOption = Annotated[
     list[str] | None, value("--connect", "EP", "Endpoint to connect to; repeatable.")
@@ -218,19 +224,29 @@ RouterOption = Annotated[
     value(
         "--router",
         "EP",
-        "Endpoint of a router to use instead, as in tcp/192.0.2.1:7447; repeatable: "
-        "the first router that answers is used.",
+        "Endpoint of a router to use instead of direct connections, for example "
+        "tcp/192.0.2.1:7447. If repeated, the first router that answers is used.",
     ),
 ]
 ZenohConfigOption = Annotated[
     Path | None,
-    value("--zenoh-config", "FILE", "Your own Zenoh configuration: TLS, QUIC, access."),
+    value(
+        "--zenoh-config",
+        "FILE",
+        "Your own Zenoh configuration file, for example for TLS, QUIC or access control.",
+    ),
 ]
 KeysOption = Annotated[
-    Path | None, value("--keys", "DIR", "Folder of this member's keys (trilat keys new).")
+    Path | None,
+    value("--keys", "DIR", "Folder with this member's keys, created by `trilat keys new`."),
 ]
 InsecureOption = Annotated[
-    bool, flag("--insecure", "Allow --listen on a network whose users you trust, unencrypted.")
+    bool,
+    flag(
+        "--insecure",
+        "Allow other machines to connect without encryption, on a network whose users you "
+        "trust.",
+    ),
 ]
 
 
@@ -262,7 +278,7 @@ ClockOffsetOption = Annotated[
     value(
         "--clock-offset-s",
         "S",
-        "For tests: use a clock this far ahead of the machine's, s.",
+        "For tests: offset added to the clock of this machine, s.",
         callback=check_range(-1e6, 1e6, "a number of seconds"),
     ),
 ]
@@ -271,7 +287,7 @@ ClockDriftOption = Annotated[
     value(
         "--clock-drift-ppm",
         "PPM",
-        "For tests: use a clock that is faster than the machine's by this share, ppm.",
+        "For tests: drift added to the clock of this machine, ppm; positive is faster.",
         callback=check_range(-200.0, 200.0, "a number"),
     ),
 ]
@@ -281,12 +297,14 @@ ViewsOption = Annotated[
     value(
         "--views",
         "off|full|HZ",
-        "Rate of the standard channels for ROS 2 and viewers, Hz; extremes are kept.",
+        "Rate of the channels with standard messages for ROS 2 and viewers, Hz; the "
+        "decimation keeps minima and maxima. full: every record; off: no such channels.",
     ),
 ]
 
 JobsOption = Annotated[
-    int | None, value("--jobs", "N", "Processes; default: one per core.", min=1)
+    int | None,
+    value("--jobs", "N", "Number of parallel processes; default: one per core.", min=1),
 ]
 
 
@@ -298,11 +316,17 @@ ROS_ROUTER = "tcp/127.0.0.1:7447"
 RosRouterOption = Annotated[
     list[str] | None,
     value(
-        "--ros", "EP", f"Endpoint of ROS's Zenoh router (rmw_zenohd); default: {ROS_ROUTER}."
+        "--ros",
+        "EP",
+        f"Endpoint of the Zenoh router of ROS (rmw_zenohd); default: {ROS_ROUTER}.",
     ),
 ]
-RosDomainOption = Annotated[int, value("--domain", "N", "ROS_DOMAIN_ID.", min=0, max=232)]
-NeedsRecorderOption = Annotated[bool, flag("--needs-recorder", "Wait for a recorder.")]
+RosDomainOption = Annotated[
+    int, value("--domain", "N", "ROS 2 domain (ROS_DOMAIN_ID).", min=0, max=232)
+]
+NeedsRecorderOption = Annotated[
+    bool, flag("--needs-recorder", "Do not start until a recorder has joined the session.")
+]
 
 
 MinCoverageOption = Annotated[
@@ -310,7 +334,7 @@ MinCoverageOption = Annotated[
     value(
         "--min-coverage",
         "SHARE",
-        "Least share of each site's ticks that must be judged for a pass.",
+        "Smallest share of each site's ticks (control periods) that must be checked to pass.",
         callback=check_range(0.0, 1.0, "a share"),
     ),
 ]
@@ -522,17 +546,25 @@ class LawFiles(NamedTuple):
 
     law: Annotated[
         list[Path] | None,
-        value("--law", "FILE", "Allow this file to run as a law of the log; repeatable."),
+        value(
+            "--law",
+            "FILE",
+            "Allow this file to run as a control law that the log names; repeatable.",
+        ),
     ] = None
     other_version: Annotated[
         bool,
-        flag("--other-version", "Accept a --law FILE that differs from the file that ran."),
+        flag(
+            "--other-version",
+            "Accept a --law FILE that differs from the file used in the recorded session.",
+        ),
     ] = False
     remember: Annotated[
         bool,
         flag(
             "--remember",
-            "Also allow the --law FILE for other logs with its hash and the same settings.",
+            "Remember the permission of --law, for later logs that name a file of the same "
+            "hash with the same settings.",
         ),
     ] = False
 
@@ -558,7 +590,7 @@ class RunOptions(NamedTuple):
 
     duration: DurationOption = None
     folder: Annotated[
-        Path | None, value("--out -o", "DIR", "Folder of the results; default: runs/NAME-N.")
+        Path | None, value("--out -o", "DIR", "Folder for the results; default: runs/NAME-N.")
     ] = None
     seed: SeedOption = None
     overrides: SetOption = None
@@ -586,20 +618,32 @@ class PageServing(NamedTuple):
         value(
             "--host",
             "ADDRESS",
-            "Address of the page; beyond loopback it needs --tls or --insecure.",
+            "Address on which the page is served; any address other than loopback requires "
+            "--tls or --insecure.",
         ),
     ] = "127.0.0.1"
     port: Annotated[
-        int, typer.Option("--port", min=0, max=65535, help="Port of the page; 0: any.")
+        int,
+        typer.Option(
+            "--port",
+            min=0,
+            max=65535,
+            help="Port on which the page is served; 0 selects any free port.",
+        ),
     ] = 0
     insecure: Annotated[
-        bool, flag("--insecure", "Allow --host beyond loopback, without encryption.")
+        bool, flag("--insecure", "Allow a --host other than loopback without encryption.")
     ] = False
     browser: Annotated[
-        bool, flag("--browser/--no-browser", "Open a browser if there is one.")
+        bool,
+        flag(
+            "--browser/--no-browser",
+            "Open the page in a browser, if this machine has a browser.",
+        ),
     ] = True
     tls: Annotated[
-        Path | None, value("--tls", "DIR", "Encrypt with the keys of a member in this folder.")
+        Path | None,
+        value("--tls", "DIR", "Encrypt the page with the member's keys in this folder."),
     ] = None
 
 
