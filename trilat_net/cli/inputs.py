@@ -118,10 +118,10 @@ def _print_skeleton(kind: str, written: list[Path], key: str, check: str) -> Non
 
 @options.command("mylaw.py")
 def new_law_command(
-    file: Annotated[Path, typer.Argument(help="File to write, as in mylaw.py.")],
+    file: Annotated[Path, typer.Argument(help="File to write, for example mylaw.py.")],
     force: options.ForceOption = False,
 ) -> None:
-    """Writes a working control law with comments, for you to change, and its test."""
+    """Writes a working, commented control law as a starting point, together with its test."""
     from ..scenario.skeletons import new_law
 
     _print_skeleton("law", new_law(file, force=force), "control.law={}", "certify")
@@ -129,10 +129,10 @@ def new_law_command(
 
 @options.command("myhand.py")
 def new_hand_command(
-    file: Annotated[Path, typer.Argument(help="File to write, as in myhand.py.")],
+    file: Annotated[Path, typer.Argument(help="File to write, for example myhand.py.")],
     force: options.ForceOption = False,
 ) -> None:
-    """Writes a working hand, a program that acts as a user, for you to change, and its test."""
+    """Writes a working hand (a program that acts as a user) as a starting point, with its test."""
     from ..scenario.skeletons import new_hand
 
     key = """'sites.m2.hands=[{{kind="own", class="{}"}}]'"""
@@ -141,10 +141,10 @@ def new_hand_command(
 
 @options.command("myplant.py")
 def new_plant_command(
-    file: Annotated[Path, typer.Argument(help="File to write, as in myplant.py.")],
+    file: Annotated[Path, typer.Argument(help="File to write, for example myplant.py.")],
     force: options.ForceOption = False,
 ) -> None:
-    """Writes a working plant, your own model of an arm, for you to change, and its test."""
+    """Writes a working plant (a model of an arm) as a starting point, together with its test."""
     from ..scenario.skeletons import new_plant
 
     _print_skeleton("plant", new_plant(file, force=force), "sites.s.plant={}", "verify")
@@ -152,29 +152,34 @@ def new_plant_command(
 
 @options.command("irtt run.json.gz", "csv drive.txt --way half -o drive.csv")
 def trace_import_command(
-    form: Annotated[str, typer.Argument(help="irtt, ping or csv.", metavar="FORM")],
+    form: Annotated[
+        str, typer.Argument(help="Format of FILE: irtt, ping or csv.", metavar="FORM")
+    ],
     file: Annotated[Path, typer.Argument(metavar="FILE")],
-    out: Annotated[
-        Path | None, value("--out -o", "CSV", "Default: FILE as -trace.csv, here.")
-    ] = None,
+    out: Annotated[Path | None, value("--out -o", "CSV")] = None,
     way: Annotated[str, value("--way", "half|send|receive|whole")] = "",
-    column: Annotated[
-        str, value("--column", "NAME", "Column of a table with the delays.")
-    ] = "",
+    column: Annotated[str, value("--column", "NAME")] = "",
     every_s: Annotated[
-        float, value("--every", "S", "Interval of a ping without times, s.")
+        float,
+        value("--every", "S", "Interval between pings, s, if the output of ping has no times."),
     ] = 1.0,
     as_json: options.JsonOption = False,
     force: options.ForceOption = False,
 ) -> None:
     """Converts delays that another program measured into a trace for links.
 
-    Prints statistics of the network as well.
+    The command also prints statistics of the network.
 
     Options:
-        file: JSON of irtt, lines of ping or fping, or a table with a header.
-        way: Half a round trip, one direction of irtt (send or receive), or delays as they are.
-            Default: half a round trip; one-way delays as they are.
+        file: File with the JSON output of irtt, the text output of ping or fping, or a table
+            with a header.
+        out: File for the trace; default: the name of FILE with -trace.csv in place of its
+            ending, in the current folder.
+        way: Delay to use: half of a round trip (half), one direction that irtt measured (send
+            or receive), or the delay unchanged (whole). Default: half of a round trip; one-way
+            delays stay unchanged.
+        column: Column of the table that contains the delays; default: the first column whose
+            name says so.
     """
     from ..scenario.delay_traces import import_trace
 
@@ -192,23 +197,28 @@ def trace_import_command(
 
 @options.command("keys m1 m2 s recorder operator --host 192.0.2.1")
 def keys_new_command(
-    folder: Annotated[Path, typer.Argument(help="New folder of the keys.", metavar="DIR")],
+    folder: Annotated[
+        Path, typer.Argument(help="Folder to create for the keys.", metavar="DIR")
+    ],
     members: Annotated[list[str], typer.Argument(metavar="MEMBER...")],
     hosts: Annotated[list[str] | None, value("--host", "NAME")] = None,
     days: Annotated[
-        int, typer.Option("--days", min=1, max=3650, help="Validity of the certificates.")
+        int,
+        typer.Option("--days", min=1, max=3650, help="Validity of the certificates, in days."),
     ] = 30,
 ) -> None:
     """Creates keys: a certificate authority, and a folder of keys for each member.
 
-    Bring each folder to its member's machine by a channel that you trust, and pass it with
-    --keys. Members without keys, or with keys of another authority, cannot connect; a member
-    can send only under its own name. Keep the folder `authority` on a machine where no member
-    runs: `trilat keys renew` needs it before the keys expire.
+    Copy each folder to its member's machine over a channel that you trust, and name the folder
+    with --keys. Members without keys, or with keys from another authority, cannot connect; a
+    member can send only under its own name. Keep the folder `authority` on a machine where no
+    member runs: `trilat keys renew` needs this folder before the keys expire.
 
     Options:
-        members: The sites; and recorder, operator, router, bridge if there are any.
-        hosts: Host name or address at which a member listens; repeatable.
+        members: Members of the session: all sites, and the recorder, operator, router and
+            bridge if the session has them.
+        hosts: Host name or address on which a member listens; repeatable. This machine is
+            always included.
     """
     from ..net.member_keys import create_keys
 
@@ -225,21 +235,22 @@ def keys_new_command(
 @options.command("keys", "keys m1 recorder --days 90")
 def keys_renew_command(
     folder: Annotated[
-        Path, typer.Argument(help="Folder that trilat keys new created.", metavar="DIR")
+        Path, typer.Argument(help="Folder that `trilat keys new` created.", metavar="DIR")
     ],
     members: Annotated[list[str] | None, typer.Argument(metavar="[MEMBER]...")] = None,
     days: Annotated[
-        int, typer.Option("--days", min=1, max=3650, help="Validity of the certificates.")
+        int,
+        typer.Option("--days", min=1, max=3650, help="Validity of the certificates, in days."),
     ] = 30,
 ) -> None:
     """Renews the certificates of members; their private keys stay the same.
 
-    The authority in the folder signs the new certificates. Bring the files authority.pem,
-    certificate.pem and members.json of each folder to its machine again, and restart the member
-    before its next session: a running member keeps its old certificate.
+    The authority in the folder signs the new certificates. Copy the files authority.pem,
+    certificate.pem and members.json from each folder to the member's machine again, and restart
+    the member before its next session: a running member keeps its old certificate.
 
     Options:
-        members: Default: all members with a folder.
+        members: Members whose certificates are renewed; default: all members with a folder.
     """
     from ..net.member_keys import renew_keys
 
@@ -249,12 +260,17 @@ def keys_renew_command(
 
 @options.command("lab")
 def keys_pair_command(
-    name: Annotated[Path, typer.Argument(help="Writes NAME.key and NAME.pub.", metavar="NAME")],
+    name: Annotated[
+        Path,
+        typer.Argument(
+            help="Name of the pair; its files are NAME.key and NAME.pub.", metavar="NAME"
+        ),
+    ],
 ) -> None:
     """Creates a pair of Ed25519 keys, to sign logs and to check signatures.
 
-    Keep NAME.key private. Give NAME.pub, by a channel that they trust, to everybody who checks
-    your logs.
+    Keep NAME.key private. Give NAME.pub to everybody who checks your logs, over a channel that
+    they trust.
     """
     from ..log.log_signature import create_signing_keys
 
@@ -268,7 +284,7 @@ def keys_info_command(
     folder: Annotated[Path, typer.Argument(help="Folder of one member's keys.", metavar="DIR")],
     as_json: options.JsonOption = False,
 ) -> None:
-    """Shows the member and the expiry of keys, and the Zenoh settings that they imply."""
+    """Shows the member to whom keys belong, their expiry, and the Zenoh settings they imply."""
     from ..net.member_keys import read_member_keys
 
     keys = read_member_keys(folder)

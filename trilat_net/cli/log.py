@@ -44,10 +44,10 @@ def log_check_command(
     ] = None,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Checks that a log is well-formed, complete and consistent; executes nothing.
+    """Checks that a log is well-formed, complete and consistent, without executing anything.
 
-    Exit code 0: sound; 1: not sound; 2: no such file. For files of other programs only the
-    structure is checked.
+    Exit code 0: the log is sound. 1: the log is not sound. 2: the file does not exist. For
+    files from other programs, only the structure is checked.
     """
     from ..log.session_check import check_file
 
@@ -71,7 +71,7 @@ def log_check_command(
 def log_sign_command(
     file: options.LogArgument,
     key: Annotated[
-        Path, options.value("--key", "KEY", "Private key, created by trilat keys pair.")
+        Path, options.value("--key", "KEY", "Private key, created by `trilat keys pair`.")
     ],
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
@@ -97,16 +97,18 @@ def log_recover_command(
     output: Annotated[
         Path | None,
         options.value(
-            "-o --out --output", "OUT", "Default: FILE without .active, or FILE.recovered.mcap."
+            "-o --out --output",
+            "OUT",
+            "File for the recovered log; default: FILE without .active, or FILE.recovered.mcap.",
         ),
     ] = None,
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Recovers a torn or damaged log into a new, complete file; the original is not changed.
+    """Recovers an unfinished or damaged log into a new, complete file.
 
-    Works with every MCAP file. Exit code 0: nothing was lost; 3: something was lost, and is
-    listed; 1: nothing could be recovered.
+    The original file is not changed. The command works with every MCAP file. Exit code 0:
+    nothing was lost. 3: something was lost, and is listed. 1: nothing could be recovered.
     """
     from ..log.recover import recover
 
@@ -127,17 +129,19 @@ def log_export_command(
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Exports a log to files for other tools: names end in their units, numbers are exact.
+    """Exports a log to files for other tools, with exact numbers and with units in the names.
 
     Options:
-        form: ros2: an MCAP file of standard messages at full rate; parquet, csv: a folder with
-            a file per site and kind; npz, mat: one file with an array per column; lerobot: a
-            dataset of LeRobot, with an episode for each log in FILE.
-        settings: Setting of a format, repeatable: for lerobot fps=30, program=m2 (a user that
-            is a program); for ros2 names=crtk (or a file of names).
-        actions: Actions of lerobot as its plugin accepts them: positions of end effectors, or
-            angles of joints. Default: the pose that sites share.
-        output: File or folder; default: next to FILE, named after it.
+        form: Format. ros2: an MCAP file of standard messages at full rate; parquet or csv: a
+            folder with a file for each site and kind of record; npz or mat: one file with an
+            array for each column; lerobot: a LeRobot dataset with an episode for each log in
+            FILE.
+        settings: Setting of the format; repeatable. For lerobot: fps=30, or program=m2 if the
+            user m2 is the program to be trained. For ros2: names=crtk, or a file of names.
+        actions: For lerobot: store the actions as the LeRobot plugin accepts them, as positions
+            of the end effectors (tip) or angles of the joints (joints). Default: the values
+            that the sites exchange.
+        output: File or folder to write; default: next to FILE, with a name derived from it.
     """
     from ..log.log_reader import open_logs
     from ..reporting.export import Exporter
@@ -178,15 +182,15 @@ def log_view_command(
     ] = False,
     save: Annotated[
         Path | None,
-        options.value("--save", "OUT.rrd", "Write a file for Rerun instead of opening it."),
+        options.value("--save", "OUT.rrd", "Write a Rerun file instead of opening Rerun."),
     ] = None,
     force: options.ForceOption = False,
 ) -> None:
-    """Opens a log in Rerun: a column per site, a name for every curve.
+    """Opens a log in Rerun, with a column for each site and a label for every curve.
 
-    If a log lacks the standard channels (--views off), was not finished or has parts, a
-    temporary file with these channels is written first. If Rerun is not installed, the log's
-    page opens in a browser instead.
+    If a log lacks the standard channels (--views off), was not finished or is split into parts,
+    a temporary file with these channels is written first. If Rerun is not installed, the page
+    of the log opens in a browser instead.
     """
     from importlib.util import find_spec
 

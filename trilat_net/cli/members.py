@@ -127,8 +127,7 @@ def hand_command(
 
     The class (kind = "own", process = true) runs in this process: it reads the state of the
     site and decides how to move the arm, and the site applies each decision after the hand's
-    delay_ms. A device (kind = "live")
-    leads an arm of a session that is already running.
+    delay_ms. A device (kind = "live") leads an arm of a session that is already running.
 
     Options:
         name: Name of the site in the scenario.

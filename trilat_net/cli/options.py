@@ -348,6 +348,7 @@ OnOption = Annotated[
         "Run on the workers of this Dask scheduler instead of on this machine.",
     ),
 ]
+FIGURE_HELP = "File for a figure of the result (.png, .svg or .pdf)."
 PngOption = Annotated[bool, flag("--png", "Write every figure as a PNG file too.")]
 JsonOption = Annotated[bool, flag("--json", "Print everything as JSON.")]
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 def sim_command(
     scenario: options.ScenarioArgument,
     output: Annotated[
-        Path | None, value("-o --out --output", "FILE", "Default: NAME.mcap.")
+        Path | None, value("-o --out --output", "FILE", "File of the log; default: NAME.mcap.")
     ] = None,
     duration: options.DurationOption = None,
     seed: options.SeedOption = None,
@@ -83,19 +83,20 @@ def verify_command(
     min_coverage: options.MinCoverageOption = options.MIN_COVERAGE,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Executes every site again from a log and compares every computed field of every record.
+    """Executes every site again from its log, and compares every computed field of the records.
 
     A record is the stored result of a site in one control period. The numbers must agree bit
     for bit.
 
     Exit code 0: everything agrees, the log was not changed, and enough of every site was
-    judged. 1: something differs, was changed, or is missing. 2: no log. 4: a site's law is code
-    from outside that may not run without --law; everything else agrees.
+    checked. 1: something differs, was changed, or is missing. 2: there is no log. 4: the
+    control law of a site is external code that needs --law to run; everything else agrees.
 
     Options:
-        virtual: Compare with virtual time too, with and without the log's arrivals.
-        resume_every: Restart sites from the records every N ticks, which reveals state of a law
-            that the records lack.
+        virtual: Also compare the log with two runs in virtual time: one with the recorded
+            arrival times of messages, and one over a network that adds no delay.
+        resume_every: Restart each site from its records every N ticks (control periods), to
+            reveal state of a control law that the records lack; default 0: never.
     """
     from ..execution.log_checks import run_log_checks
 
@@ -123,31 +124,42 @@ def certify_command(
         list[Accepted] | None,
         typer.Option(
             "--accept",
-            help="Also exit 0 for a bounded oscillation or an open verdict; repeatable.",
+            help="Also return exit code 0 for a bounded oscillation or an open verdict; "
+            "repeatable.",
         ),
     ] = None,
     min_coverage: options.MinCoverageOption = options.MIN_COVERAGE,
     own_laws: Annotated[
         bool,
-        flag("--own-laws", "Run the code of imported laws for the energies that they declare."),
+        flag(
+            "--own-laws",
+            "Run the code of imported control laws to compute the energies that they declare.",
+        ),
     ] = False,
     twins: Annotated[
-        int, value("--twins", "N", "Number of twins with a small push.", min=0, max=99)
+        int,
+        value(
+            "--twins",
+            "N",
+            "Number of twins, which are repetitions of the run with a small push.",
+            min=0,
+            max=99,
+        ),
     ] = 8,
     *,
     laws: options.LawFiles,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Judges if a run is stable, not stable or open, and gives the reasons.
+    """Judges whether a run is stable, not stable or undecided (open), and gives the reasons.
 
-    Prints the energy function V of the stability proof with its balance, the conditions of the
-    proof (premises), and the roots of the linearised loop at the final pose. Executes the run
-    again together with twins, which are repetitions with a small push. Runs code of imported
-    laws only with --law or --own-laws. docs/certificate.md defines every term and every key of
-    the JSON.
+    The command prints the energy function V of the stability proof with its energy balance, the
+    conditions of the proof (premises), and the roots of the linearised loop at the final pose.
+    It executes the run again together with twins, which are repetitions with a small push. The
+    code of imported control laws runs only with --law or --own-laws. docs/certificate.md
+    defines every term and every key of the JSON.
 
     Exit code 0: stable. 1: not stable (bounded oscillation, drifting, growing, diverged) or
-    open. 2: no log.
+    open. 2: there is no log.
     """
     from ..theory.linear_analysis import certify_run
 
@@ -160,8 +172,10 @@ def certify_command(
 
 
 _PUSH_HELP = (
-    "Push a twin: m1.q1=1e-6 (rad), m1.qd1, m1.theta1, all of m1.q or of q; repeatable, "
-    "one twin each. Default: the pushes of certify."
+    "Quantity that is pushed, and size of the push, for example m1.q1=1e-6. Quantities are the "
+    "angle of a joint (m1.q1, rad), its speed (m1.qd1, rad/s), an estimated parameter of the "
+    "arm (m1.theta1), and all joints of a site (m1.q) or of all sites (q). Repeatable: each "
+    "push makes one twin. Default: the pushes of `trilat certify`."
 )
 
 
@@ -175,10 +189,14 @@ def twin_command(
     ] = None,
     delta: Annotated[
         str,
-        value("--delta", "LOW:HIGH", "Sizes of one push, as in 1e-9:1e-3: a twin per decade."),
+        value(
+            "--delta",
+            "LOW:HIGH",
+            "Range of sizes for a single push, for example 1e-9:1e-3; one twin per decade.",
+        ),
     ] = "",
     picture: Annotated[
-        Path | None, value("-o --out --output", "FILE", "Draw a figure: .png, .svg or .pdf.")
+        Path | None, value("-o --out --output", "FILE", options.FIGURE_HELP)
     ] = None,
     *,
     laws: options.LawFiles,
@@ -187,9 +205,10 @@ def twin_command(
 ) -> None:
     """Executes a run again with small pushes, and shows whether these disturbances grow.
 
-    A pushed repetition is called a twin. It gets the arrivals, delays, hands and changes of the
-    run, and the difference from the run is simulated in full, without a linear model
-    (docs/certificate.md, "Twins"). Exit code 0 for any growth.
+    A repetition with a push is called a twin. Each twin uses the recorded arrivals of messages,
+    delays, hands and changes of the run. The difference from the run is simulated in full,
+    without a linear model (docs/certificate.md, "Twins"). The exit code is 0 whether or not the
+    disturbances grow.
     """
     from ..analysis.twin_growth import twin
 
@@ -212,9 +231,9 @@ def identify_hand_command(
 ) -> None:
     """Identifies the mass, damping and stiffness of the hand that holds an arm.
 
-    During the run a sum of sines moves the arm: the scenario has an operator of kind
+    A sum of sines must move the arm during the run, so the scenario needs an operator of kind
     "multisine" at any site (docs/ports.md, "Measured operators"). `trilat linear --operators`
-    reads the JSON of the result.
+    reads the result that --json prints.
     """
     from ..studies.hand_impedance import identify_hand
 
@@ -224,12 +243,12 @@ def identify_hand_command(
 
 @options.command("run.mcap")
 def metrics_command(file: options.LogsArgument, as_json: options.JsonOption = False) -> None:
-    """Measures a run by all metrics that apply to it.
+    """Computes all metrics that apply to a run.
 
-    They cover tracking, effort, energies, force sharing, impedance, walls, learning and the
-    network. The table has a column for each site, link and wall. A dash is a missing number. If
-    the run could have the number, the reason is given below the table. docs/metrics.md has
-    every formula.
+    The metrics cover tracking, effort, energies, force sharing, impedance, walls, learning and
+    the network. The table has a column for each site, link and wall. A dash marks a missing
+    value; if the run could have the value, the reason is given below the table. docs/metrics.md
+    has every formula.
     """
     from ..analysis.metrics.log_metrics import compute_log_metrics
 
@@ -246,11 +265,10 @@ def figure_command(
     ] = None,
     width_in: Annotated[float, value("--width", "3.5|7")] = 3.5,
     formats: Annotated[
-        str, value("--format", "pdf,png,svg", "One or more formats.")
+        str,
+        value("--format", "pdf,png,svg", "File formats of the figures, separated by commas."),
     ] = "pdf,png",
-    folder: Annotated[
-        Path | None, value("--out -o", "DIR", "Default: FILE without .mcap, -figures.")
-    ] = None,
+    folder: Annotated[Path | None, value("--out -o", "DIR")] = None,
     others: Annotated[list[Path] | None, value("--with", "FILE")] = None,
     *,
     laws: options.LawFiles,
@@ -258,14 +276,17 @@ def figure_command(
     as_json: Annotated[bool, flag("--json", "Print the list or the paths as JSON.")] = False,
     force: options.ForceOption = False,
 ) -> None:
-    """Draws figures of a log for a paper, as vectors with embedded fonts of 8 pt.
+    """Draws figures of a log for a paper, as PDF, PNG or SVG files with text of 8 pt.
 
-    The same log gives the same bytes every time.
+    The same log always gives the same bytes.
 
     Options:
-        names: Names of figures, see --list; default: all that FILE has.
-        width_in: Width of one or two columns of a paper, in.
-        others: Draw this log over FILE, as the figure overlay; repeatable.
+        names: Names of the figures (see --list); default: all figures for which FILE has data.
+        width_in: Width of the figures in inches: one or two columns of a paper.
+        folder: Folder for the figures; default: the name of FILE with -figures in place of
+            .mcap.
+        others: Draw this log together with FILE in one figure, which is named overlay;
+            repeatable.
     """
     log = laws.open(file)
     if listed:
@@ -337,7 +358,10 @@ def _list_figures(log: "Log", *, as_json: bool) -> None:
 def report_command(
     files: options.LogsArgument,
     folder: Annotated[
-        Path | None, value("-o --out", "DIR", "Default: FILE without .mcap.")
+        Path | None,
+        value(
+            "-o --out", "DIR", "Folder for the report; default: the name of FILE without .mcap."
+        ),
     ] = None,
     *,
     laws: options.LawFiles,
@@ -346,7 +370,7 @@ def report_command(
     png: options.PngOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Writes the page and the summary of a log, and with --png its figures."""
+    """Writes a report of a log: a web page and a summary, and with --png also its figures."""
     from ..files import make_results_folder, refuse_link
     from ..reporting.conclude import conclude
 
@@ -375,7 +399,7 @@ def rerun_command(
         ),
     ] = None,
     closed_loop: Annotated[
-        bool, flag("--closed-loop", "Execute all sites, over the network of the log.")
+        bool, flag("--closed-loop", "Execute all sites again, over the recorded network.")
     ] = False,
     overrides: options.SetOption = None,
     *,
@@ -388,8 +412,8 @@ def rerun_command(
 ) -> None:
     """Executes sites of a log again with changed settings, and compares the results.
 
-    Without --closed-loop only the sites of --replace are executed again. The other sites stay
-    as recorded and do not react.
+    Without --closed-loop, only the sites that --replace names are executed again. The other
+    sites repeat what was recorded, and do not react.
     """
     from ..execution.rerun import rerun
     from ..files import refuse_existing
@@ -429,12 +453,20 @@ def linear_command(
     overrides: options.SetOption = None,
     pose: Annotated[
         str | None,
-        value("--pose", "Q1,Q2,...", "Pose of all sites, rad; default: the end of a run."),
+        value(
+            "--pose",
+            "Q1,Q2,...",
+            "Pose of all sites, rad; default: the pose at the end of a run of the scenario.",
+        ),
     ] = None,
     roots: Annotated[int, value("--roots", "N", "Number of roots to print.")] = 6,
     over: Annotated[
         list[str] | None,
-        value("--over", "KEY=LOW:HIGH", "Find edges of stability along a key; repeatable."),
+        value(
+            "--over",
+            "KEY=LOW:HIGH",
+            "Find the stability limits in this range of a scenario key; repeatable.",
+        ),
     ] = None,
     ports: Annotated[
         bool,
@@ -445,25 +477,24 @@ def linear_command(
         value(
             "--operators",
             "FILE",
-            "A measured operator, from `trilat identify hand --json`; repeatable.",
+            "JSON file of a measured operator, from `trilat identify hand --json`; repeatable.",
         ),
     ] = None,
-    picture: Annotated[
-        Path | None, value("--figure", "FILE", "Draw a figure: .png, .svg or .pdf.")
-    ] = None,
+    picture: Annotated[Path | None, value("--figure", "FILE", options.FIGURE_HELP)] = None,
     drawn: Annotated[
         LinearFigure,
-        typer.Option("--draw", help="What to draw: roots, impedances, or passivity."),
+        typer.Option("--draw", help="What the figure shows: roots, impedances, or passivity."),
     ] = LinearFigure.ROOTS,
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
     """Linearises the loop about its equilibrium, and analyses the stability of small motions.
 
-    Computes the characteristic roots, the largest stable delay and the edges of stability with
-    delays (docs/linear.md). For the arms without operators and environments it computes
-    passivity, Llewellyn's criterion of absolute stability, and the impedances that operators
-    feel (docs/ports.md). Exit code 0 for any verdict.
+    The command computes the characteristic roots, the largest delay for which the loop is
+    stable, and the stability limits along scenario keys (edges of stability, docs/linear.md).
+    For the arms without operators and environments, it computes passivity, Llewellyn's
+    criterion of absolute stability, and the impedances that operators feel (docs/ports.md). The
+    exit code is 0 for every verdict.
     """
     options.check_picture(picture, force=force)
     from ..studies.hand_impedance import read_hands

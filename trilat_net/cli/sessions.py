@@ -34,7 +34,7 @@ def demo_command(
 ) -> None:
     """Runs a scenario live over Zenoh, then verifies its log and writes a report.
 
-    Each site and the recorder is a process of its own.
+    Each site runs in its own process, and so does the recorder.
     """
     run_and_report(run.load(scenario), run)
 
@@ -117,10 +117,11 @@ def live_command(
     serving: options.PageServing,
     run: options.RunOptions,
 ) -> None:
-    """Runs a scenario live, with a page on which to watch it and to lead the arms.
+    """Runs a scenario live, with a web page that shows the session and lets you lead the arms.
 
-    The page's button or Ctrl-C ends the session; then its log is verified and a report is
-    written. With --session the page shows a session that already runs, and leaves it running.
+    A button on the page or Ctrl-C ends the session; then its log is verified and a report is
+    written. With --session, the page shows a session that is already running, and leaves it
+    running.
 
     Options:
         session: Show this running session instead of starting one.
@@ -182,7 +183,8 @@ def ping_command(
     *,
     reach: options.Reach,
     count: Annotated[
-        int, value("--count", "N", "Round trips to each member.", callback=_check_count)
+        int,
+        value("--count", "N", "Number of round trips to each member.", callback=_check_count),
     ] = 50,
     timeout: options.AnswerOption = 3.0,
     benchmark: Annotated[
@@ -206,27 +208,30 @@ def ping_command(
     clock_offset: options.ClockOffsetOption = 0.0,
     clock_drift: options.ClockDriftOption = 0.0,
 ) -> None:
-    """Shows round trip, clock offset and jitter between here and every member of a session.
+    """Shows the round trip, clock offset and jitter from here to every member of a session.
 
-    The session may still wait for members. If it runs, the links that its sites measure are
-    shown too. Without endpoints the command asks the first site, at its loopback port, for the
-    others.
+    The session may still be waiting for members. If it is running, the delays that its sites
+    measure on their links are shown too. Without endpoints, the command connects to the
+    loopback port of the first site and asks for the other sites.
 
-    With --benchmark it needs no session: it measures whether the network is good enough for a
-    scenario, by the delay margin of trilat linear. The far end is trilat ping --answer EP on
-    another machine, reached with --connect EP; without --connect the far end runs here, over
-    TCP, TLS and QUIC. This takes half a minute; exit code 1 if the network is not good enough.
+    With --benchmark no session is needed: the command measures whether the network is good
+    enough for a scenario, using the delay margin that `trilat linear` computes. To measure the
+    network to another machine, run `trilat ping --answer EP` there, and use --connect EP here.
+    Without --connect, both ends run on this machine, over TCP, TLS and QUIC. The benchmark
+    takes half a minute. The exit code is 1 if the network is not good enough.
 
-    With --ros2 it needs no session either: it listens to a topic of ROS 2 over Zenoh, of any
-    message type (docs/ros2.md).
+    With --ros2 no session is needed either: the command listens over Zenoh to a ROS 2 topic of
+    any message type (docs/ros2.md).
 
     Options:
-        benchmark: Measure the network instead, by size, rate and transport, for this scenario.
+        benchmark: Measure the network for this scenario instead, for several message sizes,
+            rates and transports.
         ros2: Measure the delay of messages of this ROS 2 topic instead.
-        seconds: Duration of all cases together, s; default 24. With --answer: time until the
-            command ends; with --ros2: duration of the measurement, default 5.
-        picture: Draw the benchmark: .png, .svg or .pdf.
-        answer: Answer benchmarks from other machines, at this endpoint; repeatable.
+        seconds: Total duration of the benchmark, s; default: 24. With --ros2: duration of the
+            measurement, s; default: 5. With --answer: time after which the command ends, s;
+            default: no limit.
+        picture: File for a figure of the benchmark (.png, .svg or .pdf).
+        answer: Answer benchmarks from other machines on this endpoint; repeatable.
     """
     mode = ""
     if benchmark is not None:
@@ -439,12 +444,12 @@ def watch_command(
     reach: options.Reach,
     timeout: options.AnswerOption = 10.0,
 ) -> None:
-    """Shows a running session in a terminal, until the session ends or Ctrl-C.
+    """Shows a running session in a terminal, until the session ends or you press Ctrl-C.
 
     Each site has a line with its joint angles, the size |e| of its synchronisation error, its
-    torque and mode, the age of the newest sample of each peer, and who holds the arm. The line
-    above the sites has V, the energy function of the stability proof. Without endpoints the
-    command asks the first site, at its loopback port, for the others.
+    torque and mode, the age of the newest sample of each peer, and the holder of the arm. The
+    line above the sites shows V, the energy function of the stability proof. Without endpoints,
+    the command connects to the loopback port of the first site and asks for the other sites.
     """
     from live.terminal_watch import show_in_terminal, watch_session
 
@@ -463,9 +468,10 @@ def watch_command(
     )
 
 
-SessionOption = Annotated[str, value("--session", "ID", "The session.")]
+SessionOption = Annotated[str, value("--session", "ID", "Name of the session.")]
 SitesArgument = Annotated[
-    list[str] | None, typer.Argument(metavar="SITE...", help="Default: all.")
+    list[str] | None,
+    typer.Argument(metavar="SITE...", help="Names of the sites; default: all sites."),
 ]
 
 
@@ -495,9 +501,10 @@ def stop_command(
 ) -> None:
     """Stops arms at once while the session continues: the arms come to rest where they are.
 
-    They stay stopped until `trilat enable`. With --end all sites end their run at the same time
-    instead. Without endpoints the command asks the sites on this machine at the addresses in
-    their files, or else the first site, at its loopback port, for the others.
+    The arms stay stopped until you run `trilat enable`. With --end, all sites end their run at
+    the same time instead. Without endpoints, the command reaches the sites on this machine at
+    the addresses that they have stored in files. If there are none, it connects to the loopback
+    port of the first site and asks for the other sites.
     """
     if end and sites:
         raise UsageError("--end ends the whole session: name no site")
@@ -510,21 +517,23 @@ def stop_command(
 def enable_command(
     session: SessionOption, sites: SitesArgument = None, *, reach: options.Reach
 ) -> None:
-    """Enables stopped arms: they wait for the other arms, align with them and follow again."""
+    """Enables stopped arms: they wait for the other arms, align with them, and follow them."""
     terminal.print_texts(_connect(session, reach).enable(*(sites or ())))
 
 
 @options.command("--session paper s")
 def reset_command(
     session: SessionOption,
-    sites: Annotated[list[str], typer.Argument(metavar="SITE...", help="Sites with a fault.")],
+    sites: Annotated[
+        list[str], typer.Argument(metavar="SITE...", help="Sites whose fault is cleared.")
+    ],
     *,
     reach: options.Reach,
 ) -> None:
-    """Clears the fault of sites unless its cause persists.
+    """Clears the faults of sites, except faults whose cause persists.
 
-    The sites then wait for the other sites, and their arms align with those before they follow
-    them.
+    The sites then wait for the other sites. Each arm aligns with the other arms before it
+    follows them.
     """
     terminal.print_texts(_connect(session, reach).reset(*sites))
 
@@ -604,7 +613,8 @@ def set_command(
 ) -> None:
     """Changes a link, or a row of the dominance matrix, while a session runs.
 
-    Without endpoints the command asks the first site, at its loopback port, for the others.
+    Without endpoints, the command connects to the loopback port of the first site and asks for
+    the other sites.
     """
     name = None if session is None else options.check_session_name(session)
     # Typer runs this function first, and then the command of the group, which needs both.
@@ -614,17 +624,25 @@ def set_command(
 @options.command("'m1->s' --delay 350ms --loss 5%")
 def set_link_command(
     context: typer.Context,
-    name: Annotated[str, typer.Argument(help="The link, as in m1->s.", metavar="FROM->TO")],
+    name: Annotated[
+        str, typer.Argument(help="Link that is changed, for example m1->s.", metavar="FROM->TO")
+    ],
     delay: Annotated[
-        str | None, typer.Option("--delay", help="New delay, as in 350ms.")
+        str | None, typer.Option("--delay", help="New delay, for example 350ms.")
     ] = None,
-    loss: Annotated[str | None, typer.Option("--loss", help="New loss, as in 5%.")] = None,
+    loss: Annotated[
+        str | None, typer.Option("--loss", help="New packet loss, for example 5%.")
+    ] = None,
     preset: Annotated[
-        str | None, typer.Option("--preset", help="A named link, as in 4g.")
+        str | None, typer.Option("--preset", help="Preset of link settings, for example 4g.")
     ] = None,
     to: Annotated[
         list[str] | None,
-        value("--to", "KEY=VALUE", "Any key of a link, as in model=gamma; repeatable."),
+        value(
+            "--to",
+            "KEY=VALUE",
+            "New value of any link key, for example model=gamma; repeatable.",
+        ),
     ] = None,
 ) -> None:
     """Changes keys of a directed link; a model or a preset replaces all keys."""
@@ -650,14 +668,15 @@ def set_dominance_command(
     shares: Annotated[
         list[str],
         typer.Argument(
-            metavar="PEER=SHARE...", help="New shares of its peers, which sum to 1."
+            metavar="PEER=SHARE...",
+            help="New dominance shares of the site's peers, which sum to 1.",
         ),
     ],
     ramp: Annotated[
-        str, typer.Option("--ramp", help="Duration of the change, as in 2s.")
+        str, typer.Option("--ramp", help="Duration of the ramp, for example 2s.")
     ] = "1s",
 ) -> None:
-    """Changes one row of the dominance matrix along a linear ramp; its sum stays 1."""
+    """Changes one row of the dominance matrix along a linear ramp; the row always sums to 1."""
     pairs = parse_pairs(shares, "m1=0.9")
     table = {peer: parse_share(str(share)) for peer, share in pairs.items()}
     ramp_s = parse_milliseconds(ramp) / 1e3
@@ -699,13 +718,15 @@ def doctor_command(
         str | None,
         value("--session", "ID", "Also check the clocks of this session's members."),
     ] = None,
-    folder: Annotated[Path, value("--out -o", "DIR", "Folder for results.")] = Path("runs"),
+    folder: Annotated[
+        Path, value("--out -o", "DIR", "Folder planned for results, whose disk is checked.")
+    ] = Path("runs"),
     as_json: options.JsonOption = False,
 ) -> None:
-    """Checks keys, endpoints, clocks, real-time rights, disk and processors of this machine.
+    """Checks this machine: keys, endpoints, clocks, real-time privileges, disk and processors.
 
-    Use the options of the site, recorder or router that shall run here. Exit code 1 if a check
-    fails.
+    Use the options of the site, recorder or router that will run on this machine. The exit code
+    is 1 if a check fails.
     """
     from sites.doctor import examine_machine
 

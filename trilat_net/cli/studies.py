@@ -48,7 +48,8 @@ def test_command(
         list[str] | None,
         typer.Argument(
             metavar="[SCENARIO]...",
-            help="Names or paths; default: all shipped scenarios with \\[expect].",
+            help="Names or paths of scenarios; default: all shipped scenarios with an \\[expect] "
+            "section.",
             autocompletion=options.complete_scenarios,
         ),
     ] = None,
@@ -56,12 +57,17 @@ def test_command(
         bool,
         flag(
             "--live/--virtual",
-            "Run live over a network, in sequence, or in virtual time.",
+            "Run the scenarios live over a network, one after another, instead of in virtual "
+            "time.",
         ),
     ] = False,
     seeds: Annotated[
         str | None,
-        value("--seeds", "LIST", "Seeds, as in 1..20 or 1,5,9; default: the scenario's."),
+        value(
+            "--seeds",
+            "LIST",
+            "Seeds, for example 1..20 or 1,5,9; default: the seed of the scenario.",
+        ),
     ] = None,
     junit: Annotated[
         Path | None, value("--junit", "FILE", "Write the results as JUnit XML as well.")
@@ -71,9 +77,10 @@ def test_command(
     overrides: options.SetOption = None,
     as_json: options.JsonOption = False,
 ) -> None:
-    r"""Runs scenarios, checks their \[expect], and prints margins.
+    r"""Runs scenarios, checks the expectations in their \[expect] sections, and prints margins.
 
-    For each failure it prints the command that repeats the run.
+    A margin is the distance of a measured value from its expected bound. For each failure, the
+    command that repeats the run is printed.
     """
     from ..files import write_whole
     from ..studies.executor import check_workers
@@ -327,7 +334,7 @@ def compare_command(
     files: Annotated[list[Path] | None, typer.Argument(metavar="FILE FILE...")] = None,
     tune: Annotated[str | None, _option("--tune", "SCENARIO")] = None,
     law: Annotated[str | None, _option("--law", "LAW,LAW...")] = None,
-    budget: Annotated[int, _option("--budget", "N", "Candidates per law.")] = 64,
+    budget: Annotated[int, _option("--budget", "N")] = 64,
     seed: Annotated[int, _option("--seed", "S", "Seed of the search.")] = 1,
     seeds: Annotated[int, _option("--seeds", "N")] = 1,
     objective: Annotated[str, _option("--objective", "error|settling")] = "error",
@@ -340,21 +347,22 @@ def compare_command(
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Compares logs and the differences of their experiments, or tuned control laws.
+    """Compares logs and shows how their experiments differ, or compares tuned control laws.
 
-    One procedure tunes all laws. Nothing is ranked: arms that hang freely, or that no operator
-    moves, also have small errors.
+    All control laws are tuned by the same procedure. The results are not ranked, because small
+    errors can also mean that an arm hangs freely, or that no operator moves it.
 
     Options:
         files: Two or more MCAP logs.
-        tune: Compare tuned control laws in this scenario instead.
+        tune: Tune control laws in this scenario and compare them, instead of logs.
         law: Control laws; default: adaptive,adaptive_box,p_d,pd_d. Others: adaptive_robust,
             known, p_f, wave, tdpa, tanks, four_channel, six_channel, saturated_pd, authority,
-            impedance, smith, and your own, as in mylaws:Law.
+            impedance, smith, and your own, for example mylaws:Law.
+        budget: Number of settings (candidates) that are tried for each control law.
         seeds: Number of seeds of the scenario over which each candidate is averaged.
-        objective: The objective besides effort.
+        objective: Objective that is minimised together with effort.
         gravity: Gravity that all laws assume, in % of the true gravity.
-        output: Folder of the results; default: the next free runs/tune-...
+        output: Folder for the results; default: the next free runs/tune-NAME-N.
     """
     if tune is None:
         for name in options.list_used_options(context):
@@ -388,40 +396,51 @@ def compare_command(
     "--arm arm6.urdf --delay 40ms --figure gains.png", "--arm my.urdf --delay measured:run.mcap"
 )
 def tune_command(
-    arm: Annotated[Path, value("--arm", "URDF", "The arm: a file, or a shipped one.")],
+    arm: Annotated[
+        Path, value("--arm", "URDF", "URDF file of the arm, or name of a shipped one.")
+    ],
     delay: Annotated[str, value("--delay", "40ms|measured:SESSION|CSV")],
-    law: Annotated[str, value("--law", "LAW", "p_d, pd_d or saturated_pd.")] = "p_d",
+    law: Annotated[
+        str, value("--law", "LAW", "Control law: p_d, pd_d or saturated_pd.")
+    ] = "p_d",
     tip: Annotated[
-        str, value("--tip", "LINK", "End link; default: the only one without a child.")
+        str,
+        value("--tip", "LINK", "End link of the arm; default: the only link without a child."),
     ] = "",
     sites: Annotated[
         int, value("--sites", "2|3", "Number of arms that follow one another.")
     ] = 2,
-    rate: Annotated[int, value("--rate", "HZ", "Tick rate.")] = 1000,
+    rate: Annotated[
+        int, value("--rate", "HZ", "Rate of the control loops (tick rate), Hz.")
+    ] = 1000,
     margin: Annotated[
-        float, value("--margin", "FACTOR", "Factor by which K is below the edge.")
+        float,
+        value(
+            "--margin", "FACTOR", "Factor by which the gain K stays below the stability limit."
+        ),
     ] = 2.0,
     damping: Annotated[float, value("--damping", "RATIO", "Damping ratio of an arm.")] = 0.7,
     quantile: Annotated[float, value("--quantile", "SHARE")] = 1.0,
     overrides: options.SetOption = None,
     *,
     reach: options.Reach,
-    picture: Annotated[
-        Path | None, value("--figure", "FILE", "Draw a figure: .png, .svg or .pdf.")
-    ] = None,
+    picture: Annotated[Path | None, value("--figure", "FILE", options.FIGURE_HELP)] = None,
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Finds the largest gains for an arm over a delay, and confirms them by runs.
+    """Finds the largest gains for an arm on links with a delay, and confirms them by simulation.
 
-    The gains keep a margin to the edge of stability. Two or three such arms follow one another
-    over links of that delay in both directions (docs/arms.md). Paste the last line into a
-    scenario. Exit code 0: all runs behave as the linear loop predicts. 1: a run does not.
+    The gains keep a margin to the stability limit. Two or three such arms follow one another
+    over links with that delay in both directions (docs/arms.md). Paste the last line of the
+    output into a scenario. Exit code 0: all simulated runs behave as the linear loop predicts.
+    1: at least one run does not.
 
     Options:
-        delay: One-way delay; or the delays of a log, a running session, or a table
-            t_s,delay_ms.
-        quantile: Quantile of varying delays that is used as the constant delay; 1: the largest.
+        delay: One-way delay of the links, for example 40ms. The delays can also come from a
+            running session (measured:SESSION), a log (measured:FILE), or a table with the
+            columns t_s,delay_ms.
+        quantile: Quantile of varying delays that is used as the constant delay; 1 is the
+            largest delay.
     """
     options.check_picture(picture, force=force)
     from ..studies.arm_gains import tune_arm
@@ -547,13 +566,18 @@ def bench_command(
         str, value("--study", "full|small|round-trips", "Part of the suite to run.")
     ] = "full",
     small: Annotated[
-        bool, typer.Option("--small", help="Same as --study small: some minutes.")
+        bool, typer.Option("--small", help="Same as --study small, which takes a few minutes.")
     ] = False,
-    task: Annotated[str | None, value("--task", "TASK,TASK...", "Only these tasks.")] = None,
-    law: Annotated[str | None, value("--law", "LAW,LAW...", "Only these laws.")] = None,
+    task: Annotated[
+        str | None, value("--task", "TASK,TASK...", "Run only these tasks; default: all.")
+    ] = None,
+    law: Annotated[
+        str | None, value("--law", "LAW,LAW...", "Run only these control laws; default: all.")
+    ] = None,
     link: Annotated[str | None, value("--link", "LINK,LINK...")] = None,
     seeds: Annotated[
-        int | None, value("--seeds", "N", "Number of seeds; default: the study's.")
+        int | None,
+        value("--seeds", "N", "Number of seeds; default: the number of the study."),
     ] = None,
     cell: Annotated[str | None, value("--cell", "TASK/LAW/LINK")] = None,
     tune: Annotated[bool, typer.Option("--tune", rich_help_panel="Gains")] = False,
@@ -565,15 +589,18 @@ def bench_command(
 ) -> None:
     """Runs control laws on the same tasks over the same links, and tabulates the results.
 
-    The tables show stability, energy, errors, effort and stiffness. One procedure tuned the
-    gains of every law. Finished runs are kept: the same command continues.
+    The tables show stability, energy, errors, effort and stiffness. The gains of all laws were
+    tuned by the same procedure. Finished runs are kept; use the same command again to continue
+    an interrupted suite.
 
     Options:
-        link: Other links, as in rtt68-loss10,4g.
-        cell: Print the commands that write logs of a cell.
+        link: Use these links instead of the links of the study, for example rtt68-loss10,4g.
+        cell: Print the commands that write the logs of this cell of the tables, and run nothing.
         tune: Tune the laws again, and store their gains with the suite.
-        confirm: Run unstable cells again for 100 s, which refutes or confirms the verdict.
-        output: Folder; continues a suite in it. Default: runs/bench-STUDY.
+        confirm: Run the runs that are not stable again, for 100 s, to confirm or refute their
+            verdicts.
+        output: Folder for the results; a suite that the folder already contains is continued.
+            Default: runs/bench-STUDY.
     """
     from ..studies.bench import plan_bench, prepare_bench_folder
     from ..studies.bench.bench_figures import write_bench
@@ -628,15 +655,20 @@ def bench_command(
     terminal.print_paths([] if as_json else paths)
 
 
-ProtocolArgument = Annotated[Path, typer.Argument(help="A protocol (TOML).", metavar="FILE")]
+ProtocolArgument = Annotated[
+    Path, typer.Argument(help="Protocol of an experiment (a TOML file).", metavar="FILE")
+]
 FolderArgument = Annotated[Path, typer.Argument(help="Folder of an experiment.", metavar="DIR")]
 
 
 @options.command("reaching.toml", "two-people.toml --pair")
 def experiment_new_command(
-    file: ProtocolArgument,
+    file: Annotated[
+        Path, typer.Argument(help="Protocol to write (a TOML file).", metavar="FILE")
+    ],
     pair: Annotated[
-        bool, flag("--pair", "For two people, each of whom holds a master.")
+        bool,
+        flag("--pair", "Write a protocol for two people, each of whom holds a master arm."),
     ] = False,
     force: options.ForceOption = False,
 ) -> None:
@@ -663,9 +695,12 @@ def experiment_run_command(
         Path, typer.Argument(help="A protocol, or the folder of an experiment to continue.")
     ],
     out: Annotated[
-        Path | None, value("--out -o", "DIR", "Default: runs/experiment-NAME-N.")
+        Path | None,
+        value("--out -o", "DIR", "Folder for the results; default: runs/experiment-NAME-N."),
     ] = None,
-    live: Annotated[bool, flag("--live", "With people, on pages in their browsers.")] = False,
+    live: Annotated[
+        bool, flag("--live", "Run with people, who take part on pages in their browsers.")
+    ] = False,
     *,
     serving: options.PageServing,
     jobs: options.JobsOption = None,
@@ -674,9 +709,9 @@ def experiment_run_command(
 ) -> None:
     """Runs an experiment with synthetic participants in virtual time, or with people.
 
-    Each trial leaves a verified log. With --live the command prints a link for the experimenter
-    and one for each user; trials begin once all users are ready on their pages. The page's
-    button or Ctrl-C pauses the experiment.
+    Each trial produces a verified log. With --live, the command prints a link for the
+    experimenter and one for each user; trials begin once all users are ready on their pages.
+    The button on the experimenter's page or Ctrl-C pauses the experiment.
     """
     from live.page_server import PageOptions
 
@@ -707,18 +742,16 @@ def experiment_run_command(
 @options.command("runs/experiment-reaching-001")
 def experiment_analyse_command(
     folder: FolderArgument,
-    out: Annotated[
-        Path | None, value("--out -o", "DIR", "Default: its folder analysis.")
-    ] = None,
-    exclude: Annotated[
-        list[str] | None,
-        value(
-            "--exclude", "WHO=REASON", "Leave out a participant or pair, and why; repeatable."
-        ),
-    ] = None,
+    out: Annotated[Path | None, value("--out -o", "DIR")] = None,
+    exclude: Annotated[list[str] | None, value("--exclude", "WHO=REASON")] = None,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Compares the conditions of an experiment: tables, figures, a paragraph for a paper."""
+    """Compares the conditions of an experiment, and writes tables, figures and a text for a paper.
+
+    Options:
+        out: Folder for the results; default: the subfolder analysis of the experiment.
+        exclude: Participant or pair to leave out, with the reason; repeatable.
+    """
     from ..studies.experiment.experiment_analysis import analyse_experiment
 
     excluded = {}
@@ -736,14 +769,21 @@ def experiment_power_command(
         float, typer.Argument(help="Cohen's d_z of a paired comparison.", min=0.01, max=10.0)
     ],
     participants: Annotated[
-        int | None, value("--participants", "N", "Number of participants.", min=2)
+        int | None,
+        value(
+            "--participants",
+            "N",
+            "Planned number of participants, whose power is computed.",
+            min=2,
+        ),
     ] = None,
-    seed: Annotated[int, value("--seed", "S", "Seed of the drawn experiments.")] = 1,
+    seed: Annotated[int, value("--seed", "S", "Seed of the simulated experiments.")] = 1,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Computes how many participants are needed to find an effect.
+    """Computes how many participants are needed to detect an effect.
 
-    The power is computed by theory and from drawn experiments.
+    The power is computed from theory. With --participants, it is also computed from simulated
+    experiments, whose data are random.
     """
     from ..studies.experiment.experiment_analysis import compute_experiment_power
 

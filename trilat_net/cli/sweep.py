@@ -320,15 +320,16 @@ def sweep_command(
     metric: Annotated[list[str] | None, value("--metric", "KEY")] = None,
     output: Annotated[Path | None, value("-o --out", "DIR")] = None,
     resume: Annotated[
-        Path | None, value("--resume", "DIR", "Continue an interrupted sweep.")
+        Path | None, value("--resume", "DIR", "Continue the interrupted sweep in this folder.")
     ] = None,
     cell: Annotated[int | None, value("--cell", "N")] = None,
     jobs: options.JobsOption = None,
     on: options.OnOption = None,
-    yes: Annotated[bool, flag("--yes", "Run an oversized sweep.")] = False,
+    yes: Annotated[bool, flag("--yes", "Run the sweep even if it is very large.")] = False,
     overrides: options.SetOption = None,
     mapped: Annotated[
-        bool, _option("--map", help="Draw the stability map with theory lines.")
+        bool,
+        _option("--map", help="Draw the stability map, with the stability limits from theory."),
     ] = False,
     width: Annotated[float | None, _option("--width", metavar="3.5|7")] = None,
     margin: Annotated[str | None, _option("--margin", metavar="KEY=FROM:TO")] = None,
@@ -336,27 +337,34 @@ def sweep_command(
     confirm: Annotated[int | None, _option("--confirm", metavar="K", min=1)] = None,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Runs a scenario over a grid of its keys in virtual time, and classifies stability.
+    """Runs a scenario over a grid of scenario keys in virtual time, and judges its stability.
 
-    All cores are used. Finished runs are kept, however the sweep ends: --resume, or the same
-    command with the same -o, continues the sweep.
+    All cores are used. Finished runs are kept even if the sweep is interrupted. To continue it,
+    use --resume, or the same command with the same -o. A cell is one combination of values in
+    the grid.
 
     Options:
-        scenario: Name of a shipped scenario, or path of a TOML file; or path of the results of
-            a sweep.
-        over: An axis, as in link.delay_ms=0:1600:50 or link.order=newest,in_order; repeatable.
-        seeds: Number of seeds, or a list, as in 1..20; default: one.
-        law: Sweep laws as well; default: the scenario's.
-        longest: Longest run of an undecided cell, s; default: eight times the duration.
-        judge: What a map shows: classes, or growth exponents of pushed twins, for which short
-            runs suffice.
+        scenario: Name of a shipped scenario, path of a TOML file, or folder with the results of
+            an earlier sweep.
+        over: Axis of the grid: a scenario key with its values, for example
+            link.delay_ms=0:1600:50 or link.order=newest,in_order; repeatable.
+        seeds: Number of seeds, or a list of seeds, for example 1..20; default: one.
+        law: Control laws, as a further axis of the grid; default: the law of the scenario.
+        longest: Longest run of a cell whose stability is still undecided, s; default: eight
+            times the duration.
+        judge: Quantity in the map: stability classes (verdict), or growth exponents of runs
+            with a small push (twins), for which short runs suffice.
         metric: Measure this metric of every run as well (docs/metrics.md); repeatable.
-        output: Folder of the results; a sweep in it is continued. Default: runs/sweep-NAME-N.
-        cell: With results: print the commands that write logs of a cell.
-        width: Width of the map, in; default: one column.
-        margin: Search the edge of stability along a key instead, at every point of the grid.
-        tolerance: Width of an edge relative to its value.
-        confirm: With results: run this many cells on each side of the edge live.
+        output: Folder for the results; a sweep that the folder already contains is continued.
+            Default: runs/sweep-NAME-N.
+        cell: For an earlier sweep: print the commands that write the logs of this cell.
+        width: Width of the map in inches: one or two columns of a paper; default: one column.
+        margin: Instead of a full sweep, search for the stability limit in this range of a
+            scenario key, at every point of the grid.
+        tolerance: Largest uncertainty of a stability limit that --margin finds, relative to its
+            value.
+        confirm: For an earlier sweep: run up to this many cells on each side of the stability
+            limit as live sessions.
     """
     from ..studies.sweep import plan_sweep
     from ..studies.sweep.margin_search import format_range_axis, parse_search_range
