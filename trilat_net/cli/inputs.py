@@ -121,7 +121,7 @@ def new_law_command(
     file: Annotated[Path, typer.Argument(help="File to write, for example mylaw.py.")],
     force: options.ForceOption = False,
 ) -> None:
-    """Writes a working, commented control law as a starting point, together with its test."""
+    """Writes a working, commented control law as a starting point, and a test of it."""
     from ..scenario.skeletons import new_law
 
     _print_skeleton("law", new_law(file, force=force), "control.law={}", "certify")
@@ -132,7 +132,7 @@ def new_hand_command(
     file: Annotated[Path, typer.Argument(help="File to write, for example myhand.py.")],
     force: options.ForceOption = False,
 ) -> None:
-    """Writes a working hand (a program that acts as a user) as a starting point, with its test."""
+    """Writes a working hand, which acts as a user, as a starting point, and a test of it."""
     from ..scenario.skeletons import new_hand
 
     key = """'sites.m2.hands=[{{kind="own", class="{}"}}]'"""
@@ -144,7 +144,7 @@ def new_plant_command(
     file: Annotated[Path, typer.Argument(help="File to write, for example myplant.py.")],
     force: options.ForceOption = False,
 ) -> None:
-    """Writes a working plant (a model of an arm) as a starting point, together with its test."""
+    """Writes a working plant, a model of an arm, as a starting point, and a test of it."""
     from ..scenario.skeletons import new_plant
 
     _print_skeleton("plant", new_plant(file, force=force), "sites.s.plant={}", "verify")
@@ -178,8 +178,8 @@ def trace_import_command(
         way: Delay to use: half of a round trip (half), one direction that irtt measured (send
             or receive), or the delay unchanged (whole). Default: half of a round trip; one-way
             delays stay unchanged.
-        column: Column of the table that contains the delays; default: the first column whose
-            name says so.
+        column: Column of the table that contains the delays; default: the first one with
+            a name such as delay, rtt or latency.
     """
     from ..scenario.delay_traces import import_trace
 
@@ -284,7 +284,7 @@ def keys_info_command(
     folder: Annotated[Path, typer.Argument(help="Folder of one member's keys.", metavar="DIR")],
     as_json: options.JsonOption = False,
 ) -> None:
-    """Shows the member to whom keys belong, their expiry, and the Zenoh settings they imply."""
+    """Shows whose keys they are, when they expire, and the Zenoh settings that they imply."""
     from ..net.member_keys import read_member_keys
 
     keys = read_member_keys(folder)

@@ -99,7 +99,8 @@ def log_recover_command(
         options.value(
             "-o --out --output",
             "OUT",
-            "File for the recovered log; default: FILE without .active, or FILE.recovered.mcap.",
+            "File for the recovered log; default: the name of FILE without .active, or with "
+            ".recovered.mcap in place of .mcap.",
         ),
     ] = None,
     force: options.ForceOption = False,
@@ -129,7 +130,7 @@ def log_export_command(
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Exports a log to files for other tools, with exact numbers and with units in the names.
+    """Exports a log to files for other tools, with exact numbers and units in the column names.
 
     Options:
         form: Format. ros2: an MCAP file of standard messages at full rate; parquet or csv: a
@@ -137,7 +138,7 @@ def log_export_command(
             array for each column; lerobot: a LeRobot dataset with an episode for each log in
             FILE.
         settings: Setting of the format; repeatable. For lerobot: fps=30, or program=m2 if the
-            user m2 is the program to be trained. For ros2: names=crtk, or a file of names.
+            user m2 is a program. For ros2: names=crtk, or a file of names.
         actions: For lerobot: store the actions as the LeRobot plugin accepts them, as positions
             of the end effectors (tip) or angles of the joints (joints). Default: the values
             that the sites exchange.

@@ -213,7 +213,9 @@ DurationOption = Annotated[
 ForceOption = Annotated[bool, flag("--force", "Replace existing files.")]
 ListenOption = Annotated[
     list[str] | None,
-    value("--listen", "EP", "Endpoint to listen on, for example tcp/192.0.2.1:7447."),
+    value(
+        "--listen", "EP", "Endpoint to listen on, for example tcp/192.0.2.1:7447; repeatable."
+    ),
 ]
 ConnectOption = Annotated[
     list[str] | None, value("--connect", "EP", "Endpoint to connect to; repeatable.")

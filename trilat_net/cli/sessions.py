@@ -208,7 +208,7 @@ def ping_command(
     clock_offset: options.ClockOffsetOption = 0.0,
     clock_drift: options.ClockDriftOption = 0.0,
 ) -> None:
-    """Shows the round trip, clock offset and jitter from here to every member of a session.
+    """Shows round-trip time, clock offset and jitter between this machine and every member.
 
     The session may still be waiting for members. If it is running, the delays that its sites
     measure on their links are shown too. Without endpoints, the command connects to the
@@ -613,8 +613,7 @@ def set_command(
 ) -> None:
     """Changes a link, or a row of the dominance matrix, while a session runs.
 
-    Without endpoints, the command connects to the loopback port of the first site and asks for
-    the other sites.
+    Without endpoints, it asks the first site, on its loopback port, for the other sites.
     """
     name = None if session is None else options.check_session_name(session)
     # Typer runs this function first, and then the command of the group, which needs both.

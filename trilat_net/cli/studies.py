@@ -48,8 +48,8 @@ def test_command(
         list[str] | None,
         typer.Argument(
             metavar="[SCENARIO]...",
-            help="Names or paths of scenarios; default: all shipped scenarios with an \\[expect] "
-            "section.",
+            help="Names or paths of scenarios; default: all shipped scenarios with a section "
+            "\\[expect].",
             autocompletion=options.complete_scenarios,
         ),
     ] = None,
@@ -405,7 +405,9 @@ def tune_command(
     ] = "p_d",
     tip: Annotated[
         str,
-        value("--tip", "LINK", "End link of the arm; default: the only link without a child."),
+        value(
+            "--tip", "LINK", "End link of the arm; default: the only link that has no child."
+        ),
     ] = "",
     sites: Annotated[
         int, value("--sites", "2|3", "Number of arms that follow one another.")
@@ -428,7 +430,7 @@ def tune_command(
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Finds the largest gains for an arm on links with a delay, and confirms them by simulation.
+    """Finds the largest gains for an arm on links with a delay, and tests them in simulation.
 
     The gains keep a margin to the stability limit. Two or three such arms follow one another
     over links with that delay in both directions (docs/arms.md). Paste the last line of the
@@ -595,10 +597,10 @@ def bench_command(
 
     Options:
         link: Use these links instead of the links of the study, for example rtt68-loss10,4g.
-        cell: Print the commands that write the logs of this cell of the tables, and run nothing.
+        cell: Only print the commands that write the logs of this cell of the tables.
         tune: Tune the laws again, and store their gains with the suite.
-        confirm: Run the runs that are not stable again, for 100 s, to confirm or refute their
-            verdicts.
+        confirm: Repeat the runs that are not stable over 100 s, to confirm or refute the
+            verdict.
         output: Folder for the results; a suite that the folder already contains is continued.
             Default: runs/bench-STUDY.
     """
@@ -746,10 +748,10 @@ def experiment_analyse_command(
     exclude: Annotated[list[str] | None, value("--exclude", "WHO=REASON")] = None,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Compares the conditions of an experiment, and writes tables, figures and a text for a paper.
+    """Compares the conditions of an experiment, in tables, figures and a paragraph for a paper.
 
     Options:
-        out: Folder for the results; default: the subfolder analysis of the experiment.
+        out: Folder for the results; default: analysis, in the folder of the experiment.
         exclude: Participant or pair to leave out, with the reason; repeatable.
     """
     from ..studies.experiment.experiment_analysis import analyse_experiment

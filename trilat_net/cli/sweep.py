@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from ..studies.sweep.sweep_run import DurationEstimate, SweepFolder
 
 
-_option = partial(typer.Option, rich_help_panel="Maps and edges")
+_option = partial(typer.Option, rich_help_panel="Maps and stability limits")
 
 
 def _check_modes(used_options: Sequence[str]) -> None:
@@ -344,19 +344,19 @@ def sweep_command(
     the grid.
 
     Options:
-        scenario: Name of a shipped scenario, path of a TOML file, or folder with the results of
+        scenario: Name of a shipped scenario, path of a TOML file, or folder (or results.csv) of
             an earlier sweep.
         over: Axis of the grid: a scenario key with its values, for example
             link.delay_ms=0:1600:50 or link.order=newest,in_order; repeatable.
         seeds: Number of seeds, or a list of seeds, for example 1..20; default: one.
         law: Control laws, as a further axis of the grid; default: the law of the scenario.
         longest: Longest run of a cell whose stability is still undecided, s; default: eight
-            times the duration.
+            times the duration, or the duration with --judge twins.
         judge: Quantity in the map: stability classes (verdict), or growth exponents of runs
             with a small push (twins), for which short runs suffice.
         metric: Measure this metric of every run as well (docs/metrics.md); repeatable.
         output: Folder for the results; a sweep that the folder already contains is continued.
-            Default: runs/sweep-NAME-N.
+            Default: runs/sweep-NAME-N, or runs/margin-NAME-N with --margin.
         cell: For an earlier sweep: print the commands that write the logs of this cell.
         width: Width of the map in inches: one or two columns of a paper; default: one column.
         margin: Instead of a full sweep, search for the stability limit in this range of a
