@@ -90,12 +90,12 @@ def test_a_full_disk_has_its_exit_code_and_leaves_nothing(tmp_path: Path) -> Non
 def test_a_folder_that_was_not_made_here_is_never_replaced(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("years")
-    with pytest.raises(UsageError, match="is no folder that was exported"):
+    with pytest.raises(UsageError, match="is not an exported folder"):
         make(tmp_path / "mine", "1", folder=True, force=True)
-    with pytest.raises(UsageError, match="is no file;"):
+    with pytest.raises(UsageError, match="is not a file;"):
         make(tmp_path / "mine", "1", folder=False, force=True)
     (tmp_path / "notes").write_text("notes")
-    with pytest.raises(UsageError, match="is no folder that was exported"):
+    with pytest.raises(UsageError, match="is not an exported folder"):
         refuse_existing(tmp_path / "notes", force=True, manifest=EXPORT_MANIFEST)
     assert everything(tmp_path)["mine/thesis.tex"] == "years"
 
@@ -195,7 +195,7 @@ def test_no_output_is_written_through_a_link(
         (tmp_path / "real").write_text("years")
     (tmp_path / "linked").symlink_to(tmp_path / "real")
     with pytest.raises(
-        UsageError, match="linked: is a symbolic link, and no output is written through one"
+        UsageError, match="linked: is a symbolic link, through which no output is written"
     ):
         write(tmp_path / "linked")
     assert (tmp_path / "linked").is_symlink()

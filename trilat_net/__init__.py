@@ -182,8 +182,8 @@ def _import_name(name: str) -> _Any:
 
         remedy = "which is not installed"
         if package in STUDY_LIBRARIES:
-            remedy = "which trilat-net-core does without: pip install trilat-net"
-        return _make_stand_in(name, f"this needs {package}, {remedy}")
+            remedy = "which trilat-net-core does not include: pip install trilat-net"
+        return _make_stand_in(name, f"{name} needs {package}, {remedy}")
 
 
 def _make_stand_in(name: str, problem: str) -> _Any:

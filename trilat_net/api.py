@@ -255,7 +255,7 @@ def report(
     first = Path(opened.sources[0])
     if not first.is_file():
         raise UsageError(
-            "a report needs a log in a file: save it first, as in log.save('run.mcap')"
+            "a report needs a log in a file: save the log first, as in log.save('run.mcap')"
         )
     folder = first.with_suffix("") if out is None else Path(out)
     return conclude(opened, make_results_folder(folder, "", force=force), png=png)
@@ -305,7 +305,7 @@ def linear(
         angles = None if pose is None else tuple(map(float, pose))
     except (TypeError, ValueError):
         raise UsageError(
-            f"a pose consists of angles in rad, as in (0.1, 0.3), not {pose!r}"
+            f"a pose must consist of angles in rad, as in (0.1, 0.3), but is {pose!r}"
         ) from None
     return analyse_linear_loop(
         load_scenario(scenario, set),

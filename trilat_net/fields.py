@@ -351,7 +351,7 @@ def check_choice(word: Any, valid: Sequence[str], path: str) -> None:
     if word not in valid:
         choices = ", ".join(map(repr, valid))
         hint = suggest_nearest(str(word), valid)
-        raise ScenarioError(f"is {word!r}, must be one of {choices}{hint}", path=path)
+        raise ScenarioError(f"is {word!r}, but must be one of {choices}{hint}", path=path)
 
 
 def check_finite(value: Any, path: str) -> None:
@@ -368,9 +368,10 @@ def check_finite(value: Any, path: str) -> None:
         ScenarioError: A number is refused. The error has the path of its key.
     """
     if isinstance(value, float) and not math.isfinite(value):
-        raise ScenarioError(f"must be a finite number, is {value}", path=path)
+        raise ScenarioError(f"must be a finite number, but is {value}", path=path)
     if isinstance(value, int) and not -(2**63) <= value < 2**63:
-        problem = f"must be a number of at most 64 bits, has {value.bit_length()}"
+        length = value.bit_length()
+        problem = f"must be an integer of at most 64 bits, but has {length} bits"
         raise ScenarioError(problem, path=path)
     if isinstance(value, dict):
         for key, entry in value.items():

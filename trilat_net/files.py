@@ -48,7 +48,7 @@ def require_libraries(*names: str) -> None:
     missing = [name for name in names or STUDY_LIBRARIES if find_spec(name) is None]
     if missing:
         raise UsageError(
-            f"this needs {', '.join(missing)}, which trilat-net-core does without: "
+            f"this command needs {', '.join(missing)}, which trilat-net-core does not include: "
             "pip install trilat-net"
         )
 
@@ -146,7 +146,7 @@ def open_regular(path: Path, **options: Any) -> Any:
     stream = open(path, mode, opener=open_without_blocking, **options)  # noqa: SIM115
     if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
         stream.close()
-        raise OSError(errno.EINVAL, "it is a pipe or a device, no file", str(path))
+        raise OSError(errno.EINVAL, "the path is a pipe or a device, not a file", str(path))
     return stream
 
 
@@ -202,7 +202,7 @@ def decode_text(raw: bytes, *, any_code_page: bool = False) -> str:
     if raw[:2].count(0) == 1:
         return raw.decode("utf-16-be" if raw[0] == 0 else "utf-16-le")
     if 0 in raw:
-        raise ValueError("is not text: it has zero bytes")
+        raise ValueError("is not text: the file contains null bytes")
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -217,7 +217,7 @@ def _describe_kind(kind: str) -> str:
     Args:
         kind: The kind of file, with its article, as in "a PDF document".
     """
-    advice = "save its sheet as CSV" if "spreadsheet" in kind else "a text file is needed"
+    advice = "save the sheet as CSV" if "spreadsheet" in kind else "a text file is needed"
     return f"is {kind}, not text: {advice}"
 
 
@@ -283,7 +283,7 @@ def make_folder(folder: Path) -> Path:
     except OSError as error:
         if error.errno in DISK_ERRNOS:
             raise describe_write_error(folder, error) from None
-        raise UsageError(f"{folder}: cannot be made: {error.strerror}") from None
+        raise UsageError(f"{folder}: cannot be created: {error.strerror}") from None
     return folder
 
 
@@ -303,8 +303,9 @@ def refuse_link(path: Path) -> None:
         UsageError: The path is a symbolic link outside of `SYSTEM_FOLDERS`.
     """
     if path.is_symlink() and path.parent.as_posix() not in SYSTEM_FOLDERS:
-        problem = "is a symbolic link, and no output is written through one"
-        raise UsageError(f"{path}: {problem}; remove it, or choose another name")
+        problem = "is a symbolic link, through which no output is written"
+        advice = "remove the link, or choose another name"
+        raise UsageError(f"{path}: {problem}; {advice}")
 
 
 def make_subfolder(folder: Path) -> Path:
@@ -377,10 +378,10 @@ def make_results_folder(folder: Path | None, name: str, *, force: bool | None) -
     try:
         occupied = not force and folder.exists() and any(folder.iterdir())
     except OSError as error:
-        raise UsageError(f"{folder}: cannot be made or read: {error.strerror}") from None
+        raise UsageError(f"{folder}: cannot be created or read: {error.strerror}") from None
     if occupied:
         advice = "" if force is None else ", or use --force"
-        raise UsageError(f"{folder}: holds something; choose another folder{advice}")
+        raise UsageError(f"{folder}: is not empty; choose another folder{advice}")
     return make_folder(folder)
 
 
@@ -425,16 +426,18 @@ def refuse_existing(
     if os.path.lexists(path) and not is_empty_folder:
         is_same_kind = (path / manifest).is_file() if manifest else path.is_file()
         if not is_same_kind:
-            kind = "folder that was exported" if manifest else "file"
-            raise UsageError(f"{path}: exists, and is no {kind}; choose another name")
+            kind = "an exported folder" if manifest else "a file"
+            problem = f"already exists and is not {kind}"
+            raise UsageError(f"{path}: {problem}; choose another name")
         if not force:
-            raise UsageError(f"{path}: exists; choose another name, or replace it with --force")
+            advice = "choose another name, or replace it with --force"
+            raise UsageError(f"{path}: already exists; {advice}")
 
     if unfinished is not None and unfinished.exists() and not force:
         raise UsageError(
-            f"{unfinished}: exists: it is being written, or was never finished; make it whole "
-            f"with: trilat log recover {unfinished}; or choose another name, or replace it "
-            "with --force"
+            f"{unfinished}: already exists: this file is still being written, or was never "
+            f"finished. Recover it with: trilat log recover {unfinished}; choose another name; "
+            "or replace it with --force"
         )
 
 
@@ -460,7 +463,8 @@ def publish_file(unfinished: Path, path: Path, *, force: bool) -> None:
         unfinished.unlink()
     except FileExistsError:
         raise UsageError(
-            f"{path}: exists by now; the finished file is {unfinished}: give it a name"
+            f"{path}: was created by another program in the meantime; the finished file is "
+            f"{unfinished}: rename that file"
         ) from None
     except OSError:  # the file system does not support links
         refuse_existing(path, force=False)

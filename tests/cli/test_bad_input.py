@@ -217,7 +217,7 @@ def test_usage_errors_exit_with_2_without_a_traceback(
 def test_a_demo_keeps_what_is_in_its_folder(tmp_path: Path) -> None:
     (tmp_path / "precious").write_text("precious")
     trilat("demo", "two_sites", "--out", tmp_path, cwd=tmp_path).refuses(
-        "holds something", "--force"
+        "is not empty", "--force"
     )
     trilat("demo", "two_sites", "--out", "precious", cwd=tmp_path).refuses(
         "precious", "Not a directory"

@@ -89,7 +89,7 @@ def test_search_says_its_time_and_its_procedure_and_writes_folder(logs: Path) ->
     assert json.loads(again) == json.loads((logs / "fronts" / "front.json").read_text())
     assert is_documented("compare --tune", json.loads(again))
     trilat("compare", "--tune", "trio.toml", *options, cwd=logs).refuses(
-        "fronts: holds something", "--force"
+        "fronts: is not empty", "--force"
     )
 
 

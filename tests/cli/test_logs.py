@@ -156,7 +156,7 @@ def test_report_goes_beside_its_log_and_keeps_what_is_there(tmp_path: Path) -> N
     ]
     verified = trilat("verify", "run.mcap", cwd=tmp_path).succeeds().splitlines()
     assert [line for line in verified if line.startswith("link ")] == links
-    trilat("report", "run.mcap", cwd=tmp_path).refuses("holds something", "--force")
+    trilat("report", "run.mcap", cwd=tmp_path).refuses("is not empty", "--force")
     assert (tmp_path / "run.mcap").read_bytes() == before
 
 
@@ -173,4 +173,4 @@ def test_a_name_that_is_no_file_is_left_alone(tmp_path: Path) -> None:
     done = trilat(
         "sim", "two_sites", "--duration", "0.1", "-o", "/dev/full", "--force", cwd=tmp_path
     )
-    done.refuses("/dev/full: exists, and is no file")
+    done.refuses("/dev/full: already exists and is not a file")

@@ -248,7 +248,7 @@ def test_a_robot_needs_no_library_of_studies(tmp_path: Path) -> None:
     refused = done.stderr.splitlines()
     assert len(refused) == len(NEED_STUDIES), done.stderr
     assert all(
-        line.endswith("which trilat-net-core does without: pip install trilat-net")
+        line.endswith("which trilat-net-core does not include: pip install trilat-net")
         for line in refused
     )
     assert {path.name for path in tmp_path.iterdir()} == {"keys", "run.mcap"}

@@ -85,7 +85,7 @@ BAD = {
         ["--over", "control.Kd=1,2", "-o", "done"],
         ["done", "a sweep of other axes", "results are not mixed"],
     ),
-    "somebody else's folder": (["--over", "control.Kd=1,2", "-o", "."], ["holds something"]),
+    "somebody else's folder": (["--over", "control.Kd=1,2", "-o", "."], ["is not empty"]),
     "nothing to sweep": ([], ["--over"]),
     "no seeds": (["--over", "control.Kd=1,2", "--seeds", "5..1"], ["1..20"]),
     "a cell of a scenario": (["--cell", "3"], ["trio.toml", "no results of a sweep"]),

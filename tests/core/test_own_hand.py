@@ -93,7 +93,7 @@ def test_it_says_when_it_needs_the_arm() -> None:
         ((1.0, 2.0, 3.0), "3 numbers, not 2"),
         ((math.nan, 0.0), "not finite"),
         ((math.inf, 0.0), "not finite"),
-        ((80.0, 80.0), "at most 100 is accepted"),
+        ((80.0, 80.0), "norm of 113.137, but at most 100 is accepted"),
     ],
 )
 def test_a_goal_that_is_none_is_refused(goal: tuple[float, ...], problem: str) -> None:

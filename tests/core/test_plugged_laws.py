@@ -116,18 +116,18 @@ def test_names_of_several_senders_are_joined() -> None:
     assert [one.name for one in vectors] == ["E", "u", "F"]
     assert a.find_columns(vectors) == [0, 1, 2, -1, -1]
     assert b.find_columns(vectors) == [2, -1, -1, 0, 1]
-    with pytest.raises(ValueError, match="E of 1 and of 3 numbers"):
+    with pytest.raises(ValueError, match="E with different lengths, 1 and 3 numbers"):
         join_received([a, LawChannel((SentVector("E", "J", 3),), 2)])
 
 
 REFUSED = {
-    "CallsPlain": r"it uses plain \(line \d+\), which is neither a number nor a function with @tri",
-    "CallsMethod": "it calls its method double: use a function with @trilat_net.compiled",
-    "ReadsText": "self.name is a str: a number, or a list of numbers of fixed length, is accepted",
-    "ReadsNothing": "self.gain is no attribute of it",
-    "MakesList": r"it makes an array or a list \(line \d+\): arithmetic goes number by number, as in now",
-    "Returns": "torque returns something: compiled, it writes now.tau instead",
-    "RemembersText": "name, which it remembers, is neither a number nor a list of numbers",
+    "CallsPlain": r"the law uses plain \(line \d+\), which is neither a number nor a function with @tri",
+    "CallsMethod": "the law calls the method self.double: use a function with @trilat_net.compiled",
+    "ReadsText": "self.name is of type str, but must be a number, or a list of numbers of fixed length",
+    "ReadsNothing": "self.gain does not exist, but must be a number",
+    "MakesList": r"the law creates an array or a list \(line \d+\): compute number by number, as in now",
+    "Returns": "torque returns a value, but a compiled law must write the torque to now.tau instead",
+    "RemembersText": "the attribute name, which the law keeps from tick to tick, must be a number",
 }
 
 
@@ -189,7 +189,7 @@ def test_arithmetic_of_vectors_is_that_of_arrays(
 def test_arithmetic_that_vectors_lack_says_what_has_it() -> None:
     for law, fact in (
         ("Squares", "as in numpy.asarray"),
-        ("Mismatched", "arithmetic of 2 numbers with 3"),
+        ("Mismatched", "cannot combine a vector of 2 numbers with a vector of 3"),
     ):
         with pytest.raises(LawFailed, match=fact):
             trilat_net.simulate(
@@ -198,7 +198,7 @@ def test_arithmetic_that_vectors_lack_says_what_has_it() -> None:
 
 
 FAILING = {
-    "Forgets": (3, r"torque\[0\] is nan, no finite number"),
+    "Forgets": (3, r"torque\[0\] must be a finite number, but is nan"),
     "BeyondEnd": (2, "IndexError: index is out of bounds"),
 }
 

@@ -179,7 +179,7 @@ def test_a_law_failing_only_now_is_a_difference(file: Path) -> None:
 
 
 FAILURES = {
-    "nan": "torque[1] is nan, no finite number",
+    "nan": "torque[1] must be a finite number, but is nan",
     "raises": "ValueError: out of",
     "short": "torque has 1 number, not 2",
     "none": "TypeError",

@@ -172,7 +172,7 @@ def test_site_that_says_it_made_endless_ticks_is_not_believed() -> None:
     [
         ("a = " + "[" * 5000, "nested too deep"),
         ("a = " + "1" * 5000, "is not TOML"),
-        ("seed = 0x" + "f" * 4000, "at most 64 bits, has 16000"),
+        ("seed = 0x" + "f" * 4000, "at most 64 bits, but has 16000 bits"),
         ("[" + "a." * 3000 + "a]", "more than 32 parts"),
         ("a" * 100 + " = {" + "a." * 20_000 + "a = 1}", "line 1: a key has more than 32 parts"),
         (

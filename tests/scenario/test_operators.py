@@ -87,7 +87,7 @@ def test_value_of_wrong_kind_is_told_what_its_key_wants(
         (
             "hands",
             {"kind": "pluse"},
-            ".kind: is 'pluse', must be one of 'pulse', .*; did you mean 'pulse'",
+            ".kind: is 'pluse', but must be one of 'pulse', .*; did you mean 'pulse'",
         ),
         ("hands", WALL, ".kind: is 'wall', which belongs in environment"),
         ("environment", PULSE, ".kind: is 'pulse', which belongs in hands"),

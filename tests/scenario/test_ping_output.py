@@ -248,7 +248,7 @@ def test_a_spreadsheet_is_named_as_one(
     kind = (
         "a ZIP archive"
         if ending == "zip"
-        else f"a spreadsheet \\(.{ending}\\), not text: save its sheet as CSV"
+        else f"a spreadsheet \\(.{ending}\\), not text: save the sheet as CSV"
     )
     link = {"link": {"model": "trace", "file": str(path)}}
     with pytest.raises(ScenarioError, match=f"is {kind}"):

@@ -246,7 +246,10 @@ def _compile_law(torque: Callable[..., Any], form: _Form) -> Any:
         return compile_named(call, f"law_{digest[:32]}", signature, **_CHECKED)
     function = numba.njit(signature, **_CHECKED)(call)
     if any(known.return_type != types.none for known in compute.nopython_signatures):
-        raise NumbaError("torque returns something: compiled, it writes now.tau instead")
+        raise NumbaError(
+            "torque returns a value, but a compiled law must write the torque to now.tau "
+            "instead"
+        )
     return function
 
 
@@ -304,8 +307,8 @@ def _explain(error: Exception, law: Any) -> str:
 
     if "NRT required" in text or "returning of array" in text:
         return (
-            f"it makes an array or a list{location}: arithmetic goes number by number, as in "
-            "now.tau[i] = -now.qd[i]; a list is made in __init__, and written into here"
+            f"the law creates an array or a list{location}: compute number by number, as in "
+            "now.tau[i] = -now.qd[i]; create lists in __init__, and let torque write into them"
         )
     attribute = re.search(r"Unknown attribute '(\w+)' of type Record", text)
     if isinstance(error, KeyError):
@@ -315,8 +318,8 @@ def _explain(error: Exception, law: Any) -> str:
     unknown = re.search(r"Untyped global name '(\w+)'", text)
     if unknown:
         return (
-            f"it uses {unknown[1]}{location}, which is neither a number nor a function with "
-            "@trilat_net.compiled"
+            f"the law uses {unknown[1]}{location}, which is neither a number nor a function "
+            "with @trilat_net.compiled"
         )
 
     lines = [line.strip() for line in text.splitlines() if line.strip()]
@@ -334,14 +337,18 @@ def _explain_attribute(name: str, law: Any, location: str) -> str:
         location: Line of the law, as in " (line 12)"; empty if unknown.
     """
     if not hasattr(law, name):
-        kind = "no attribute of it"
+        problem = "does not exist"
     elif callable(getattr(law, name)):
-        return f"it calls its method {name}{location}: use a function with @trilat_net.compiled"
+        return (
+            f"the law calls the method self.{name}{location}: use a function with "
+            "@trilat_net.compiled instead"
+        )
     else:
-        kind = f"a {type(getattr(law, name)).__name__}"
+        kind = type(getattr(law, name)).__name__
+        problem = f"is of type {kind}"
     return (
-        f"self.{name} is {kind}{location}: a number, or a list of numbers of fixed length, is "
-        "accepted"
+        f"self.{name} {problem}{location}, but must be a number, or a list of numbers of fixed "
+        "length"
     )
 
 
@@ -371,8 +378,8 @@ class CompiledLaw:
         missing = [name for name in remembered if name not in numbers]
         if missing:
             raise ScenarioError(
-                f"{law_name(law)}: {missing[0]}, which it remembers, is neither a number nor a "
-                "list of numbers",
+                f"{law_name(law)}: the attribute {missing[0]}, which the law keeps from tick "
+                "to tick, must be a number or a list of numbers",
                 path=path,
             )
 

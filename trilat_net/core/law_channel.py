@@ -187,5 +187,6 @@ def join_received(channels: Sequence[LawChannel]) -> tuple[SentVector, ...]:
             other = by_name.setdefault(vector.name, vector)
             if other.length != vector.length:
                 count = count_nouns(vector.length, "number")
-                raise ValueError(f"peers send {vector.name} of {other.length} and of {count}")
+                problem = f"peers send {vector.name} with different lengths"
+                raise ValueError(f"{problem}, {other.length} and {count}")
     return tuple(by_name.values())

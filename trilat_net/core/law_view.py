@@ -254,7 +254,9 @@ def _collect_vectors(declared: Sequence[SentVector], vectors: Any, name: str) ->
     for vector in declared:
         values = list(getattr(vectors, vector.name))
         if len(values) != vector.length:
-            count = count_nouns(len(values), "number")
-            raise ValueError(f"{name}.{vector.name} has {count}, not {vector.length}")
+            required = count_nouns(vector.length, "number")
+            raise ValueError(
+                f"{name}.{vector.name} must have {required}, but has {len(values)}"
+            )
         numbers += map(float, values)
     return numbers

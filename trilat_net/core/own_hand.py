@@ -238,16 +238,15 @@ class OwnHand:
         """
         numbers = () if goal is None else tuple(float(number) for number in goal)
         if goal is not None and len(numbers) != self._rules.size:
-            raise ValueError(
-                f"it acts with {count_nouns(len(numbers), 'number')}, not {self._rules.size}"
-            )
+            count = count_nouns(len(numbers), "number")
+            raise ValueError(f"the action has {count}, not {self._rules.size}")
         if not all(map(math.isfinite, numbers)):
-            raise ValueError(f"it acts with {list(numbers)}, which is not finite")
+            raise ValueError(f"the action {list(numbers)} is not finite")
         norm = math.hypot(*numbers)
         largest_norm = self._rules.max_goal_norm
         if norm > largest_norm:
             raise ValueError(
-                f"it acts with a norm of {norm:g}, at most {largest_norm:g} is accepted"
+                f"the action has a norm of {norm:g}, but at most {largest_norm:g} is accepted"
             )
         if k <= self._newest:
             return

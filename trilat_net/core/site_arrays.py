@@ -424,13 +424,13 @@ def apply_change(arrays: SiteArrays, change: CoreChange, t_ns: int) -> None:
         s.order = max(s.order, change.order)
     if change.model is not None:
         if arrays.links[change.peer].models >= arrays.models.shape[1]:
-            raise ValueError(f"a run takes at most {MAX_CHANGES} changes of a link")
+            raise ValueError(f"a run can have at most {MAX_CHANGES} changes to a link")
         add_model(arrays, change.peer, change.model)
     if change.ramp is not None:
         s.ramps = fold_ramps(t_ns, int(s.ramps), arrays.ramps)
         if s.ramps >= len(arrays.ramps):
             raise ValueError(
-                f"at most {MAX_RAMPS} changes of the shares of a site wait to begin"
+                f"at most {MAX_RAMPS} changes to the shares of a site can be pending at once"
             )
         add_ramp(arrays, change.ramp)
 

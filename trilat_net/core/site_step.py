@@ -599,7 +599,7 @@ class Site:
         """
         if len(arrivals) > MAX_ARRIVALS:
             raise ValueError(
-                f"a tick takes at most {MAX_ARRIVALS} arrivals, got {len(arrivals)}"
+                f"a tick can process at most {MAX_ARRIVALS} arrivals, but has {len(arrivals)}"
             )
         offset = 0
         newest = self._sizer.newest

@@ -80,8 +80,9 @@ def _make_operator(operate: Callable[[Any, Any], Any]) -> Any:
             # An array computes the result itself, as an array.
             return NotImplemented
         if len(other) != len(numbers):
+            count = count_nouns(len(numbers), "number")
             raise ValueError(
-                f"arithmetic of {count_nouns(len(numbers), 'number')} with {len(other)}"
+                f"cannot combine a vector of {count} with a vector of {len(other)}"
             )
         return LawVector(map(operate, numbers, other))
 
@@ -301,7 +302,7 @@ def check_results(law: UserLaw, site: str, tick: int, results: LawResults) -> No
             continue
         for n, value in enumerate(values):
             if not math.isfinite(value):
-                problem = f"{name}[{n}] is {value}, no finite number"
+                problem = f"{name}[{n}] must be a finite number, but is {value}"
                 raise _law_error(law, site, tick, problem)
 
 

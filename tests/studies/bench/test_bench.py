@@ -440,5 +440,5 @@ def test_folder_takes_more_of_suite_and_nothing_from_elsewhere(
         prepare_bench_folder(asked(), tmp_path / "one")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine.txt").touch()
-    with pytest.raises(UsageError, match="holds something"):
+    with pytest.raises(UsageError, match="is not empty"):
         prepare_bench_folder(asked(), tmp_path / "full")

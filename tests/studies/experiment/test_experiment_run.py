@@ -133,7 +133,7 @@ def test_log_that_was_changed_is_named(done: Experiment, tmp_path: Path) -> None
 
 def test_folder_of_another_plan_is_refused(tmp_path: Path) -> None:
     begun = begin_experiment(write_protocol(tmp_path), tmp_path / "out")
-    with pytest.raises(UsageError, match="holds something"):
+    with pytest.raises(UsageError, match="is not empty"):
         begin_experiment(tmp_path / "short.toml", tmp_path / "out")
     file = begun.folder / "protocol.toml"
     file.write_text(

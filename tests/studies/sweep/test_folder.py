@@ -94,7 +94,7 @@ def test_a_folder_that_holds_something_else_is_left_alone(tmp_path: Path) -> Non
     other = tmp_path / "o"
     other.mkdir()
     (other / "precious").write_text("precious")
-    assert "holds something; choose another folder" in refused(other)
+    assert "is not empty; choose another folder" in refused(other)
     assert [path.name for path in other.iterdir()] == ["precious"]
 
 
