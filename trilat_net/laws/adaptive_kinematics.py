@@ -104,7 +104,13 @@ def _end_effector_motion(lengths: Pair, q: Pair, qd: Pair) -> tuple[float, float
 
 
 @leaf
-def _jacobian_rate_times(lengths: Pair, length_rates: Pair, q: Pair, qd: Pair, v: Pair) -> Pair:
+def _jacobian_rate_times(
+    lengths: Pair,
+    length_rates: Pair,
+    q: Pair,
+    qd: Pair,
+    v: Pair,
+) -> Pair:
     """Returns the derivative of the Jacobian times v.
 
     Args:
@@ -266,7 +272,13 @@ class AdaptiveKinematics(ControlLaw):
         x_rate = -self.Lambda[0] * e_x
         y_rate = -self.Lambda[1] * e_y
         v = _solve_jacobian(lengths, q, (x_rate, y_rate))
-        bias = _jacobian_rate_times(lengths=lengths, length_rates=length_rates, q=q, qd=qd, v=v)
+        bias = _jacobian_rate_times(
+            lengths=lengths,
+            length_rates=length_rates,
+            q=q,
+            qd=qd,
+            v=v,
+        )
         a_x = -self.Lambda[0] * ed_x - bias[0]
         a_y = -self.Lambda[1] * ed_y - bias[1]
         a = _solve_jacobian(lengths, q, (a_x, a_y))
@@ -274,7 +286,13 @@ class AdaptiveKinematics(ControlLaw):
 
         now.tau[0] = -self.Kp[0] * r[0] - (l1 * across_1 + l2 * across_2)
         now.tau[1] = -self.Kp[1] * r[1] - l2 * across_2
-        first, second = regressor(g=self.g_m_s2, q=q, qd=qd, v=v, a=a)
+        first, second = regressor(
+            g=self.g_m_s2,
+            q=q,
+            qd=qd,
+            v=v,
+            a=a,
+        )
         for p in range(len(self.Yr)):
             Yr = first[p] * r[0] + second[p] * r[1]
             if now.k > 0:

@@ -268,7 +268,11 @@ class LawSettings(Frozen, frozen=True):
             Otherwise, the check of the class raises an error.
             """
             check_law_class(
-                kind=self.kind, code=self.tag, context=context, sites=sites, scheme=scheme
+                kind=self.kind,
+                code=self.tag,
+                context=context,
+                sites=sites,
+                scheme=scheme,
             )
             gains = asdict(self)
             law: UserLaw = make_instance(self.kind, self.tag, context, gains)
@@ -441,7 +445,13 @@ def _depends_on_gains(name: str, value: Any) -> bool:
     return name in LawSettings.__annotations__
 
 
-def check_law_class(kind: Any, code: str, context: LawContext, sites: int, scheme: str) -> None:
+def check_law_class(
+    kind: Any,
+    code: str,
+    context: LawContext,
+    sites: int,
+    scheme: str,
+) -> None:
     """Refuses a class that is not a control law, or that does not suit the site.
 
     A law may restrict its use: `sites = 2` or `sites = (2, 4)`, `schemes = ("digital",)`, and
@@ -566,7 +576,11 @@ def _find_written_attributes(kind: Any) -> list[str]:
 
 
 def make_instance(
-    kind: Any, code: str, context: Any, settings: dict[str, Any], path: str = ""
+    kind: Any,
+    code: str,
+    context: Any,
+    settings: dict[str, Any],
+    path: str = "",
 ) -> Any:
     """Returns an instance of a user's class, created from its context and settings.
 

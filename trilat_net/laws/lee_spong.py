@@ -89,7 +89,13 @@ class LeeSpong(ControlLaw):
                 their number.
         """
         known = (theta * self.gravity).tolist()
-        return Gains(Law.KNOWN, K=self.K, Kd=self.Kd, d=self.damping, known=known)
+        return Gains(
+            Law.KNOWN,
+            K=self.K,
+            Kd=self.Kd,
+            d=self.damping,
+            known=known,
+        )
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
         """Evaluates for which gains and delays this law is stable at one site of a scenario.

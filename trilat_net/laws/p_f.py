@@ -84,7 +84,13 @@ class PF(ControlLaw):
                 their number.
         """
         known = (theta * self.gravity).tolist()
-        return Gains(Law.KNOWN, K=self.K, d=self.d, k_f=self.k_f, known=known)
+        return Gains(
+            Law.KNOWN,
+            K=self.K,
+            d=self.d,
+            k_f=self.k_f,
+            known=known,
+        )
 
     def check(self, path: str, sites: int) -> None:
         """Refuses a scenario that has more or fewer than two sites.

@@ -72,7 +72,13 @@ class PdD(ControlLaw):
                 their number.
         """
         known = (theta * self.gravity).tolist()
-        return Gains(Law.KNOWN, K=self.K, Kd=self.Kd, d=self.d, known=known)
+        return Gains(
+            Law.KNOWN,
+            K=self.K,
+            Kd=self.Kd,
+            d=self.d,
+            known=known,
+        )
 
     def exchanges_positions(self) -> bool:
         """Returns True if the law compensates gravity exactly.

@@ -99,7 +99,13 @@ class Sync(ControlLaw):
         for i in range(2):
             peer_output = now.qd_des[i] + self.Lambda[i] * now.q_des[i]
             now.tau[i] = self.K[i] * (peer_output - r[i])
-        first, second = regressor(g=self.g_m_s2, q=q, qd=qd, v=v, a=a)
+        first, second = regressor(
+            g=self.g_m_s2,
+            q=q,
+            qd=qd,
+            v=v,
+            a=a,
+        )
         for p in range(len(self.Yr)):
             Yr = first[p] * r[0] + second[p] * r[1]
             if now.k > 0:

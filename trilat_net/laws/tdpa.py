@@ -51,7 +51,13 @@ _SLACK_NM = 1e-9
 
 
 @compiled
-def book_leader_work(now: LawInput, j: int, i: int, torque: float, step: float) -> float:
+def book_leader_work(
+    now: LawInput,
+    j: int,
+    i: int,
+    torque: float,
+    step: float,
+) -> float:
     """Adds the work of a leader's arm in one period to the energy account of a coupling.
 
     A coupling connects the leader to an arm that follows it. If the work is positive, the arm
@@ -98,7 +104,13 @@ def observe_leader(law: Any, now: LawInput, j: int, i: int) -> None:
     if law.by_step:
         # The step of the previous period, which is known now.
         step = now.q[i] - now.q_before[i]
-        known_energy += book_leader_work(now=now, j=j, i=i, torque=law.F_led[index], step=step)
+        known_energy += book_leader_work(
+            now=now,
+            j=j,
+            i=i,
+            torque=law.F_led[index],
+            step=step,
+        )
     sent.W_led[i] = known_energy
 
 
@@ -231,7 +243,12 @@ def find_known_energy(law: Any, now: LawInput, j: int, i: int) -> float:
 
 @compiled
 def limit_follower_velocity(
-    law: Any, now: LawInput, j: int, i: int, force: float, price: float
+    law: Any,
+    now: LawInput,
+    j: int,
+    i: int,
+    force: float,
+    price: float,
 ) -> float:
     """Reduces the velocity of a followed peer if the known energy does not cover its work.
 
@@ -267,7 +284,11 @@ def limit_follower_velocity(
 
 @compiled
 def compute_drift_velocity(
-    law: Any, now: LawInput, i: int, error: float, available_J: float
+    law: Any,
+    now: LawInput,
+    i: int,
+    error: float,
+    available_J: float,
 ) -> float:
     """Returns the velocity that moves the goal back to the peers, as far as energy allows.
 
@@ -309,7 +330,13 @@ def compute_drift_velocity(
 
 
 @compiled
-def find_affordable_velocity(law: Any, now: LawInput, j: int, i: int, force: float) -> float:
+def find_affordable_velocity(
+    law: Any,
+    now: LawInput,
+    j: int,
+    i: int,
+    force: float,
+) -> float:
     """Returns the largest velocity of a followed peer that the known energy covers, rad/s.
 
     The peer is another arm. Its velocity moves the goal to which a spring pulls this arm, and
@@ -334,7 +361,14 @@ def find_affordable_velocity(law: Any, now: LawInput, j: int, i: int, force: flo
 
 
 @compiled
-def book_follower(law: Any, now: LawInput, j: int, i: int, force: float, drift: float) -> None:
+def book_follower(
+    law: Any,
+    now: LawInput,
+    j: int,
+    i: int,
+    force: float,
+    drift: float,
+) -> None:
     """Books the energy at the follower's end of the coupling to peer j.
 
     If work is computed by step, torque and energy belong to the velocity in use. In the
@@ -400,7 +434,12 @@ def charge_unpaid_energy(law: Any, now: LawInput, i: int, spring: float) -> None
 
 @compiled
 def settle_follower(
-    law: Any, now: LawInput, i: int, stretch: float, drift_velocity: float, available_J: float
+    law: Any,
+    now: LawInput,
+    i: int,
+    stretch: float,
+    drift_velocity: float,
+    available_J: float,
 ) -> None:
     """Computes the torque of a following joint so that known energy covers its work.
 
@@ -436,7 +475,11 @@ def settle_follower(
             index = j * n + i
             if sweep > 0:
                 law.v_led[index] = find_affordable_velocity(
-                    law=law, now=now, j=j, i=i, force=force
+                    law=law,
+                    now=now,
+                    j=j,
+                    i=i,
+                    force=force,
                 )
             velocity += now.peers[j].alpha * law.v_led[index]
 
@@ -445,7 +488,14 @@ def settle_follower(
         share = law.left_J[j * n + i] / available_J if available_J > 0.0 else 0.0
         drift = share * force * drift_velocity * h
         peer_force = now.peers[j].alpha * force
-        book_follower(law=law, now=now, j=j, i=i, force=peer_force, drift=drift)
+        book_follower(
+            law=law,
+            now=now,
+            j=j,
+            i=i,
+            force=peer_force,
+            drift=drift,
+        )
 
     law.goal[i] += h * velocity
     law.force[i] = force
@@ -520,7 +570,12 @@ def follow_peers(law: Any, now: LawInput, i: int) -> None:
         peer_price = alpha * price
         now.sent[j].F[i] = peer_force
         remaining_J = limit_follower_velocity(
-            law=law, now=now, j=j, i=i, force=peer_force, price=peer_price
+            law=law,
+            now=now,
+            j=j,
+            i=i,
+            force=peer_force,
+            price=peer_price,
         )
         left_J = max(remaining_J, 0.0) * (alpha > 0.0)
         law.left_J[j * n + i] = left_J
@@ -531,7 +586,11 @@ def follow_peers(law: Any, now: LawInput, i: int) -> None:
     if law.drift_rad_s > 0.0 and available_J > 0.0 and least_J >= 0.0:
         error = target - law.goal[i] - h * velocity
         drift_velocity = compute_drift_velocity(
-            law=law, now=now, i=i, error=error, available_J=available_J
+            law=law,
+            now=now,
+            i=i,
+            error=error,
+            available_J=available_J,
         )
     settle_follower(
         law=law,
@@ -688,7 +747,13 @@ class Tdpa(EnergyLaw):
                 torque = reduction * self.F_now[index]
                 self.F_led[index] = torque
                 if not self.by_step:
-                    taken = book_leader_work(now=now, j=j, i=i, torque=torque, step=step)
+                    taken = book_leader_work(
+                        now=now,
+                        j=j,
+                        i=i,
+                        torque=torque,
+                        step=step,
+                    )
                     now.sent[j].W_led[i] += taken
             now.tau[i] = self.carried[i] + (force - applied) / self.beta
 

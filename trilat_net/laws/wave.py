@@ -70,7 +70,13 @@ STAMP_FILTER_TICKS = 20.0
 
 
 @compiled
-def replay_wave(law: Any, index: int, fresh: float, energy: float, h: float) -> float:
+def replay_wave(
+    law: Any,
+    index: int,
+    fresh: float,
+    energy: float,
+    h: float,
+) -> float:
     """Returns the wave to play so that lost waves are made up for, as far as energy allows.
 
     The waves that were lost are known only by the integral of their sum, which later samples
@@ -133,14 +139,26 @@ def conceal_wave(law: Any, index: int, energy: float, h: float) -> float:
         # Earlier waves are owed in the same direction.
         spent = 0.5 * held * held * h
         remaining = energy - spent
-        played = replay_wave(law=law, index=index, fresh=held, energy=remaining, h=h)
+        played = replay_wave(
+            law=law,
+            index=index,
+            fresh=held,
+            energy=remaining,
+            h=h,
+        )
     law.owed_U[index] -= held * h
     law.held_s[index] += h
     return played
 
 
 @compiled
-def receive_wave(law: Any, now: LawInput, j: int, i: int, missed: float) -> float:
+def receive_wave(
+    law: Any,
+    now: LawInput,
+    j: int,
+    i: int,
+    missed: float,
+) -> float:
     """Returns the wave of one line that an end plays in a tick, and books its energy.
 
     The energy of a new sample is added to the line's account W of known energy, and the energy
@@ -191,7 +209,13 @@ def receive_wave(law: Any, now: LawInput, j: int, i: int, missed: float) -> floa
 
     # Choose the wave to play.
     if law.playing == _REPLAY and missed >= 0.0:
-        played = replay_wave(law=law, index=index, fresh=fresh, energy=sent.W[i], h=h)
+        played = replay_wave(
+            law=law,
+            index=index,
+            fresh=fresh,
+            energy=sent.W[i],
+            h=h,
+        )
     elif law.playing == _SCALED:
         known_energy = max(sent.W[i] + fresh_energy, 0.0)
         largest_wave = math.sqrt(2.0 * known_energy / h)
@@ -207,7 +231,13 @@ def receive_wave(law: Any, now: LawInput, j: int, i: int, missed: float) -> floa
 
 
 @compiled
-def follow_wave(law: Any, now: LawInput, j: int, i: int, v: float) -> float:
+def follow_wave(
+    law: Any,
+    now: LawInput,
+    j: int,
+    i: int,
+    v: float,
+) -> float:
     """Computes the torque by which a received wave moves the arm through a spring.
 
     The wave moves one end of a spring and damper, and the other end pulls the arm. Part of the
@@ -475,13 +505,25 @@ class Wave(EnergyLaw):
                 b = self.impedance[index]
                 if b == 0.0:
                     continue
-                played = receive_wave(law=self, now=now, j=j, i=i, missed=missed)
+                played = receive_wave(
+                    law=self,
+                    now=now,
+                    j=j,
+                    i=i,
+                    missed=missed,
+                )
                 self.played[index] = played
                 if self.K[i] == 0.0:
                     c = math.sqrt(2.0 * b)
                     force = c * played - b * now.qd[i]
                 else:
-                    force = follow_wave(law=self, now=now, j=j, i=i, v=played)
+                    force = follow_wave(
+                        law=self,
+                        now=now,
+                        j=j,
+                        i=i,
+                        v=played,
+                    )
                 now.tau[i] += force / self.beta
 
         for i in range(n):
