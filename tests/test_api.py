@@ -300,12 +300,12 @@ WRONG: dict[str, tuple[Callable[[Path], object], str]] = {
     "export": (lambda file: tn.export(file, "npz", file), "replace it with force=True$"),
     "sweep seeds": (
         lambda _: tn.sweep("free", "control.Kd=1,2", seeds="1..3"),
-        "^seeds is a number from 1",
+        "^seeds must be a number from 1",
     ),
-    "sweep over": (lambda _: tn.sweep("free", 5), "^over reads KEY=VALUES"),
+    "sweep over": (lambda _: tn.sweep("free", 5), "^over must have the form KEY=VALUES"),
     "sweep law": (lambda _: tn.sweep("free", laws="pd"), "^laws: there is no law 'pd'"),
     "margin": (lambda _: tn.margin("free", "x"), "^along reads KEY=FROM:TO"),
-    "tune": (lambda _: tn.tune("free", gravity_percent=5), "^gravity_percent is from 50"),
+    "tune": (lambda _: tn.tune("free", gravity_percent=5), "^gravity_percent must be from 50"),
     "rerun": (
         lambda file: tn.rerun(file),
         r"replace=NAME \(of m, s\), or closed_loop=True for all",
@@ -315,7 +315,7 @@ WRONG: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda _: tn.linear("two_sites", pose=["x"]),
         "a pose consists of angles in rad",
     ),
-    "bench": (lambda _: tn.bench(seeds=0), "^seeds is a number from 1 to 1000, not 0"),
+    "bench": (lambda _: tn.bench(seeds=0), "^seeds must be a number from 1 to 1000, not 0"),
 }
 
 

@@ -109,7 +109,7 @@ def test_search_says_its_time_and_its_procedure_and_writes_folder(logs: Path) ->
             ["no law 'adaptve'", "did you mean 'adaptive'"],
         ),
         (["--tune", "free", "--budget", "0"], ["--budget", "not 0"]),
-        (["--tune", "training"], ["keep one of the operators"]),
+        (["--tune", "training"], ["keep only one of the operators"]),
     ],
 )
 def test_bad_input_is_refused_in_one_line(

@@ -83,7 +83,7 @@ BAD = {
     ),
     "another sweep's folder": (
         ["--over", "control.Kd=1,2", "-o", "done"],
-        ["done", "a sweep of other axes", "results are not mixed"],
+        ["done", "a sweep with other axes", "results cannot be mixed"],
     ),
     "somebody else's folder": (["--over", "control.Kd=1,2", "-o", "."], ["is not empty"]),
     "nothing to sweep": ([], ["--over"]),
@@ -170,7 +170,7 @@ def test_margins_are_printed_and_kept(folder: Path) -> None:
         (("trio.toml", "--resume", "done"), "--resume continues the sweep of its folder"),
         (("done", "--cell", "12"), "numbered from 0 to 11"),
         (("--cell", "1"), "--cell belongs to results"),
-        (("--resume", "none"), "no sweep was begun there"),
+        (("--resume", "none"), "this folder contains no sweep"),
         (("none.csv",), "no results of a sweep"),
         (("--over", "control.Kd=1,2"), "name a scenario"),
         (("done", "--map", "--confirm", "1"), "--map and --confirm exclude each other"),

@@ -188,7 +188,8 @@ def test_a_worker_with_another_program_is_refused_even_later(
         until(lambda: workers_of(cluster) == 2, 60)
         first.kill()
         with pytest.raises(
-            UsageError, match=rf"the worker tcp://\S+ has source files \w+, .*here is.* {here}"
+            UsageError,
+            match=rf"the worker tcp://\S+ has source files \w+, .*the study needs.* {here}",
         ):
             pool.map(abs, range(-99, 0))
     with (
@@ -217,7 +218,7 @@ def test_what_differs_is_named_on_both_sides() -> None:
     assert explain_unfit_worker(WorkerRequirements(here), here, []) == ""
     for name in ("trilat-net", "arithmetic", "Python", "numpy", "numba", "scipy"):
         text = explain_unfit_worker(WorkerRequirements(here), {**here, name: "other"}, [])
-        assert f"has {name} other, and here is {name} {here[name]}" in text
+        assert f"has {name} other, but the study needs {name} {here[name]}" in text
     assert explain_unfit_worker(WorkerRequirements(here), {**here, "commit": "other"}, []) == ""
     assert "a.b:Law" in explain_unfit_worker(WorkerRequirements(here), here, ["a.b:Law"])
 

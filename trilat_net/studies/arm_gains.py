@@ -250,8 +250,8 @@ def _read_delay(delay: str | float) -> tuple[dict[str, Any], str]:
     path = Path(text.removeprefix("measured:"))
     if path.suffix not in (".csv", ".mcap"):
         raise UsageError(
-            "--delay reads 40ms, measured:run.mcap or a table t_s,delay_ms such as run.csv, "
-            f"not {text!r}"
+            "--delay must be a time such as 40ms, a log such as measured:run.mcap, or a table "
+            f"of t_s,delay_ms such as run.csv, not {text!r}"
         )
     link = {"model": "trace", "file": str(path), "at_end": "loop"}
     if path.suffix == ".csv":
@@ -298,10 +298,11 @@ def _build_loop(
     if law not in TUNED_LAWS:
         known = ", ".join(TUNED_LAWS)
         raise UsageError(
-            f"--law {law}: has no stiffness K with a damping d of motion only; {known} have"
+            f"--law must be one of {known}, which have a stiffness K and a damping d that "
+            f"acts on motion only, not {law}"
         )
     if sites not in _SITES:
-        raise UsageError(f"--sites is 2 or 3, not {sites}")
+        raise UsageError(f"--sites must be 2 or 3, not {sites}")
 
     names = _SITES[sites]
     gains = {gain: _NO_GAIN for gain in ("K", "d", "Kd") if gain in BUILT_IN[law].tune}
@@ -325,7 +326,8 @@ def _build_loop(
     scenario = load_scenario(tables, overrides)
     if getattr(scenario.controls[0], "gravity", 1.0) != 1.0:
         raise UsageError(
-            "--set control.gravity: only with exact gravity is every pose an equilibrium"
+            "--set control.gravity: gravity must be exact here, because only then is every "
+            "pose an equilibrium"
         )
 
     # Friction and damping of the joints are the attributes of the URDF's <dynamics>.
@@ -761,7 +763,7 @@ def tune_arm(
     }
     for name, (value, low, high) in ranges.items():
         if not low <= value <= high:
-            raise UsageError(f"{name} is from {low:g} to {high:g}, not {value:g}")
+            raise UsageError(f"{name} must be from {low:g} to {high:g}, not {value:g}")
 
     link, delay_text = _read_delay(delay)
     scenario = _build_loop(arm, link, law, set, sites=sites, tip=tip, rate_hz=rate_hz)

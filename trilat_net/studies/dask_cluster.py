@@ -116,7 +116,10 @@ def explain_unfit_worker(
             differing.append("commit")
         remote_text = _list_properties(identity, differing)
         local_text = _list_properties(local, differing)
-        return f"has {remote_text}, and here is {local_text}; results are not mixed"
+        return (
+            f"has {remote_text}, but the study needs {local_text}; results from both cannot "
+            "be mixed"
+        )
     if lacks:
         return (
             f"lacks the control law {', '.join(lacks)}, or has another file of it: "
@@ -216,8 +219,9 @@ class DaskCluster:
         except UnknownHost as unknown:
             raise UsageError(f"--on {unknown}") from None
         except (OSError, ValueError, TypeError) as error:  # TimeoutError is an OSError
+            reason = str(error).splitlines()[0]
             raise UsageError(
-                f"--on {address}: no Dask scheduler answers there: {str(error).splitlines()[0]}"
+                f"--on {address}: no Dask scheduler responds at this address: {reason}"
             ) from None
 
     def __enter__(self) -> "DaskCluster":
@@ -272,7 +276,7 @@ class DaskCluster:
             if worker_python != python:
                 raise UsageError(
                     f"the worker {worker} has Python {worker_python}, "
-                    f"and here is Python {python}"
+                    f"but this program runs on Python {python}"
                 )
         answers = self._client.run(_make_probe(), files, on_error="return")
         for worker, answer in answers.items():
@@ -296,7 +300,9 @@ class DaskCluster:
         try:
             workers = self.workers
         except (OSError, TimeoutError) as error:
-            raise RunFailed(f"the scheduler at {self.address} is gone: {error}") from None
+            raise RunFailed(
+                f"the scheduler at {self.address} no longer responds: {error}"
+            ) from None
         now_ns = self._clock.monotonic_ns()
         if workers or self._last_worker_ns < 0:
             self._last_worker_ns = now_ns

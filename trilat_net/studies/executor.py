@@ -408,7 +408,10 @@ class WorkerPool:
         for number, item in given_up:
             if lost is None:
                 name = textwrap.shorten(str(item), _MAX_NAME, placeholder="...")
-                raise RunFailed(f"{name} ended {MAX_LOSSES} worker processes{self._hint}")
+                raise RunFailed(
+                    f"{MAX_LOSSES} worker processes ended unexpectedly while running "
+                    f"{name}{self._hint}"
+                )
             yield number, lost(item)
 
     def _replace_executor(self, broken: Executor) -> None:
@@ -424,7 +427,7 @@ class WorkerPool:
             RunFailed: The executor cannot be replaced.
         """
         if self._restart is None:
-            raise RunFailed(f"a worker process was ended{self._hint}") from None
+            raise RunFailed(f"a worker process ended unexpectedly{self._hint}") from None
         if broken is self._executor:
             self._executor = self._restart()
 
@@ -500,7 +503,7 @@ def check_workers(jobs: int | None, on: Workers) -> None:
     """
     if on is not None and jobs is not None:
         raise UsageError(
-            "--jobs is the number of processes of this machine: leave it out with --on"
+            "--jobs sets the number of processes on this machine: leave it out with --on"
         )
 
 

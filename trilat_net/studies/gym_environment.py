@@ -315,7 +315,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
     ) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             modes = ", ".join(self.metadata["render_modes"])
-            raise UsageError(f"render_mode is {modes} or None, not {render_mode!r}")
+            raise UsageError(f"render_mode must be {modes} or None, not {render_mode!r}")
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": rate_hz}
         self._picture: EpisodePicture | None = None
@@ -611,14 +611,16 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
             values = np.array(action, dtype=np.float64)
         except (TypeError, ValueError):
             size = count_nouns(self._action_size, "number")
-            raise UsageError(f"an action: it is {size}, not {action!r:.80}") from None
+            raise UsageError(f"an action must be {size}, not {action!r:.80}") from None
         if values.shape != (self._action_size,):
             content = f"an array of shape {values.shape}"
             if values.ndim == 1:
                 content = count_nouns(values.size, "number")
-            raise UsageError(f"an action: it has {content}, not {self._action_size}")
+            raise UsageError(
+                f"an action must have {self._action_size} numbers, but this one has {content}"
+            )
         if not np.isfinite(values).all():
-            raise UsageError(f"an action: it has {values.tolist()}, which is not finite")
+            raise UsageError(f"the action {values.tolist()} is not finite")
         return np.clip(values, -self._action_limit, self._action_limit)
 
     def render(self) -> Any:
@@ -662,7 +664,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
             UsageError: The episode has no step yet, or the file exists.
         """
         if not self._actions:
-            raise UsageError("an episode has a log once it has a step")
+            raise UsageError("an episode has no log before its first step")
         player = ActedHand(self._build_hand_site(self.scenario), self._actions)
         hands = {self._user: player.track}
         elapsed_s = self._k / self._tick_rate_hz

@@ -76,7 +76,7 @@ def format_toml_value(value: Any) -> str:
         return tomli_w.dumps({"v": value}).removeprefix("v = ").removesuffix("\n")
     except TypeError:
         raise ScenarioError(
-            f"{value!r:.80} is no value of a scenario: scenarios have values of TOML"
+            f"{value!r:.80} cannot be a value in a scenario: scenarios contain TOML values only"
         ) from None
 
 

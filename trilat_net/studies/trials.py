@@ -220,7 +220,7 @@ def trials(
     for seed in distinct_seeds:
         if not 0 <= seed < 2**63:
             raise ScenarioError(
-                f"must be from 0 to 2^63 - 1, is {seed}", path="seed", source=label
+                f"must be from 0 to 2^63 - 1, not {seed}", path="seed", source=label
             )
     if not scenario.random and not live:
         del distinct_seeds[1:]
@@ -262,11 +262,13 @@ def _check_expectations_reachable(scenario: Scenario, source: str) -> None:
 
     by_s = expect.synchronised_by_s
     if by_s is not None and by_s >= end_s:
-        problem = f"must be before the end of the run at {end_s:g} s, is {by_s:g}"
+        problem = f"must be before the end of the run at {end_s:g} s, not {by_s:g}"
         raise ScenarioError(problem, path="expect.synchronised_by_s", source=source)
     for n, window in enumerate(expect.windows):
         if window.to_s > end_s:
-            problem = f"must not be after the end of the run at {end_s:g} s, is {window.to_s:g}"
+            problem = (
+                f"must not be after the end of the run at {end_s:g} s, not {window.to_s:g}"
+            )
             raise ScenarioError(problem, path=f"expect.windows[{n}].to_s", source=source)
 
 

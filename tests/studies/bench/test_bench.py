@@ -397,7 +397,7 @@ def test_gains_of_another_law_or_scenario_are_stale() -> None:
         ({"laws": ["p_dd"]}, "no law 'p_dd' is available; did you mean"),
         ({"tasks": ["handover"]}, "no task 'handover' is available"),
         ({"links": ["rtt9"]}, "no link 'rtt9' is available; did you mean"),
-        ({"seeds": 0}, "seeds is a number from 1 to 1000, not 0"),
+        ({"seeds": 0}, "seeds must be a number from 1 to 1000, not 0"),
         (
             {"study": "full", "laws": ["smith"], "tasks": ["handover"]},
             "cannot run in handover",
@@ -435,7 +435,7 @@ def test_folder_takes_more_of_suite_and_nothing_from_elsewhere(
     origin = tmp_path / "one" / "origin.json"
     origin.write_text(origin.read_text().replace("numpy", "numpi"))
     with pytest.raises(
-        UsageError, match="results are not mixed: choose another folder with out"
+        UsageError, match="results from both cannot be mixed: choose another folder with out"
     ):
         prepare_bench_folder(asked(), tmp_path / "one")
     (tmp_path / "full").mkdir()

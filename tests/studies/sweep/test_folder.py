@@ -54,19 +54,19 @@ def test_the_same_sweep_goes_on_in_its_folder(begun: Path) -> None:
         (
             [],
             {"over": [DAMPING]},
-            ("other axes", "there link.delay_ms=0:40:20, control.Kd=1:4:1, here"),
+            ("other axes", "axes: link.delay_ms=0:40:20, control.Kd=1:4:1 in the folder, "),
         ),
-        ([], {"seeds": 3}, ("other seeds", "there 1..1, here 1..3")),
-        ([], {"seeds": [5, 1]}, ("other seeds", "here 5, 1")),
-        ([], {"laws": ["adaptive"]}, ("other laws", "there none, here adaptive")),
-        ([], {"longest_s": 2.0}, ("another longest time", "there 4 s, here 2 s")),
+        ([], {"seeds": 3}, ("other seeds", "1..1 in the folder, 1..3 now")),
+        ([], {"seeds": [5, 1]}, ("other seeds", "5, 1 now")),
+        ([], {"laws": ["adaptive"]}, ("other laws", "none in the folder, adaptive now")),
+        ([], {"longest_s": 2.0}, ("another longest time", "4 s in the folder, 2 s now")),
     ],
 )
 def test_another_sweep_is_refused_with_what_differs(
     begun: Path, overrides: list[str], settings: dict[str, Any], words: tuple[str, ...]
 ) -> None:
     problem = refused(begun, *overrides, **settings)
-    for word in (str(begun), "results are not mixed", "choose another folder", *words):
+    for word in (str(begun), "results cannot be mixed", "choose another folder", *words):
         assert word in problem
 
 
@@ -101,7 +101,7 @@ def test_a_folder_that_holds_something_else_is_left_alone(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (None, "no sweep was begun there"),
+        (None, "this folder contains no sweep"),
         ("{", "is not JSON"),
         ("[]", "is no plan"),
         ("{}", "is no plan"),

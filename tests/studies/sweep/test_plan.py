@@ -77,7 +77,7 @@ def test_laws_by_key_are_classes_and_vectors_are_single_values() -> None:
     laws, poses = list_axes({"control.law": [Adaptive, "p_d"], "sites.s.q0_rad": np.eye(2)})
     assert laws == 'control.law="tests.laws:Adaptive",p_d'
     assert len(parse_axis(laws).texts) == len(parse_axis(poses).texts) == 2
-    with pytest.raises(ScenarioError, match="is no value of a scenario"):
+    with pytest.raises(ScenarioError, match="cannot be a value in a scenario"):
         list_axes({"control.d": [None]})
 
 
@@ -176,7 +176,7 @@ def test_a_key_that_nothing_follows_is_refused(tmp_path: Path) -> None:
     own = SHORT + "".join(f"[sites.{name}.control]\nKd = 2.0\n" for name in ("m1", "m2", "s"))
     (tmp_path / "own.toml").write_text(own)
     problem = refused(str(tmp_path / "own.toml"), over=["control.Kd=1:3:1"])
-    assert "control.Kd: 1 and 2 are the same experiment" in problem
+    assert "control.Kd: 1 and 2 give the same experiment" in problem
     assert "sites.NAME.control" in problem
 
 
@@ -282,7 +282,7 @@ def test_a_range_of_very_many_values_takes_no_room() -> None:
         ("a=1,,2", ("a: is empty",)),
         ("a=1:2", ("KEY=0:1600:50", "'1:2'")),
         ("a=1:2:3:4", ("'1:2:3:4'",)),
-        ("a=x:y:z", ("a range is of numbers", "'x'")),
+        ("a=x:y:z", ("a range a:b:step must consist of numbers", "'x'")),
         ("a=0:nan:1", ("finite", "'nan'")),
         ("a=0:inf:1", ("finite", "'inf'")),
         ("a=1,nan", ("finite", "nan")),

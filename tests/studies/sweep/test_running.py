@@ -120,7 +120,7 @@ def test_enormous_sweep_is_refused_with_its_count_and_its_time(judge: Judge) -> 
         "2000000 cells (10000 x 200)",
         "25 h on 2 cores",
         "larger steps",
-        "yes runs it",
+        "with yes",
     ):
         assert word in str(error.value)
     many = DurationEstimate(1_000_001, 60.0, [])

@@ -187,7 +187,7 @@ def test_what_holds_no_results_is_refused(tmp_path: Path) -> None:
     refused(begun, "no results", f"trilat sweep --resume {begun}")
     refused(tmp_path / "none.csv", "no results")
     (tmp_path / "other.csv").write_text("a,b\n1,2\n")
-    refused(tmp_path / "other.csv", "holds no results of a sweep", "plan.json")
+    refused(tmp_path / "other.csv", "contains no results of a sweep", "plan.json")
 
 
 @pytest.mark.parametrize(
@@ -198,7 +198,7 @@ def test_what_holds_no_results_is_refused(tmp_path: Path) -> None:
         (lambda text: text.replace("0,", "zero,", 1), "cannot be read"),
         (lambda text: text.replace("false", "yes", 1), "'yes' is neither true nor false"),
         (lambda text: text[: text.rindex("[")], "cannot be read"),
-        (lambda _: "PAR1 nothing PAR1\n\0", "holds no results"),
+        (lambda _: "PAR1 nothing PAR1\n\0", "contains no results"),
     ],
 )
 def test_a_damaged_table_is_refused(

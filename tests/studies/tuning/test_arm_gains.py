@@ -288,18 +288,21 @@ REFUSED = {
     "no such file": (("--arm", "none.urdf"), "none.urdf cannot be read"),
     "no delay": (
         ("--delay", "soon"),
-        "--delay reads 40ms, measured:run.mcap or a table t_s,delay_ms",
+        "--delay must be a time such as 40ms, a log such as measured:run.mcap",
     ),
     "too long a delay": (("--delay", "20s"), "delay_ms"),
     "no such log": (("--delay", "measured:none.mcap"), "none.mcap"),
     "a trace without points": (("--delay", "empty.csv"), "has no points"),
-    "a law without stiffness": (("--law", "adaptive"), "p_d, pd_d, saturated_pd have"),
-    "no such law": (("--law", "pid"), "p_d, pd_d, saturated_pd have"),
+    "a law without stiffness": (
+        ("--law", "adaptive"),
+        "--law must be one of p_d, pd_d, saturated_pd",
+    ),
+    "no such law": (("--law", "pid"), "--law must be one of p_d, pd_d, saturated_pd"),
     "no such tip": (("--tip", "hand"), "there is no link 'hand'"),
-    "four sites": (("--sites", "4"), "--sites is 2 or 3, not 4"),
+    "four sites": (("--sites", "4"), "--sites must be 2 or 3, not 4"),
     "no rate": (("--rate", "0"), "rate_hz"),
-    "no margin": (("--margin", "0.5"), "margin is from 1 to 100, not 0.5"),
-    "half of gravity": (("--set", "control.gravity=0.5"), "only with exact gravity"),
+    "no margin": (("--margin", "0.5"), "margin must be from 1 to 100, not 0.5"),
+    "half of gravity": (("--set", "control.gravity=0.5"), "gravity must be exact here"),
 }
 
 
@@ -316,5 +319,5 @@ def test_bad_input_is_refused_with_what_is_right(
 
 
 def test_python_names_its_arguments(one_joint: Path) -> None:
-    with pytest.raises(TrilatError, match=r"^margin is from 1 to 100"):
+    with pytest.raises(TrilatError, match=r"^margin must be from 1 to 100"):
         tune_arm(one_joint, 40, margin=0.5)

@@ -106,7 +106,7 @@ def test_twin_has_no_torque_without_target_and_no_wall() -> None:
 
 def test_two_hands_that_disagree_are_refused_with_the_site() -> None:
     with pytest.raises(
-        ScenarioError, match=r"training: sites\.m1\.hands: at 0 s .* keep one of the operators"
+        ScenarioError, match=r"training: sites\.m1\.hands: at 0 s .* keep only one of the operators"
     ):
         check_comparable(load_scenario("training"))
 
@@ -120,7 +120,7 @@ def test_two_hands_that_disagree_are_refused_with_the_site() -> None:
         ),
         (
             "task.space=position",
-            "task.space: laws are compared by the distance of joint angles",
+            "task.space: laws are compared by the distance between joint angles",
         ),
         (
             "sites.m2.plant=external",

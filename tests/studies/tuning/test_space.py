@@ -189,5 +189,5 @@ def test_all_candidates_know_one_share_of_gravity_no_inertia(percent: float) -> 
 
 @pytest.mark.parametrize("percent", [0.0, 49.0, 151.0, float("nan"), float("inf")])
 def test_what_nobody_could_be_told_is_refused(percent: float) -> None:
-    with pytest.raises(UsageError, match="gravity_percent is from 50 to 150 %"):
+    with pytest.raises(UsageError, match="gravity_percent must be from 50 to 150 %"):
         build_model_information(percent)

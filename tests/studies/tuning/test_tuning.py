@@ -130,11 +130,14 @@ def test_hanging_arms_are_on_no_front_of_a_real_search(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"budget": 0}, "budget is the number of candidates per law, 1 to 100000, not 0"),
+        (
+            {"budget": 0},
+            "budget, the number of candidates per law, must be from 1 to 100000, not 0",
+        ),
         ({"budget": 10**6}, "1 to 100000, not 1000000"),
-        ({"seed": -1}, "seed is from 0"),
-        ({"objective": "rank"}, "objective is error or settling, not 'rank'"),
-        ({"gravity_percent": 0.0}, "gravity_percent is from 50 to 150"),
+        ({"seed": -1}, "seed must be from 0"),
+        ({"objective": "rank"}, "objective must be error or settling, not 'rank'"),
+        ({"gravity_percent": 0.0}, "gravity_percent must be from 50 to 150"),
         ({"laws": ["p_dd"]}, "no law 'p_dd' to tune; did you mean"),
     ],
 )

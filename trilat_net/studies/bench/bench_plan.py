@@ -751,7 +751,7 @@ def plan_bench(
     if seeds is None:
         seeds = bench_study.seeds
     elif not 1 <= seeds <= MAX_BENCH_SEEDS:
-        raise UsageError(f"--seeds is a number from 1 to {MAX_BENCH_SEEDS}, not {seeds}")
+        raise UsageError(f"--seeds must be a number from 1 to {MAX_BENCH_SEEDS}, not {seeds}")
     all_laws = [law for form_laws in bench_study.laws.values() for law in form_laws]
     tasks = _select_names("task", tasks, default=bench_study.tasks)
     laws = _select_names("law", laws, default=all_laws)

@@ -473,8 +473,8 @@ def _check_origin(path: Path, folder_origin: str, origin: str) -> None:
     folder_text = " ".join(folder_origin.split())
     local_text = " ".join(origin.split())
     raise UsageError(
-        f"{path}: the runs in this folder are of {folder_text}, and this program is "
-        f"{local_text}; results are not mixed: choose another folder with --out"
+        f"{path}: the runs in this folder were made with {folder_text}, but this program is "
+        f"{local_text}; results from both cannot be mixed: choose another folder with --out"
     )
 
 

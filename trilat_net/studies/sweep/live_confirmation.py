@@ -98,7 +98,7 @@ def choose_cells_near_edges(
         UsageError: The results have no edge, or all cells on one side of it ran too long.
     """
     if count < 1:
-        raise UsageError(f"--confirm takes a number of cells from 1 on, not {count}")
+        raise UsageError(f"--confirm must be a number of cells, at least 1, not {count}")
     row_of_index = _index_rows(rows, axes)
     distances = _compute_edge_distances(row_of_index, len(axes))
     if not distances:

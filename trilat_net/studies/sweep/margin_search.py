@@ -271,16 +271,17 @@ def parse_search_range(text: str, tolerance: float = MARGIN_TOLERANCE) -> Search
         search_range = SearchRange(key.strip(), float(low), float(high), tolerance)
     except ValueError:
         raise UsageError(
-            f"--margin reads KEY=FROM:TO, as in control.d=0.2:3, not {text!r}"
+            f"--margin must have the form KEY=FROM:TO, as in control.d=0.2:3, not {text!r}"
         ) from None
     if not 0.0 < tolerance < 1.0:
         raise UsageError(
-            f"--tolerance is a share of the edge's value, as in 0.005, not {tolerance:g}"
+            f"--tolerance must be a fraction of the value at the edge, as in 0.005, "
+            f"not {tolerance:g}"
         )
     is_rising = -float("inf") < search_range.low < search_range.high < float("inf")
     if not colon or not search_range.key or not is_rising:
         form = "KEY=FROM:TO with FROM below TO, as in control.d=0.2:3"
-        raise UsageError(f"--margin reads {form}, not {text!r}")
+        raise UsageError(f"--margin must have the form {form}, not {text!r}")
     return search_range
 
 

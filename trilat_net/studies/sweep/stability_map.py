@@ -217,7 +217,10 @@ def build_plane(
     numeric_keys = [key for key in axes if all(is_number(row[key]) for row in rows)]
     drawn_keys = numeric_keys[:2]
     if not drawn_keys:
-        raise UsageError(f"a map needs a numeric axis, and {', '.join(axes)} has no numbers")
+        raise UsageError(
+            "a map needs a numeric axis, but these axes have values that are not numbers: "
+            f"{', '.join(axes)}"
+        )
 
     values = {key: {row[key] for row in rows} for key in axes}
     plane_axes = []
@@ -235,7 +238,7 @@ def build_plane(
         rows_of_panel.setdefault(settings, []).append(row)
     if len(rows_of_panel) > MAX_PANELS:
         raise UsageError(
-            f"a map has at most {MAX_PANELS} panels, and {', '.join(panel_keys)} would make "
+            f"a map has at most {MAX_PANELS} panels, but {', '.join(panel_keys)} would give "
             f"{len(rows_of_panel)}: sweep fewer values of the axes that are not drawn"
         )
 

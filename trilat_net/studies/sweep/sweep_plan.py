@@ -129,14 +129,18 @@ def parse_axis(description: str) -> SweepAxis:
     """
     key, equals, text = (part.strip() for part in str(description).partition("="))
     if not equals or not key:
-        raise ScenarioError(f"--over reads KEY=VALUES, {_VALUES_EXAMPLE}, not {description!r}")
+        raise ScenarioError(
+            f"--over must have the form KEY=VALUES, {_VALUES_EXAMPLE}, not {description!r}"
+        )
     if key in _KEYS_WITH_OPTIONS:
-        raise ScenarioError(f"is no axis: {_KEYS_WITH_OPTIONS[key]}", path=key)
+        raise ScenarioError(f"cannot be an axis: {_KEYS_WITH_OPTIONS[key]}", path=key)
 
     parts = _split_outside_brackets(text, ":")
     if len(parts) not in (1, 3):
         example = _VALUES_EXAMPLE.removeprefix("as in ")
-        raise ScenarioError(f"values read {example}, not {text!r}", path=key)
+        raise ScenarioError(
+            f"the values must have a form such as {example}, not {text!r}", path=key
+        )
     texts: tuple[str, ...] | _Steps
     if len(parts) == 1:
         texts = _parse_list(key, text)
@@ -218,15 +222,17 @@ def _parse_decimal(key: str, text: str) -> Decimal:
         number = Decimal(text)
     except InvalidOperation:
         problem = (
-            f"a range is of numbers, a:b:step, and {text!r} is not a number; "
+            f"a range a:b:step must consist of numbers, and {text!r} is not a number; "
             "list words as in KEY=first,second"
         )
         raise ScenarioError(problem, path=key) from None
     if not number.is_finite():
-        raise ScenarioError(f"a range is of finite numbers, not {text!r}", path=key)
+        raise ScenarioError(f"a range must consist of finite numbers, not {text!r}", path=key)
     size = abs(number)
     if size > Decimal("1e18") or 0 < size < Decimal("1e-18"):
-        raise ScenarioError(f"a range is of sizes from 1e-18 to 1e18, not {text}", path=key)
+        raise ScenarioError(
+            f"the magnitudes in a range must be from 1e-18 to 1e18, not {text}", path=key
+        )
     return number
 
 
@@ -492,7 +498,7 @@ def plan_sweep(
         )
     law_overrides = {law: _list_law_overrides(written, texts, loaded, law) for law in law_names}
     if judge not in JUDGES:
-        raise UsageError(f"--judge is one of {', '.join(JUDGES)}, not {judge!r}")
+        raise UsageError(f"--judge must be one of {', '.join(JUDGES)}, not {judge!r}")
 
     plan = SweepPlan(
         written=written,
@@ -509,7 +515,7 @@ def plan_sweep(
         longest_s = plan.default_longest_s
     elif not base.duration_s <= longest_s <= MAX_SCENARIO_S:
         raise UsageError(
-            "--longest is the longest duration of an undecided cell, from "
+            "--longest, the maximum duration of an undecided cell, must be from "
             f"{base.duration_s:g} s to {MAX_SCENARIO_S:g} s, not {longest_s:g}"
         )
     plan = plan._replace(longest_s=longest_s)
@@ -580,7 +586,8 @@ def _resolve_seeds(seeds: int | Sequence[int], scenario_seed: int) -> tuple[int,
     if isinstance(seeds, int | str):
         if isinstance(seeds, str) or not 1 <= seeds <= MAX_SEEDS:
             raise UsageError(
-                f"--seeds is a number from 1 to {MAX_SEEDS}, or a list as in 1..20; not {seeds}"
+                f"--seeds must be a number from 1 to {MAX_SEEDS}, "
+                f"or a list as in 1..20, not {seeds}"
             )
         seeds = range(scenario_seed, scenario_seed + seeds)
     if len(seeds) > MAX_SEEDS:
@@ -589,7 +596,7 @@ def _resolve_seeds(seeds: int | Sequence[int], scenario_seed: int) -> tuple[int,
         )
     for seed in seeds:
         if not 0 <= seed < 2**63:
-            raise UsageError(f"a seed is from 0 to 2^63 - 1, not {seed}")
+            raise UsageError(f"a seed must be from 0 to 2^63 - 1, not {seed}")
     return tuple(dict.fromkeys(seeds)) or (scenario_seed,)
 
 
@@ -716,9 +723,9 @@ def _check_axes(plan: SweepPlan, law_index: int) -> None:
             text = axis.texts[index]
             if digest in value_of_digest:
                 raise ScenarioError(
-                    f"{value_of_digest[digest]} and {text} are the same experiment: "
-                    "no site or link uses this key; each may have its own value, as in "
-                    "sites.NAME.control or links.A->B",
+                    f"{value_of_digest[digest]} and {text} give the same experiment: "
+                    "no site or link uses this key; perhaps each site or link has its own "
+                    "value, as in sites.NAME.control or links.A->B",
                     path=axis.key,
                     source=plan.written.label,
                 )

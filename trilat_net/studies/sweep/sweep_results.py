@@ -303,7 +303,7 @@ def read_results(path: Path) -> SweepResults:
     plan_file = file.with_name(PLAN_FILE)
     if not plan_file.is_file():
         raise UsageError(
-            f"{file}: holds no results of a sweep: there is no {PLAN_FILE} beside it"
+            f"{file}: contains no results of a sweep: there is no {PLAN_FILE} next to this file"
         )
     try:
         plan = plan_from_json(json.loads(plan_file.read_text(encoding="utf-8")))
@@ -316,7 +316,9 @@ def read_results(path: Path) -> SweepResults:
             lines = list(csv.DictReader(stream, strict=True))
         rows = [_read_row(line, plan) for line in lines]
     except KeyError as error:
-        raise UsageError(f"{file}: holds no results of a sweep: {error} is missing") from None
+        raise UsageError(
+            f"{file}: contains no results of a sweep: the column {error} is missing"
+        ) from None
     except (OSError, ValueError, TypeError, IndexError, csv.Error) as error:
         raise UsageError(f"{file}: cannot be read as results of a sweep: {error}") from None
     return SweepResults(plan, rows)

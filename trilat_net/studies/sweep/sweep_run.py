@@ -127,8 +127,8 @@ def open_sweep_folder(path: Path, expected: SweepPlan | None = None) -> SweepFol
             stored_text = _format_fact(key, stored)
             current_text = _format_fact(key, current)
             raise UsageError(
-                f"{path}: holds a sweep of {difference}: there {stored_text}, "
-                f"here {current_text}; results are not mixed: choose another folder"
+                f"{path}: contains a sweep with {difference}: {stored_text} in the folder, "
+                f"{current_text} now; results cannot be mixed: choose another folder"
             )
     return _build_folder(path, plan_from_json(stored), stored)
 
@@ -174,7 +174,9 @@ def _read_facts(path: Path) -> dict[str, Any]:
     try:
         facts = json.loads(file.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise UsageError(f"{path}: no sweep was begun there: it has no {PLAN_FILE}") from None
+        raise UsageError(
+            f"{path}: this folder contains no sweep: {PLAN_FILE} is missing"
+        ) from None
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "is not JSON"
         raise UsageError(f"{file}: cannot be read: {reason}") from None
@@ -182,7 +184,7 @@ def _read_facts(path: Path) -> dict[str, Any]:
     optional = {"judge", "metrics"}
     required = {"source", "folder", "name", *_DIFFERENCES} - optional
     if not isinstance(facts, dict) or not required <= facts.keys():
-        raise UsageError(f"{file}: is no plan of a sweep")
+        raise UsageError(f"{file}: is not the plan of a sweep")
     return facts
 
 
@@ -205,7 +207,7 @@ _PROBES = 7
 """Largest number of runs from which the duration of a sweep is estimated."""
 _PROBING_S = 3.0
 """Time after which the estimate starts no further run, in s of real time."""
-_RESUME_HINT = "; what is done is kept: go on with --resume"
+_RESUME_HINT = "; finished runs are kept: continue with --resume"
 """Advice for the user after a worker died."""
 
 
@@ -377,7 +379,7 @@ def refuse_oversized_sweep(
     cores = count_nouns(jobs or count_cores(), "core")
     raise UsageError(
         f"{cells} ({sizes}{seeds}) would take about {format_wall_time(expected.seconds)} "
-        f"on {cores}; larger steps make it fewer, --yes runs it all the same"
+        f"on {cores}; use larger steps for fewer cells, or run the sweep anyway with --yes"
     )
 
 

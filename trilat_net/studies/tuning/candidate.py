@@ -76,8 +76,8 @@ def check_comparable(scenario: Scenario) -> None:
     refuse_live_only(scenario)
     if any(spec.task.shared for spec in scenario.sites.values()):
         raise ScenarioError(
-            "laws are compared by the distance of joint angles, but here the end effectors "
-            "agree: take a scenario in joint space",
+            "laws are compared by the distance between joint angles, but in this scenario the "
+            "end effectors are synchronised: choose a scenario in joint space",
             path="task.space",
             source=scenario.name,
         )
@@ -87,8 +87,8 @@ def check_comparable(scenario: Scenario) -> None:
     if len(groups) > 1:
         group_names = [", ".join(scenario.names[site] for site in group) for group in groups]
         raise ScenarioError(
-            f"these groups follow no other site: {' and '.join(group_names)}; there is no pose "
-            "that all would reach",
+            f"these groups of sites do not follow each other: {' and '.join(group_names)}; "
+            "the sites therefore have no common pose",
             path="dominance",
             source=scenario.name,
         )
@@ -102,9 +102,9 @@ def check_comparable(scenario: Scenario) -> None:
         if conflict_rad.max(initial=0.0) > CONFLICT_RAD:
             worst_s = t_s[conflict_rad.max(axis=1).argmax()]
             raise ScenarioError(
-                f"at {worst_s:g} s this hand wants another pose than the others: no law can "
-                "bring the arms together, and their distance says nothing about the law; keep "
-                "one of the operators",
+                f"at {worst_s:g} s this hand pulls towards a different pose from the other "
+                "hands: no law can bring the arms together, so their distance says nothing "
+                "about the law; keep only one of the operators",
                 path=f"sites.{spring.site}.hands",
                 source=scenario.name,
             )

@@ -139,7 +139,9 @@ def build_model_information(gravity_percent: float) -> ModelInformation:
         UsageError: The number is not from 50 to 150.
     """
     if not 50.0 <= gravity_percent <= 150.0:
-        raise UsageError(f"--gravity is from 50 to 150 % of the truth, not {gravity_percent:g}")
+        raise UsageError(
+            f"--gravity must be from 50 to 150 % of the true value, not {gravity_percent:g}"
+        )
     return ModelInformation(gravity_percent / 100.0)
 
 

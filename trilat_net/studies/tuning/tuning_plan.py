@@ -747,15 +747,17 @@ def plan_tuning(
     """
     if not 1 <= budget <= MAX_BUDGET:
         raise UsageError(
-            f"--budget is the number of candidates per law, 1 to {MAX_BUDGET}, not {budget}"
+            f"--budget, the number of candidates per law, must be from 1 to {MAX_BUDGET}, "
+            f"not {budget}"
         )
     if not 0 <= seed < 2**63:
-        raise UsageError(f"--seed is from 0 to 2^63 - 1, not {seed}")
+        raise UsageError(f"--seed must be from 0 to 2^63 - 1, not {seed}")
     if objective not in list(Objective):
-        raise UsageError(f"--objective is {' or '.join(Objective)}, not {objective!r}")
+        raise UsageError(f"--objective must be {' or '.join(Objective)}, not {objective!r}")
     if not 1 <= seeds <= MAX_TUNING_SEEDS:
         raise UsageError(
-            f"--seeds is how many runs each candidate has, 1 to {MAX_TUNING_SEEDS}, not {seeds}"
+            f"--seeds, the number of runs per candidate, must be from 1 to {MAX_TUNING_SEEDS}, "
+            f"not {seeds}"
         )
     knowledge = build_model_information(gravity_percent)
     base = load_tuning_scenario(source, overrides)
@@ -764,8 +766,8 @@ def plan_tuning(
     ticks = sum(map(scenario.ticks, scenario.names))
     if ticks > MAX_TICKS:
         problem = (
-            f"a candidate would take {count_nouns(ticks, 'tick')}, and at most {MAX_TICKS} are "
-            "allowed: shorten it with --duration"
+            f"a candidate would take {count_nouns(ticks, 'tick')}, but at most {MAX_TICKS} are "
+            "allowed: shorten the run with --duration"
         )
         raise ScenarioError(problem, path="duration_s", source=base.source)
     check_comparable(scenario)
