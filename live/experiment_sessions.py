@@ -284,7 +284,7 @@ class ExperimentSessions:
         if reason:
             self._record_aborted(step.planned, reason)
             self.stage.show_feedback(None, reason)
-            self.say(f"trial {step.planned.number} is to be made again: {reason}")
+            self.say(f"trial {step.planned.number} must be repeated: {reason}")
         return not reason
 
     def _count_trial(self, trial: ExperimentTrial, path: Path) -> str:

@@ -287,9 +287,10 @@ class PageOptions:
         """
         if self.make_context() is None and self.host not in HERE and not self.insecure:
             raise UsageError(
-                f"--host {self.host}: whoever reads the network reads the page's token and "
-                "could take part; give the keys of a member with --tls, say --insecure if "
-                "that network is yours, or leave out --host and use an SSH tunnel"
+                f"--host {self.host}: anyone who can listen on this network can read the "
+                "token of the page and take part; give the keys of a member with --tls, "
+                "give --insecure if you trust everybody on this network, or leave out "
+                "--host and use an SSH tunnel"
             )
         try:
             family = socket.AF_INET6 if ":" in self.host else socket.AF_INET

@@ -89,7 +89,8 @@ def open_device(text: str) -> Device:
     known = sorted(module_info.name for module_info in iter_modules(__path__))
     if name not in known:
         raise UsageError(
-            f"--device is one of {', '.join(known)}, with its =ADDRESS if need be, not {text!r}"
+            f"--device must be one of {', '.join(known)}, "
+            f"optionally followed by =ADDRESS, not {text!r}"
         )
     module = import_module(f"{__name__}.{name}")
     class_name = name.replace("_", "")

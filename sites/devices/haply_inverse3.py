@@ -81,7 +81,7 @@ class HaplyInverse3:
             self._socket = self._open.enter_context(connection)
         except (OSError, ValueError, WebSocketException) as error:
             raise ConnectionError(
-                f"no service of an Inverse3 at {self._address}: {error}"
+                f"no Inverse3 service answers at {self._address}: {error}"
             ) from None
 
         self._was_connected = True

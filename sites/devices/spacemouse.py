@@ -118,14 +118,14 @@ class SpaceMouse:
             waiting.
 
         Raises:
-            ConnectionError: The device is gone.
+            ConnectionError: The device was disconnected.
         """
         try:
             report = os.read(self._file, 64)
         except BlockingIOError:
             return False
         if not report:
-            raise ConnectionError("the SpaceMouse is gone")
+            raise ConnectionError("the SpaceMouse was disconnected")
 
         kind = report[0]
         if kind == _MOTION_REPORT and len(report) >= 7:

@@ -39,10 +39,10 @@ def test_what_is_wrong_is_said_in_a_sentence(tmp_path: Path) -> None:
     file.write_text(text.replace("participants = 12", "participants = 11"), encoding="utf-8")
     refused = trilat("experiment", "check", "reaching.toml", cwd=tmp_path)
     assert refused.code == 2
-    assert "the number of participants must be a multiple of 4, is 11" in " ".join(
+    assert "the number of participants must be a multiple of 4, not 11" in " ".join(
         refused.err.split()
     )
-    assert "holds no experiment" in trilat("experiment", "status", ".", cwd=tmp_path).err
+    assert "contains no experiment" in trilat("experiment", "status", ".", cwd=tmp_path).err
     assert (
         "reaching.toml: exists"
         in trilat("experiment", "new", "reaching.toml", cwd=tmp_path).err
@@ -62,7 +62,7 @@ def test_protocol_of_two_people_runs_as_it_is_written(tmp_path: Path) -> None:
     assert "two_people: 2 of 2 trials, in models" in told
     refused = trilat("experiment", "run", "models", "--live", "--no-browser", cwd=tmp_path)
     assert refused.code == 2
-    assert "its trials are of synthetic participants" in " ".join(refused.err.split())
+    assert "trials were done by synthetic participants" in " ".join(refused.err.split())
     refused = trilat(
         "experiment", "run", "two-people.toml", "--live", "--host", "0.0.0.0", cwd=tmp_path
     )

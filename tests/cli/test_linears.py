@@ -118,4 +118,6 @@ def test_a_hand_that_was_identified_holds_the_ports(tmp_path: Path) -> None:
     held = ("linear", "p_d_margin_two", *AT, "--set", "control.d=1.96", "--operators", "m.json")
     line = "the measured operators at the masters, any at each: not shown at 0.001-"
     assert line in trilat(*held, cwd=tmp_path).succeeds()
-    trilat(*held, "--operators", "run.mcap", cwd=tmp_path).refuses("run.mcap: contains no hand")
+    trilat(*held, "--operators", "run.mcap", cwd=tmp_path).refuses(
+        "run.mcap: does not contain the output"
+    )

@@ -209,11 +209,11 @@ def test_trial_that_somebody_stops_is_made_again(stage: Stage) -> None:
         take_part(people, lambda: people[0].look().get("appeared"))
         people[0].page.mouse.up()  # a mouse that holds an arm presses no button
         people[0].page.click("text=stop this trial")
-        running.prints("is to be made again: m1 stopped it")
+        running.prints("must be repeated: m1 stopped it")
         people[1].page.wait_for_selector("text=This trial is made again: m1 stopped it.")
         take_part(people, lambda: people[0].look().get("appeared"))
         people[1].page.context.close()
-        running.prints("is to be made again: the page of m2 is gone")
+        running.prints("must be repeated: the page of m2 is gone")
         browser = people[0].page.context.browser
         assert browser is not None
         take_part([people[0], join(browser, running, "m2")], running.ended)
@@ -242,4 +242,4 @@ def test_experimenter_ends_it_for_now_and_it_goes_on(stage: Stage) -> None:
     assert json.loads(status.text())["done"] == 1
     synthetic = stage.start("synthetic", "experiment", "run", str(folder))
     assert synthetic.code() == 2
-    assert "its trials are of people" in " ".join(synthetic.text().split())
+    assert "the finished trials were done by people" in " ".join(synthetic.text().split())

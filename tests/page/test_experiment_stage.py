@@ -204,7 +204,7 @@ def test_aborted_trial_is_kept_aside_and_made_again(experiment: Experiment) -> N
     assert people.run(stops)
     assert tries == ["00001-01", "00001-02", "00002-01"]
     assert (experiment.folder / "tries" / "00001-01" / "run.mcap").exists()
-    assert "trial 1 is to be made again: m1 stopped it" in people.said
+    assert "trial 1 must be repeated: m1 stopped it" in people.said
     assert_whole(experiment)
 
 
@@ -234,7 +234,9 @@ def test_log_that_ends_too_early_does_not_count(experiment: Experiment) -> None:
 def test_people_and_models_of_them_share_no_folder(experiment: Experiment) -> None:
     people = People(experiment)
     people.run(lambda watch, _: setattr(people, "ends", watch.trial.planned.number == 1))
-    with pytest.raises(UsageError, match="its trials are of people: continue with"):
+    with pytest.raises(
+        UsageError, match="the finished trials were done by people: continue with"
+    ):
         open_experiment(experiment.folder).run(jobs=1)
 
 

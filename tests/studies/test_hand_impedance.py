@@ -127,7 +127,7 @@ def test_intervals_hold_nine_tenths_of_twenty_hands() -> None:
     ("changes", "problem"),
     [
         ({}, "no operator of kind 'multisine'"),
-        (moved_from("s", 5.0, 6.0), "m1: 0 whole segments of 8 s .* at least 28 s"),
+        (moved_from("s", 5.0, 6.0), "m1: the log has 0 whole segments of 8 s .* at least 28 s"),
     ],
 )
 def test_a_run_that_tells_nothing_is_refused(changes: dict[str, Any], problem: str) -> None:
@@ -149,5 +149,5 @@ def test_motion_along_a_line_is_refused() -> None:
 def test_a_file_of_no_hand_is_refused(text: str, tmp_path: Path) -> None:
     file = tmp_path / "m1.json"
     file.write_text(text, encoding="utf-8")
-    with pytest.raises(UsageError, match=r"m1\.json: contains no hand"):
+    with pytest.raises(UsageError, match=r"m1\.json: does not contain the output"):
         read_hands([file])

@@ -243,8 +243,9 @@ def identify_hand(log: Log | str | Path, site: str = "m1") -> HandImpedance:
         segments = count_nouns(len(phasors), "whole segment")
         needed_s = sines.start_s + (0.5 * MIN_SEGMENTS + 1.0) * segment_s
         raise UsageError(
-            f"{site}: {segments} of {segment_s:g} s while the sines act, and intervals need "
-            f"{MIN_SEGMENTS}: a run of at least {needed_s:g} s"
+            f"{site}: the log has {segments} of {segment_s:g} s in which the sines act, but "
+            f"the confidence intervals need {MIN_SEGMENTS}: record a run of at least "
+            f"{needed_s:g} s"
         )
 
     axis_count = force.shape[1]
@@ -439,7 +440,7 @@ def _fit_with_intervals(site: str, F: Complex, X: Complex, w: Array) -> _HandFit
     motions = -np.concatenate((s**2 * X, s * X, X), axis=2)
     if not _can_distinguish(motions):
         raise UsageError(
-            f"{site}: its end effector moved along fewer than {count_nouns(axes, 'axis')}, "
+            f"{site}: the end effector moved along fewer than {count_nouns(axes, 'axis')}, "
             "or at too few frequencies to distinguish mass, damping and stiffness: "
             "let sines of other frequencies act on another joint"
         )
@@ -566,13 +567,13 @@ def _read_hand(file: Path) -> HandMatrices:
         values = json.loads(file.read_text(encoding="utf-8"))
         M, B, K = (np.array(values[key], dtype=np.float64) for key in KEYS)
         if not M.shape == B.shape == K.shape or M.shape not in ((2, 2), (3, 3)):
-            raise ValueError("its matrices have different shapes")
+            raise ValueError("the matrices must all have 2 rows and columns, or all have 3")
         if not np.isfinite([M, B, K]).all():
-            raise ValueError("its numbers are not finite")
+            raise ValueError("a number is not finite")
     except (OSError, ValueError, KeyError, TypeError) as error:
         # The text of a KeyError is only the key.
-        problem = f"KeyError {error}" if isinstance(error, KeyError) else str(error)
+        problem = f"the key {error} is missing" if isinstance(error, KeyError) else str(error)
         raise UsageError(
-            f"{file}: contains no hand of `trilat identify hand --json`: {problem}"
+            f"{file}: does not contain the output of `trilat identify hand --json`: {problem}"
         ) from None
     return HandMatrices(M, B, K)

@@ -79,7 +79,9 @@ def test_who_is_excluded_is_said_with_the_reason(folder: Path, tmp_path: Path) -
         "The data of 1 participant were analysed; 1 more was excluded (P2: stopped in block 2)."
     )
     assert {row["participant"] for row in found.rows} == {"P1"}
-    with pytest.raises(UsageError, match="there is no participant P9: there are P1, P2"):
+    with pytest.raises(
+        UsageError, match="there is no participant P9; the participants are P1, P2"
+    ):
         tn.analyse_experiment(folder, tmp_path / "other", exclude={"P9": ""})
 
 
@@ -176,7 +178,7 @@ def test_missing_answers_are_counted_and_not_averaged(pair: Path, tmp_path: Path
 
 def test_nothing_to_analyse_is_said(tmp_path: Path) -> None:
     begun = begin_experiment(write_protocol(tmp_path), tmp_path / "out")
-    with pytest.raises(UsageError, match="no trial that counts is done yet"):
+    with pytest.raises(UsageError, match="there are no trials to analyse yet"):
         tn.analyse_experiment(begun.folder)
 
 

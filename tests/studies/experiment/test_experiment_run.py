@@ -139,9 +139,9 @@ def test_folder_of_another_plan_is_refused(tmp_path: Path) -> None:
     file.write_text(
         file.read_text(encoding="utf-8").replace("trials = 2", "trials = 3"), encoding="utf-8"
     )
-    with pytest.raises(UsageError, match="its protocol was changed after the experiment began"):
+    with pytest.raises(UsageError, match="the protocol was changed after the experiment began"):
         tn.open_experiment(begun.folder)
-    with pytest.raises(UsageError, match="holds no experiment"):
+    with pytest.raises(UsageError, match="contains no experiment"):
         tn.open_experiment(tmp_path)
 
 

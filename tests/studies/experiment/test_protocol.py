@@ -119,16 +119,19 @@ def test_digest_knows_what_was_planned() -> None:
         ),
         (
             {"users": ["m1", "m2"], "participants": 5},
-            "5 participants make no pairs: their number must be even",
+            "5 participants cannot form pairs: the number of participants must be even",
         ),
-        ({"users": ["m1", "m2", "s"]}, "users are one or two sites, not m1, m2, s"),
-        ({"users": ["m3"]}, "condition near: .*has no site m3; there are m1, m2, s"),
-        ({"users": ["s"]}, "has no live hand, so nobody can hold it"),
+        ({"users": ["m1", "m2", "s"]}, "users must be one or two sites, not m1, m2, s"),
+        (
+            {"users": ["m3"]},
+            "condition near: .*the scenario has no site m3; its sites are m1, m2, s",
+        ),
+        ({"users": ["s"]}, "has no live hand, so nobody can hold this arm"),
         ({"participants": ["A", "A"]}, "two participants have the same pseudonym"),
         ({"force_limit_n": {"P9": 5.0}}, "force_limit_n: there is no participant P9"),
         (
             {"force_limit_n": {"P1": 50.0}},
-            "condition near: .*50 N: the live hand at m1 has a limit of 40 N",
+            "condition near: .*50 N exceeds the limit of the live hand at m1, which is 40 N",
         ),
         ({"catch": {"condition": "nowhere"}}, "catch.condition: there is no condition nowhere"),
         (
@@ -137,17 +140,20 @@ def test_digest_knows_what_was_planned() -> None:
         ),
         (
             {"questionnaires": [{"name": "mine"}]},
-            "mine has no items; those that ship are tlx, sus, agency",
+            "mine has no items; the built-in questionnaires are tlx, sus, agency",
         ),
         (
             {"questionnaires": [{"name": "sus", "items": {"a": "A?"}}]},
-            "give your own another name",
+            "give your questionnaire another name",
         ),
         (
             {"questionnaires": [{"name": "mine", "items": {"a": "A?"}, "most": 1}]},
-            "a scale has 2 to 101 numbers",
+            "the scale must have 2 to 101 numbers",
         ),
-        ({"foreperiod_s": [2.0, 1.0]}, "foreperiod_s is from the shorter to the longer time"),
+        (
+            {"foreperiod_s": [2.0, 1.0]},
+            "foreperiod_s must go from the shorter to the longer time",
+        ),
         (
             {"task": {"kind": "reach", "handover_s": 2.0}},
             "a training, a handover and .* need two users",
@@ -158,7 +164,7 @@ def test_digest_knows_what_was_planned() -> None:
         ),
         (
             {"training": {"lead": {"near": [1.0, 0.0]}}},
-            "training.lead: is a pair .* of near, far",
+            "training.lead: must have a pair .* of near, far",
         ),
         (
             {
@@ -174,9 +180,12 @@ def test_digest_knows_what_was_planned() -> None:
                 "task": {"kind": "reach", "handover_s": 2.0},
                 "set": {**LIVE, "dominance.s": {"m1": 1.0}},
             },
-            "dominance.s.*both users are to have a share",
+            "dominance.s.*both users must have a share above 0",
         ),
-        ({"task": {"kind": "contact"}}, "sites.s.environment.*there is no wall to press"),
+        (
+            {"task": {"kind": "contact"}},
+            "sites.s.environment.*the slave has no wall to press against",
+        ),
         (
             {"conditions": {"a": {"link.delay_ms": -1}, "b": {"control.K": 1}}},
             "condition a: .*; condition b: ",
@@ -201,7 +210,7 @@ def test_all_that_is_wrong_is_named_before_anybody_sits_down(
             "name = 'a'\nscenario = 'paper'\nconditions = {}\ntrails = 3",
             "unknown field `trails`",
         ),
-        ("name =", "is no TOML"),
+        ("name =", "is not valid TOML"),
         (
             "name = 'a'\nscenario = 'paper'\nconditions = {}\nparticipants = ['../x']",
             "matching regex",

@@ -158,12 +158,12 @@ def test_people_choose_after_each_pair(tmp_path: Path) -> None:
         (
             '"link.delay_ms" = 200',
             '"control.K" = 1',
-            "staircase.key: control.K is set by condition far too",
+            "staircase.key: control.K must not be set by condition far too",
         ),
         (
             "trials = 2",
             "trials = 3",
-            "a staircase consists of pairs of trials: their number must be even, is 3",
+            "a staircase consists of pairs of trials: the number of trials must be even, not 3",
         ),
         (
             'users = ["m1"]',

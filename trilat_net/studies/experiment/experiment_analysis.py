@@ -147,7 +147,10 @@ class ExperimentAnalysis(Result):
             row for row in self.learning_rows if row.get("phase") not in _UNCOUNTED_PHASES
         ]
         if not self.rows:
-            raise UsageError(f"{experiment.folder}: no trial that counts is done yet")
+            raise UsageError(
+                f"{experiment.folder}: there are no trials to analyse yet; practice trials, "
+                "catch trials and trials of excluded participants do not count"
+            )
         self.throughput_rows = list(self._find_throughput())
         self.gain_rows = list(self._find_gains())
         self.threshold_rows = self._sort_by_condition(list(self._find_thresholds()))
@@ -178,9 +181,9 @@ class ExperimentAnalysis(Result):
         names = {"-".join(group) for group in groups}
         unknown = sorted(self._exclude.keys() - names)
         if unknown:
+            valid = ", ".join(sorted(names))
             raise UsageError(
-                f"there is no {self.unit} {', '.join(unknown)}: "
-                f"there are {', '.join(sorted(names))}"
+                f"there is no {self.unit} {', '.join(unknown)}; the {self.unit}s are {valid}"
             )
 
     def _is_counted(self, row: Mapping[str, Any]) -> bool:

@@ -128,8 +128,8 @@ class Experiment(Result):
                 if people:
                     advice = "synthetic participants: continue without"
                 raise UsageError(
-                    f"{self.folder}: its trials are of {advice} --live, "
-                    "or begin another experiment"
+                    f"{self.folder}: the finished trials were done by {advice} --live, "
+                    "or start another experiment"
                 )
         return RunJournal(
             self.folder / JOURNAL_FILE, self.plan.digest, TrialEntry, self._remedy
@@ -410,7 +410,7 @@ class Experiment(Result):
         for note in self.read_notes():
             if note.kind == "aborted":
                 trial_name = f"trial {note.number}, {note.who}"
-                yield f"{trial_name}, was aborted and is made again: {note.text}"
+                yield f"{trial_name}, was aborted and is repeated: {note.text}"
 
 
 _SHOWN_MEASURES = ("error_end_mm", "error_rms_mm", "path_m", "sparc")
@@ -509,7 +509,8 @@ def open_experiment(folder: str | Path) -> Experiment:
         facts = json.loads((path / PLAN_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         raise UsageError(
-            f"{path}: holds no experiment; `trilat experiment run FILE` begins one"
+            f"{path}: contains no experiment; "
+            "start an experiment with `trilat experiment run FILE`"
         ) from None
     scenarios = {}
     for name, text in facts["scenarios"].items():
@@ -518,8 +519,8 @@ def open_experiment(folder: str | Path) -> Experiment:
     plan = plan_experiment(protocol, scenarios=scenarios)
     if plan.digest != facts["digest"]:
         raise UsageError(
-            f"{path}: its protocol was changed after the experiment began: "
-            "begin another experiment"
+            f"{path}: the protocol was changed after the experiment began; "
+            "start another experiment"
         )
     return Experiment(path, plan)
 

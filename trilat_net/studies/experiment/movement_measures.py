@@ -44,11 +44,14 @@ def _read(name: str, values: ArrayLike, dimensions: int) -> Array:
     """
     samples = np.asarray(values, dtype=np.float64)
     if samples.ndim != dimensions or not samples.size:
-        shape = "(K,), a number" if dimensions == 1 else "(K, D), a row"
-        raise UsageError(f"{name}: shape {samples.shape}; give {shape} per sample")
+        shape = "(K,), with a number" if dimensions == 1 else "(K, D), with a row"
+        raise UsageError(
+            f"{name}: the array has shape {samples.shape}; give shape {shape} per sample"
+        )
     if not np.isfinite(samples).all():
         raise UsageError(
-            f"{name}: a sample is not a finite number; leave out what was not measured"
+            f"{name}: a sample is not a finite number; "
+            "leave out the samples that were not measured"
         )
     return samples
 
@@ -63,7 +66,7 @@ def _read_same_shape(**values: ArrayLike) -> list[Array]:
     different_shapes = {array.shape for array in arrays.values()}
     if len(different_shapes) > 1:
         shapes = ", ".join(f"{name} {array.shape}" for name, array in arrays.items())
-        raise UsageError(f"{shapes}: give as many samples and axes of each")
+        raise UsageError(f"{shapes}: give the same number of samples and axes in each array")
     return list(arrays.values())
 
 
@@ -251,7 +254,8 @@ def measure_throughput(
     lengths = np.linalg.norm(axes, axis=1)
     if not lengths.all():
         raise UsageError(
-            "starts: a movement starts at its own target; give the centre of the target before"
+            "starts: a movement must not start at its own target; "
+            "give the centre of the previous target"
         )
     # How far each end point is beyond its target, along the axis of the task.
     end_errors = end_points - target_points
@@ -385,10 +389,15 @@ def _list_ratings(ratings: Mapping[str, float]) -> list[float]:
     """
     if ratings.keys() != set(TLX_SCALES):
         rated = ", ".join(ratings) or "nothing"
-        raise UsageError(f"ratings of {rated}: NASA-TLX has {', '.join(TLX_SCALES)}")
+        scales = ", ".join(TLX_SCALES)
+        raise UsageError(
+            f"ratings are given for {rated}, but NASA-TLX needs a rating for each of {scales}"
+        )
     for scale, rating in ratings.items():
         if not 0.0 <= rating <= 100.0:
-            raise UsageError(f"{scale} = {rating}: a rating of NASA-TLX lies between 0 and 100")
+            raise UsageError(
+                f"{scale} = {rating}: a rating of NASA-TLX must be between 0 and 100"
+            )
     return [float(ratings[scale]) for scale in TLX_SCALES]
 
 
@@ -423,9 +432,10 @@ def weighted_tlx(ratings: Mapping[str, float], weights: Mapping[str, int]) -> fl
     is_whole = has_all and all(weight == int(weight) for weight in ordered_weights)
     is_possible = sums[-1] == 15 and not (sums < least_sums).any()
     if not is_whole or not is_possible:
+        scales = ", ".join(TLX_SCALES)
         raise UsageError(
-            f"weights {dict(weights)}: give how often each of {', '.join(TLX_SCALES)} "
-            "was chosen, 0 to 5, in the 15 comparisons of two"
+            f"weights {dict(weights)}: for each of {scales}, give how often the scale was "
+            "chosen (0 to 5) in the 15 pairwise comparisons"
         )
     return float(np.dot(ordered_ratings, ordered_weights) / 15.0)
 
@@ -440,10 +450,14 @@ def sus_score(answers: Sequence[int]) -> float:
     (1996).
     """
     if len(answers) != 10:
-        raise UsageError(f"{count_nouns(len(answers), 'answer')}: SUS has 10 questions")
+        count = count_nouns(len(answers), "answer was", "answers were")
+        raise UsageError(f"{count} given, but SUS has 10 questions")
     for number, answer in enumerate(answers, 1):
         if answer not in (1, 2, 3, 4, 5):
-            raise UsageError(f"answer {number} = {answer}: an answer of SUS is 1, 2, 3, 4 or 5")
+            raise UsageError(
+                f"answer {number} = {answer}: "
+                "an answer to a question of SUS must be 1, 2, 3, 4 or 5"
+            )
     # Odd questions are worded positively, even questions negatively.
     positive_points = sum(answer - 1 for answer in answers[::2])
     negative_points = sum(5 - answer for answer in answers[1::2])

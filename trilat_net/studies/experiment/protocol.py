@@ -488,7 +488,7 @@ def read_protocol(file: str | Path) -> Protocol:
     except OSError as error:
         raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path}: is no TOML: {error}") from None
+        raise UsageError(f"{path}: is not valid TOML: {error}") from None
     except msgspec.ValidationError as error:
         valid = ", ".join(key.encode_name for key in msgspec.structs.fields(Protocol))
         raise UsageError(f"{path}: {error}; the keys of a protocol are {valid}") from None
@@ -561,7 +561,7 @@ def _find_problems(protocol: Protocol) -> Iterator[str]:
     shortest_s, longest_s = protocol.foreperiod_s
     if shortest_s > longest_s:
         foreperiod_s = list(protocol.foreperiod_s)
-        yield f"foreperiod_s is from the shorter to the longer time, not {foreperiod_s}"
+        yield f"foreperiod_s must go from the shorter to the longer time, not {foreperiod_s}"
     yield from _find_pseudonym_problems(protocol)
     yield from _find_table_problems(protocol)
     yield from _find_form_problems(protocol)
@@ -592,7 +592,7 @@ def _find_table_problems(protocol: Protocol) -> Iterator[str]:
         yield f"catch.condition: there is no condition {catch.condition}"
     if training is not None and training.lead.keys() != protocol.conditions.keys():
         conditions = ", ".join(protocol.conditions)
-        yield f"training.lead: is a pair of numbers for each of {conditions}"
+        yield f"training.lead: must have a pair of numbers for each of {conditions}"
     tables = [table for table in (training, catch, staircase) if table is not None]
     if len(tables) > 1:
         yield "catch trials, a training and a staircase exclude each other"
@@ -624,10 +624,10 @@ def _find_group_problems(protocol: Protocol) -> Iterator[str]:
     users = protocol.users
     name_count = len(_list_pseudonyms(protocol))
     if not 1 <= len(users) <= 2 or len(set(users)) < len(users):
-        yield f"users are one or two sites, not {', '.join(users)}"
+        yield f"users must be one or two sites, not {', '.join(users)}"
     elif name_count % len(users):
-        participants = count_nouns(name_count, "participant makes", "participants make")
-        yield f"{participants} no pairs: their number must be even"
+        participants = count_nouns(name_count, "participant")
+        yield f"{participants} cannot form pairs: the number of participants must be even"
     orders = list_orders(protocol.design, list(protocol.conditions), protocol.seed)
     group_count = len(protocol.groups)
     if protocol.design in ("williams", "latin") and group_count % len(orders):
@@ -636,23 +636,23 @@ def _find_group_problems(protocol: Protocol) -> Iterator[str]:
         yield (
             f"a {protocol.design} design of {conditions} has "
             f"{count_nouns(len(orders), 'order')}: the number of {units} must be a multiple of "
-            f"{len(orders)}, is {group_count}"
+            f"{len(orders)}, not {group_count}"
         )
 
 
 def _find_staircase_problems(protocol: Protocol, staircase: Staircase) -> Iterator[str]:
     """Yields the problems of a protocol with a staircase."""
     if len(protocol.users) != 1:
-        yield "staircase: needs exactly one user, who answers"
+        yield "staircase: needs exactly one user, who answers after each pair of trials"
     if protocol.trials % 2:
         yield (
-            "trials: a staircase consists of pairs of trials: their number must be even, "
-            f"is {protocol.trials}"
+            "trials: a staircase consists of pairs of trials: the number of trials must be "
+            f"even, not {protocol.trials}"
         )
     key = staircase.key
     conditions = [name for name, keys in protocol.conditions.items() if key in _list_keys(keys)]
     if conditions:
-        yield f"staircase.key: {key} is set by condition {', '.join(conditions)} too"
+        yield f"staircase.key: {key} must not be set by condition {', '.join(conditions)} too"
 
 
 def _check_scenario(scenario: Scenario, protocol: Protocol) -> Scenario:
@@ -665,20 +665,24 @@ def _check_scenario(scenario: Scenario, protocol: Protocol) -> Scenario:
     for user in protocol.users:
         if user not in scenario.names:
             raise ScenarioError(
-                f"has no site {user}; there are {', '.join(scenario.names)}", path="users"
+                f"the scenario has no site {user}; its sites are {', '.join(scenario.names)}",
+                path="users",
             )
         if scenario.sites[user].find_live_hand(is_open=True) is None:
             raise ScenarioError(
-                "has no live hand, so nobody can hold it: hands = [{ kind = 'live' }]",
+                "has no live hand, so nobody can hold this arm; "
+                "add hands = [{ kind = 'live' }]",
                 path=f"sites.{user}.hands",
             )
     slave = scenario.slave
     if protocol.task.needs_wall and not scenario.sites[slave].environment:
-        raise ScenarioError("there is no wall to press", path=f"sites.{slave}.environment")
+        raise ScenarioError(
+            "the slave has no wall to press against", path=f"sites.{slave}.environment"
+        )
     shares = [scenario.dominance[slave].get(user, 0.0) for user in protocol.users]
     needs_shares = protocol.training is not None or protocol.task.needs_pair
     if needs_shares and min(shares) <= 0.0:
-        raise ScenarioError("both users are to have a share", path=f"dominance.{slave}")
+        raise ScenarioError("both users must have a share above 0", path=f"dominance.{slave}")
     for group in protocol.groups:
         limit_forces(scenario, protocol, group)
     staircase = protocol.staircase
@@ -716,12 +720,18 @@ def limit_forces(
         live_hand = spec.find_live_hand(is_open=True)
         if limit_n is None or live_hand is None:
             continue
-        has_no_limit = live_hand.mode == "joint"
-        if has_no_limit or live_hand.force_limit_n < limit_n:
-            scenario_limit = "none, N" if has_no_limit else f"{live_hand.force_limit_n:g} N"
+        key = f"force_limit_n.{name}"
+        if live_hand.mode == "joint":
             raise ScenarioError(
-                f"{limit_n:g} N: the live hand at {user} has a limit of {scenario_limit}",
-                path=f"force_limit_n.{name}",
+                f"the live hand at {user} has the mode 'joint' and therefore no limit in N",
+                path=key,
+            )
+        hand_limit_n = live_hand.force_limit_n
+        if hand_limit_n < limit_n:
+            raise ScenarioError(
+                f"{limit_n:g} N exceeds the limit of the live hand at {user}, "
+                f"which is {hand_limit_n:g} N",
+                path=key,
             )
         limited_hand = replace(live_hand, force_limit_n=limit_n)
         hands = tuple(limited_hand if hand is live_hand else hand for hand in spec.hands)

@@ -83,7 +83,10 @@ class Questionnaire(Frozen, frozen=True):
         are_valid = all(self._is_valid(value) for value in values)
         if len(values) != len(self.items) or not are_valid:
             count = count_nouns(len(self.items), "answer")
-            raise UsageError(f"{self.name}: {count} of {self.least} to {self.most}")
+            raise UsageError(
+                f"{self.name}: give {count} between {self.least} and {self.most}, "
+                f"in steps of {self.step}"
+            )
         return dict(zip(self.items, values, strict=True))
 
     def _is_valid(self, value: float | None) -> bool:
@@ -138,17 +141,20 @@ def find_form(questionnaire: Questionnaire) -> Questionnaire:
     if not questionnaire.items:
         if name not in shipped:
             raise UsageError(
-                f"questionnaire {name} has no items; those that ship are {', '.join(shipped)}"
+                f"questionnaire {name} has no items; "
+                f"the built-in questionnaires are {', '.join(shipped)}"
             )
         form = msgspec.convert({"name": name, **shipped[name]}, Questionnaire)
         return replace(form, after=questionnaire.after)
     if name in shipped:
         raise UsageError(
-            f"questionnaire {name} ships with its items: give your own another name"
+            f"questionnaire {name} is built in and has its own items; "
+            "give your questionnaire another name"
         )
     length = questionnaire.most - questionnaire.least
     if not questionnaire.step <= length <= 100 * questionnaire.step:
         raise UsageError(
-            f"questionnaire {name}: a scale has 2 to 101 numbers from least to most"
+            f"questionnaire {name}: the scale must have 2 to 101 numbers; "
+            "correct least, most or step"
         )
     return questionnaire

@@ -78,7 +78,8 @@ def average_trials(
         missing = [key for key in (unit, "condition") if key not in row]
         if missing:
             raise UsageError(
-                f"a row without {' and '.join(missing)}: tidy rows have a key for each"
+                f"a row lacks {' and '.join(missing)}: "
+                f"every row must have the keys {unit} and condition"
             )
         values_by_unit = values.setdefault(str(row["condition"]), {})
         value = row.get(measure)
@@ -93,10 +94,8 @@ def average_trials(
     if not any(means.values()):
         keys = {key for row in rows for key in row}
         names = sorted(keys - {"participant", "pair", "condition"})
-        raise UsageError(
-            f"no trial has a number for {measure}; "
-            f"the rows have {', '.join(names) or 'nothing'}"
-        )
+        measures = ", ".join(names) or "no measures"
+        raise UsageError(f"no trial has a number for {measure}; the rows contain {measures}")
     return means
 
 
@@ -118,7 +117,9 @@ def read_number(value: Any, measure: str, row: Row) -> float:
     if not math.isfinite(number):
         keys = ("participant", "condition", "trial")
         trial = ", ".join(f"{key} {row[key]}" for key in keys if key in row)
-        raise UsageError(f"{measure} = {value!r} ({trial}): give a finite number, or nothing")
+        raise UsageError(
+            f"{measure} = {value!r} ({trial}): give a finite number, or leave the value empty"
+        )
     return number
 
 
@@ -443,9 +444,12 @@ def fit_mixed_model(rows: Sequence[Row], measure: str) -> MixedModel:
     users = {user for _, user, _, _ in records}
     freedom = len(records) - len(users) - len(means) + 1
     if len(means) < 2 or freedom < 1:
+        mean_count = count_nouns(len(records), "mean")
+        user_count = count_nouns(len(users), "participant")
+        condition_count = count_nouns(len(means), "condition")
         raise UsageError(
-            f"{measure}: {len(records)} means of {count_nouns(len(users), 'participant')}; "
-            "two conditions need more"
+            f"{measure}: {mean_count} of {user_count} under {condition_count}, "
+            "which is too few to compare two conditions"
         )
     frame = frames.DataFrame(records, columns=["pair", "participant", "condition", "measure"])
     frame["condition"] = frames.Categorical(frame["condition"], categories=list(means))
@@ -493,7 +497,8 @@ def _fit(formulas: Any, frame: Any, measure: str) -> Any:
     finite_fits = [fit for fit in fits if np.isfinite([fit.llf, *fit.bse_fe]).all()]
     if not finite_fits:
         raise UsageError(
-            f"{measure}: no mixed model can be fitted to its means; compare conditions instead"
+            f"{measure}: no mixed model can be fitted to the means of this measure; "
+            "compare conditions instead"
         )
     return max(finite_fits, key=lambda fit: float(fit.llf))
 
@@ -511,10 +516,12 @@ def _find_pairs(rows: Sequence[Row]) -> dict[str, str]:
         if pairs.setdefault(user, pair) != pair:
             raise UsageError(
                 f"participant {user} is in pairs {pairs[user]} and {pair}: "
-                "a participant belongs to one pair"
+                "a participant must belong to exactly one pair"
             )
     if "" in pairs.values() or len(set(pairs.values())) == len(pairs):
-        raise UsageError("no pair has two participants: a mixed model is of users within pairs")
+        raise UsageError(
+            "no pair has two participants: a mixed model needs users nested within pairs"
+        )
     return pairs
 
 
@@ -565,7 +572,8 @@ def power(d_z: float, number: int, *, alpha: float = 0.05) -> float:
     """
     if number < 2 or not 0.0 < alpha < 1.0:
         raise UsageError(
-            f"{number} units, alpha {alpha}: give two units or more, and alpha between 0 and 1"
+            f"the number of units is {number} and alpha is {alpha}: "
+            "give at least two units, and an alpha between 0 and 1"
         )
     stats = import_scipy_stats()
     shift = abs(d_z) * math.sqrt(number)
@@ -593,8 +601,8 @@ def find_least_number(
     """
     if not 0.0 < wanted < 1.0 or power(d_z, most, alpha=alpha) < wanted:
         raise UsageError(
-            f"power {wanted} at d_z = {d_z}: not with {most} units; "
-            "give a larger effect, or less power"
+            f"a power of {wanted} at d_z = {d_z} cannot be reached with {most} units; "
+            "give a larger effect or a lower power"
         )
     return bisect_left(
         range(most), wanted, lo=2, key=lambda number: power(d_z, number, alpha=alpha)
@@ -796,15 +804,20 @@ def _check_facts(facts: Mapping[str, Any]) -> None:
         raise UsageError(f"a methods paragraph needs {', '.join(missing)}")
     unknown = [key for key in facts if key not in known]
     if unknown:
-        raise UsageError(f"{', '.join(unknown)}: facts are {', '.join(known)}")
+        raise UsageError(
+            f"unknown facts: {', '.join(unknown)}; the known facts are {', '.join(known)}"
+        )
     unknown_analyses = [name for name in facts.get("computed", ()) if name not in COMPUTED]
     if unknown_analyses:
-        raise UsageError(f"{', '.join(unknown_analyses)}: analyses are {', '.join(COMPUTED)}")
+        raise UsageError(
+            f"unknown analyses: {', '.join(unknown_analyses)}; "
+            f"the known analyses are {', '.join(COMPUTED)}"
+        )
     for name, condition in facts["conditions"].items():
         if not any(key.startswith("delay") for key in condition):
             raise UsageError(
-                f"condition {name} has no delay: give delay_ms, as measured, "
-                "0 if there was none"
+                f"condition {name} has no delay: "
+                "give the measured delay_ms, or 0 if there was no delay"
             )
 
 
