@@ -107,7 +107,8 @@ class SingleSender:
         self._received_ns = now_ns
         if now_ns - self._conflict_ns < SENDER_TIMEOUT_NS:
             raise ValueError(
-                "has two publishers: neither moves the arm until the other is gone"
+                "has two publishers: the messages of both are refused until one of them is "
+                "silent"
             )
         return silent_ns
 
@@ -232,7 +233,8 @@ class DominanceTopic:
         shares = _check_finite(cdr.read_float_array(data))
         if len(shares) != len(self._peers):
             size = count_nouns(len(shares), "number")
-            raise ValueError(f"has {size}; the peers are {', '.join(self._peers)}")
+            peers_text = ", ".join(self._peers)
+            raise ValueError(f"has {size}, but needs one weight for each peer: {peers_text}")
         silent_ns = self._sender.admit(attachment.gid)
         if silent_ns > SENDER_TIMEOUT_NS:
             self._sent_request = None
@@ -394,7 +396,10 @@ def _order_joints(
     is_safe_valid = len(safe_command) == count and all(map(math.isfinite, safe_command))
     if not is_complete or not is_safe_valid:
         known = ", ".join(names[0] for names in joints)
-        raise UsageError(f"--names: `controller` and `safe` have one of each joint: {known}")
+        raise UsageError(
+            "--names: `controller` and `safe` must each have one entry for every joint "
+            f"({known}), and the numbers of `safe` must be finite"
+        )
     return joint_order
 
 
@@ -421,7 +426,8 @@ def find_joint_indices(joints: Sequence[Sequence[str]], state: cdr.RosJoints) ->
     missing = [names[0] for names in joints if set(names).isdisjoint(state.names)]
     if missing:
         present = ", ".join(state.names[:9]) or "no names"
-        raise ValueError(f"lacks {', '.join(missing)}; it has {present}")
+        missing_text = ", ".join(missing)
+        raise ValueError(f"lacks {missing_text}; the message has {present}")
     for names in joints:
         for name in names:
             if state.names.count(name) > 1:
@@ -486,7 +492,9 @@ def read_vector_target(
     """
     message_frame, numbers = cdr.read_frame_vectors(data, count)
     if message_frame not in ("", frame):
-        raise ValueError(f"is in the frame {message_frame[:80]!r}, and here it is {frame!r}")
+        raise ValueError(
+            f"is in the frame {message_frame[:80]!r}, but this site uses {frame!r}"
+        )
     return _check_finite(numbers[:axes])
 
 
@@ -976,7 +984,8 @@ def refuse_other_robots(table: TopicTable, scenario: Scenario) -> None:
         if site not in scenario.outside and has_settings:
             outside = ", ".join(scenario.outside) or "none"
             raise UsageError(
-                f"--names: sites.{site}: there is no external arm; sites with one: {outside}"
+                f"--names: sites.{site}: no site of this name has an external arm; sites with "
+                f"an external arm: {outside}"
             )
 
 

@@ -165,8 +165,10 @@ class TrilatRobot(Robot):
         deadline_s = time.monotonic() + timeout_s
         while set(self._sites) - self._records.keys():
             if time.monotonic() > deadline_s:
-                sites = " and ".join(self._sites)
-                raise DeviceNotConnectedError(f"no records of both {sites}")
+                sites_text = " and ".join(self._sites)
+                raise DeviceNotConnectedError(
+                    f"the records of both {sites_text} did not arrive within {timeout_s:g} s"
+                )
             time.sleep(0.002)
             self._receive_newest()
 

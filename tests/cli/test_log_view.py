@@ -27,7 +27,7 @@ def test_a_rate_that_is_none_is_refused(
     tmp_path: Path, command: tuple[str, ...], views: str
 ) -> None:
     done = trilat(*command, "--views", views, cwd=tmp_path)
-    done.refuses("--views is off, full, or messages a second from 1 on", repr(views))
+    done.refuses("--views must be off, full, or a number of messages per second", repr(views))
     assert not list(tmp_path.iterdir())
 
 

@@ -171,7 +171,7 @@ def test_names_of_endpoints_differ() -> None:
 
 @pytest.mark.parametrize("name", ["", "/", "a//b", "a-b", "1a", "a/1", "a/", "é"])
 def test_a_name_that_ros_refuses_is_refused(name: str) -> None:
-    with pytest.raises(UsageError, match="is no name of ROS 2"):
+    with pytest.raises(UsageError, match="is not a valid ROS 2 name"):
         check_ros_name(name, "session")
 
 
@@ -184,12 +184,12 @@ def test_a_name_of_ros_is_taken_without_its_slash() -> None:
     [
         (0, STRING, STRING_HASH, ""),
         (0, STRING, "TypeHashNotSupported", ""),
-        (3, STRING, STRING_HASH, "in domain 3, and this is domain 0"),
+        (3, STRING, STRING_HASH, "in domain 3, but this subscription is in domain 0"),
         (
             0,
             LOG,
             STRING_HASH,
-            "as rcl_interfaces::msg::dds_::Log_, and here it is std_msgs::msg::dds_::String_",
+            "as rcl_interfaces::msg::dds_::Log_, but this subscription expects std_msgs::msg::dds_::String_",
         ),
         (0, STRING, "RIHS01_0", "with another definition of std_msgs/msg/String, RIHS01_0"),
     ],
@@ -296,7 +296,12 @@ def test_publishers_that_do_not_fit_are_named_as_they_appear(wire: Wire) -> None
         1, EndpointKind.PUBLISHER, "a", STRING, STRING_HASH, QualityOfService()
     )
     with_token = wire.stranger.liveliness().declare_token(token)
-    until(lambda: wire.said == ["refused: a is published in domain 3, and this is domain 0"])
+    until(
+        lambda: (
+            wire.said
+            == ["refused: a is published in domain 3, but this subscription is in domain 0"]
+        )
+    )
     with_token.undeclare()
 
 
@@ -341,7 +346,7 @@ def test_a_peer_forwards_nothing_and_is_named_with_the_cure() -> None:
     (place,) = find_free_endpoints(1)
     with (
         closing(opened("peer", place)),
-        pytest.raises(UsageError, match=r"is no router.*rmw_zenohd"),
+        pytest.raises(UsageError, match=r"is not a router.*rmw_zenohd"),
     ):
         Ros2Graph(Refusals(print), [place], "play", "trilat", SystemClock())
 

@@ -127,7 +127,7 @@ def test_two_publishers_move_nothing_until_one_is_gone() -> None:
     desk.hears(0.3, after_ns=200_000_000)
     assert desk.arm.goals == [(0.1, 0.5), (0.3, 0.5)]
     assert desk.said == [
-        "refused: play/m1/target_pose has two publishers: neither moves the arm until the other is gone"
+        "refused: play/m1/target_pose has two publishers: the messages of both are refused until one of them is silent"
     ]
     assert desk.refusals.counts.total() == 10
 
@@ -157,7 +157,7 @@ def test_a_pose_in_another_frame_moves_nothing() -> None:
     desk.hears(0.2, frame="camera")
     assert desk.arm.goals == [(0.1, 0.5)]
     assert desk.said == [
-        "refused: play/m1/target_pose is in the frame 'camera', and here it is 'm1/base'"
+        "refused: play/m1/target_pose is in the frame 'camera', but this site uses 'm1/base'"
     ]
 
 
@@ -172,8 +172,8 @@ def test_joints_are_found_by_their_names_in_any_order() -> None:
 @pytest.mark.parametrize(
     ("names", "angles", "said"),
     [
-        (["m1_q1"], [1.0], "lacks m1_q2; it has m1_q1"),
-        ([], [], "lacks m1_q1, m1_q2; it has no names"),
+        (["m1_q1"], [1.0], "lacks m1_q2; the message has m1_q1"),
+        ([], [], "lacks m1_q1, m1_q2; the message has no names"),
         (["q1", "q2"], [1.0, math.nan], "has a number that is not finite"),
         (["q1", "q2", "q1"], [1.0, 2.0, 3.0], "has q1 twice"),
     ],
@@ -208,17 +208,26 @@ def test_topics_are_called_as_a_file_says(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("joint_state = 'a'", "no topic 'joint_state'.*joint_states"),
-        ("joint_states = 'a b'", "joint_states 'a b' is no name of ROS 2"),
+        ("joint_state = 'a'", "there is no topic 'joint_state'.*joint_states"),
+        ("joint_states = 'a b'", "joint_states 'a b' is not a valid ROS 2 name"),
         ("joint_states = true", "joint_states must be a text in quotes, not True"),
-        ("joint_states", "is no TOML"),
-        ("joint_states = 'a'\nreference = 'a'", "two topics have one name"),
-        ("robot_commands = '/commands'", "one that begins with / is for one site"),
-        ("[sites.s]\nmode = '/a'\n[sites.m]\nmode = '/a'", "two topics have one name"),
-        ("sites = 1", "is no TOML of names: Expected `object`"),
-        ("[sites.s]\nsafe = ['a']", "is no TOML of names: Expected `float`, got `str`"),
-        ("[sites.s]\njoint = ['a']", "no topic 'joint'"),
-        (None, "--names is crisp, crtk or a file, and .* cannot be read: No such file"),
+        ("joint_states", "is not a valid TOML file"),
+        ("joint_states = 'a'\nreference = 'a'", "two topics have the same name"),
+        (
+            "robot_commands = '/commands'",
+            "a name that begins with / can be used for one site only",
+        ),
+        ("[sites.s]\nmode = '/a'\n[sites.m]\nmode = '/a'", "two topics have the same name"),
+        ("sites = 1", "is not a valid TOML file of names: Expected `object`"),
+        (
+            "[sites.s]\nsafe = ['a']",
+            "is not a valid TOML file of names: Expected `float`, got `str`",
+        ),
+        ("[sites.s]\njoint = ['a']", "there is no topic 'joint'"),
+        (
+            None,
+            "--names must be crisp, crtk or the path of a file, but .* cannot be read: No such file",
+        ),
     ],
 )
 def test_names_that_cannot_be_right_are_refused(
@@ -238,7 +247,8 @@ def test_a_robot_of_a_site_without_external_arm_is_refused(tmp_path: Path, site:
     )
     scenario = load_scenario(str(Path(__file__).parents[2] / "examples" / "external_arm.toml"))
     with pytest.raises(
-        UsageError, match=rf"sites\.{site}: there is no external arm; sites with one: s"
+        UsageError,
+        match=rf"sites\.{site}: no site of this name has an external arm; sites with an external arm: s",
     ):
         refuse_other_robots(read_topic_table(str(tmp_path / "names.toml")), scenario)
 
@@ -377,9 +387,9 @@ def test_shares_are_asked_for_once_and_refusals_are_said() -> None:
     assert asked == [{"m1": 0.9, "m2": 0.1}, {"m1": 0.5, "m2": 0.1}]
     assert said == [
         "refused: t/s/set_dominance must sum to 1",
-        "refused: t/s/set_dominance has 1 number; the peers are m1, m2",
+        "refused: t/s/set_dominance has 1 number, but needs one weight for each peer: m1, m2",
         "refused: t/s/set_dominance has a number that is not finite",
-        "refused: t/s/set_dominance is not plain CDR, little-endian",
+        "refused: t/s/set_dominance is not encoded as plain little-endian CDR",
     ]
     # whoever asks for the same later may have been overruled meanwhile
     clock.sleep_until(2 * SENDER_TIMEOUT_NS)
@@ -495,8 +505,8 @@ def test_joint_states_of_a_robot_are_its_sites_measurements() -> None:
 @pytest.mark.parametrize(
     ("names", "q", "qd", "said"),
     [
-        (["shoulder"], [1.0], [0.0], "lacks elbow; it has shoulder"),
-        ([], [], [], "lacks shoulder, elbow; it has no names"),
+        (["shoulder"], [1.0], [0.0], "lacks elbow; the message has shoulder"),
+        ([], [], [], "lacks shoulder, elbow; the message has no names"),
         (["shoulder", "elbow"], [1.0, math.nan], [0.0, 0.0], "has a number that is not finite"),
         (["shoulder", "elbow"], [1.0, 2.0], [0.0, math.inf], "has a number that is not finite"),
         (["shoulder", "elbow"], [1.0, 2.0], [], "has 2 positions and 0 velocities"),
@@ -522,7 +532,7 @@ def test_two_robots_on_one_topic_measure_nothing() -> None:
     robot.says(*pose)
     assert len(robot.measured()) == 1
     assert robot.said == [
-        "refused: joint_states has two publishers: neither moves the arm until the other is gone"
+        "refused: joint_states has two publishers: the messages of both are refused until one of them is silent"
     ]
 
 
@@ -581,7 +591,7 @@ def test_a_robot_without_a_torque_gets_the_safe_command() -> None:
     "controller", [["elbow"], ["elbow", "wrist"], ["elbow", "shoulder", "wrist"]]
 )
 def test_a_controller_of_other_joints_is_refused(controller: list[str]) -> None:
-    with pytest.raises(UsageError, match="have one of each joint: shoulder, elbow"):
+    with pytest.raises(UsageError, match=r"one entry for every joint \(shoulder, elbow\)"):
         Robot(controller)
 
 

@@ -275,9 +275,9 @@ def describe_mismatch(token: str, domain: int, kind: str) -> str:
     """
     _, token_domain, *_, token_type, token_hash, _ = token.split("/")
     if token_domain != str(domain):
-        return f"in domain {token_domain}, and this is domain {domain}"
+        return f"in domain {token_domain}, but this subscription is in domain {domain}"
     if token_type != name_dds_type(kind):
-        return f"as {token_type}, and here it is {name_dds_type(kind)}"
+        return f"as {token_type}, but this subscription expects {name_dds_type(kind)}"
     if token_hash not in (find_type_hash(kind, "jazzy"), _NO_HASH):
         return f"with another definition of {kind}, {token_hash}"
     return ""
@@ -452,8 +452,9 @@ class Ros2Graph:
             self._session.close()
             endpoints = ", ".join(map(str, routers))
             raise UsageError(
-                f"{endpoints} is no router, and forwards nothing: with --ros name that of ROS "
-                "(ros2 run rmw_zenoh_cpp rmw_zenohd, at port 7447), or trilat router"
+                f"{endpoints} is not a router and does not forward messages: with --ros, name "
+                "the ROS router (ros2 run rmw_zenoh_cpp rmw_zenohd, at port 7447), or a router "
+                "that was started with trilat router"
             )
 
         self._node = Ros2Member(domain, str(self._session.zid()), namespace, name)

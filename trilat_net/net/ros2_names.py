@@ -31,6 +31,7 @@ def check_ros_name(name: str, kind: str) -> str:
     relative_name = name.removeprefix("/")
     if not _NAME.fullmatch(relative_name):
         raise UsageError(
-            f"{kind} {name!r} is no name of ROS 2: letters, digits and _ in parts between /"
+            f"{kind} {name!r} is not a valid ROS 2 name: a name consists of letters, digits "
+            "and _, in parts that are separated by / and do not begin with a digit"
         )
     return relative_name

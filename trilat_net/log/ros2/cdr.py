@@ -362,7 +362,7 @@ class CdrReader:
 
     def __init__(self, payload: bytes) -> None:
         if payload[:2] != _HEAD[:2] or len(payload) < len(_HEAD):
-            raise ValueError("is not plain CDR, little-endian")
+            raise ValueError("is not encoded as plain little-endian CDR")
         self._data = payload[len(_HEAD) :]
         self._position = 0
 

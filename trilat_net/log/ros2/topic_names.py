@@ -160,7 +160,7 @@ def _read_names_file(source: str) -> TopicTable:
     """Reads a names file: the changed names, and the robots by site.
 
     Raises:
-        UsageError: The file cannot be read, or is no valid TOML.
+        UsageError: The file cannot be read, or is not valid TOML.
     """
     try:
         with open_regular(Path(source)) as stream:
@@ -174,10 +174,11 @@ def _read_names_file(source: str) -> TopicTable:
         robots = msgspec.convert(robot_fields, dict[str, RobotTable])
     except OSError as error:
         raise UsageError(
-            f"--names is crisp, crtk or a file, and {source} cannot be read: {error.strerror}"
+            f"--names must be crisp, crtk or the path of a file, but {source} cannot be read: "
+            f"{error.strerror}"
         ) from None
     except (ValueError, msgspec.ValidationError) as error:
-        raise UsageError(f"{source}: is no TOML of names: {error}") from None
+        raise UsageError(f"{source}: is not a valid TOML file of names: {error}") from None
     return TopicTable(names, site_names, robots)
 
 
@@ -194,7 +195,7 @@ def _check_names(source: str, names: Mapping[str, object]) -> None:
     for topic, name in names.items():
         if topic not in TOPICS:
             suggestion = suggest_nearest(topic, list(TOPICS))
-            raise UsageError(f"{source}: no topic {topic!r}{suggestion}")
+            raise UsageError(f"{source}: there is no topic {topic!r}{suggestion}")
         if not isinstance(name, str):
             raise UsageError(f"{source}: {topic} must be a text in quotes, not {name!r}")
         check_ros_name(name, f"{source}: {topic}")
@@ -219,5 +220,6 @@ def _check_unique_names(source: str, table: TopicTable) -> None:
         full_names += [table.find("", site, topic) for topic in topics]
     if len(set(full_names)) < len(full_names):
         raise UsageError(
-            f"{source}: two topics have one name; one that begins with / is for one site"
+            f"{source}: two topics have the same name; a name that begins with / can be used "
+            "for one site only"
         )

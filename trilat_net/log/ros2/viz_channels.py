@@ -323,7 +323,7 @@ def parse_viz_rate(text: str) -> float:
     """Parses the option `--views`, the rate of the messages for viewers.
 
     Args:
-        text: A number from 1 on, "off" or "full".
+        text: A number from 1 to 1e6, "off" or "full".
 
     Returns:
         The rate in Hz. It is 0 for "off" and `FULL_RATE_HZ` for "full".
@@ -339,7 +339,10 @@ def parse_viz_rate(text: str) -> float:
     except ValueError:
         rate_hz = math.nan
     if not 1.0 <= rate_hz <= 1e6:
-        raise UsageError(f"--views is off, full, or messages a second from 1 on, not {text!r}")
+        raise UsageError(
+            "--views must be off, full, or a number of messages per second from 1 to 1000000, "
+            f"not {text!r}"
+        )
     return rate_hz
 
 

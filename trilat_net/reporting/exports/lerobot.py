@@ -141,8 +141,9 @@ def _write(
         columns, log_names = _read_columns(log, frames.rows, program, actions)
         names = names or log_names
         if log_names != names:
+            first_source = logs[0].source
             raise LogError(
-                f"{log.source}: its users and joints are not those of {logs[0].source}"
+                f"{log.source}: the users or joints are not the same as in {first_source}"
             )
         first_episode = parts[-1]["episode_index"][-1] + 1 if parts else 0
         columns["episode_index"] = frames.episode + first_episode
@@ -185,9 +186,11 @@ def _check_settings(fps: int, actions: str) -> None:
         UsageError: A setting is not valid.
     """
     if fps < 1:
-        raise UsageError(f"fps is a whole number of frames a second, not {fps}")
+        raise UsageError(
+            f"fps must be a whole number of frames per second, at least 1, not {fps}"
+        )
     if actions not in ("", *ACTIONS):
-        raise UsageError(f"actions are {' or '.join(ACTIONS)}, not {actions!r}")
+        raise UsageError(f"actions must be {' or '.join(ACTIONS)}, not {actions!r}")
 
 
 def _write_json(folder: Path, files: dict[str, Any]) -> None:
@@ -243,7 +246,11 @@ def _choose_frames(log: Log, fps: int) -> _Frames:
     rows = {site: np.flatnonzero(log[site].mode != "diverged") for site in log.sites}
     empty_sites = [site for site, site_rows in rows.items() if not len(site_rows)]
     if empty_sites:
-        raise LogError(f"{log.source}: no records of {', '.join(empty_sites)}")
+        sites_text = ", ".join(empty_sites)
+        raise LogError(
+            f"{log.source}: the log has no records of {sites_text}; records of a site that has "
+            "diverged do not count"
+        )
     stamps_ns = {}
     for site, site_rows in rows.items():
         stamps_ns[site] = log[site].tick[site_rows] * NS_PER_S // log[site].rate_hz
@@ -294,7 +301,7 @@ def _read_columns(
     """
     slave, users = find_users(log.scenario)
     if not slave or not users:
-        raise LogError(f"{log.source}: it has no slave that follows a master")
+        raise LogError(f"{log.source}: the session must have a slave and at least one master")
 
     # The action of a frame is the command of the user with the largest dominance factor.
     alpha = trace_dominance(log, slave, log[slave].t_s[rows[slave]]).alpha
@@ -365,8 +372,8 @@ def _read_commands(
     for user in users:
         if joints[user] != joints[first_user]:
             raise LogError(
-                f"{log.source}: the joints of {user} are not those of {first_user}, so that "
-                "the two have no common action: use --actions tip"
+                f"{log.source}: {user} and {first_user} have different joints, so that the two "
+                "users have no common action: use --actions tip"
             )
     angles = [log[user].q[rows[user]] for user in users]
     return angles, [f"{joint}.pos" for joint in joints[first_user]]
