@@ -176,7 +176,9 @@ def expand_vectors(table: TomlTable, kind: StructType, counts: VectorCounts) -> 
     Returns:
         The table with these vectors. Other keys are unchanged.
     """
-    lengths = {key: getattr(counts, per) for key, per in _vector_keys(kind, "per").items()}
+    lengths: dict[str, int] = {}
+    for key, per in _vector_keys(kind, "per").items():
+        lengths[key] = getattr(counts, per)
     expanded: TomlTable = {}
     for field in msgspec.structs.fields(kind):
         name = field.name
@@ -193,7 +195,7 @@ def expand_vectors(table: TomlTable, kind: StructType, counts: VectorCounts) -> 
 
 _OWNERS = {
     **dict.fromkeys(("joints", "parameters"), "the arm has"),
-    "axes": "its space has",
+    "axes": "the space of the arm has",
     "shared": "sites share",
 }
 
@@ -211,8 +213,9 @@ def find_count_problem(
     Returns:
         The key and the problem. None if all vectors have the right lengths.
     """
-    vectors = {**_vector_keys(kind, "per"), **_vector_keys(kind, "point")}
-    for key, per in vectors.items():
+    expandable = _vector_keys(kind, "per")
+    points = _vector_keys(kind, "point")
+    for key, per in {**expandable, **points}.items():
         required = getattr(counts, per)
         value = table.get(key)
         if not isinstance(value, list) or len(value) == required:
@@ -243,7 +246,9 @@ def is_distribution(value: Any) -> bool:
     Args:
         value: A value as it was read from TOML.
     """
-    return isinstance(value, dict) and not value.keys().isdisjoint(("normal", "uniform"))
+    if not isinstance(value, dict):
+        return False
+    return "normal" in value or "uniform" in value
 
 
 def split_refusal(error: msgspec.ValidationError) -> tuple[str, str]:
@@ -270,7 +275,12 @@ def reword_problem(problem: str) -> str:
     Returns:
         The reworded message. A message without terms of msgspec is returned unchanged.
     """
-    replacements = (("`", ""), ("Expected ", "expected "), ("array", "list"), ("str", "text"))
+    replacements = (
+        ("`", ""),
+        ("Expected ", "expected "),
+        ("array", "list"),
+        ("str", "text"),
+    )
     for old, new in replacements:
         problem = problem.replace(old, new)
     return problem
@@ -323,7 +333,10 @@ def check_keys(table: Any, valid: Sequence[str], path: str) -> TomlTable:
         if key in valid:
             continue
         key_path = f"{path}.{key}" if path else key
-        hint = suggest_nearest(key, valid) or f"; valid are {', '.join(valid)}"
+        hint = suggest_nearest(key, valid)
+        if not hint:
+            choices = ", ".join(valid)
+            hint = f"; valid keys are {choices}"
         raise ScenarioError(f"unknown key{hint}", path=key_path)
     return table
 
@@ -349,7 +362,8 @@ def check_choice(word: Any, valid: Sequence[str], path: str) -> None:
         ScenarioError: The word is not valid. The message suggests a similar one.
     """
     if word not in valid:
-        choices = ", ".join(map(repr, valid))
+        quoted = [repr(choice) for choice in valid]
+        choices = ", ".join(quoted)
         hint = suggest_nearest(str(word), valid)
         raise ScenarioError(f"is {word!r}, but must be one of {choices}{hint}", path=path)
 

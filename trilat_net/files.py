@@ -45,10 +45,12 @@ def require_libraries(*names: str) -> None:
     Raises:
         UsageError: A library is not installed. The message has the command that installs it.
     """
-    missing = [name for name in names or STUDY_LIBRARIES if find_spec(name) is None]
+    required = names or STUDY_LIBRARIES
+    missing = [name for name in required if find_spec(name) is None]
     if missing:
+        libraries = ", ".join(missing)
         raise UsageError(
-            f"this command needs {', '.join(missing)}, which trilat-net-core does not include: "
+            f"this command needs {libraries}, which trilat-net-core does not include: "
             "pip install trilat-net"
         )
 
@@ -144,7 +146,8 @@ def open_regular(path: Path, **options: Any) -> Any:
         return os.open(name, flags | no_block)
 
     stream = open(path, mode, opener=open_without_blocking, **options)  # noqa: SIM115
-    if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
+    mode_bits = os.fstat(stream.fileno()).st_mode
+    if not stat.S_ISREG(mode_bits):
         stream.close()
         raise OSError(errno.EINVAL, "the path is a pipe or a device, not a file", str(path))
     return stream

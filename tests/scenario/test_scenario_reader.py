@@ -297,7 +297,7 @@ def test_unknown_key_is_refused_with_its_path_and_nearest_name(key: str, nearest
 
 
 def test_a_key_unlike_any_other_is_refused_with_all_valid() -> None:
-    assert "valid are l1_m, m1_kg" in refused({"arm.zzzzzz": 1}).problem
+    assert "valid keys are l1_m, m1_kg" in refused({"arm.zzzzzz": 1}).problem
 
 
 @pytest.mark.parametrize(

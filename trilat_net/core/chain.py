@@ -187,13 +187,19 @@ def put_three(a: Array, values: Three) -> None:
         a: The array, which is changed.
         values: The three numbers.
     """
-    a[0], a[1], a[2] = values
+    x, y, z = values
+    a[0] = x
+    a[1] = y
+    a[2] = z
 
 
 @leaf
 def dot(a: Three, b: Three) -> float:
     """Returns the scalar product a' b."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    x = a[0] * b[0]
+    y = a[1] * b[1]
+    z = a[2] * b[2]
+    return x + y + z
 
 
 @leaf
@@ -208,19 +214,28 @@ def cross(a: Three, b: Three) -> Three:
 @leaf
 def add(a: Three, b: Three) -> Three:
     """Returns a + b."""
-    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+    x = a[0] + b[0]
+    y = a[1] + b[1]
+    z = a[2] + b[2]
+    return x, y, z
 
 
 @leaf
 def subtract(a: Three, b: Three) -> Three:
     """Returns a - b."""
-    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+    x = a[0] - b[0]
+    y = a[1] - b[1]
+    z = a[2] - b[2]
+    return x, y, z
 
 
 @leaf
 def scale(factor: float, a: Three) -> Three:
     """Returns factor * a."""
-    return factor * a[0], factor * a[1], factor * a[2]
+    x = factor * a[0]
+    y = factor * a[1]
+    z = factor * a[2]
+    return x, y, z
 
 
 @leaf
@@ -262,11 +277,12 @@ def apply(a: Matrix, b: Three) -> Three:
         a: The matrix, three rows of three numbers.
         b: The vector, three numbers.
     """
-    row_1, row_2, row_3 = a
     x, y, z = b
-    first = row_1[0] * x + row_1[1] * y + row_1[2] * z
-    second = row_2[0] * x + row_2[1] * y + row_2[2] * z
-    third = row_3[0] * x + row_3[1] * y + row_3[2] * z
+    products = []
+    for a_x, a_y, a_z in a:
+        product = a_x * x + a_y * y + a_z * z
+        products.append(product)
+    first, second, third = products
     return first, second, third
 
 
@@ -303,10 +319,12 @@ def place_joints(chain: RowArray, q: Vector) -> None:
             versine = 1.0 - cosine
         for j in range(3):
             for k in range(3):
+                at_rest = row.at_rest[j, k]
                 sine_part = sine * row.by_sine[j, k]
                 versine_part = versine * row.by_cosine[j, k]
-                row.R[j, k] = row.at_rest[j, k] + sine_part + versine_part
-            row.p[j] = row.origin[j] + q[i] * row.slide[j]
+                row.R[j, k] = at_rest + sine_part + versine_part
+            displacement = q[i] * row.slide[j]
+            row.p[j] = row.origin[j] + displacement
 
 
 @leaf
@@ -319,13 +337,18 @@ def _move(row: Row, linear: Three, angular: Three, rate: float) -> Spatial:
         angular: Angular part of V_p, in the previous link's frame.
         rate: Velocity of the joint.
     """
-    velocity_at_p = add(linear, cross(angular, three(row.p)))
+    p = three(row.p)
+    turning_velocity = cross(angular, p)
+    velocity_at_p = add(linear, turning_velocity)
     link_linear = rotate_back(row.R, velocity_at_p)
     link_angular = rotate_back(row.R, angular)
-    joint_velocity = scale(rate, three(row.axis))
+    axis = three(row.axis)
+    joint_velocity = scale(rate, axis)
     if row.prismatic == 0:
-        return link_linear, add(link_angular, joint_velocity)
-    return add(link_linear, joint_velocity), link_angular
+        link_angular = add(link_angular, joint_velocity)
+    else:
+        link_linear = add(link_linear, joint_velocity)
+    return link_linear, link_angular
 
 
 @leaf
@@ -339,7 +362,9 @@ def _momentum(pi: Vector, first: int, linear: Three, angular: Three) -> Spatial:
         angular: Angular part of V.
     """
     m = pi[first]
-    mc = (pi[first + 1], pi[first + 2], pi[first + 3])
+    mc_x = pi[first + 1]
+    mc_y = pi[first + 2]
+    mc_z = pi[first + 3]
     I_xx = pi[first + 4]
     I_xy = pi[first + 5]
     I_yy = pi[first + 6]
@@ -350,9 +375,13 @@ def _momentum(pi: Vector, first: int, linear: Three, angular: Three) -> Spatial:
     spin_x = I_xx * x + I_xy * y + I_xz * z
     spin_y = I_xy * x + I_yy * y + I_yz * z
     spin_z = I_xz * x + I_yz * y + I_zz * z
+    mc = (mc_x, mc_y, mc_z)
     spin = (spin_x, spin_y, spin_z)
-    linear_momentum = add(scale(m, linear), cross(angular, mc))
-    angular_momentum = add(cross(mc, linear), spin)
+    origin_momentum = scale(m, linear)
+    turning_momentum = cross(angular, mc)
+    linear_momentum = add(origin_momentum, turning_momentum)
+    moment = cross(mc, linear)
+    angular_momentum = add(moment, spin)
     return linear_momentum, angular_momentum
 
 
@@ -367,8 +396,9 @@ def _along_axis(row: Row, linear: Three, angular: Three) -> float:
         linear: Linear part of f, the force.
         angular: Angular part of f, the torque.
     """
+    axis = three(row.axis)
     along = angular if row.prismatic == 0 else linear
-    return dot(three(row.axis), along)
+    return dot(axis, along)
 
 
 @leaf
@@ -384,8 +414,9 @@ def friction_torque(row: Row, speed: float) -> float:
         speed: Velocity v of the joint, rad/s or m/s.
     """
     x = speed / COULOMB_SPEED
+    smooth_sign = x / sqrt(1.0 + x * x)
     viscous: float = row.viscous * speed
-    coulomb: float = row.coulomb * (x / sqrt(1.0 + x * x))
+    coulomb: float = row.coulomb * smooth_sign
     return viscous + coulomb
 
 
@@ -397,11 +428,16 @@ def _pass_force(row: Row, before: Row) -> None:
         row: Row of the link's joint.
         before: Row of the previous joint, which is changed.
     """
-    force = rotate(row.R, three(row.f_lin))
-    lever_torque = cross(three(row.p), force)
-    torque = add(rotate(row.R, three(row.f_ang)), lever_torque)
-    put_three(before.f_lin, add(three(before.f_lin), force))
-    put_three(before.f_ang, add(three(before.f_ang), torque))
+    R = row.R
+    p = three(row.p)
+    force = rotate(R, three(row.f_lin))
+    link_torque = rotate(R, three(row.f_ang))
+    lever_torque = cross(p, force)
+    torque = add(link_torque, lever_torque)
+    total_force = add(three(before.f_lin), force)
+    total_torque = add(three(before.f_ang), torque)
+    put_three(before.f_lin, total_force)
+    put_three(before.f_ang, total_torque)
 
 
 @leaf
@@ -436,12 +472,16 @@ def propagate_motion(
         W_lin, W_ang = _move(row, W_lin, W_ang, v[i])
         A_lin, A_ang = _move(row, A_lin, A_ang, a[i])
         # V x (S v)
-        joint_velocity = scale(v[i], three(row.axis))
+        axis = three(row.axis)
+        joint_velocity = scale(v[i], axis)
         if row.prismatic == 0:
-            A_lin = add(A_lin, cross(V_lin, joint_velocity))
-            A_ang = add(A_ang, cross(V_ang, joint_velocity))
+            linear_part = cross(V_lin, joint_velocity)
+            angular_part = cross(V_ang, joint_velocity)
+            A_lin = add(A_lin, linear_part)
+            A_ang = add(A_ang, angular_part)
         else:
-            A_lin = add(A_lin, cross(V_ang, joint_velocity))
+            linear_part = cross(V_ang, joint_velocity)
+            A_lin = add(A_lin, linear_part)
         put_three(row.V_lin, V_lin)
         put_three(row.V_ang, V_ang)
         put_three(row.W_lin, W_lin)
@@ -455,8 +495,11 @@ def _motion_cross(V: Spatial, W: Spatial) -> Spatial:
     """Returns V x W of two spatial velocities."""
     V_lin, V_ang = V
     W_lin, W_ang = W
-    linear = add(cross(V_ang, W_lin), cross(V_lin, W_ang))
-    return linear, cross(V_ang, W_ang)
+    turned_W = cross(V_ang, W_lin)
+    moved_W = cross(V_lin, W_ang)
+    linear = add(turned_W, moved_W)
+    angular = cross(V_ang, W_ang)
+    return linear, angular
 
 
 @leaf
@@ -464,8 +507,11 @@ def _force_cross(V: Spatial, f: Spatial) -> Spatial:
     """Returns V x* f of a spatial velocity and a spatial force."""
     V_lin, V_ang = V
     force, torque = f
-    angular = add(cross(V_ang, torque), cross(V_lin, force))
-    return cross(V_ang, force), angular
+    linear = cross(V_ang, force)
+    turned_torque = cross(V_ang, torque)
+    moved_force = cross(V_lin, force)
+    angular = add(turned_torque, moved_force)
+    return linear, angular
 
 
 @leaf
@@ -493,13 +539,18 @@ def inverse_dynamics(
     for i in range(n):
         row: Row = chain[i]
         first = LINK_PARAMETERS * i
-        V = (three(row.V_lin), three(row.V_ang))
-        W = (three(row.W_lin), three(row.W_ang))
-        A = (three(row.A_lin), three(row.A_ang))
+        V_lin = three(row.V_lin)
+        V_ang = three(row.V_ang)
+        W_lin = three(row.W_lin)
+        W_ang = three(row.W_ang)
+        A_lin = three(row.A_lin)
+        A_ang = three(row.A_ang)
+        V = (V_lin, V_ang)
+        W = (W_lin, W_ang)
         V_x_W = _motion_cross(V, W)
-        I_V = _momentum(theta, first, V[0], V[1])
-        I_W = _momentum(theta, first, W[0], W[1])
-        I_A = _momentum(theta, first, A[0], A[1])
+        I_V = _momentum(theta, first, V_lin, V_ang)
+        I_W = _momentum(theta, first, W_lin, W_ang)
+        I_A = _momentum(theta, first, A_lin, A_ang)
         # V x* I W + W x* I V - I (V x W)
         V_x_I_W = _force_cross(V, I_W)
         W_x_I_V = _force_cross(W, I_V)
@@ -508,13 +559,18 @@ def inverse_dynamics(
         torque_sum = add(V_x_I_W[1], W_x_I_V[1])
         turning_force = subtract(force_sum, I_V_x_W[0])
         turning_torque = subtract(torque_sum, I_V_x_W[1])
-        put_three(row.f_lin, add(I_A[0], scale(0.5, turning_force)))
-        put_three(row.f_ang, add(I_A[1], scale(0.5, turning_torque)))
+        half_force = scale(0.5, turning_force)
+        half_torque = scale(0.5, turning_torque)
+        put_three(row.f_lin, add(I_A[0], half_force))
+        put_three(row.f_ang, add(I_A[1], half_torque))
     for i in range(n - 1, -1, -1):
         row = chain[i]
-        rigid = _along_axis(row, three(row.f_lin), three(row.f_ang))
+        force = three(row.f_lin)
+        moment = three(row.f_ang)
+        rigid = _along_axis(row, force, moment)
         drive = row.armature_kg_m2 * a[i]
-        torque[i] = rigid + drive + friction_torque(row, v[i])
+        friction = friction_torque(row, v[i])
+        torque[i] = rigid + drive + friction
         if i > 0:
             _pass_force(row, chain[i - 1])
 
@@ -535,19 +591,24 @@ def _add_products(factor: float, x: Spatial, y: Spatial, first: int, gradient: A
     x_1, x_2, x_3 = x_ang
     y_1, y_2, y_3 = y_ang
     by_m = dot(x_lin, y_lin)
-    by_mc = add(cross(y_lin, x_ang), cross(x_lin, y_ang))
+    y_part = cross(y_lin, x_ang)
+    x_part = cross(x_lin, y_ang)
+    by_mc = add(y_part, x_part)
+    by_Ixx = x_1 * y_1
     by_Ixy = x_1 * y_2 + x_2 * y_1
+    by_Iyy = x_2 * y_2
     by_Ixz = x_1 * y_3 + x_3 * y_1
     by_Iyz = x_2 * y_3 + x_3 * y_2
+    by_Izz = x_3 * y_3
     gradient[first] += factor * by_m
     for j in range(3):
         gradient[first + 1 + j] += factor * by_mc[j]
-    gradient[first + 4] += factor * (x_1 * y_1)
+    gradient[first + 4] += factor * by_Ixx
     gradient[first + 5] += factor * by_Ixy
-    gradient[first + 6] += factor * (x_2 * y_2)
+    gradient[first + 6] += factor * by_Iyy
     gradient[first + 7] += factor * by_Ixz
     gradient[first + 8] += factor * by_Iyz
-    gradient[first + 9] += factor * (x_3 * y_3)
+    gradient[first + 9] += factor * by_Izz
 
 
 @leaf
@@ -565,17 +626,24 @@ def parameter_gradient(chain: RowArray, gradient: Array) -> None:
     """
     for i in range(chain.shape[0]):
         row: Row = chain[i]
-        V = (three(row.V_lin), three(row.V_ang))
-        W = (three(row.W_lin), three(row.W_ang))
-        A = (three(row.A_lin), three(row.A_ang))
-        s_lin = subtract(V[0], W[0])
-        s_ang = subtract(V[1], W[1])
+        V_lin = three(row.V_lin)
+        V_ang = three(row.V_ang)
+        W_lin = three(row.W_lin)
+        W_ang = three(row.W_ang)
+        A_lin = three(row.A_lin)
+        A_ang = three(row.A_ang)
+        s_lin = subtract(V_lin, W_lin)
+        s_ang = subtract(V_ang, W_ang)
+        V = (V_lin, V_ang)
+        W = (W_lin, W_ang)
+        A = (A_lin, A_ang)
         s = (s_lin, s_ang)
         V_x_s = _motion_cross(V, s)
         W_x_s = _motion_cross(W, s)
         V_x_W = _motion_cross(V, W)
         first = LINK_PARAMETERS * i
-        for p in range(first, first + LINK_PARAMETERS):
+        end = first + LINK_PARAMETERS
+        for p in range(first, end):
             gradient[p] = 0.0
         # s' (V x* I W) = -(V x s)' I W, so each term has the form x' I y.
         _add_products(factor=1.0, x=s, y=A, first=first, gradient=gradient)
@@ -600,27 +668,53 @@ def _add_composite(row: Row, before: Row) -> None:
     R = row.R
     m = pi[0]
     p = three(row.p)
-    mc = rotate(R, (pi[1], pi[2], pi[3]))
-    # x, y and z are the columns of R I. I is symmetric, and R I R' has the rows I_x, I_y, I_z.
-    x = rotate(R, (pi[4], pi[5], pi[7]))
-    y = rotate(R, (pi[5], pi[6], pi[8]))
-    z = rotate(R, (pi[7], pi[8], pi[9]))
-    I_x = rotate(R, (x[0], y[0], z[0]))
-    I_y = rotate(R, (x[1], y[1], z[1]))
-    I_z = rotate(R, (x[2], y[2], z[2]))
-    polar = 2.0 * dot(p, mc) + m * dot(p, p)
+    link_mc = (pi[1], pi[2], pi[3])
+    mc = rotate(R, link_mc)
+    # I is the inertia matrix about the origin of the link, in the axes of the link. It is
+    # symmetric. x, y and z are the columns of R I, and R I R' has the rows I_x, I_y and I_z.
+    column_1 = (pi[4], pi[5], pi[7])
+    column_2 = (pi[5], pi[6], pi[8])
+    column_3 = (pi[7], pi[8], pi[9])
+    x = rotate(R, column_1)
+    y = rotate(R, column_2)
+    z = rotate(R, column_3)
+    row_1 = (x[0], y[0], z[0])
+    row_2 = (x[1], y[1], z[1])
+    row_3 = (x[2], y[2], z[2])
+    I_x = rotate(R, row_1)
+    I_y = rotate(R, row_2)
+    I_z = rotate(R, row_3)
+    p_mc = dot(p, mc)
+    p_p = dot(p, p)
+    polar = 2.0 * p_mc + m * p_p
     p_x, p_y, p_z = p
     mc_x, mc_y, mc_z = mc
+    mp_x = m * p_x
+    mp_y = m * p_y
+    mp_z = m * p_z
     # The moments of inertia about the previous link's origin.
-    I_xx = I_x[0] + polar - 2.0 * p_x * mc_x - m * p_x * p_x
-    I_xy = I_x[1] - p_x * mc_y - p_y * mc_x - m * p_x * p_y
-    I_yy = I_y[1] + polar - 2.0 * p_y * mc_y - m * p_y * p_y
-    I_xz = I_x[2] - p_x * mc_z - p_z * mc_x - m * p_x * p_z
-    I_yz = I_y[2] - p_y * mc_z - p_z * mc_y - m * p_y * p_z
-    I_zz = I_z[2] + polar - 2.0 * p_z * mc_z - m * p_z * p_z
+    I_xx = I_x[0] + polar
+    I_xx -= 2.0 * p_x * mc_x
+    I_xx -= mp_x * p_x
+    I_xy = I_x[1] - p_x * mc_y
+    I_xy -= p_y * mc_x
+    I_xy -= mp_x * p_y
+    I_yy = I_y[1] + polar
+    I_yy -= 2.0 * p_y * mc_y
+    I_yy -= mp_y * p_y
+    I_xz = I_x[2] - p_x * mc_z
+    I_xz -= p_z * mc_x
+    I_xz -= mp_x * p_z
+    I_yz = I_y[2] - p_y * mc_z
+    I_yz -= p_z * mc_y
+    I_yz -= mp_y * p_z
+    I_zz = I_z[2] + polar
+    I_zz -= 2.0 * p_z * mc_z
+    I_zz -= mp_z * p_z
     total[0] += m
-    for j in range(3):
-        total[1 + j] += mc[j] + m * p[j]
+    total[1] += mc_x + mp_x
+    total[2] += mc_y + mp_y
+    total[3] += mc_z + mp_z
     total[4] += I_xx
     total[5] += I_xy
     total[6] += I_yy
@@ -644,8 +738,9 @@ def mass_matrix(chain: RowArray, theta: Vector) -> None:
     n = chain.shape[0]
     for i in range(n):
         row: Row = chain[i]
+        first = LINK_PARAMETERS * i
         for p in range(LINK_PARAMETERS):
-            row.composite[p] = theta[LINK_PARAMETERS * i + p]
+            row.composite[p] = theta[first + p]
     still = (0.0, 0.0, 0.0)
     for i in range(n - 1, -1, -1):
         row = chain[i]
@@ -655,12 +750,14 @@ def mass_matrix(chain: RowArray, theta: Vector) -> None:
             linear, angular = _momentum(row.composite, 0, still, axis)
         else:
             linear, angular = _momentum(row.composite, 0, axis, still)
-        row.M[i] = _along_axis(row, linear, angular) + row.armature_kg_m2
+        rigid = _along_axis(row, linear, angular)
+        row.M[i] = rigid + row.armature_kg_m2
         for j in range(i - 1, -1, -1):
             link: Row = chain[j + 1]
             linear = rotate(link.R, linear)
+            link_torque = rotate(link.R, angular)
             lever_torque = cross(three(link.p), linear)
-            angular = add(rotate(link.R, angular), lever_torque)
+            angular = add(link_torque, lever_torque)
             row.M[j] = _along_axis(chain[j], linear, angular)
         if i > 0:
             _add_composite(row, chain[i - 1])
@@ -677,10 +774,12 @@ def _stop_torque(row: Row, q: float, qd: float) -> float:
     """
     damper = row.stop_damping * qd
     if q < row.lower:
-        push: float = row.stop_stiffness * (row.lower - q) - damper
+        spring = row.stop_stiffness * (row.lower - q)
+        push: float = spring - damper
         return max(push, 0.0)
     if q > row.upper:
-        push = row.stop_stiffness * (row.upper - q) - damper
+        spring = row.stop_stiffness * (row.upper - q)
+        push = spring - damper
         return min(push, 0.0)
     return 0.0
 
@@ -709,23 +808,31 @@ def _bias(chain: RowArray, theta: Vector, gravity: Vector, q: Vector, qd: Vector
         V_lin, V_ang = _move(row, V_lin, V_ang, qd[i])
         A_lin, A_ang = _move(row, A_lin, A_ang, 0.0)
         # V x (S qd)
-        joint_velocity = scale(qd[i], three(row.axis))
+        axis = three(row.axis)
+        joint_velocity = scale(qd[i], axis)
         if row.prismatic == 0:
-            A_lin = add(A_lin, cross(V_lin, joint_velocity))
-            A_ang = add(A_ang, cross(V_ang, joint_velocity))
+            linear_part = cross(V_lin, joint_velocity)
+            angular_part = cross(V_ang, joint_velocity)
+            A_lin = add(A_lin, linear_part)
+            A_ang = add(A_ang, angular_part)
         else:
-            A_lin = add(A_lin, cross(V_ang, joint_velocity))
+            linear_part = cross(V_ang, joint_velocity)
+            A_lin = add(A_lin, linear_part)
         # I A + V x* I V
         first = LINK_PARAMETERS * i
         force, torque = _momentum(theta, first, A_lin, A_ang)
         momentum = _momentum(theta, first, V_lin, V_ang)
-        turning = _force_cross((V_lin, V_ang), momentum)
-        put_three(row.f_lin, add(force, turning[0]))
-        put_three(row.f_ang, add(torque, turning[1]))
+        V = (V_lin, V_ang)
+        turning_force, turning_torque = _force_cross(V, momentum)
+        put_three(row.f_lin, add(force, turning_force))
+        put_three(row.f_ang, add(torque, turning_torque))
     for i in range(n - 1, -1, -1):
         row = chain[i]
-        rigid = _along_axis(row, three(row.f_lin), three(row.f_ang))
-        row.bias = rigid + friction_torque(row, qd[i])
+        force = three(row.f_lin)
+        moment = three(row.f_ang)
+        rigid = _along_axis(row, force, moment)
+        friction = friction_torque(row, qd[i])
+        row.bias = rigid + friction
         row.bias -= _stop_torque(row, q[i], qd[i])
         if i > 0:
             _pass_force(row, chain[i - 1])
@@ -804,11 +911,13 @@ def find_acceleration(
             M_j = chain[j].M
             for k in range(j):
                 pivot = chain[k].M[k]
-                M_i[j] -= M_i[k] * M_j[k] * pivot
+                product = M_i[k] * M_j[k]
+                M_i[j] -= product * pivot
             M_i[j] /= M_j[j]
         for k in range(i):
             pivot = chain[k].M[k]
-            M_i[i] -= M_i[k] * M_i[k] * pivot
+            square = M_i[k] * M_i[k]
+            M_i[i] -= square * pivot
         total = torque[i] - row.bias
         for k in range(i):
             total -= M_i[k] * qdd[k]
@@ -856,9 +965,13 @@ def place_end_effector(chain: RowArray, tip: Vector) -> Three:
             offset = rotate(before, three(row.p))
             position = add(position, offset)
             for k in range(3):
-                column = rotate(before, (R[0, k], R[1, k], R[2, k]))
-                R_base[0, k], R_base[1, k], R_base[2, k] = column
-        put_three(row.axis_base, rotate(R_base, three(row.axis)))
+                column = (R[0, k], R[1, k], R[2, k])
+                x, y, z = rotate(before, column)
+                R_base[0, k] = x
+                R_base[1, k] = y
+                R_base[2, k] = z
+        axis = rotate(R_base, three(row.axis))
+        put_three(row.axis_base, axis)
         put_three(row.p_base, position)
     tip_offset = rotate(chain[n - 1].R_base, three(tip))
     position = add(position, tip_offset)

@@ -121,7 +121,10 @@ def law_stage(
     s: Row = site[0]
     s.asked = 1
     call_address(address, (law, site, links, channel.received, sent))
-    if not (_all_finite(s.tau[: s.joints]) and _all_finite(s.theta_hat) and _all_finite(sent)):
+    is_torque_finite = _all_finite(s.tau[: s.joints])
+    is_estimate_finite = _all_finite(s.theta_hat)
+    is_sent_finite = _all_finite(sent)
+    if not (is_torque_finite and is_estimate_finite and is_sent_finite):
         raise FloatingPointError
     if not _all_finite(law[: s.remembered]):
         raise FloatingPointError
@@ -383,7 +386,8 @@ class CompiledLaw:
                 path=path,
             )
 
-        received_size = 0 if arrays.channel is None else arrays.channel.received.shape[-1]
+        channel = arrays.channel
+        received_size = 0 if channel is None else channel.received.shape[-1]
         fields: Any = [(name, value.dtype, value.shape) for name, value in numbers.items()]
         form = _Form(
             law=np.dtype((np.record, fields or [("nothing", "f8")])),

@@ -228,8 +228,10 @@ def minimum_jerk(t_s: float, start_s: float, end_s: float) -> Pair:
         return 1.0, 0.0
     duration_s = end_s - start_s
     x = (t_s - start_s) / duration_s
-    progress = x * x * x * (10.0 + x * (6.0 * x - 15.0))
-    rate = 30.0 * x * x * (1.0 - x) * (1.0 - x) / duration_s
+    rest = 1.0 - x
+    polynomial = 10.0 + x * (6.0 * x - 15.0)
+    progress = x * x * x * polynomial
+    rate = 30.0 * x * x * rest * rest / duration_s
     return progress, rate
 
 
@@ -304,7 +306,8 @@ def _spring_force(actor: Row, t_s: float, at: Vector, speed: Vector) -> Pair:
     if actor.kind == _LIVE_FORCE:
         x = actor.a[0]
         y = actor.a[1]
-    share = _live_share(actor, x * x + y * y)
+    square = x * x + y * y
+    share = _live_share(actor, square)
     return share * x, share * y
 
 
@@ -326,7 +329,8 @@ def _find_table_rows(actor: Row, t_s: float, table: TorqueTable) -> tuple[int, i
     if count < 1 or t_s < table[first, 0] or t_s > table[last, 0]:
         return -1, -1, 0.0
     before = count_started(table, first, count, t_s) - 1
-    low = first + max(min(before, count - 2), 0)
+    offset = max(min(before, count - 2), 0)
+    low = first + offset
     high = min(low + 1, last)
     low_s = table[low, 0]
     span_s = table[high, 0] - low_s
@@ -356,7 +360,8 @@ def _recorded_torque(actor: Row, t_s: float, table: TorqueTable) -> Pair:
 @leaf
 def _sine_of_turns(turns: float) -> float:
     """Returns sin(2 pi turns), with the whole turns removed first."""
-    s, _ = sincos(2.0 * math.pi * (turns - math.floor(turns)))
+    fraction = turns - math.floor(turns)
+    s, _ = sincos(2.0 * math.pi * fraction)
     return s
 
 
@@ -377,9 +382,11 @@ def _chirp_size(actor: Row, t_s: float) -> float:
     last_hz = actor.b[1]
     span_s = actor.move_end_s - actor.move_start_s
     x = t_s - actor.start_s
-    x -= span_s * math.floor(x / span_s)
+    sweeps = math.floor(x / span_s)
+    x -= span_s * sweeps
     # The mean frequency of the sweep so far.
-    mean_hz = first_hz + 0.5 * (last_hz - first_hz) / span_s * x
+    rise_hz = 0.5 * (last_hz - first_hz)
+    mean_hz = first_hz + rise_hz / span_s * x
     return _sine_of_turns(x * mean_hz)
 
 
@@ -398,7 +405,8 @@ def _multisine_size(actor: Row, t_s: float, table: TorqueTable) -> float:
     for n in range(first, first + actor.table_count):
         frequency_hz = table[n, 0]
         phase_turns = table[n, 1]
-        total += _sine_of_turns(frequency_hz * elapsed_s + phase_turns)
+        turns = frequency_hz * elapsed_s + phase_turns
+        total += _sine_of_turns(turns)
     return total
 
 
@@ -443,7 +451,9 @@ def _wall_force(actor: Row, at: Pair, speed: Pair) -> Pair:
     if not depth > 0.0:
         return 0.0, 0.0
     outward = speed[0] * normal_x + speed[1] * normal_y
-    push = max(actor.K[0] * depth - actor.B[0] * outward, 0.0)
+    spring = actor.K[0] * depth
+    damper = actor.B[0] * outward
+    push = max(spring - damper, 0.0)
     return push * normal_x, push * normal_y
 
 
@@ -545,7 +555,9 @@ def source_torque(
     if actor.kind == _HAND or actor.kind == _LIVE_JOINT:
         torque = _spring_force(actor, t_s, q, qd)
     elif actor.kind == _VISCOUS:
-        torque = -actor.B[0] * qd[0], -actor.B[1] * qd[1]
+        damping_0 = -actor.B[0] * qd[0]
+        damping_1 = -actor.B[1] * qd[1]
+        torque = (damping_0, damping_1)
     elif actor.kind == _RECORDED:
         torque = _recorded_torque(actor, t_s, table)
     elif actor.kind == _OWN_JOINTS:
@@ -556,7 +568,9 @@ def source_torque(
         )
     else:
         size = _scripted_size(actor, t_s, table)
-        torque = actor.a[0] * size, actor.a[1] * size
+        scripted_0 = actor.a[0] * size
+        scripted_1 = actor.a[1] * size
+        torque = (scripted_0, scripted_1)
     return torque[0], torque[1], 0.0
 
 
@@ -639,7 +653,8 @@ def _force_in_space(
             x, y, z = three(actor.a)
         square = x * x + y * y + z * z
         share = _live_share(actor, square)
-        return share * x, share * y, share * z
+        force = (x, y, z)
+        return scale(share, force)
 
     # A wall.
     normal = three(actor.b)
@@ -648,8 +663,10 @@ def _force_in_space(
     if not depth > 0.0:
         return 0.0, 0.0, 0.0
     outward = dot(speed, normal)
-    push = max(actor.K[0] * depth - actor.B[0] * outward, 0.0)
-    return push * normal[0], push * normal[1], push * normal[2]
+    spring = actor.K[0] * depth
+    damper = actor.B[0] * outward
+    push = max(spring - damper, 0.0)
+    return scale(push, normal)
 
 
 @leaf
@@ -773,7 +790,8 @@ def put_torque_on_chain(
     largest_n = 0.0
     for m in range(actors.shape[0]):
         actor: Row = actors[m]
-        if actor.sampled != sampled or not actor.start_s <= t_s < actor.end_s:
+        is_active = actor.start_s <= t_s < actor.end_s
+        if actor.sampled != sampled or not is_active:
             continue
         if not _is_at_end_effector(actor):
             _add_joint_torque(
@@ -785,7 +803,8 @@ def put_torque_on_chain(
             has_motion = True
         force = _force_in_space(actor=actor, t_s=t_s, at=at, speed=speed, table=table)
         for i in range(n):
-            torque[i] += dot(three(chain[i].J_lin), force)
+            column = three(chain[i].J_lin)
+            torque[i] += dot(column, force)
         if actor.kind == _WALL:
             force_n = math.sqrt(dot(force, force))
             largest_n = max(largest_n, force_n)

@@ -123,11 +123,15 @@ def rotation_vector(R: Array | Matrix) -> Three:
     """
     w, v = _quaternion(R)
     x, y, z = v
-    n = math.sqrt(x * x + y * y + z * z)
+    square = x * x + y * y + z * z
+    n = math.sqrt(square)
     if n < _SMALL:
         return scale(2.0 / w, v)
     # `arctan` takes arguments up to 1.
-    half_angle = arctan(n / w) if n <= w else 0.5 * math.pi - arctan(w / n)
+    if n <= w:
+        half_angle = arctan(n / w)
+    else:
+        half_angle = 0.5 * math.pi - arctan(w / n)
     angle = 2.0 * half_angle
     return scale(angle / n, v)
 
@@ -176,7 +180,8 @@ def compose_rotations(turn: Three, vector: Three) -> Three:
         vector: Rotation vector of the first rotation.
     """
     turn_matrix = rotation_matrix(turn)
-    inverse = rotation_matrix(scale(-1.0, vector))
+    inverse_vector = scale(-1.0, vector)
+    inverse = rotation_matrix(inverse_vector)
     return relative_rotation(turn_matrix, inverse)
 
 
@@ -221,7 +226,9 @@ def angular_velocity(turn: Three, rate: Three) -> Three:
         twice_gain = (angle - s) / (a2 * angle)
     once = cross(turn, rate)
     twice = cross(turn, once)
-    correction = add(scale(once_gain, once), scale(twice_gain, twice))
+    once_part = scale(once_gain, once)
+    twice_part = scale(twice_gain, twice)
+    correction = add(once_part, twice_part)
     return add(rate, correction)
 
 
@@ -241,9 +248,12 @@ def rotation_vector_rate(turn: Three, velocity: Three) -> Three:
         a4 = a2 * a2
         twice_gain = 1.0 / 12.0 + a2 / 720.0 + a4 / 30240.0
     else:
-        s, c = sincos(0.5 * angle)
-        twice_gain = (1.0 - 0.5 * angle * c / s) / a2
+        half_angle = 0.5 * angle
+        s, c = sincos(half_angle)
+        twice_gain = (1.0 - half_angle * c / s) / a2
     once = cross(turn, velocity)
     twice = cross(turn, once)
-    correction = add(scale(-0.5, once), scale(twice_gain, twice))
+    once_part = scale(-0.5, once)
+    twice_part = scale(twice_gain, twice)
+    correction = add(once_part, twice_part)
     return add(velocity, correction)

@@ -423,7 +423,9 @@ def apply_change(arrays: SiteArrays, change: CoreChange, t_ns: int) -> None:
     elif change.order is not None:
         s.order = max(s.order, change.order)
     if change.model is not None:
-        if arrays.links[change.peer].models >= arrays.models.shape[1]:
+        link: Row = arrays.links[change.peer]
+        largest_count = arrays.models.shape[1]
+        if link.models >= largest_count:
             raise ValueError(f"a run can have at most {MAX_CHANGES} changes to a link")
         add_model(arrays, change.peer, change.model)
     if change.ramp is not None:
@@ -468,7 +470,8 @@ def stack_site_arrays(
     margin_ns = late_ns + _SLACK * NS_PER_S // fastest_hz
     pages = calendar_pages(fastest_hz, longest_us, margin_ns)
     layouts = [setup.layout for setup in setups]
-    largest = Layout(*map(max, zip(*layouts, strict=True)))
+    lengths_by_field = zip(*layouts, strict=True)
+    largest = Layout(*map(max, lengths_by_field))
     plugged = any(setup.law_factory is not None for setup in setups)
     sites = [
         build_site_arrays(setup, (spare, spare), pages, largest, plugged=plugged)
@@ -519,7 +522,10 @@ def select_site(stacked: SiteArrays, i: int, layout: Layout) -> SiteArrays:
     """
     channel = stacked.channel
     if channel is not None:
-        channel = ChannelArrays(channel.waiting[i], channel.received[i], channel.columns[i])
+        waiting = channel.waiting[i]
+        received = channel.received[i]
+        columns = channel.columns[i]
+        channel = ChannelArrays(waiting, received, columns)
     chain = stacked.chain
     if chain is not None:
         chain = chain[i, : layout.joints]
@@ -564,7 +570,8 @@ def _stack_channels(
 
 def _stack_padded(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
     """Returns arrays stacked, each filled up with zeros to the longest along every axis."""
-    shape = np.max([array.shape for array in arrays], axis=0)
+    shapes = [array.shape for array in arrays]
+    shape = np.max(shapes, axis=0)
     padded = []
     for array in arrays:
         missing = shape - array.shape
@@ -620,8 +627,10 @@ def _build_site(setup: SiteSetup, layout: Layout) -> RowArray:
         s.singular_value = task.singular_value
         s.axes[: site_layout.shared] = task.axes
         s.posture[: site_layout.joints] = task.posture or setup.q0
+    lengths = site_layout.axes()
     for name, numbers in _list_vectors(setup).items():
-        (length,) = field_shape(FIELDS["site"][name], site_layout.axes())
+        field = FIELDS["site"][name]
+        (length,) = field_shape(field, lengths)
         s[name][:length] = numbers
     return site
 
@@ -644,7 +653,8 @@ def _list_vectors(setup: SiteSetup) -> dict[str, Any]:
     vectors["q_before"] = setup.q0
     if gains.law is Law.USER and setup.theta_known:
         vectors["known"] = setup.theta
-    vectors["theta_hat"] = gains.known if gains.law is Law.KNOWN else gains.theta_hat0
+    has_known_gravity = gains.law is Law.KNOWN
+    vectors["theta_hat"] = gains.known if has_known_gravity else gains.theta_hat0
     return vectors
 
 
@@ -680,8 +690,9 @@ def _build_links(
         shared: Number of coordinates of a sample.
     """
     most_models = max(len(link.models) for link in links)
+    model_rows = most_models + spare
     rows = np.zeros(len(links), link_dtype(shared))
-    all_models = np.zeros((len(links), most_models + spare), LINK_MODEL_DTYPE)
+    all_models = np.zeros((len(links), model_rows), LINK_MODEL_DTYPE)
     trace_points: list[Any] = []
     outages: list[Any] = []
     for link in links:
@@ -689,7 +700,8 @@ def _build_links(
             if trace is not None:
                 trace_points.extend(trace)
         outages.extend(link.outages)
-    points = np.array(trace_points + outages, dtype=np.int64).reshape(-1, 2)
+    all_points = np.array(trace_points + outages, dtype=np.int64)
+    points = all_points.reshape(-1, 2)
 
     trace_first = 0
     outage_first = len(trace_points)

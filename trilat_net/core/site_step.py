@@ -110,8 +110,10 @@ class Site:
         self._mode = self._site["mode"]
         self._used = self._links["used"]
         self._arrival_bytes = self._buffers.arrivals.view(np.uint8).data
-        self._force_bytes = self._buffers.forces.view(np.uint8).reshape(-1).data
-        self._sent = self._buffers.record[self.layout.floats - self.layout.sent :]
+        force_bytes = self._buffers.forces.view(np.uint8)
+        self._force_bytes = force_bytes.reshape(-1).data
+        sent_first = self.layout.floats - self.layout.sent
+        self._sent = self._buffers.record[sent_first:]
         self._plug_law(setup)
         live = [n for n, actor in enumerate(setup.actors) if actor.kind in LIVE_KINDS]
         self._hand = self._find_hand(live[0]) if live else None
@@ -208,7 +210,8 @@ class Site:
             self.restore_links(k, [None] * len(self.peers), ())
         self._site["first"] = k
         for n, link in enumerate(self._links):
-            sample = (k - 1) * int(link["rate_hz"]) // self.rate_hz
+            peer_hz = int(link["rate_hz"])
+            sample = (k - 1) * peer_hz // self.rate_hz
             if sample >= 0:
                 find_release(n, sample, self._arrays)
         self._links["copies"] = 0
@@ -353,7 +356,8 @@ class Site:
     @property
     def q(self) -> list[float]:
         """Joint angles at the next tick, rad."""
-        angles: list[float] = self._site[0]["q"][: self.layout.joints].tolist()
+        joints = self.layout.joints
+        angles: list[float] = self._site[0]["q"][:joints].tolist()
         return angles
 
     def _apply_hand(self, vector: Sequence[float]) -> Sequence[float]:
@@ -372,7 +376,8 @@ class Site:
         hand = HandInForce.read(action)
         grip[0] = hand.grip
         target[:] = hand.target
-        target_ahead[:] = [x + v for x, v in zip(hand.target, hand.rate, strict=True)]
+        motion = zip(hand.target, hand.rate, strict=True)
+        target_ahead[:] = [x + v for x, v in motion]
         return action
 
     def _compute_crc(self, packed_bytes: int, arrivals: int) -> int:
@@ -387,8 +392,10 @@ class Site:
             force_bytes = arrivals * 8 * self.layout.shared
             crc = zlib.crc32(self._force_bytes[:force_bytes], crc)
         if self._received_counts:
-            for n, peer in enumerate(self._buffers.arrivals["peer"][:arrivals].tolist()):
-                sent = self._buffers.sent[n, : self._received_counts[peer]]
+            peers = self._buffers.arrivals["peer"][:arrivals].tolist()
+            for n, peer in enumerate(peers):
+                count = self._received_counts[peer]
+                sent = self._buffers.sent[n, :count]
                 crc = zlib.crc32(sent.data, crc)
         return crc
 
@@ -397,7 +404,8 @@ class Site:
 
         `restore_state` reads the same numbers in the same order.
         """
-        memory = [*self._q_held.tolist(), float(self._return_from_ns.item())]
+        return_from_ns = float(self._return_from_ns.item())
+        memory = [*self._q_held.tolist(), return_from_ns]
         if not self._glides:
             return memory
         memory += self._qd_held.tolist()
@@ -416,10 +424,11 @@ class Site:
 
         The links are in scenario order. `LinkCounts` explains the counts.
         """
-        return tuple(
-            LinkCounts(*(int(link[field]) for field in LinkCounts._fields))
-            for link in self._links
-        )
+        counts = []
+        for link in self._links:
+            numbers = [int(link[field]) for field in LinkCounts._fields]
+            counts.append(LinkCounts(*numbers))
+        return tuple(counts)
 
     def release_tick(self, peer: int, tick: int) -> int | None:
         """Finds the control period of this site in which a sample of a peer is used first.
@@ -446,7 +455,8 @@ class Site:
             peer: Index of the sender at the other end of the link.
         """
         link: Row = self._links[peer]
-        return bool(self._arrays.models[peer, link.model]["kind"] == DelayKind.MEASURED)
+        model: Row = self._arrays.models[peer, link.model]
+        return bool(model["kind"] == DelayKind.MEASURED)
 
     def peer_rate_hz(self, peer: int) -> int:
         """Returns the tick rate of a peer, Hz.
@@ -577,9 +587,8 @@ class Site:
         if sample is None or not len(sample.ch):
             channel.received[peer] = 0.0
             return
-        sent = np.append(
-            sample.ch, 0.0
-        )  # column -1, of a number that is not sent, reads this 0
+        # Column -1, of a number that is not sent, reads the 0 that is appended.
+        sent = np.append(sample.ch, 0.0)
         channel.received[peer] = sent[channel.columns[peer]]
 
     def _pack(self, k: int, arrivals: Sequence[Arrival]) -> int:

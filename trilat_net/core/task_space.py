@@ -76,10 +76,12 @@ def update_pose(s: Row, chain: RowArray) -> None:
         chain: Rows of the chain, after `place_joints`.
     """
     position = place_end_effector(chain, s.tip)
-    put_three(s.x[:3], scale(s.scale, position))
+    task_position = scale(s.scale, position)
+    put_three(s.x[:3], task_position)
     if s.shared == POSE:
         last: Row = chain[chain.shape[0] - 1]
-        put_three(s.x[3:], relative_rotation(last.R_base, s.tip_back))
+        orientation = relative_rotation(last.R_base, s.tip_back)
+        put_three(s.x[3:], orientation)
     J = s.J
     xd = s.xd
     for j in range(s.shared):
@@ -116,7 +118,8 @@ def _update_jacobian_rate(s: Row, chain: RowArray, tip: Three) -> None:
     origin_before = zeros
     for i in range(chain.shape[0]):
         column = three(chain[i].J_lin)
-        tip_velocity = add(tip_velocity, scale(s.qd[i], column))
+        joint_part = scale(s.qd[i], column)
+        tip_velocity = add(tip_velocity, joint_part)
     for i in range(chain.shape[0]):
         row: Row = chain[i]
         axis = three(row.axis_base)
@@ -124,7 +127,8 @@ def _update_jacobian_rate(s: Row, chain: RowArray, tip: Three) -> None:
         joint_velocity = scale(s.qd[i], axis)
         # The previous link carries the joint's origin along.
         link_vector = subtract(origin, origin_before)
-        origin_velocity = add(origin_velocity, cross(angular_velocity, link_vector))
+        link_velocity = cross(angular_velocity, link_vector)
+        origin_velocity = add(origin_velocity, link_velocity)
         origin_before = origin
         if row.prismatic == 0:
             # The derivatives of the joint's columns, J_ang = axis and J_lin = axis x lever.
@@ -132,7 +136,9 @@ def _update_jacobian_rate(s: Row, chain: RowArray, tip: Three) -> None:
             axis_rate = cross(angular_velocity, axis)
             lever = subtract(tip, origin)
             lever_rate = subtract(tip_velocity, origin_velocity)
-            linear = add(cross(axis_rate, lever), cross(axis, lever_rate))
+            axis_part = cross(axis_rate, lever)
+            lever_part = cross(axis, lever_rate)
+            linear = add(axis_part, lever_part)
             angular = axis_rate
         else:
             # The derivatives of J_ang = 0 and J_lin = axis.
@@ -163,19 +169,23 @@ def update_orientation_reference(s: Row, links: RowArray) -> None:
         s: State of the site (the process that runs this arm); the reference is written into it.
         links: States of the links from the other arms, one row per link.
     """
-    orientation = rotation_matrix(three(s.x[3:]))
+    rotation_vector = three(s.x[3:])
+    orientation = rotation_matrix(rotation_vector)
     difference = (0.0, 0.0, 0.0)
     velocity = (0.0, 0.0, 0.0)
     for j in range(links.shape[0]):
         link: Row = links[j]
-        peer_orientation = rotation_matrix(three(link.q[3:]))
+        peer_vector = three(link.q[3:])
+        peer_orientation = rotation_matrix(peer_vector)
         turn = relative_rotation(orientation, peer_orientation)
-        difference = add(difference, scale(link.alpha, turn))
+        weighted_turn = scale(link.alpha, turn)
+        difference = add(difference, weighted_turn)
         peer_velocity = scale(link.alpha, three(link.qd[3:]))
         ramp_velocity = scale(-link.alpha_rate, turn)
-        velocity = add(velocity, add(peer_velocity, ramp_velocity))
+        link_velocity = add(peer_velocity, ramp_velocity)
+        velocity = add(velocity, link_velocity)
     turn_back = scale(-1.0, difference)
-    reference = compose_rotations(turn_back, three(s.x[3:]))
+    reference = compose_rotations(turn_back, rotation_vector)
     put_three(s.q_des[3:], reference)
     put_three(s.qd_des[3:], velocity)
 
@@ -201,7 +211,8 @@ def _factor(s: Row, damping: float) -> None:
                 total += J[j, i] * J[k, i]
             for p in range(k):
                 pivot = A[p, p]
-                total -= A[j, p] * A[k, p] * pivot
+                product = A[j, p] * A[k, p]
+                total -= product * pivot
             if k < j:
                 pivot = A[k, k]
                 total = total / pivot if pivot > TINY else 0.0
@@ -253,7 +264,8 @@ def _factor_damped(s: Row) -> None:
         for k in range(s.shared):
             s.b[k] = 1.0 if k == j else 0.0
         _solve(s, s.b, s.y)
-        trace += s.y[j] * s.axes[j]
+        diagonal = s.y[j]
+        trace += diagonal * s.axes[j]
     lower_bound = 1.0 / trace if trace > 0.0 else limit
     if lower_bound < limit:
         _factor(s, limit - lower_bound)
@@ -268,7 +280,8 @@ def _update_axis_errors(s: Row) -> None:
     if s.shared == POSE:
         orientation = rotation_matrix(three(s.x[3:]))
         reference = rotation_matrix(three(s.q_des[3:]))
-        put_three(s.e[3:], relative_rotation(orientation, reference))
+        turn = relative_rotation(orientation, reference)
+        put_three(s.e[3:], turn)
     for j in range(s.shared):
         mask = s.axes[j]
         s.e[j] *= mask
@@ -324,8 +337,10 @@ def update_task_errors(s: Row) -> None:
     for j in range(m):
         b[j] = -s.Lambda[j] * s.ed[j]
         for i in range(n):
-            Jd_part = Jd[j, i] * (v[i] + J_y[i])
-            J_part = J[j, i] * (a[i] + Jd_y[i])
+            rate = v[i] + J_y[i]
+            acceleration = a[i] + Jd_y[i]
+            Jd_part = Jd[j, i] * rate
+            J_part = J[j, i] * acceleration
             b[j] -= Jd_part + J_part
     _solve(s, b, y)
     # v = psi + J' y and a = psi' + Jd' y + J' y'
@@ -368,5 +383,6 @@ def update_wrench(s: Row) -> None:
     for j in range(s.shared):
         b[j] = 0.0
         for i in range(s.joints):
-            b[j] -= s.J[j, i] * s.on_arm[i]
+            on_joint = s.on_arm[i]
+            b[j] -= s.J[j, i] * on_joint
     _solve(s, b, s.wrench)

@@ -65,7 +65,9 @@ def theta_from_links(links: ArmLinks) -> Array:
         The parameters, shape (5,).
     """
     l1, m1, lc1, I1, _, m2, lc2, I2 = links
-    theta_1 = m1 * lc1**2 + m2 * (l1**2 + lc2**2) + I1 + I2
+    inner_inertia = m1 * lc1**2
+    outer_inertia = m2 * (l1**2 + lc2**2)
+    theta_1 = inner_inertia + outer_inertia + I1 + I2
     theta_2 = m2 * l1 * lc2
     theta_3 = m2 * lc2**2 + I2
     theta_4 = m1 * lc1 + m2 * l1
@@ -83,9 +85,12 @@ def is_positive_definite(theta: Array) -> bool:
     Args:
         theta: Dynamic parameters of the arm, shape (5,).
     """
-    least_determinant = theta[0] * theta[2] - theta[2] ** 2 - theta[1] ** 2
-    margin = 1e-9 * theta[0] * theta[2]
-    return bool(theta[2] > 0.0 and least_determinant > margin)
+    theta_1 = theta[0]
+    theta_2 = theta[1]
+    theta_3 = theta[2]
+    least_determinant = theta_1 * theta_3 - theta_3**2 - theta_2**2
+    margin = 1e-9 * theta_1 * theta_3
+    return bool(theta_3 > 0.0 and least_determinant > margin)
 
 
 @leaf
@@ -101,7 +106,10 @@ def inertia(theta: Vector, q: Vector) -> tuple[Pair, Pair]:
     _, c2 = sincos(q[1])
     m11 = theta[0] + 2.0 * theta[1] * c2
     m12 = theta[2] + theta[1] * c2
-    return (m11, m12), (m12, theta[2])
+    m22 = theta[2]
+    first = (m11, m12)
+    second = (m12, m22)
+    return first, second
 
 
 @leaf
@@ -144,10 +152,13 @@ def regressor(g: float, q: Vector, qd: Vector, v: Vector, a: Vector) -> tuple[Fi
     c12 = c1 * c2 - s1 * s2
     a1 = a[0]
     a2 = a[1]
+    outer_rate = qd[0] + qd[1]
     # The first row of C v is -theta_2 sin(q2) times this sum.
-    coriolis_1 = qd[1] * v[0] + (qd[0] + qd[1]) * v[1]
-    y12 = c2 * (2.0 * a1 + a2) - s2 * coriolis_1
-    y22 = c2 * a1 + s2 * qd[0] * v[0]
+    coriolis_1 = qd[1] * v[0] + outer_rate * v[1]
+    centrifugal_2 = s2 * qd[0] * v[0]
+    inertial_1 = c2 * (2.0 * a1 + a2)
+    y12 = inertial_1 - s2 * coriolis_1
+    y22 = c2 * a1 + centrifugal_2
     gravity_1 = g * c1
     gravity_12 = g * c12
     first = (a1, y12, a2, gravity_1, gravity_12)
@@ -187,7 +198,8 @@ def forward_dynamics(theta: Vector, g: float, q: Vector, qd: Vector, torque: Vec
     outer = theta[4] * g * c12
     # The torques that accelerate the arm.
     f1 = torque[0] - coriolis_1 - inner - outer
-    f2 = torque[1] + h * qd1 * qd1 - outer
+    centrifugal_2 = h * qd1 * qd1
+    f2 = torque[1] + centrifugal_2 - outer
     determinant = m11 * m22 - m12 * m12
     qdd1 = (m22 * f1 - m12 * f2) / determinant
     qdd2 = (m11 * f2 - m12 * f1) / determinant
@@ -211,7 +223,9 @@ def forward_kinematics(lengths: Vector, q: Vector) -> tuple[Pair, Pair]:
     elbow_y = lengths[0] * s1
     x = elbow_x + lengths[1] * c12
     y = elbow_y + lengths[1] * s12
-    return (elbow_x, elbow_y), (x, y)
+    elbow = (elbow_x, elbow_y)
+    end_effector = (x, y)
+    return elbow, end_effector
 
 
 @leaf
@@ -230,6 +244,8 @@ def end_effector_jacobian(lengths: Vector, q: Vector) -> tuple[Pair, Pair]:
     inner_x = lengths[0] * c1
     outer_x = lengths[1] * c12
     outer_y = lengths[1] * s12
-    row_x = (-lengths[0] * s1 - outer_y, -outer_y)
-    row_y = (inner_x + outer_x, outer_x)
+    x_by_first = -lengths[0] * s1 - outer_y
+    y_by_first = inner_x + outer_x
+    row_x = (x_by_first, -outer_y)
+    row_y = (y_by_first, outer_x)
     return row_x, row_y
