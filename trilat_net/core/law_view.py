@@ -132,7 +132,8 @@ class PlainLaw:
         self._peer_columns: list[Any] = []
         for name in PeerView._fields:
             column = arrays.links[name]
-            self._peer_columns.append(column if column.ndim == 1 else column[:, :m])
+            is_vector = column.ndim > 1
+            self._peer_columns.append(column[:, :m] if is_vector else column)
 
         self._received = None if arrays.channel is None else arrays.channel.received
         self._receives = setup.received_vectors
@@ -170,7 +171,8 @@ class PlainLaw:
         self._update(k, t_ns, a.site, a.links, a.chain)
         now = self._read(k)
         results = call_law(self._law, setup.name, now, self._collect_sent)
-        self._views["tau"][:] = np.clip(results.torque, -self._limit, self._limit)
+        limit = self._limit
+        self._views["tau"][:] = np.clip(results.torque, -limit, limit)
         self._views["theta_hat"][:] = results.theta_hat
         self._sent[:] = results.sent
         return results.memory
@@ -209,7 +211,9 @@ class PlainLaw:
         for j in range(len(peers)):
             first = self._to_all_size + j * self._peer_size
             to_peers.append(_name_vectors(self._sends_to_peer, sent[first:]))
-        vectors = {name: LawVector(view.tolist()) for name, view in self._views.items()}
+        vectors = {}
+        for name, view in self._views.items():
+            vectors[name] = LawVector(view.tolist())
         return LawInput(
             k=k,
             t_s=k / setup.rate_hz,

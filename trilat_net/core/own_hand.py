@@ -236,7 +236,9 @@ class OwnHand:
             ValueError: The goal has the wrong number of coordinates, is not finite, or is too
                 large.
         """
-        numbers = () if goal is None else tuple(float(number) for number in goal)
+        numbers: tuple[float, ...] = ()
+        if goal is not None:
+            numbers = tuple(float(number) for number in goal)
         if goal is not None and len(numbers) != self._rules.size:
             count = count_nouns(len(numbers), "number")
             raise ValueError(f"the action has {count}, not {self._rules.size}")

@@ -83,7 +83,8 @@ def digest_sibling_sources(function: Callable[..., Any]) -> str:
     folder = Path(function.__code__.co_filename).parent
     if not folder.is_relative_to(Path(__file__).parents[1]):
         return ""
-    sources = [file.read_bytes() for file in sorted(folder.glob("*.py"))]
+    files = sorted(folder.glob("*.py"))
+    sources = [file.read_bytes() for file in files]
     return hashlib.sha256(b"".join(sources)).hexdigest()
 
 
@@ -117,7 +118,8 @@ def list_numbers(model: Any) -> Array:
     Returns:
         The numbers. The array is empty if the model has no parameters.
     """
-    fields = [value.ravel() for value in _find_numbers(model).values()]
+    values = _find_numbers(model).values()
+    fields = [value.ravel() for value in values]
     # A model without numbers gives an empty array.
     return np.concatenate([np.zeros(0), *fields])
 

@@ -128,10 +128,7 @@ def rotation_vector(R: Array | Matrix) -> Three:
     if n < _SMALL:
         return scale(2.0 / w, v)
     # `arctan` takes arguments up to 1.
-    if n <= w:
-        half_angle = arctan(n / w)
-    else:
-        half_angle = 0.5 * math.pi - arctan(w / n)
+    half_angle = arctan(n / w) if n <= w else 0.5 * math.pi - arctan(w / n)
     angle = 2.0 * half_angle
     return scale(angle / n, v)
 

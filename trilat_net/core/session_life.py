@@ -388,7 +388,9 @@ def _find_offset(t_ns: int, duration_s: float, site: SiteRow, i: int) -> tuple[f
     start_slope = duration_s * site.qd_held[i]
     from_start = start * (1.0 - x * x * (3.0 - 2.0 * x))
     from_slope = start_slope * x * remaining * remaining
-    slope = start_slope * remaining * (1.0 - 3.0 * x) - start * 6.0 * x * remaining
+    slope_part = start_slope * remaining * (1.0 - 3.0 * x)
+    offset_part = start * 6.0 * x * remaining
+    slope = slope_part - offset_part
     return from_start + from_slope, slope / duration_s
 
 

@@ -210,7 +210,8 @@ def needed_pages(setup: SiteSetup) -> int:
     Returns:
         The number of entries of the ring buffer of a link, a power of two.
     """
-    longest_us = max(max_delay_us(link.models, link.traces) for link in setup.links)
+    delays_us = [max_delay_us(link.models, link.traces) for link in setup.links]
+    longest_us = max(delays_us)
     return calendar_pages(setup.rate_hz, longest_us, _NEAR_NS)
 
 
@@ -236,7 +237,8 @@ def _count_kept_dues(setup: SiteSetup) -> int:
 
     The due times span the stamps from the latest possible sample to the sample farthest ahead.
     """
-    fastest_hz = max(setup.rate_hz, *(link.rate_hz for link in setup.links))
+    peer_rates_hz = [link.rate_hz for link in setup.links]
+    fastest_hz = max(setup.rate_hz, *peer_rates_hz)
     span_ns = MAX_DELAY_US * 1000 + AHEAD_LIMIT_NS
     return span_ticks(span_ns, fastest_hz) + _SLACK
 
@@ -254,9 +256,10 @@ def widen_calendars(arrays: SiteArrays, k: int, pages: int) -> SiteArrays:
     Returns:
         New arrays with the larger buffers.
     """
-    ticks = np.arange(k, k + arrays.calendars.shape[1])
+    old_count = arrays.calendars.shape[1]
+    ticks = np.arange(k, k + old_count)
     # A tick's page is its lowest bits, as the number of pages is a power of two.
-    old_pages = ticks & (len(ticks) - 1)
+    old_pages = ticks & (old_count - 1)
     new_pages = ticks & (pages - 1)
     calendars = np.zeros((len(arrays.links), pages), arrays.calendars.dtype)
     calendars["tick"] = -1
@@ -364,7 +367,8 @@ def add_ramp(arrays: SiteArrays, ramp: DominanceRamp) -> None:
     ramps = arrays.ramps
     starts_ns = ramps[1:count, 0]
     index = 1 + int(np.searchsorted(starts_ns, ramp.start_ns, side="right"))
-    ramps[index + 1 : count + 1] = ramps[index:count].copy()
+    later_ramps = ramps[index:count].copy()
+    ramps[index + 1 : count + 1] = later_ramps
     ramps[index] = (ramp.start_ns, ramp.end_ns, *ramp.alpha)
     site.ramps = count + 1
 
@@ -385,7 +389,8 @@ def add_model(arrays: SiteArrays, peer: int, model: LinkModel) -> None:
     count = int(link.models)
     starts_ns = models["from_ns"][1:count]
     index = 1 + int(np.searchsorted(starts_ns, model.from_ns, side="right"))
-    models[index + 1 : count + 1] = models[index:count].copy()
+    later_models = models[index:count].copy()
+    models[index + 1 : count + 1] = later_models
     models[index] = model
     link.models = count + 1
     # The model in force moves down one row. Samples that are scheduled already keep their

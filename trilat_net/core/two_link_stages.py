@@ -45,7 +45,8 @@ def update_errors(s: Row) -> None:
     put(s.r, r)
     put(s.Y[0], Y[0])
     put(s.Y[1], Y[1])
-    put(s.Yr, control.regressor_transpose_times(Y, r))
+    Yr = control.regressor_transpose_times(Y, r)
+    put(s.Yr, Yr)
 
 
 @leaf
@@ -61,7 +62,8 @@ def advance_estimate(s: Row, gain_s: float, Yr: Vector) -> None:
         Yr: Product Y' r of the regressor Y and the filtered error r, shape (5,).
     """
     estimate = control.update_estimate(s.theta_hat, gain_s, s.Gamma, Yr)
-    put(s.theta_hat, control.project_estimate(estimate, s.low, s.high))
+    projected = control.project_estimate(estimate, s.low, s.high)
+    put(s.theta_hat, projected)
 
 
 @leaf
@@ -217,7 +219,9 @@ def update_external_torque(
     )
     put(s.held, (held[0], held[1]))
     s.wall_n = max(held[2], now[2])
-    put(s.on_arm, (now[0] + held[0], now[1] + held[1]))
+    total_0 = now[0] + held[0]
+    total_1 = now[1] + held[1]
+    put(s.on_arm, (total_0, total_1))
     if s.external != 0:
         for i in range(2):
             s.on_arm[i] += s.sensed[i]
@@ -226,7 +230,9 @@ def update_external_torque(
 @leaf
 def add_scaled(x: Vector, step_s: float, rate: Vector) -> Pair:
     """Returns x + step_s * rate, a linear step of two numbers over the duration `step_s`."""
-    return x[0] + step_s * rate[0], x[1] + step_s * rate[1]
+    first = x[0] + step_s * rate[0]
+    second = x[1] + step_s * rate[1]
+    return first, second
 
 
 @leaf
