@@ -313,7 +313,7 @@ def test_what_is_cached_beside_a_law_is_not_run(place: Path) -> None:
             ScenarioError,
             "is no law: it has no torque",
         ),
-        (f"{WITNESS}class Spring(", "mylaws.py", ScenarioError, "is no Python"),
+        (f"{WITNESS}class Spring(", "mylaws.py", ScenarioError, "is not valid Python"),
         (None, "mylaws.py", ScenarioError, "cannot be read"),
     ],
 )
@@ -322,7 +322,7 @@ def test_a_file_that_differs_is_refused_before_it_runs(
 ) -> None:
     if text is not None:
         (place / name).write_text(text)
-    asked = fact.startswith(("defines", "is no law: it", "is no Python"))
+    asked = fact.startswith(("defines", "is no law: it", "is not valid Python"))
     with pytest.raises(error, match=fact):
         tn.open_log("run.mcap", law=name, other_version=asked)
     done = trilat("verify", "run.mcap", "--law", name, *["--other-version"] * asked, cwd=place)

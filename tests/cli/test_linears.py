@@ -62,7 +62,7 @@ REFUSED = {
     "a pose with letters": (["free", "--pose", "up"], ["--pose is angles in rad", "'up'"]),
     "a range without a colon": (
         ["free", "--over", "control.Kd=5"],
-        ["--over reads KEY=LOW:HIGH"],
+        ["--over must have the form KEY=LOW:HIGH"],
     ),
     "a figure of no kind": (["free", "--figure", "map.jpg"], ["map.jpg", ".pdf, .png, .svg"]),
     "a figure in no folder": (
@@ -71,7 +71,7 @@ REFUSED = {
     ),
     "a measured link": (
         ["free", "--set", "link.model=measured"],
-        ["links.", "its delay is not known"],
+        ["links.", "is not known"],
     ),
 }
 

@@ -273,7 +273,7 @@ def test_law_of_ones_own_is_same_to_last_digits(monkeypatch: pytest.MonkeyPatch)
 def test_all_sites_are_ends_of_lines_at_one_rate() -> None:
     with pytest.raises(ScenarioError, match="all sites"):
         unit_scenario({"m": {"control": WAVE}, "s": {"control": {"law": "p_d"}}}, WAVE)
-    with pytest.raises(ScenarioError, match="one tick rate"):
+    with pytest.raises(ScenarioError, match="the same at all sites"):
         unit_scenario({"m": {}, "s": {"rate_hz": 500}}, WAVE)
     with pytest.raises(ScenarioError, match="m-x"):
         unit_scenario({"m": {}, "s": {}}, {**WAVE, "lines": {"m-x": 1.0}})

@@ -73,9 +73,12 @@ def test_name_that_is_none_is_refused_as_scenario_is_read(law: str, fact: str) -
     [
         ({"control.law": "tests.laws:Missing"}, "defines no class Missing"),
         ({"control.law": "tests.laws:NoLaw"}, "NoLaw is no law: it has no torque"),
-        ({"control.law": LAW, "control.Kdd": 2}, "cannot be made with Kdd = 2: TypeError"),
-        ({"control.law": "tests.laws:Pair"}, "is for 2 sites, and the scenario has 3"),
-        ({"control.law": "tests.laws:Odd"}, "sites must be as in 2 or (2, 4), is 'many'"),
+        ({"control.law": LAW, "control.Kdd": 2}, "cannot be created with Kdd = 2: TypeError"),
+        ({"control.law": "tests.laws:Pair"}, "is for 2 sites, but the scenario has 3"),
+        (
+            {"control.law": "tests.laws:Odd"},
+            "sites must be a number as in 2 or a range as in (2, 4), not 'many'",
+        ),
     ],
 )
 def test_a_wrong_law_is_refused_as_the_site_is_built(
@@ -221,15 +224,15 @@ def test_law_that_sends_nothing_leaves_its_scenario_as_it_was(folder: Path) -> N
 @pytest.mark.parametrize(
     ("sends", "key", "fact"),
     [
-        ("make()", "law", "must be written out, as it is read and not run"),
-        ("{'u': {}, 'u': {}}", "law", "has a name twice"),
+        ("make()", "law", "must be written out as a literal"),
+        ("{'u': {}, 'u': {}}", "law", "contains the same name twice"),
         ("['u']", "law", "expected object, got list"),
         ("{'u': {'units': 'J'}}", "law", "unknown field units"),
         ("{'u': {'length': 0}}", "law", ">= 1"),
         ("{'u': {'length': 'arms'}}", "law", "arms"),
-        ("{'two words': {}}", "sends.two words", "is no name for a vector"),
-        ("{'class': {}}", "sends.class", "is no name for a vector"),
-        ("{'T': {}}", "sends.T", "is taken"),
+        ("{'two words': {}}", "sends.two words", "is not a valid name for a vector"),
+        ("{'class': {}}", "sends.class", "is not a valid name for a vector"),
+        ("{'T': {}}", "sends.T", "is reserved"),
         (
             "{'u': {'length': 20}, 'v': {'length': 13, 'per_peer': True}}",
             "sends",
@@ -253,7 +256,7 @@ def test_what_cannot_be_sent_is_refused_as_scenario_is_read(
         (
             "{'u': {}}; schemes = ('digital',)",
             {},
-            "is for scheme = 'digital', and here it is 'second_order'",
+            "is for scheme = 'digital', but the scheme here is 'second_order'",
         ),
         ("{'u': {}}; schemes = ('digital',)", {"scheme": "digital"}, ""),
     ],

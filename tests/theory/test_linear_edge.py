@@ -154,7 +154,9 @@ def test_every_edge_is_found_and_none_where_nothing_changes() -> None:
     ("low", "high"), [(2.0, 1.0), (1.0, 1.0), (float("nan"), 1.0), (0.0, float("inf"))]
 )
 def test_a_range_that_is_none_is_refused(low: float, high: float) -> None:
-    with pytest.raises(UsageError, match=r"control\.d is scanned from a value to a larger one"):
+    with pytest.raises(
+        UsageError, match=r"control\.d must be scanned from a lower to a higher value"
+    ):
         next(iterate_linear_edges(load_scenario("p_d_margin"), "control.d", low, high), None)
 
 

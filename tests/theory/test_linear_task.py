@@ -269,7 +269,7 @@ def test_poses_that_have_no_loop_are_refused_by_name() -> None:
         find_equilibrium(scenario, (2.0, 0.0, 0.0))
     assert refused.value.path == "sites.m.task.axes"
     with pytest.raises(
-        ScenarioError, match=r"sites\.m\.q0_rad: its end effector does not reach the pose"
+        ScenarioError, match=r"sites\.m\.q0_rad: the end effector does not reach the pose"
     ):
         find_equilibrium(scenario, (2.5, 0.0, 0.0))
     with pytest.raises(UsageError, match="pose is a position in m of the end effectors"):

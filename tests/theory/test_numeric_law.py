@@ -86,7 +86,7 @@ def test_memory_is_linearised_as_it_is_sampled(scheme: str) -> None:
 
 
 def test_what_is_not_linearised_is_refused() -> None:
-    with pytest.raises(ScenarioError, match="sends vectors of its own"):
+    with pytest.raises(ScenarioError, match="sends vectors that the law defines"):
         linear(Line)
 
 

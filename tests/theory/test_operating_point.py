@@ -65,11 +65,11 @@ def test_what_varies_is_said_with_its_mean() -> None:
 @pytest.mark.parametrize(
     ("overrides", "facts"),
     [
-        ({"link.model": "measured"}, ["links.", ".model", "its delay is not known"]),
+        ({"link.model": "measured"}, ["links.", ".model", "is not known"]),
         ({"sites.s.plant": "external"}, ["sites.s.plant", "plant = 'simulated'"]),
         (
             {"control.law": "tests.plugged_laws:Line"},
-            [".control.law", "sends vectors of its own"],
+            [".control.law", "sends vectors that the law defines"],
         ),
     ],
 )
@@ -144,5 +144,7 @@ def test_play_out_makes_jitter_a_constant_delay() -> None:
 
 def test_a_link_that_delivers_nothing_is_refused() -> None:
     chosen = scenario(loss=1.0)
-    with pytest.raises(ScenarioError, match=r"links\.m->s: no sample of it ever arrives"):
+    with pytest.raises(
+        ScenarioError, match=r"links\.m->s: no sample sent over this link ever arrives"
+    ):
         compute_effective_delay(chosen, "m", "s", chosen.links["m->s"])

@@ -124,7 +124,7 @@ def test_one_way_networks_have_no_damping_for_all_weights() -> None:
 def test_what_cannot_be_asked_is_refused() -> None:
     scenario = load_scenario("p_d_margin_two")
     rest = find_equilibrium(scenario, POSE)
-    with pytest.raises(UsageError, match="no site 'x' at the ports; there are m, s"):
+    with pytest.raises(UsageError, match="no site 'x' among the ports; the sites are m, s"):
         analyse_ports(scenario, rest, "x")
     for band_hz in ((1.0, 1.0), (1.0, 0.1), (0.0, 0.1)):
         with pytest.raises(UsageError, match="to a higher one"):

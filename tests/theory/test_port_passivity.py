@@ -214,7 +214,7 @@ def test_clamps_that_reflect_onto_each_other_are_refused() -> None:
 
 
 def test_a_clamp_at_no_site_is_refused() -> None:
-    with pytest.raises(UsageError, match="no site 'z' at the ports; there are a, b"):
+    with pytest.raises(UsageError, match="no site 'z' among the ports; the sites are a, b"):
         clamp_site(pair().loop, "z")
 
 

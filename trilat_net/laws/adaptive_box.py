@@ -85,13 +85,14 @@ class AdaptiveBox(Adaptive):
         Raises:
             ScenarioError: A bound or an estimate is refused; the error names the key.
         """
-        bounds = zip(self.theta_low, self.theta_hat0, self.theta_high, strict=True)
-        for n, (low, first, high) in enumerate(bounds):
+        parameters = zip(self.theta_low, self.theta_hat0, self.theta_high, strict=True)
+        for n, (low, first, high) in enumerate(parameters):
             if low > high:
-                problem = f"must be at least theta_low = {low:g}, is {high:g}"
+                problem = f"must be at least theta_low = {low:g}, not {high:g}"
                 raise ScenarioError(problem, path=f"{path}.theta_high[{n}]")
             if not low <= first <= high:
-                problem = f"must lie in its box from {low:g} to {high:g}, is {first:g}"
+                bounds = f"theta_low = {low:g} and theta_high = {high:g}"
+                problem = f"must lie between {bounds}, not be {first:g}"
                 raise ScenarioError(problem, path=f"{path}.theta_hat0[{n}]")
 
     @classmethod

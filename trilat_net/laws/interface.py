@@ -326,7 +326,7 @@ class ControlLaw:
             default = getattr(type(self), name, None)
             is_gain = isinstance(default, bool | float | int | str | tuple | dict)
             if not is_gain:
-                raise TypeError(f"it has no gain {name!r}")
+                raise TypeError(f"this law has no gain {name!r}")
             setattr(self, name, value)
         self.begin(facts)
 
@@ -354,7 +354,7 @@ class ControlLaw:
         if required in (None, len(roles)):
             return ""
         sites = count_nouns(required, "site")
-        return f"is for {sites}, and this has {len(roles)}: leave it out"
+        return f"is for {sites}, but this scenario has {len(roles)}: leave the law out"
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
@@ -474,7 +474,7 @@ def check_law_class(
     schemes = getattr(kind, "schemes", None) or (scheme,)
     if scheme not in schemes:
         allowed = " or ".join(map(repr, schemes))
-        problem = f"{code} is for scheme = {allowed}, and here it is {scheme!r}"
+        problem = f"{code} is for scheme = {allowed}, but the scheme here is {scheme!r}"
         raise ScenarioError(problem, path=path)
 
     needs_theta = getattr(kind, "needs_theta", False)
@@ -517,8 +517,8 @@ def _check_methods(kind: Any, code: str, path: str) -> None:
     if written:
         name = written[0]
         problem = (
-            f"{code} writes self.{name}: if torque needs that at the next tick, its "
-            f"class has remembers = ({name!r},), else remembers = (); see {page}"
+            f"{code} writes self.{name}: if torque needs this attribute at the next tick, the "
+            f"class must have remembers = ({name!r},), otherwise remembers = (); see {page}"
         )
         raise ScenarioError(problem, path=path)
 
@@ -543,13 +543,15 @@ def _check_site_count(kind: Any, code: str, path: str, sites: int) -> None:
         bounds = (stated, stated)
     is_pair = isinstance(bounds, tuple | list) and len(bounds) == 2
     if not is_pair or not all(isinstance(bound, int) for bound in bounds):
-        problem = f"{code}: sites must be as in 2 or (2, 4), is {stated!r}"
+        problem = (
+            f"{code}: sites must be a number as in 2 or a range as in (2, 4), not {stated!r}"
+        )
         raise ScenarioError(problem, path=path)
     least, most = bounds
     if not least <= sites <= most:
         numbers = f"{least}" if least == most else f"{least} to {most}"
         allowed = count_nouns(numbers, "site")
-        problem = f"{code} is for {allowed}, and the scenario has {sites}"
+        problem = f"{code} is for {allowed}, but the scenario has {sites}"
         raise ScenarioError(problem, path=path)
 
 
@@ -600,7 +602,7 @@ def make_instance(
         arguments = ", ".join(f"{key} = {value!r}" for key, value in settings.items())
         error_path = path or f"sites.{context.site}.control"
         problem = (
-            f"{code} cannot be made with {arguments or 'no settings'}: "
+            f"{code} cannot be created with {arguments or 'no settings'}: "
             f"{type(error).__name__}: {error}"
         )
         raise ScenarioError(problem, path=error_path) from None

@@ -89,7 +89,7 @@ def check_sends(channel: LawChannel, joints: int, path: str) -> None:
     if channel.received_size > largest_count:
         count = count_nouns(channel.received_size, "number")
         problem = (
-            f"sends {count} to each peer, and at most {largest_count} are accepted, "
+            f"sends {count} to each peer, but a law may send at most {largest_count}, "
             f"{MAX_SENT} per joint"
         )
         raise ScenarioError(problem, path=sends_path)
@@ -97,7 +97,7 @@ def check_sends(channel: LawChannel, joints: int, path: str) -> None:
         count = count_nouns(channel.record_size, "number")
         receivers = count_nouns(channel.peers, "peer")
         problem = (
-            f"sends {count} to {receivers} together, and a record holds at most "
+            f"sends {count} to {receivers} together, but a record holds at most "
             f"{MAX_RECORD_SENT}"
         )
         raise ScenarioError(problem, path=sends_path)
@@ -116,11 +116,15 @@ def _find_name_problem(name: str) -> str:
     is_public = not name.startswith("_") and len(name) <= 24
     if not (is_identifier and is_public):
         return (
-            "is no name for a vector: a letter, then letters, digits and _, at most 24 of them"
+            "is not a valid name for a vector: the name must start with a letter, contain only "
+            "letters, digits and _, have at most 24 characters, and not be a Python keyword"
         )
     is_reserved = hasattr(np.record, name) or hasattr(tuple, name)
     if is_reserved:
-        return "is taken: every record of numbers has an attribute of that name; choose another"
+        return (
+            "is reserved, because every record of numbers has an attribute of that name: "
+            "choose another name"
+        )
     return ""
 
 
@@ -138,7 +142,7 @@ def parse_classes(source: bytes, file: Path, path: str) -> dict[str, ast.ClassDe
     try:
         tree = ast.parse(source)
     except (SyntaxError, ValueError, RecursionError) as error:
-        raise ScenarioError(f"{file} is no Python: {error}", path=path) from None
+        raise ScenarioError(f"{file} is not valid Python: {error}", path=path) from None
     return {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
 
 
@@ -171,10 +175,13 @@ def read_sends(source: bytes, file: Path, code: str, path: str) -> SentVectorSpe
         try:
             sends = ast.literal_eval(value)
         except (ValueError, TypeError, RecursionError):
-            problem = f"{location} must be written out, as it is read and not run"
+            problem = (
+                f"{location} must be written out as a literal, because the file is read but "
+                "not run"
+            )
             raise ScenarioError(problem, path=path) from None
         if isinstance(value, ast.Dict) and len(sends) < len(value.keys):
-            raise ScenarioError(f"{location} has a name twice", path=path)
+            raise ScenarioError(f"{location} contains the same name twice", path=path)
     return convert_sends(sends, code, path)
 
 

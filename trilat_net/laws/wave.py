@@ -576,11 +576,13 @@ class Wave(EnergyLaw):
                 names = ", ".join(rates_hz)
                 return KeyProblem(
                     f"control.lines.{line}",
-                    f"joins no two sites: name them as in m1-s, of {names}",
+                    f"does not join two sites: name two of the sites {names}, as in m1-s",
                 )
         if len({*rates_hz.values()}) > 1:
             return KeyProblem(
-                "rate_hz", "wave is for sites of one tick rate, as a wave lasts for a tick"
+                "rate_hz",
+                "must be the same at all sites with the law wave, because a wave lasts for one "
+                "tick",
             )
         return None
 

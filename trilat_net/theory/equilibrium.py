@@ -250,8 +250,9 @@ def _refuse_singular_poses(conditions: OperatingConditions, rest: Equilibrium) -
         following = compute_following(site, arm, x)
         if not following.least > SINGULAR:
             raise ScenarioError(
-                "rests in a singular pose, where the inverse of its Jacobian, and so the loop, "
-                "has no derivative: end it elsewhere, or follow fewer axes",
+                "the arm rests in a singular pose, where neither the inverse of the Jacobian "
+                "nor the loop has a derivative: let the run end in another pose, or follow "
+                "fewer axes",
                 path=f"sites.{site.name}.task.axes",
             )
 
@@ -490,7 +491,7 @@ def _build_at_pose(pose: tuple[float, ...], conditions: OperatingConditions) -> 
     if len(pose) != coordinates or not np.isfinite(pose).all():
         expected = _describe_pose(coordinates, task=bool(task))
         more = ",..." if coordinates > 2 else ""
-        raise UsageError(f"--pose is {expected}, as in --pose 0.1,0.3{more}, not {pose}")
+        raise UsageError(f"--pose must be {expected}, as in --pose 0.1,0.3{more}, not {pose}")
 
     target = np.array(pose, dtype=np.float64)
     q = [reach_pose(site, target) if task else target for site in conditions.sites]
@@ -548,7 +549,8 @@ def reach_pose(site: SiteSetup, pose: Array) -> Array:
         q = q + step * _limit_step(step)
 
     raise ScenarioError(
-        f"its end effector does not reach the pose: {largest_error:.2g} m or rad remain",
+        "the end effector does not reach the pose: an error of "
+        f"{largest_error:.2g} m or rad remains",
         path=f"sites.{site.name}.q0_rad",
     )
 
@@ -633,7 +635,7 @@ def _require_equilibrium(scenario: Scenario, rest: Equilibrium) -> Equilibrium:
     """
     if not rest.residual <= MAX_EQUILIBRIUM_RESIDUAL:
         raise ScenarioError(
-            "the loop has no equilibrium near the end of its run "
+            "the loop has no equilibrium near the end of the run "
             f"(residual {rest.residual:.2g} rad/s^2); give a pose, as in --pose 0.1,0.3",
             source=scenario.name,
         )

@@ -193,7 +193,7 @@ def parse_edge_range(text: str) -> tuple[str, float, float]:
         return key.strip(), float(low), float(high)
     except ValueError:
         raise UsageError(
-            f"--over reads KEY=LOW:HIGH, as in control.d=0.1:3, not {text!r}"
+            f"--over must have the form KEY=LOW:HIGH, as in control.d=0.1:3, not {text!r}"
         ) from None
 
 
@@ -228,7 +228,8 @@ def iterate_linear_edges(
     is_valid_range = np.isfinite([low, high]).all() and low < high and points >= 2
     if not is_valid_range:
         raise UsageError(
-            f"{key} is scanned from a value to a larger one, not {low:g} to {high:g}"
+            f"{key} must be scanned from a lower to a higher value, "
+            f"not from {low:g} to {high:g}"
         )
     growth = _GrowthRate(scenario, key, rest, sampled)
     is_logarithmic = low > 0.0 and high / low > _LOGARITHMIC

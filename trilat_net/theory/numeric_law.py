@@ -66,19 +66,20 @@ class NumericLaw:
         memory: The memory at the start of a run.
 
     Raises:
-        ScenarioError: The law sends vectors of its own, or makes an end effector follow.
+        ScenarioError: The law sends vectors that it defines, or makes an end effector follow.
     """
 
     def __init__(self, setup: SiteSetup, code: str, shares: Sequence[float]) -> None:
         path = f"sites.{setup.name}.control.law"
         if setup.layout.sent:
             raise ScenarioError(
-                f"{code} sends vectors of its own, and such a law cannot be linearised",
+                f"{code} sends vectors that the law defines; an imported law of this kind "
+                "cannot be linearised",
                 path=path,
             )
         if setup.layout.task:
             raise ScenarioError(
-                f"{code} follows in task space, and an imported law is linearised "
+                f"{code} follows in task space, but an imported law can be linearised "
                 "in joint space only",
                 path=path,
             )

@@ -367,8 +367,8 @@ def _find_final_link(scenario: Scenario, name: str, notes: list[str]) -> LinkBas
 
     if link.measured:
         raise ScenarioError(
-            "is 'measured': its delay is not known beforehand; "
-            "give a model, as in link.model = 'constant'",
+            "must not be 'measured', because the delay of a measured link is not known "
+            "beforehand: give a model, as in link.model = 'constant'",
             path=f"links.{name}.model",
             source=scenario.name,
         )
@@ -424,7 +424,9 @@ def compute_effective_delay(
     )
     if used[-1] < 0:
         raise ScenarioError(
-            "no sample of it ever arrives", path=f"links.{peer}->{site}", source=scenario.name
+            "no sample sent over this link ever arrives",
+            path=f"links.{peer}->{site}",
+            source=scenario.name,
         )
 
     first = int(np.argmax(used >= 0))

@@ -294,7 +294,8 @@ def analyse_ports(
     low, high = band_hz
     if not 0.0 < low < high:
         raise UsageError(
-            f"a band goes from a frequency to a higher one, not from {low:g} to {high:g} Hz"
+            "a band must go from a lower to a higher frequency, "
+            f"not from {low:g} to {high:g} Hz"
         )
 
     conditions = derive_operating_conditions(scenario)
@@ -409,8 +410,8 @@ def _locate_hands(
         J = end_effector.J[0]
         if any(len(hand.B) != len(J) for hand in hands):
             raise UsageError(
-                f"{site.name}: its end effector moves along {count_nouns(len(J), 'axis')}, "
-                "and a hand along another number"
+                f"{site.name}: the end effector moves along {count_nouns(len(J), 'axis')}, "
+                "but a hand was measured along a different number of axes"
             )
 
         place = np.zeros((len(J), len(loop.inputs)))

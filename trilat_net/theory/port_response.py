@@ -194,7 +194,8 @@ def build_admittance(loop: LinearLoop) -> PortResponse:
     torques = loop.B.shape[1]
     if velocities != torques:
         raise RuntimeFault(
-            f"ports need as many velocities as torques, not {velocities} of {torques}"
+            "a loop with ports must have as many velocities as torques, but there are "
+            f"{velocities} velocities and {torques} torques"
         )
 
     def evaluate_admittance(w_rad_s: Array) -> Complex:
@@ -247,7 +248,7 @@ def find_site_ports(loop: LinearLoop, site: str) -> list[int]:
     ports = [n for n, name in enumerate(loop.inputs) if parse_port_site(name) == site]
     if not ports:
         sites = ", ".join(list_port_sites(loop))
-        raise UsageError(f"no site {site!r} at the ports; there are {sites}")
+        raise UsageError(f"there is no site {site!r} among the ports; the sites are {sites}")
     return ports
 
 
@@ -366,7 +367,8 @@ def clamp_site(loop: LinearLoop, site: str) -> LinearLoop:
     acceleration_block = np.ix_(speeds, ports)
     if any(term.B[acceleration_block].any() for term in loop.delayed):
         raise UsageError(
-            f"clamped sites that reflect force onto each other have no finite answer: {site}"
+            "clamped sites that reflect force onto each other do not have a finite response: "
+            f"{site}"
         )
     inertia = np.linalg.inv(loop.B[acceleration_block])
     sums: dict[float, DelayedTerm] = {}
@@ -553,7 +555,9 @@ def measure_transparency(loop: LinearLoop, at: str, of: str) -> tuple[Transparen
 
     ports = find_site_ports(loop, at)
     if at == of:
-        raise UsageError(f"a load at {at} would be at the operator's own site")
+        raise UsageError(
+            f"a load cannot be placed at {at}, because this is the operator's own site"
+        )
     clamped_loop = clamp_site(loop, of)
     clamped_ports = find_site_ports(clamped_loop, at)
     evaluate_free = select_ports(build_admittance(loop), ports)
