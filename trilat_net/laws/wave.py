@@ -103,13 +103,20 @@ def replay_wave(
     sign = 1.0 if owed_integral > 0.0 else -1.0
     mean_wave = owed / max(owed_s, CONCEALED_S, h)
     # The other half of the reserve is for the ticks without a sample (`conceal_wave`).
-    available = max(energy - 0.5 * law.reserve, 0.0)
+    free = energy - 0.5 * law.reserve
+    available = max(free, 0.0)
     # Beside the wave f, an extra wave e costs f + e / 2 per unit of the integral.
-    affordable = 2.0 * (available / owed - sign * fresh)
-    extra: float = max(0.0, min(affordable, mean_wave))
+    energy_per_integral = available / owed
+    aligned_wave = sign * fresh
+    affordable = 2.0 * (energy_per_integral - aligned_wave)
+    largest_extra = min(affordable, mean_wave)
+    extra: float = max(0.0, largest_extra)
 
-    law.owed_U[index] = owed_integral - sign * extra * h
-    law.owed_s[index] = max(owed_s - extra / mean_wave * h, 0.0)
+    repaid_integral = sign * extra * h
+    repaid_s = extra / mean_wave * h
+    remaining_s = owed_s - repaid_s
+    law.owed_U[index] = owed_integral - repaid_integral
+    law.owed_s[index] = max(remaining_s, 0.0)
     return fresh + sign * extra
 
 
@@ -132,8 +139,11 @@ def conceal_wave(law: Any, index: int, energy: float, h: float) -> float:
         The wave, sqrt(W).
     """
     duration_s = max(CONCEALED_S, h)
-    largest_wave = math.sqrt(2.0 * max(energy, 0.0) / duration_s)
-    held = max(-largest_wave, min(largest_wave, law.wave[index]))
+    available = max(energy, 0.0)
+    largest_wave = math.sqrt(2.0 * available / duration_s)
+    last_wave = law.wave[index]
+    bounded_above = min(largest_wave, last_wave)
+    held = max(-largest_wave, bounded_above)
     played: float = held
     if law.owed_U[index] * held > 0.0:
         # Earlier waves are owed in the same direction.
@@ -146,7 +156,8 @@ def conceal_wave(law: Any, index: int, energy: float, h: float) -> float:
             energy=remaining,
             h=h,
         )
-    law.owed_U[index] -= held * h
+    anticipated = held * h
+    law.owed_U[index] -= anticipated
     law.held_s[index] += h
     return played
 
@@ -187,20 +198,27 @@ def receive_wave(
     fresh = 0.0
     fresh_energy = 0.0
     played = 0.0
-    if missed < 0.0 and law.playing == _REPLAY:
-        played = conceal_wave(law, index, sent.W[i], h)
-    elif missed >= 0.0:
+    has_sample = missed >= 0.0
+    is_replay = law.playing == _REPLAY
+    if not has_sample and is_replay:
+        known_energy = sent.W[i]
+        played = conceal_wave(law, index, known_energy, h)
+    elif has_sample:
         fresh = received.u[i]
         law.wave[index] = fresh
         fresh_energy = 0.5 * fresh * fresh * h
         if missed > 0.0:
             # The sums U and E contain the waves that did not arrive.
-            missed_energy = received.E[i] - law.E_seen[index] - fresh_energy
+            energy_sum = received.E[i]
+            wave_sum = received.U[i]
+            missed_energy = energy_sum - law.E_seen[index] - fresh_energy
+            missed_integral = wave_sum - law.U_seen[index] - fresh * h
             energy = max(missed_energy, 0.0)
-            law.owed_U[index] += received.U[i] - law.U_seen[index] - fresh * h
+            law.owed_U[index] += missed_integral
             if energy > 0.0:
                 missed_s = missed * h
-                law.owed_s[index] += max(missed_s - law.held_s[index], 0.0)
+                unplayed_s = missed_s - law.held_s[index]
+                law.owed_s[index] += max(unplayed_s, 0.0)
             sent.W[i] += energy
         law.held_s[index] = 0.0
         law.U_seen[index] = received.U[i]
@@ -208,7 +226,7 @@ def receive_wave(
         played = fresh
 
     # Choose the wave to play.
-    if law.playing == _REPLAY and missed >= 0.0:
+    if is_replay and has_sample:
         played = replay_wave(
             law=law,
             index=index,
@@ -217,10 +235,13 @@ def receive_wave(
             h=h,
         )
     elif law.playing == _SCALED:
-        known_energy = max(sent.W[i] + fresh_energy, 0.0)
+        energy = sent.W[i] + fresh_energy
+        known_energy = max(energy, 0.0)
         largest_wave = math.sqrt(2.0 * known_energy / h)
-        scaled = math.sqrt(law.rate[j]) * law.wave[index]
-        played = max(-largest_wave, min(largest_wave, scaled))
+        scale = math.sqrt(law.rate[j])
+        scaled = scale * law.wave[index]
+        bounded_above = min(largest_wave, scaled)
+        played = max(-largest_wave, bounded_above)
     elif law.playing == _HOLD:
         played = law.wave[index]
 
@@ -263,13 +284,17 @@ def follow_wave(
     stretch = law.q_sd[index] - now.q[i]
     spring_force = K * stretch
     c = math.sqrt(2.0 * b)
-    qd_sd = (c * v - spring_force + B * qd) / (b + B)
+    wave_force = c * v
+    arm_force = B * qd
+    qd_sd = (wave_force - spring_force + arm_force) / (b + B)
     stretch_rate = qd_sd - qd
     force: float = spring_force + B * stretch_rate
     # The energy that the spring is expected to receive in this period.
-    law.spring_gain_J[i] += (spring_force * stretch_rate) * h
+    spring_power = spring_force * stretch_rate
+    law.spring_gain_J[i] += spring_power * h
     law.q_sd[index] += h * qd_sd
-    now.sent[j].u[i] = v - c / b * force
+    reflected = c / b * force
+    now.sent[j].u[i] = v - reflected
     return force
 
 
@@ -289,25 +314,31 @@ def close_wave_period(law: Any, now: LawInput, i: int) -> None:
         i: Index of the joint.
     """
     H = now.to_all.H
+    K = law.K[i]
+    q = now.q[i]
+    is_first = now.k == 0
     spring = 0.0
     for j in range(len(now.peers)):
         index = j * now.joints + i
-        if now.k == 0:
-            law.q_sd[index] = now.peers[j].q[i]
+        if is_first:
+            peer = now.peers[j]
+            law.q_sd[index] = peer.q[i]
         if law.impedance[index] > 0.0:
-            stretch = law.q_sd[index] - now.q[i]
-            spring += 0.5 * law.K[i] * stretch * stretch
-    if now.k == 0:
-        H[i] = law.reserve + spring
+            stretch = law.q_sd[index] - q
+            spring += 0.5 * K * stretch * stretch
+    largest_H = law.reserve + spring
+    if is_first:
+        H[i] = largest_H
 
     coupling_torque = now.tau_before[i] - law.carried[i]
-    step = now.q[i] - now.q_before[i]
-    H[i] -= law.beta * coupling_torque * step
+    step = q - now.q_before[i]
+    work = law.beta * coupling_torque * step
+    H[i] -= work
     law.spring[i] = spring
-    largest_H = law.reserve + spring
-    if law.K[i] > 0.0 and H[i] > largest_H:
+    excess = H[i] - largest_H
+    if K > 0.0 and excess > 0.0:
         # The damper of the end has dissipated the excess.
-        law.damped[i] += H[i] - largest_H
+        law.damped[i] += excess
         H[i] = largest_H
 
 
@@ -326,24 +357,28 @@ def send_waves(law: Any, now: LawInput, i: int, committed: float) -> None:
         committed: Energy that the coming period needs for other purposes, J.
     """
     h = now.h_s
+    H = now.to_all.H
+    peers = len(now.peers)
     requested = 0.0
-    for j in range(len(now.peers)):
+    for j in range(peers):
         wave = now.sent[j].u[i]
         requested += 0.5 * wave * wave * h
-    free = now.to_all.H[i] - law.spring[i] - committed - 0.5 * law.reserve
+    spring = law.spring[i]
+    kept_reserve = 0.5 * law.reserve
+    free = H[i] - spring - committed - kept_reserve
     available = max(free, 0.0)
     scale = 1.0
     if requested > available:
         scale = math.sqrt(available / requested)
 
-    for j in range(len(now.peers)):
+    for j in range(peers):
         sent = now.sent[j]
         wave = sent.u[i] * scale
         energy = 0.5 * wave * wave * h
         sent.u[i] = wave
         sent.U[i] += wave * h
         sent.E[i] += energy
-        now.to_all.H[i] -= energy
+        H[i] -= energy
 
 
 def find_line_impedance(lines: Mapping[str, Any], site: str, peer: str) -> Any:
@@ -360,7 +395,9 @@ def find_line_impedance(lines: Mapping[str, Any], site: str, peer: str) -> Any:
     Returns:
         A number for all joints, or one number per joint. None if no impedance is stated.
     """
-    return lines.get(f"{site}-{peer}", lines.get(f"{peer}-{site}"))
+    name = f"{site}-{peer}"
+    reversed_name = f"{peer}-{site}"
+    return lines.get(name, lines.get(reversed_name))
 
 
 @compiled
@@ -440,24 +477,30 @@ class Wave(EnergyLaw):
         """
         n = facts.joints
         peers = len(facts.peers)
+        ends = n * peers
         lines = {} if self.lines == "shares" else self.lines
         self.impedance: list[float] = []
         for peer in facts.peers:
             line = find_line_impedance(lines, facts.site, peer)
-            self.impedance += self.b if line is None else (np.zeros(n) + line).tolist()
+            if line is None:
+                self.impedance += self.b
+            else:
+                impedances = np.zeros(n) + line
+                self.impedance += impedances.tolist()
         self.playing = RECEPTIONS.index(self.reception)
-        self.q_sd = [0.0] * (n * peers)
-        self.wave = [0.0] * (n * peers)
-        self.U_seen = [0.0] * (n * peers)
-        self.E_seen = [0.0] * (n * peers)
-        self.owed_U = [0.0] * (n * peers)
-        self.owed_s = [0.0] * (n * peers)
-        self.held_s = [0.0] * (n * peers)
+        self.q_sd = [0.0] * ends
+        self.wave = [0.0] * ends
+        self.U_seen = [0.0] * ends
+        self.E_seen = [0.0] * ends
+        self.owed_U = [0.0] * ends
+        self.owed_s = [0.0] * ends
+        self.held_s = [0.0] * ends
         self.stamp = [-1.0] * peers
         self.rate = [1.0] * peers
         self.reserve = float(self.reserve_J)
-        self.tau_limit = (np.zeros(n) + facts.tau_limit_nm).tolist()
-        self.played = [0.0] * (n * peers)
+        limits = np.zeros(n) + facts.tau_limit_nm
+        self.tau_limit = limits.tolist()
+        self.played = [0.0] * ends
         self.carried = [0.0] * n
         self.spring_gain_J = [0.0] * n
         self.spring = [0.0] * n
@@ -478,28 +521,35 @@ class Wave(EnergyLaw):
                 `now.tau`.
         """
         n = now.joints
+        h = now.h_s
+        peers = len(now.peers)
         for i in range(n):
             close_wave_period(self, now, i)
             if self.K[i] == 0.0:
                 # An end without a spring sends the motion of the period that has just ended.
                 step = now.q[i] - now.q_before[i]
-                for j in range(len(now.peers)):
+                for j in range(peers):
                     index = j * n + i
-                    c = math.sqrt(2.0 * self.impedance[index])
-                    now.sent[j].u[i] = c * step / now.h_s - self.played[index]
+                    b = self.impedance[index]
+                    c = math.sqrt(2.0 * b)
+                    motion_wave = c * step / h
+                    now.sent[j].u[i] = motion_wave - self.played[index]
                 send_waves(self, now, i, 0.0)
-            self.carried[i] = self.gravity * now.gravity[i]
-            now.tau[i] = self.carried[i]
+            carried = self.gravity * now.gravity[i]
+            self.carried[i] = carried
+            now.tau[i] = carried
             self.spring_gain_J[i] = 0.0
 
-        for j in range(len(now.peers)):
+        for j in range(peers):
             peer = now.peers[j]
             missed = -1.0
             if peer.new:
                 missed = peer.tick - self.stamp[j] - 1.0
                 self.stamp[j] = peer.tick
             if self.stamp[j] >= 0.0:
-                self.rate[j] += (missed + 1.0 - self.rate[j]) / STAMP_FILTER_TICKS
+                advance = missed + 1.0
+                rate = self.rate[j]
+                self.rate[j] += (advance - rate) / STAMP_FILTER_TICKS
             for i in range(n):
                 index = j * n + i
                 b = self.impedance[index]
@@ -529,9 +579,12 @@ class Wave(EnergyLaw):
         for i in range(n):
             if self.K[i] > 0.0:
                 limit = self.tau_limit[i]
-                applied = max(-limit, min(limit, now.tau[i])) - self.carried[i]
-                work = self.beta * applied * now.qd[i] * now.h_s
-                send_waves(self, now, i, work + self.spring_gain_J[i])
+                bounded_above = min(limit, now.tau[i])
+                limited = max(-limit, bounded_above)
+                applied = limited - self.carried[i]
+                work = self.beta * applied * now.qd[i] * h
+                committed = work + self.spring_gain_J[i]
+                send_waves(self, now, i, committed)
 
     def energies(self, seen: LawRecords) -> LawEnergies:
         """Computes the energies that show whether the law was passive in a run.
@@ -544,14 +597,25 @@ class Wave(EnergyLaw):
         Args:
             seen: Records of the site in the run, one per control period.
         """
+        sent_energies = []
+        used_energies = []
+        known_energies = []
+        for peer in seen.peers:
+            known = peer.sent["W"]
+            received = peer.received["E"]
+            sent_energies.append(peer.sent["E"])
+            used_energies.append(received - known)
+            known_energies.append(known)
         coupling_torque = seen.tau - seen.memory["carried"]
+        work = sum_work(coupling_torque, seen.q)
+        damped = seen.memory["damped"]
         return LawEnergies(
-            gave=[peer.sent["E"] for peer in seen.peers],
-            took=[peer.received["E"] - peer.sent["W"] for peer in seen.peers],
-            port=-self.beta * sum_work(coupling_torque, seen.q),
+            gave=sent_energies,
+            took=used_energies,
+            port=-self.beta * work,
             store=seen.to_all["H"],
-            taken=seen.memory["damped"].sum(axis=1),
-            observed=[peer.sent["W"] for peer in seen.peers],
+            taken=damped.sum(axis=1),
+            observed=known_energies,
             weight=self.beta,
             gravity=self.gravity,
         )
@@ -572,7 +636,8 @@ class Wave(EnergyLaw):
         pairs = [sorted(pair) for pair in permutations(rates_hz, 2)]
         lines = () if self.lines == "shares" else self.lines
         for line in lines:
-            if sorted(line.split("-", 1)) not in pairs:
+            ends = line.split("-", 1)
+            if sorted(ends) not in pairs:
                 names = ", ".join(rates_hz)
                 return KeyProblem(
                     f"control.lines.{line}",
@@ -612,16 +677,19 @@ class Wave(EnergyLaw):
             return self  # the user has stated the impedances
 
         lines: dict[str, Any] = {}
-        pairs = list(combinations(range(len(names)), 2))
+        sites = range(len(names))
+        pairs = list(combinations(sites, 2))
         D = find_balancing_weights(alpha)
-        is_symmetric = np.array_equal(alpha > 0.0, alpha.T > 0.0)
+        follows = alpha > 0.0
+        is_symmetric = np.array_equal(follows, follows.T)
         if D is not None and is_symmetric:
             weights = [float(D[i] * alpha[i, j]) for i, j in pairs]
             mean = sum(weights) / len(pairs)
             for (i, j), weight in zip(pairs, weights, strict=True):
                 # Twelve digits, so that rounding errors of the weights do not show.
                 share = float(f"{weight / mean:.12g}")
-                lines[f"{names[i]}-{names[j]}"] = tuple(share * b for b in self.b)
+                line = f"{names[i]}-{names[j]}"
+                lines[line] = tuple(share * b for b in self.b)
         return replace(cast(Any, self), lines=lines)
 
     def explain_idle_shares(self, situation: LawSituation) -> str:
@@ -642,11 +710,13 @@ class Wave(EnergyLaw):
         impedances = np.zeros(len(situation.names))
         for index, peer in enumerate(situation.names):
             if peer != site:
-                impedances[index] = self.find_impedances(site, peer)[0]
+                joint_impedances = self.find_impedances(site, peer)
+                impedances[index] = joint_impedances[0]
         total_impedance = impedances.sum()
         dominance_factors = situation.alpha[situation.site]
         expected_impedances = dominance_factors * total_impedance
-        if np.allclose(impedances, expected_impedances, atol=1e-6 * total_impedance):
+        tolerance = 1e-6 * total_impedance
+        if np.allclose(impedances, expected_impedances, atol=tolerance):
             return ""
 
         explanation = "lines share as b_ij / sum b_ik"
@@ -670,7 +740,9 @@ class Wave(EnergyLaw):
         line = find_line_impedance(lines, site, peer)
         if line is None:
             return self.b
-        return tuple(np.broadcast_to(line, len(self.b)).tolist())
+        joints = len(self.b)
+        impedances = np.broadcast_to(line, joints)
+        return tuple(impedances.tolist())
 
     def linear_gains(self, theta: Array) -> Gains | None:
         """Returns gains for the linear analysis that only compensate gravity.
@@ -682,7 +754,8 @@ class Wave(EnergyLaw):
             theta: Parameters of the arm's dynamics, such as masses, shape (P,), where P is
                 their number.
         """
-        return Gains(Law.KNOWN, known=(theta * self.gravity).tolist())
+        compensated = theta * self.gravity
+        return Gains(Law.KNOWN, known=compensated.tolist())
 
     def linear_form(self, situation: LinearSituation) -> LinearForm | None:
         """Returns the torque and the sent waves as functions of motion and received waves.
@@ -701,21 +774,29 @@ class Wave(EnergyLaw):
         has_springs = any(self.K)
         if has_springs and not all(self.K):
             return None
-        site = situation.names[situation.site]
-        states = [f"q_sd_{situation.names[j]}" for j in situation.peers] if has_springs else []
-        form = LinearForm(len(situation.inertia), states)
+        names = situation.names
+        site = names[situation.site]
+        joints = len(situation.inertia)
+        states: list[str] = []
+        if has_springs:
+            states = [f"q_sd_{names[j]}" for j in situation.peers]
+        form = LinearForm(joints, states)
         for j in situation.peers:
-            b = np.array(self.find_impedances(site, situation.names[j]))
+            peer = names[j]
+            impedances = self.find_impedances(site, peer)
+            b = np.array(impedances)
             if not b.all():
                 continue
             if has_springs:
-                self._add_spring_end(form, j, f"q_sd_{situation.names[j]}", b)
+                self._add_spring_end(form, j, f"q_sd_{peer}", b)
             else:
+                received = ("from", j)
+                sent = ("to", j)
                 c = np.sqrt(2.0 * b)
                 form.add("tau", "qd", -b / self.beta)
-                form.add("tau", ("from", j), c / self.beta)
-                form.add(("to", j), "qd", c)
-                form.add(("to", j), ("from", j), -1.0)
+                form.add("tau", received, c / self.beta)
+                form.add(sent, "qd", c)
+                form.add(sent, received, -1.0)
         return form
 
     def _add_spring_end(self, form: LinearForm, j: int, state: str, b: Array) -> None:
@@ -731,9 +812,11 @@ class Wave(EnergyLaw):
         B = np.array(self.B)
         c = np.sqrt(2.0 * b)
         damping = b + B
+        received = ("from", j)
+        sent = ("to", j)
         # Per column the derivative of q_sd, and the force without the part B times it.
         columns: tuple[tuple[BlockKey, Array, Any], ...] = (
-            (("from", j), c / damping, 0.0),
+            (received, c / damping, 0.0),
             (state, -K / damping, K),
             ("q", K / damping, -K),
             ("qd", B / damping, -B),
@@ -742,8 +825,8 @@ class Wave(EnergyLaw):
             force = direct_force + B * rate
             form.add(state, column, rate)
             form.add("tau", column, force / self.beta)
-            form.add(("to", j), column, -c / b * force)
-        form.add(("to", j), ("from", j), 1.0)
+            form.add(sent, column, -c / b * force)
+        form.add(sent, received, 1.0)
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
         """Evaluates whether the law keeps the session passive.
@@ -762,7 +845,8 @@ class Wave(EnergyLaw):
         total = sum(impedances) or 1.0
         shares = []
         for peer, impedance in zip(peers, impedances, strict=True):
-            shares.append(f"{peer} {impedance / total:.4g}")
+            share = impedance / total
+            shares.append(f"{peer} {share:.4g}")
         text = (
             f"lines are passive for any delays, jitter and loss, where {PASSIVE_OUTSIDE}; "
             f"the shares of {site} are b_ij / sum b_ik: {', '.join(shares)}"
