@@ -89,22 +89,27 @@ class Impedance(ControlLaw):
             if now.k == 0:
                 self.start[i] = q
             start = self.start[i]
-            q_ref = start + follows * (now.q_des[i] - start)
+            target_offset = now.q_des[i] - start
+            q_ref = start + follows * target_offset
             qd_ref = follows * now.qd_des[i]
             tau_h = 0.0 - now.tau_x[i]
             force = tau_h
             for j in range(len(now.peers)):
+                alpha = now.peers[j].alpha
                 force += now.received[j].force[i]
-                now.sent[j].force[i] = tau_h * follows * now.peers[j].alpha
-            damper = self.B[i] * (now.qd[i] - qd_ref)
-            spring = self.K[i] * (q - q_ref)
+                now.sent[j].force[i] = tau_h * follows * alpha
+            rate_error = now.qd[i] - qd_ref
+            error = q - q_ref
+            damper = self.B[i] * rate_error
+            spring = self.K[i] * error
             force -= damper + spring
             self.qdd[i] = force / self.M[i]
         # The inner loop gives the arm the acceleration of the impedance.
         for i in range(now.joints):
             tau = now.bias[i] + now.tau_x[i]
             for j in range(now.joints):
-                tau += now.inertia[i][j] * self.qdd[j]
+                inertia = now.inertia[i][j]
+                tau += inertia * self.qdd[j]
             now.tau[i] = tau
 
     def linear_gains(self, theta: Array) -> Gains | None:
@@ -132,11 +137,15 @@ class Impedance(ControlLaw):
         """
         n = len(situation.inertia)
         form = LinearForm(n)
-        inverse_M = np.broadcast_to(1.0 / np.array(self.M), n)
+        M = np.array(self.M)
+        B = np.array(self.B)
+        K = np.array(self.K)
+        inverse_M = np.broadcast_to(1.0 / M, n)
         inertia_ratio = situation.inertia @ np.diag(inverse_M)
-        stiffness = inertia_ratio * np.array(self.K)
-        damping = inertia_ratio * np.array(self.B)
-        form.add("tau", "tau_h", inertia_ratio - np.eye(n))
+        stiffness = inertia_ratio * K
+        damping = inertia_ratio * B
+        force_gain = inertia_ratio - np.eye(n)
+        form.add("tau", "tau_h", force_gain)
         form.add("tau", "q", -stiffness)
         if self.follows:
             form.add("tau", "q_des", stiffness)
@@ -144,8 +153,9 @@ class Impedance(ControlLaw):
         if self.follows:
             form.add("tau", "qd_des", damping)
         for j in situation.peers:
+            alpha = situation.alpha[situation.site, j]
             form.add("tau", ("from", j), inertia_ratio)
-            form.add(("to", j), "tau_h", self.follows * situation.alpha[situation.site, j])
+            form.add(("to", j), "tau_h", self.follows * alpha)
         return form
 
     def explain_idle_shares(self, situation: LawSituation) -> str:  # noqa: ARG002
@@ -169,13 +179,17 @@ class Impedance(ControlLaw):
             situation: All sites, their laws, and the weights with which they follow each other.
         """
         laws = situation.laws
-        followers = [n for n, law in enumerate(laws) if getattr(law, "follows", False)]
+        followers = []
+        for n, law in enumerate(laws):
+            if getattr(law, "follows", False):
+                followers.append(n)
         have_this_law = all(law.kind is Impedance for law in laws)
         if len(followers) != 1 or not have_this_law:
             text = "one site follows, and all the others have this law with follows = false"
             return StabilityCondition(False, text)
         slave = followers[0]
-        K_e = find_stiffest_wall(laws, situation.alpha[slave], slave)
+        dominance_factors = situation.alpha[slave]
+        K_e = find_stiffest_wall(laws, dominance_factors, slave)
         if K_e == 0.0:
             text = "the small-gain theorem requires B > 0 at every site"
             return StabilityCondition(False, text)
@@ -226,26 +240,36 @@ def find_stiffest_wall(laws: Sequence[Any], dominance_factors: Array, slave: int
     s = 1j * np.geomspace(1e-2, 1e4, 4000)
     stiffnesses = np.geomspace(1e-2, 1e6, 400)
     K_e = stiffnesses[:, None]
-    gains = [np.array([law.M, law.B, law.K]) for law in laws]
-    if any((gain[1] <= 0.0).any() for gain in gains):
-        return 0.0  # without damping, free motion does not decay
+    gains = []
+    for law in laws:
+        gain = np.array([law.M, law.B, law.K])
+        gains.append(gain)
+    for gain in gains:
+        B = gain[1]
+        if (B <= 0.0).any():
+            return 0.0  # without damping, free motion does not decay
 
     stiffest = np.inf
-    for joint in range(len(laws[0].K)):
-        masters: Any = 0.0
+    joints = len(laws[0].K)
+    for joint in range(joints):
+        masters: Any = 0.0  # the sum of a_i^2 over the impedances of the masters
         for n, gain in enumerate(gains):
             if n == slave:
                 continue
             M, B, K = gain[:, joint]
             impedance = M * s * s + B * s + K
-            masters = masters + dominance_factors[n] ** 2 / impedance
+            squared_factor = dominance_factors[n] ** 2
+            masters = masters + squared_factor / impedance
 
         M, B, K = gains[slave][:, joint]
         impedance = M * s * s + B * s + K
-        slave_gain = K_e * (K + B * s) / (impedance + K_e)
+        coupling = K + B * s
+        slave_gain = K_e * coupling / (impedance + K_e)
         loop_gain = np.abs(slave_gain * masters)
-        unstable = np.flatnonzero(loop_gain.max(axis=1) >= 1.0)
+        largest_gains = loop_gain.max(axis=1)
+        unstable = np.flatnonzero(largest_gains >= 1.0)
         if len(unstable):
             last_stable = max(0, unstable[0] - 1)
-            stiffest = min(stiffest, float(stiffnesses[last_stable]))
+            stiffness = float(stiffnesses[last_stable])
+            stiffest = min(stiffest, stiffness)
     return stiffest

@@ -75,7 +75,8 @@ def book_leader_work(
         The work if the arm takes energy out, J, which is negative. Otherwise 0.
     """
     work = torque * step
-    now.sent[j].E_led[i] += max(work, 0.0)
+    input_J = max(work, 0.0)
+    now.sent[j].E_led[i] += input_J
     taken: float = min(work, 0.0)
     return taken
 
@@ -99,8 +100,9 @@ def observe_leader(law: Any, now: LawInput, j: int, i: int) -> None:
     sent = now.sent[j]
     received = now.received[j]
     known_energy = sent.W_led[i] if now.k > 0 else law.reserve_J
-    known_energy += received.E_followed[i] - law.E_known[index]
-    law.E_known[index] = received.E_followed[i]
+    reported_energy = received.E_followed[i]
+    known_energy += reported_energy - law.E_known[index]
+    law.E_known[index] = reported_energy
     if law.by_step:
         # The step of the previous period, which is known now.
         step = now.q[i] - now.q_before[i]
@@ -181,22 +183,28 @@ def limit_leader_torque(law: Any, now: LawInput, j: int, i: int) -> None:
     half = 0.5 * h * h
     if law.by_step:
         half *= AHEAD * AHEAD
-        step_per_torque = half * law.inverse[i * n + i] / law.beta
+        row = i * n
+        step_per_torque = half * law.inverse[row + i] / law.beta
         step_change = law.predicted_step[i] - step
         step = AHEAD * step + AHEAD**2 * step_change
         for m in range(n):
-            step += half * law.inverse[i * n + m] * law.torque_change[m]
+            inverse_inertia = law.inverse[row + m]
+            step += half * inverse_inertia * law.torque_change[m]
 
     # The step against the torque that the joint would make without this coupling's torque.
     current = law.F_now[index]
     current_step = step_per_torque * sign * current
-    free_step = half * law.acceleration_rad_s2 - sign * step - current_step
-    cost_J = magnitude * (free_step + step_per_torque * magnitude)
+    disturbance_step = half * law.acceleration_rad_s2
+    opposed_step = sign * step
+    free_step = disturbance_step - opposed_step - current_step
+    torque_step = step_per_torque * magnitude
+    cost_J = magnitude * (free_step + torque_step)
     if cost_J > available_J:
         # The magnitude whose cost is the available energy.
         if step_per_torque > 0.0:
-            square = free_step * free_step + 4.0 * step_per_torque * available_J
-            root = max(math.sqrt(square) - free_step, 0.0)
+            discriminant = free_step * free_step + 4.0 * step_per_torque * available_J
+            numerator = math.sqrt(discriminant) - free_step
+            root = max(numerator, 0.0)
             magnitude = root / (2.0 * step_per_torque)
         else:
             magnitude = available_J / free_step
@@ -209,11 +217,13 @@ def limit_leader_torque(law: Any, now: LawInput, j: int, i: int) -> None:
         squared_step = qd * law.predicted_step[i]
         if squared_step > 0.0:
             couplings = n * len(now.peers)
+            repaying_damping = 0.1 * deficit_J / squared_step
             largest_damping = 0.25 * h * AHEAD**2 / (couplings * step_per_torque)
-            damping = min(0.1 * deficit_J / squared_step, largest_damping)
+            damping = min(repaying_damping, largest_damping)
             torque += qd * damping
 
-    law.torque_change[i] -= (torque - current) / law.beta
+    coupling_change = torque - current
+    law.torque_change[i] -= coupling_change / law.beta
     law.F_now[index] = torque
 
 
@@ -237,7 +247,8 @@ def find_known_energy(law: Any, now: LawInput, j: int, i: int) -> float:
     moved_J = law.E_moved[index]
     yielded_J = law.E_yielded[index]
     received_J = now.received[j].E_led[i]
-    known_J: float = received_J + 0.5 * law.reserve_J - moved_J + yielded_J
+    half_reserve_J = 0.5 * law.reserve_J
+    known_J: float = received_J + half_reserve_J - moved_J + yielded_J
     return known_J
 
 
@@ -277,7 +288,8 @@ def limit_follower_velocity(
     law.v_led[index] = peer_velocity
     cost_J = max(force * peer_velocity * h, 0.0)
     remaining_J: float = known_J - cost_J
-    if law.controlled and remaining_J < 0.0 and abs(force) > _SLACK_NM:
+    has_force = abs(force) > _SLACK_NM
+    if law.controlled and remaining_J < 0.0 and has_force:
         law.v_led[index] += remaining_J / (force * h)
     return remaining_J
 
@@ -308,25 +320,32 @@ def compute_drift_velocity(
         The velocity, rad/s.
     """
     h = now.h_s
-    velocity = max(-law.drift_rad_s, min(law.drift_rad_s, error / h))
+    largest_velocity = law.drift_rad_s
+    bounded_above = min(largest_velocity, error / h)
+    velocity = max(-largest_velocity, bounded_above)
     sign = 1.0 if velocity > 0.0 else -1.0
     linear = law.force[i] * sign
     square = 0.0
     magnitude = abs(velocity)
     power = available_J / h
     if law.by_step:
+        B = law.B[i]
+        K = law.K[i]
         power = available_J / max(SPENT_S, h)
-        square = law.B[i] + 0.5 * law.K[i] * h
+        square = B + 0.5 * K * h
         for j in range(len(now.peers)):
             peer = now.peers[j]
-            linear += law.B[i] * peer.alpha * abs(peer.qd[i])
+            speed = abs(peer.qd[i])
+            linear += B * peer.alpha * speed
     # The largest magnitude with linear v + square v^2 <= power.
     if square > 0.0:
-        root = math.sqrt(linear * linear + 4.0 * square * power)
+        discriminant = linear * linear + 4.0 * square * power
+        root = math.sqrt(discriminant)
         magnitude = (root - linear) / (2.0 * square)
     elif linear > 0.0:
         magnitude = power / linear
-    return float(max(-magnitude, min(magnitude, velocity)))
+    affordable = min(magnitude, velocity)
+    return float(max(-magnitude, affordable))
 
 
 @compiled
@@ -397,7 +416,8 @@ def book_follower(
     yielded_J = force * (velocity - used_velocity) * h
     law.E_yielded[index] += yielded_J - drift
     known_J = now.received[j].E_led[i] + law.reserve_J
-    sent.W_followed[i] = known_J - law.E_moved[index] + law.E_yielded[index]
+    moved_J = law.E_moved[index]
+    sent.W_followed[i] = known_J - moved_J + law.E_yielded[index]
 
 
 @compiled
@@ -418,9 +438,11 @@ def charge_unpaid_energy(law: Any, now: LawInput, i: int, spring: float) -> None
         i: Index of the joint.
         spring: Energy in the joint's spring now, J.
     """
-    arm_step = now.q[i] - now.q_before[i] - law.alignment_step[i]
+    q_before = now.q_before[i]
+    arm_step = now.q[i] - q_before - law.alignment_step[i]
     arm_work = law.force[i] * arm_step
-    unpaid = arm_work + spring - law.spring[i] - law.paid[i]
+    spring_before = law.spring[i]
+    unpaid = arm_work + spring - spring_before - law.paid[i]
     for j in range(len(now.peers)):
         index = j * now.joints + i
         if law.by_step and now.k > 0:
@@ -428,7 +450,8 @@ def charge_unpaid_energy(law: Any, now: LawInput, i: int, spring: float) -> None
             charged = max(peer_part, -law.lent[index])
             law.E_moved[index] += charged
             law.lent[index] += charged
-        law.E_settled[index] = law.E_moved[index] - law.E_yielded[index]
+        moved_J = law.E_moved[index]
+        law.E_settled[index] = moved_J - law.E_yielded[index]
     law.spring[i] = spring
 
 
@@ -467,7 +490,8 @@ def settle_follower(
             spring_torque = law.K[i] * stretch
             damper_torque = law.B[i] * (velocity - now.qd[i])
             force = spring_torque + damper_torque
-            force = max(law.low[i], min(law.high[i], force))
+            bounded_above = min(law.high[i], force)
+            force = max(law.low[i], bounded_above)
             if force * drift_velocity * h > available_J:
                 drift_velocity = available_J / (force * h)
         velocity = drift_velocity
@@ -481,11 +505,14 @@ def settle_follower(
                     i=i,
                     force=force,
                 )
-            velocity += now.peers[j].alpha * law.v_led[index]
+            alpha = now.peers[j].alpha
+            velocity += alpha * law.v_led[index]
 
     for j in range(peers):
         # Each coupling pays for drift compensation in proportion to its remaining energy.
-        share = law.left_J[j * n + i] / available_J if available_J > 0.0 else 0.0
+        share = 0.0
+        if available_J > 0.0:
+            share = law.left_J[j * n + i] / available_J
         drift = share * force * drift_velocity * h
         peer_force = now.peers[j].alpha * force
         book_follower(
@@ -541,18 +568,21 @@ def follow_peers(law: Any, now: LawInput, i: int) -> None:
     # The motion of the offset in half a period.
     law.alignment_step[i] = 0.0
     if offset != 0.0:
-        law.alignment_step[i] = 0.5 * h * (now.qd_des[i] - velocity)
+        offset_rate = now.qd_des[i] - velocity
+        law.alignment_step[i] = 0.5 * h * offset_rate
 
     low = law.low[i]
     high = law.high[i]
     stretch = law.goal[i] + offset - now.q[i]
     spring_torque = K * stretch
     damper_torque = B * (velocity - now.qd[i])
-    force = max(low, min(high, spring_torque + damper_torque))
+    bounded_above = min(high, spring_torque + damper_torque)
+    force = max(low, bounded_above)
     # Beyond the torque limit the energy of the spring grows linearly with its elongation.
     spring_J = 0.0
     if K > 0.0:
-        limited_torque = max(low, min(high, spring_torque))
+        spring_bounded_above = min(high, spring_torque)
+        limited_torque = max(low, spring_bounded_above)
         mean_stretch = stretch - 0.5 * limited_torque / K
         spring_J = limited_torque * mean_stretch
     charge_unpaid_energy(law, now, i, spring_J)
@@ -583,7 +613,9 @@ def follow_peers(law: Any, now: LawInput, i: int) -> None:
         least_J = min(least_J, remaining_J)
 
     drift_velocity = 0.0
-    if law.drift_rad_s > 0.0 and available_J > 0.0 and least_J >= 0.0:
+    has_drift_control = law.drift_rad_s > 0.0
+    costs_are_covered = least_J >= 0.0
+    if has_drift_control and available_J > 0.0 and costs_are_covered:
         error = target - law.goal[i] - h * velocity
         drift_velocity = compute_drift_velocity(
             law=law,
@@ -674,7 +706,8 @@ class Tdpa(EnergyLaw):
         self.by_step = self.energy == "step"
         self.controlled = bool(self.controlled)
         self.floor = 0.5 * self.reserve_J if self.by_step else 0.0
-        self.tau_limit = (np.zeros(n) + facts.tau_limit_nm).tolist()
+        limits = np.zeros(n) + facts.tau_limit_nm
+        self.tau_limit = limits.tolist()
         self.goal = [0.0] * n
         self.predicted_step = [0.0] * n
         self.low = [0.0] * n
@@ -709,22 +742,26 @@ class Tdpa(EnergyLaw):
         peers = len(now.peers)
         invert_inertia(self, now)
         for i in range(n):
+            limit = self.tau_limit[i]
             self.torque_change[i] = self.carried[i] - now.tau_before[i]
-            self.carried[i] = self.gravity * now.gravity[i]
-            self.low[i] = self.beta * (-self.tau_limit[i] - self.carried[i])
-            self.high[i] = self.beta * (self.tau_limit[i] - self.carried[i])
-            self.predicted_step[i] = now.qd[i] * now.h_s
+            carried = self.gravity * now.gravity[i]
+            self.carried[i] = carried
+            self.low[i] = self.beta * (-limit - carried)
+            self.high[i] = self.beta * (limit - carried)
+            predicted_step = now.qd[i] * now.h_s
             if now.k > 0:
                 last_step = now.q[i] - now.q_before[i]
-                self.predicted_step[i] += self.predicted_step[i] - last_step
+                predicted_step += predicted_step - last_step
+            self.predicted_step[i] = predicted_step
             follow_peers(self, now, i)
             self.torque_change[i] += self.force[i] / self.beta
 
             for j in range(peers):
                 index = j * n + i
                 observe_leader(self, now, j, i)
-                self.F_now[index] = self.F_led[index]
-                self.torque_change[i] -= self.F_now[index] / self.beta
+                last_force = self.F_led[index]
+                self.F_now[index] = last_force
+                self.torque_change[i] -= last_force / self.beta
 
         for _ in range(SWEEPS):
             for i in range(n):
@@ -755,7 +792,8 @@ class Tdpa(EnergyLaw):
                         step=step,
                     )
                     now.sent[j].W_led[i] += taken
-            now.tau[i] = self.carried[i] + (force - applied) / self.beta
+            coupling_force = force - applied
+            now.tau[i] = self.carried[i] + coupling_force / self.beta
 
     def energies(self, seen: LawRecords) -> LawEnergies:
         """Computes the energies that show whether the law was passive in a run.
@@ -778,19 +816,25 @@ class Tdpa(EnergyLaw):
         for j, peer in enumerate(seen.peers):
             received = peer.received
             sent = peer.sent
-            followed = np.vstack([np.zeros(n), sent["E_followed"][:-1]])
-            gave.append(np.hstack([sent["E_led"], followed]))
-            columns = slice(j * n, (j + 1) * n)
+            followed = sent["E_followed"]
+            followed_before = np.vstack([np.zeros(n), followed[:-1]])
+            input_energies = np.hstack([sent["E_led"], followed_before])
+            gave.append(input_energies)
+            first = j * n
+            columns = slice(first, first + n)
             settled = seen.memory["E_settled"][:, columns]
             taken_by_follower = settled - self.reserve_J
             taken_by_leader = received["E_followed"] - sent["W_led"]
-            took.append(np.hstack([taken_by_follower, taken_by_leader]))
-            observed.append(np.hstack([sent["W_led"], sent["W_followed"]]))
+            output_energies = np.hstack([taken_by_follower, taken_by_leader])
+            took.append(output_energies)
+            known_energies = np.hstack([sent["W_led"], sent["W_followed"]])
+            observed.append(known_energies)
         coupling_torque = seen.tau - seen.memory["carried"]
+        work = sum_work(coupling_torque, seen.q)
         return LawEnergies(
             gave=gave,
             took=took,
-            port=-self.beta * sum_work(coupling_torque, seen.q),
+            port=-self.beta * work,
             store=seen.memory["spring"],
             observed=observed,
             weight=self.beta,
@@ -810,7 +854,8 @@ class Tdpa(EnergyLaw):
         Returns:
             A sentence for the user. Empty if K or B is not zero.
         """
-        return "" if any(self.K) or any(self.B) else "K = 0 and B = 0 follow nobody"
+        follows = any(self.K) or any(self.B)
+        return "" if follows else "K = 0 and B = 0 follow nobody"
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:  # noqa: ARG002
         """Evaluates whether the law keeps the session passive.
