@@ -238,10 +238,13 @@ class AdaptiveKinematics(ControlLaw):
             received = now.received[j]
             # Before its first sample, a peer counts as being at this arm's position, at rest.
             if peer.tick >= 0:
-                e_x += peer.alpha * (x - received.x[0])
-                e_y += peer.alpha * (y - received.x[1])
-                ed_x -= peer.alpha * received.xd[0]
-                ed_y -= peer.alpha * received.xd[1]
+                alpha = peer.alpha
+                distance_x = x - received.x[0]
+                distance_y = y - received.x[1]
+                e_x += alpha * distance_x
+                e_y += alpha * distance_y
+                ed_x -= alpha * received.xd[0]
+                ed_y -= alpha * received.xd[1]
 
         # The components of Kd ed across the links. J_hat' Kd ed sums them times the lengths.
         s1, c1 = sincos(q[0])
@@ -258,8 +261,10 @@ class AdaptiveKinematics(ControlLaw):
             link_rate = qd[0] + i * qd[1]
             rate = self.length_gain_m_n * across[i] * link_rate
             if now.k > 0:
-                length = self.lengths_m[i] + half_h * (self.rate_m_s[i] + rate)
-                self.lengths_m[i] = min(max(length, self.least_m), self.most_m)
+                rate_sum = self.rate_m_s[i] + rate
+                length = self.lengths_m[i] + half_h * rate_sum
+                bounded_below = max(length, self.least_m)
+                self.lengths_m[i] = min(bounded_below, self.most_m)
             self.rate_m_s[i] = rate
         l1 = self.lengths_m[0]
         l2 = self.lengths_m[1]
@@ -284,8 +289,11 @@ class AdaptiveKinematics(ControlLaw):
         a = _solve_jacobian(lengths, q, (a_x, a_y))
         r = (qd[0] - v[0], qd[1] - v[1])
 
-        now.tau[0] = -self.Kp[0] * r[0] - (l1 * across_1 + l2 * across_2)
-        now.tau[1] = -self.Kp[1] * r[1] - l2 * across_2
+        # J_hat' Kd ed
+        error_torque_2 = l2 * across_2
+        error_torque_1 = l1 * across_1 + error_torque_2
+        now.tau[0] = -self.Kp[0] * r[0] - error_torque_1
+        now.tau[1] = -self.Kp[1] * r[1] - error_torque_2
         first, second = regressor(
             g=self.g_m_s2,
             q=q,
@@ -297,7 +305,8 @@ class AdaptiveKinematics(ControlLaw):
             Yr = first[p] * r[0] + second[p] * r[1]
             if now.k > 0:
                 gain_s = half_h * self.Gamma[p]
-                self.theta_hat[p] -= gain_s * (self.Yr[p] + Yr)
+                Yr_sum = self.Yr[p] + Yr
+                self.theta_hat[p] -= gain_s * Yr_sum
             self.Yr[p] = Yr
             estimate = self.theta_hat[p]
             now.theta_hat[p] = estimate

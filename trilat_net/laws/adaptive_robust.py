@@ -77,7 +77,8 @@ class AdaptiveRobust(AdaptiveBox):
         width = np.array(self.width_rad_s)
         adaptive: Array = AdaptiveBox.compute_torque(self, Y, theta_hat, r, ed)
         uncompensated = (1.0 - self.friction) * joint_friction
-        robust = rho * (r / np.sqrt(r * r + width * width))
+        magnitude = np.sqrt(r * r + width * width)
+        robust = rho * (r / magnitude)
         torque: Array = adaptive - uncompensated - robust
         return torque
 
@@ -92,7 +93,11 @@ class AdaptiveRobust(AdaptiveBox):
                 them.
         """
         box = AdaptiveBox.gains(self, theta)
-        return box._replace(rho=self.rho_nm, width=self.width_rad_s, friction=(self.friction,))
+        return box._replace(
+            rho=self.rho_nm,
+            width=self.width_rad_s,
+            friction=(self.friction,),
+        )
 
     def condition(self, situation: LawSituation) -> StabilityCondition:
         """Evaluates which bound of the errors is proved for this law in a scenario.
@@ -134,4 +139,5 @@ class AdaptiveRobust(AdaptiveBox):
             site: Facts about the site for which the table is written.
         """
         width_rad_s = 10.0 * gains["rho_nm"] / gains["Kp"]
-        return {**AdaptiveBox.write_control(gains, site), "width_rad_s": width_rad_s}
+        control = AdaptiveBox.write_control(gains, site)
+        return {**control, "width_rad_s": width_rad_s}

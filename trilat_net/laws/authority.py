@@ -73,12 +73,15 @@ class Authority(ControlLaw):
         for i in range(now.joints):
             K = self.K[i]
             q = now.q[i]
+            gravity = self.gravity * now.gravity[i]
             damper = self.d[i] * now.qd[i]
-            tau = self.gravity * now.gravity[i] - damper
+            tau = gravity - damper
             for j in range(len(now.peers)):
                 peer = now.peers[j]
-                share = peer.alpha * now.received[j].leads[0]
-                tau += K * share * (peer.q[i] - q)
+                leads = now.received[j].leads[0]
+                share = peer.alpha * leads
+                distance = peer.q[i] - q
+                tau += K * share * distance
             now.tau[i] = tau
 
     def linear_gains(self, theta: Array) -> Gains | None:
@@ -105,10 +108,12 @@ class Authority(ControlLaw):
             situation: The site, its peers (the other sites) and their laws.
         """
         form = LinearForm(len(situation.inertia))
+        K = np.array(self.K)
         for j in situation.peers:
-            leads = float(getattr(situation.laws[j], "leads", False))
-            share = situation.alpha[situation.site, j] * leads
-            stiffness = share * np.array(self.K)
+            peer_leads = getattr(situation.laws[j], "leads", False)
+            alpha = situation.alpha[situation.site, j]
+            share = alpha * float(peer_leads)
+            stiffness = share * K
             form.add("tau", "q", -stiffness)
             form.add("tau", ("from", j), stiffness)
             form.add(("to", j), "q", 1.0)
@@ -145,11 +150,15 @@ class Authority(ControlLaw):
         Args:
             situation: The site, its peers (the other sites) and the delays between them.
         """
-        users = [n for n, law in enumerate(situation.laws) if getattr(law, "leads", False)]
+        users = []
+        for n, law in enumerate(situation.laws):
+            if getattr(law, "leads", False):
+                users.append(n)
         if situation.site not in users:
             text = "it follows and closes no loop: stable for every delay and d > 0"
             return StabilityCondition(True, text)
-        return judge_position_exchange(situation.restrict(users), "K", "d")
+        loop_of_users = situation.restrict(users)
+        return judge_position_exchange(loop_of_users, "K", "d")
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:

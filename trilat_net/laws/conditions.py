@@ -66,7 +66,9 @@ class LawSituation(NamedTuple):
 
         It is NaN if any of these delays varies.
         """
-        return float(np.max(self.delay_s[self.alpha > 0.0], initial=0.0))
+        is_followed = self.alpha > 0.0
+        delays_s = self.delay_s[is_followed]
+        return float(np.max(delays_s, initial=0.0))
 
     def restrict(self, sites: Sequence[int]) -> "LawSituation":
         """Returns the facts about the session as if only some of the sites took part.
@@ -183,7 +185,8 @@ def _judge_two_sites(
     alpha = situation.alpha
     effective_d = d - 0.5 * K * hold_s
     round_trip_s = float(situation.delay_s.sum()) + hold_s
-    coupling = alpha[0, 1] * alpha[1, 0] * K[0] * K[1]
+    shares = alpha[0, 1] * alpha[1, 0]
+    coupling = shares * K[0] * K[1]
     left_side = 4.0 * effective_d[0] * effective_d[1]
     right_side = round_trip_s**2 * coupling
     excess = float((left_side - right_side).min())
@@ -220,7 +223,8 @@ def _judge_several_sites(
     T = situation.longest_s
     hold_s = situation.hold_s
     delays_s = situation.delay_s[situation.alpha > 0.0]
-    gains_differ = np.ptp(K, axis=0).any() or np.ptp(d, axis=0).any()
+    stiffness_differs = np.ptp(K, axis=0).any()
+    gains_differ = stiffness_differs or np.ptp(d, axis=0).any()
     if gains_differ or np.ptp(delays_s):
         text = "known of more than two sites for one K, one d and one delay"
         return StabilityCondition(None, text)
@@ -234,7 +238,8 @@ def _judge_several_sites(
         common_share = _find_common_motion_share(2.0 * T / hold_s + 1.0)
     share = max(-least, common_share)
     hold_term = 0.5 * hold_s * K[0]
-    delay_term = share * K[0] * (T + 0.5 * hold_s)
+    effective_delay_s = T + 0.5 * hold_s
+    delay_term = share * K[0] * effective_delay_s
     bound = hold_term + delay_term
     holds = bool((d[0] > bound).all())
 
@@ -254,7 +259,8 @@ def _find_common_motion_share(count: float) -> float:
     Args:
         count: The number n.
     """
-    x = np.linspace(np.pi, 2.0 * np.pi, 1001)[1:-1] / count
+    angles = np.linspace(np.pi, 2.0 * np.pi, 1001)
+    x = angles[1:-1] / count
     ratio = np.sin(count * x) / (count * np.sin(x))
     return float(-ratio.min())
 

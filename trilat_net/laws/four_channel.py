@@ -60,8 +60,10 @@ def send_acceleration(law: Any, now: LawInput) -> None:
         for j in range(n):
             rows[first + j] = now.inertia[i][j]
         limit = law.limit[i]
-        applied = min(max(now.tau[i], -limit), limit)
-        rows[first + n] = applied - now.tau_x[i] - now.bias[i]
+        bounded_below = max(now.tau[i], -limit)
+        applied = min(bounded_below, limit)
+        tau_x = now.tau_x[i]
+        rows[first + n] = applied - tau_x - now.bias[i]
     # Gaussian elimination; M is positive definite, so pivoting is not needed.
     for column in range(n):
         pivot_row = column * width
@@ -70,12 +72,14 @@ def send_acceleration(law: Any, now: LawInput) -> None:
             first = i * width
             factor = rows[first + column] / pivot
             for j in range(column, width):
-                rows[first + j] -= factor * rows[pivot_row + j]
+                pivot_entry = rows[pivot_row + j]
+                rows[first + j] -= factor * pivot_entry
     for i in range(n - 1, -1, -1):
         first = i * width
         remainder = rows[first + n]
         for j in range(i + 1, n):
-            remainder -= rows[first + j] * qdd[j]
+            entry = rows[first + j]
+            remainder -= entry * qdd[j]
         qdd[i] = remainder / rows[first + i]
 
 
@@ -122,9 +126,11 @@ class FourChannel(ControlLaw):
             facts: Facts about the site that are known before the run.
         """
         self.needs_model = self.acceleration > 0.0
-        self.limit = (np.zeros(facts.joints) + facts.tau_limit_nm).tolist()
+        n = facts.joints
+        limits = np.zeros(n) + facts.tau_limit_nm
+        self.limit = limits.tolist()
         # The equations M qdd = torque, row by row: n entries of M and the torque.
-        self.rows = [0.0] * (facts.joints * (facts.joints + 1))
+        self.rows = [0.0] * (n * (n + 1))
 
     def torque(self, now: LawInput) -> None:
         """Computes the torque of the arm in one period of the control loop.
@@ -144,8 +150,10 @@ class FourChannel(ControlLaw):
         n = now.joints
         for i in range(n):
             gravity = self.gravity * now.gravity[i]
-            spring = self.K[i] * (now.q_des[i] - now.q[i])
-            damper = self.B[i] * (now.qd_des[i] - now.qd[i])
+            error = now.q_des[i] - now.q[i]
+            error_rate = now.qd_des[i] - now.qd[i]
+            spring = self.K[i] * error
+            damper = self.B[i] * error_rate
             peer_force = self.force_peer[i] * now.felt[i]
             local_force = self.force_own[i] * now.tau_x[i]
             tau = gravity + spring
@@ -199,10 +207,13 @@ class FourChannel(ControlLaw):
         """
         if not self.acceleration and not any(self.force_own):
             return None
-        form = LinearForm(len(situation.inertia), sends_acceleration=self.acceleration > 0.0)
+        joints = len(situation.inertia)
+        sends_acceleration = self.acceleration > 0.0
+        form = LinearForm(joints, sends_acceleration=sends_acceleration)
         form.add("tau", "tau_h", self.force_own)
         for j in situation.peers:
-            gain = self.acceleration * situation.alpha[situation.site, j]
+            alpha = situation.alpha[situation.site, j]
+            gain = self.acceleration * alpha
             form.add("tau", ("from", j), gain * situation.inertia)
             form.add(("to", j), "q", 0.0)
         return form

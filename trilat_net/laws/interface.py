@@ -246,7 +246,8 @@ class LawSettings(Frozen, frozen=True):
     @property
     def sends(self) -> SentVectorSpecs:
         """Vectors that the law sends to its peers, by name."""
-        return convert_sends(getattr(self.kind, "sends", {}), self.kind.__name__, "control")
+        sends = getattr(self.kind, "sends", {})
+        return convert_sends(sends, self.kind.__name__, "control")
 
     def build_factory(self, sites: int, scheme: str) -> UserLawFactory | None:
         """Returns a function that creates the law for one site before a run.
@@ -440,8 +441,9 @@ def _depends_on_gains(name: str, value: Any) -> bool:
         value: The function, property or class variable.
     """
     if inspect.isfunction(value) or isinstance(value, property):
-        is_of_instance = name in ("begin", "torque", "energies") or name.startswith("__")
-        return not is_of_instance
+        is_special = name.startswith("__")
+        needs_instance = name in ("begin", "torque", "energies")
+        return not (is_special or needs_instance)
     return name in LawSettings.__annotations__
 
 
@@ -541,7 +543,8 @@ def _check_site_count(kind: Any, code: str, path: str, sites: int) -> None:
         bounds = (2, sys.maxsize)
     elif isinstance(stated, int):
         bounds = (stated, stated)
-    is_pair = isinstance(bounds, tuple | list) and len(bounds) == 2
+    is_sequence = isinstance(bounds, tuple | list)
+    is_pair = is_sequence and len(bounds) == 2
     if not is_pair or not all(isinstance(bound, int) for bound in bounds):
         problem = (
             f"{code}: sites must be a number as in 2 or a range as in (2, 4), not {stated!r}"
@@ -567,11 +570,13 @@ def _find_written_attributes(kind: Any) -> list[str]:
             if not inspect.isfunction(function) or function.__name__ == "__init__":
                 continue
             source = textwrap.dedent(inspect.getsource(function))
-            for node in ast.walk(ast.parse(source)):
-                is_assigned = isinstance(getattr(node, "ctx", None), ast.Store)
-                if not is_assigned:
+            tree = ast.parse(source)
+            for node in ast.walk(tree):
+                context = getattr(node, "ctx", None)
+                if not isinstance(context, ast.Store):
                     continue
-                match = re.match(r"self\.(\w+)", ast.unparse(node))
+                target = ast.unparse(node)
+                match = re.match(r"self\.(\w+)", target)
                 if match:
                     written.append(match[1])
     return written

@@ -63,12 +63,15 @@ class SaturatedPd(ControlLaw):
         for i in range(now.joints):
             q = now.q[i]
             P = self.P[i]
+            gravity = self.gravity * now.gravity[i]
             damper = self.d[i] * now.qd[i]
-            tau = self.gravity * now.gravity[i] - damper
+            tau = gravity - damper
             for j in range(len(now.peers)):
                 peer = now.peers[j]
-                spring = self.K[i] * (q - peer.q[i])
-                tau -= peer.alpha * P * tanh(spring / P)
+                error = q - peer.q[i]
+                spring = self.K[i] * error
+                saturated = tanh(spring / P)
+                tau -= peer.alpha * P * saturated
             now.tau[i] = tau
 
     def linear_gains(self, theta: Array) -> Gains | None:

@@ -62,8 +62,11 @@ def build_channel(
     counts = {"joints": layout.joints, "coordinates": layout.shared}
     vectors = []
     for name, spec in sends.items():
-        length = spec.length if isinstance(spec.length, int) else counts[spec.length]
-        vectors.append(SentVector(name, spec.unit, length, spec.per_peer))
+        length = spec.length
+        if not isinstance(length, int):
+            length = counts[length]
+        vector = SentVector(name, spec.unit, length, spec.per_peer)
+        vectors.append(vector)
     common_first = sorted(vectors, key=lambda vector: vector.per_peer)
     return LawChannel(tuple(common_first), peers)
 
@@ -119,8 +122,8 @@ def _find_name_problem(name: str) -> str:
             "is not a valid name for a vector: the name must start with a letter, contain only "
             "letters, digits and _, have at most 24 characters, and not be a Python keyword"
         )
-    is_reserved = hasattr(np.record, name) or hasattr(tuple, name)
-    if is_reserved:
+    is_record_attribute = hasattr(np.record, name)
+    if is_record_attribute or hasattr(tuple, name):
         return (
             "is reserved, because every record of numbers has an attribute of that name: "
             "choose another name"
@@ -170,6 +173,7 @@ def read_sends(source: bytes, file: Path, code: str, path: str) -> SentVectorSpe
         names = {target.id for target in targets if isinstance(target, ast.Name)}
         if "sends" not in names:
             continue
+
         value = node.value
         location = f"{code}: sends in line {node.lineno} of {file.name}"
         try:

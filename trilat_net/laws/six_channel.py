@@ -43,10 +43,12 @@ class SixChannel(FourChannel):
             situation: The three sites and the dominance factors.
         """
         a = float(situation.alpha[2, 0])
-        if not np.allclose(situation.alpha, complementary_shares(a)):
+        expected_shares = complementary_shares(a)
+        if not np.allclose(situation.alpha, expected_shares):
             text = "the shares are not those of one factor: see six_channel in docs/laws.md"
             return StabilityCondition(False, text)
-        beta = ", ".join(f"{weight:.4g}" for weight in complementary_weights(a))
+        weights = complementary_weights(a)
+        beta = ", ".join(f"{weight:.4g}" for weight in weights)
         condition = FourChannel.condition(self, situation)
         text = f"factor a = {a:g}, weights beta = ({beta}); "
         if condition is None:

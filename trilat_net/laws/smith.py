@@ -106,13 +106,17 @@ class Smith(ControlLaw):
                 goal = peer_q
                 now.to_all.w[i] = q - x
 
+            gravity = self.gravity * now.gravity[i]
             spring = K * (q - goal)
             damper = d * now.qd[i]
-            now.tau[i] = self.gravity * now.gravity[i] - spring - damper
+            now.tau[i] = gravity - spring - damper
 
-            model_torque = K * (master_q - x) - d * self.xd[i]
+            xd = self.xd[i]
+            model_spring = K * (master_q - x)
+            model_damper = d * xd
+            model_torque = model_spring - model_damper
             acceleration = model_torque / self.inertia[i]
-            self.x[i] += h * self.xd[i] + 0.5 * h * h * acceleration
+            self.x[i] += h * xd + 0.5 * h * h * acceleration
             self.xd[i] += h * acceleration
 
     def linear_gains(self, theta: Array) -> Gains | None:
@@ -146,7 +150,8 @@ class Smith(ControlLaw):
         d = np.array(self.d)
         inertia = np.array(self.inertia)
         master_q = "q" if self.predicts else "q_des"
-        form = LinearForm(len(situation.inertia), ("x", "xd"))
+        joints = len(situation.inertia)
+        form = LinearForm(joints, ("x", "xd"))
         form.add("x", "xd", 1.0)
         form.add("xd", "x", -K / inertia)
         form.add("xd", "xd", -d / inertia)
@@ -156,8 +161,9 @@ class Smith(ControlLaw):
             form.add("tau", "x", K)
             form.add("tau", ("from", peer), K)
         else:
-            form.add(("to", peer), "q", 1.0)
-            form.add(("to", peer), "x", -1.0)
+            sent = ("to", peer)
+            form.add(sent, "q", 1.0)
+            form.add(sent, "x", -1.0)
         return form
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
@@ -177,7 +183,8 @@ class Smith(ControlLaw):
             return StabilityCondition(False, "one of the two sites has predicts = true")
         for law in laws:
             for key in ("K", "d", "inertia"):
-                if getattr(law, key, None) != getattr(self, key):
+                gain = getattr(law, key, None)
+                if gain != getattr(self, key):
                     text = "K, d and inertia must be equal at both sites"
                     return StabilityCondition(False, text)
         text = (

@@ -97,8 +97,10 @@ class Sync(ControlLaw):
         a = (-Lambda_1 * qd[0], -Lambda_2 * qd[1])
         r = (qd[0] - v[0], qd[1] - v[1])
         for i in range(2):
-            peer_output = now.qd_des[i] + self.Lambda[i] * now.q_des[i]
-            now.tau[i] = self.K[i] * (peer_output - r[i])
+            position_part = self.Lambda[i] * now.q_des[i]
+            peer_output = now.qd_des[i] + position_part
+            disagreement = peer_output - r[i]
+            now.tau[i] = self.K[i] * disagreement
         first, second = regressor(
             g=self.g_m_s2,
             q=q,
@@ -110,7 +112,8 @@ class Sync(ControlLaw):
             Yr = first[p] * r[0] + second[p] * r[1]
             if now.k > 0:
                 gain_s = half_h * self.Gamma[p]
-                self.theta_hat[p] -= gain_s * (self.Yr[p] + Yr)
+                Yr_sum = self.Yr[p] + Yr
+                self.theta_hat[p] -= gain_s * Yr_sum
             self.Yr[p] = Yr
             estimate = self.theta_hat[p]
             now.theta_hat[p] = estimate

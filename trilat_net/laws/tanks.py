@@ -125,7 +125,10 @@ class Tanks(EnergyLaw):
             qd = now.qd[i]
             error = now.q[i] - now.q_des[i]
             error_rate = qd - now.qd_des[i]
-            tau = -self.K[i] * error - self.Kd[i] * error_rate - self.d[i] * qd
+            spring = -self.K[i] * error
+            error_damper = self.Kd[i] * error_rate
+            damper = self.d[i] * qd
+            tau = spring - error_damper - damper
             now.tau[i] = tau
             power += tau * qd
             torque_sum += abs(tau)
@@ -134,14 +137,19 @@ class Tanks(EnergyLaw):
         damping = 0.0
         if self.guarded:
             # The largest work of the transparency layer's torque in the coming period.
-            cost = abs(power) * now.h_s + torque_sum * self.extra_step
+            predicted_work = abs(power) * now.h_s
+            acceleration_work = torque_sum * self.extra_step
+            cost = predicted_work + acceleration_work
             affordable = 0.0 if H <= 0.0 else min(1.0, H / max(cost, H))
-            damping = self.fill_nm_s_rad_J * max(self.level_J - H, 0.0)
+            lacking_J = max(self.level_J - H, 0.0)
+            damping = self.fill_nm_s_rad_J * lacking_J
 
         for i in range(n):
             carried = self.gravity * now.gravity[i]
             self.carried[i] = carried
-            now.tau[i] = carried + affordable * now.tau[i] - damping * now.qd[i]
+            coupling_torque = affordable * now.tau[i]
+            damper = damping * now.qd[i]
+            now.tau[i] = carried + coupling_torque - damper
 
     def energies(self, seen: LawRecords) -> LawEnergies:
         """Computes the energies that show whether the law was passive in a run.
