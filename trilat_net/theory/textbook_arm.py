@@ -73,14 +73,17 @@ def _build_inertia_units() -> Numbers:
     A link's inertia is linear in its parameters: mass, first moments, second moments.
     """
     units = np.zeros((LINK_PARAMETERS, 6, 6))
-    units[0, :3, :3] = np.eye(3)
-    for n in range(3):
-        cross = build_cross_matrix(np.eye(3)[n])
-        units[1 + n, :3, 3:] = -cross
-        units[1 + n, 3:, :3] = cross
+    mass = units[0]
+    mass[:3, :3] = np.eye(3)
+    for n, axis in enumerate(np.eye(3)):
+        cross = build_cross_matrix(axis)
+        first_moment = units[1 + n]
+        first_moment[:3, 3:] = -cross
+        first_moment[3:, :3] = cross
     for n, (row, column) in enumerate(_INERTIA_ENTRIES):
+        second_moment = units[4 + n]
         # the angular half of a spatial inertia begins at index 3
-        angular = units[4 + n, 3:, 3:]
+        angular = second_moment[3:, 3:]
         angular[row, column] = 1.0
         angular[column, row] = 1.0
     return units
@@ -94,12 +97,14 @@ def _cross_motion(V: Numbers) -> Numbers:
 
     The matrix of V x* for forces is minus its transpose.
     """
+    linear = V[:3]
+    angular = V[3:]
     columns = V.shape[1:]
     matrix = np.zeros((6, 6, *columns), V.dtype)
-    rotation = build_cross_matrix(V[3:])
+    rotation = build_cross_matrix(angular)
     matrix[:3, :3] = rotation
     matrix[3:, 3:] = rotation
-    matrix[:3, 3:] = build_cross_matrix(V[:3])
+    matrix[:3, 3:] = build_cross_matrix(linear)
     return matrix
 
 
@@ -116,7 +121,8 @@ def _transpose(a: Numbers) -> Numbers:
 
 def _repeat_columns(vector: Numbers, columns: tuple[int, ...]) -> Numbers:
     """Returns an array of shape (*vector.shape, *columns) that repeats `vector`."""
-    repeated: Numbers = np.multiply.outer(vector, np.ones(columns))
+    ones = np.ones(columns)
+    repeated: Numbers = np.multiply.outer(vector, ones)
     return repeated
 
 
@@ -167,16 +173,18 @@ class PlacedChain:
         self._columns = q.shape[1:]
         self._links: list[PlacedLink] = []
 
-        J = np.zeros((6, len(q), *self._columns))
-        R_base = _repeat_columns(np.eye(3), self._columns)
-        place_m = np.zeros((3, *self._columns))
+        joints = len(q)
+        columns = self._columns
+        J = np.zeros((6, joints, *columns))
+        R_base = _repeat_columns(np.eye(3), columns)
+        place_m = np.zeros((3, *columns))
         for i, joint in enumerate(chain.joints):
             R, p = _place_joint(joint, q[i])
 
             X = _transform_velocities(R, p)
             S = _find_joint_axis(joint)
             J = _multiply(X, J)
-            J[:, i] += _add_axes(S, (6,), len(self._columns))
+            J[:, i] += _add_axes(S, (6,), len(columns))
             offset_m = multiply_columns(R_base, p)
             place_m = place_m + offset_m
             R_base = _multiply(R_base, R)
@@ -192,8 +200,10 @@ class PlacedChain:
 
     def _get_per_joint(self, name: str) -> Numbers:
         """Returns an attribute of every joint, shape (n, 1, ...)."""
-        values = np.array([getattr(joint, name) for joint in self._chain.joints])
-        return _add_axes(values, (-1,), len(self._columns))
+        joints = self._chain.joints
+        column_axes = len(self._columns)
+        values = np.array([getattr(joint, name) for joint in joints])
+        return _add_axes(values, (-1,), column_axes)
 
     def regressor_matrix(self, qd: Numbers, v: Numbers, a: Numbers) -> Numbers:
         """Computes the regressor Y, the matrix that multiplies an arm's parameters.
@@ -221,8 +231,10 @@ class PlacedChain:
             W_cross = _cross_motion(W)
             S_a = np.multiply.outer(link.S, a[i])
             S_v = np.multiply.outer(link.S, v[i])
-            A = multiply_columns(link.X, A) + S_a
-            A = A + multiply_columns(V_cross, S_v)
+            A_before = multiply_columns(link.X, A)
+            velocity_product = multiply_columns(V_cross, S_v)
+            A = A_before + S_a
+            A = A + velocity_product
 
             I_A = _multiply_inertia_units(A)
             I_V = _multiply_inertia_units(V)
@@ -234,7 +246,8 @@ class PlacedChain:
             minus_W_force = _multiply(_transpose(W_cross), I_V)
             cross_terms = minus_V_force + minus_W_force + I_VW
             F = I_A - 0.5 * cross_terms
-            block = _multiply(_transpose(link.J), F)
+            J_transposed = _transpose(link.J)
+            block = _multiply(J_transposed, F)
             blocks.append(block)
         return np.concatenate(blocks, axis=1)
 
@@ -258,7 +271,8 @@ class PlacedChain:
         """
         Y = self.regressor_matrix(qd, v, a)
         links = multiply_columns(Y, theta)
-        drives = self._get_per_joint("armature_kg_m2") * a
+        armatures = self._get_per_joint("armature_kg_m2")
+        drives = armatures * a
         friction = self.friction_torque(v)
         torque: Numbers = links + drives + friction
         return torque
@@ -272,11 +286,13 @@ class PlacedChain:
         Returns:
             Torque, shape (n, ...), with the sign of the velocity.
         """
-        viscous = self._get_per_joint("viscous") * v
+        viscous_damping = self._get_per_joint("viscous")
+        coulomb_torque = self._get_per_joint("coulomb")
+        viscous = viscous_damping * v
         # a smooth sign of the speed
         x = v / COULOMB_SPEED
         root = np.sqrt(1.0 + x * x)
-        coulomb = self._get_per_joint("coulomb") * x / root
+        coulomb = coulomb_torque * x / root
         return viscous + coulomb
 
     def gravity_torque(self, theta: Numbers) -> Numbers:
@@ -295,13 +311,16 @@ class PlacedChain:
             theta: Dynamic parameters of the links, shape (10 n, ...).
         """
         armatures = [joint.armature_kg_m2 for joint in self._chain.joints]
-        M = _repeat_columns(np.diag(armatures), self._columns)
+        drives = np.diag(armatures)
+        M = _repeat_columns(drives, self._columns)
         for i, link in enumerate(self._links):
             first = LINK_PARAMETERS * i
             parameters = theta[first : first + LINK_PARAMETERS]
             inertia = np.einsum("pab,p...->ab...", _INERTIA_UNITS, parameters)
             momentum = _multiply(inertia, link.J)
-            M = M + _multiply(_transpose(link.J), momentum)
+            J_transposed = _transpose(link.J)
+            link_inertia = _multiply(J_transposed, momentum)
+            M = M + link_inertia
         return M
 
     def joint_acceleration(self, theta: Numbers, qd: Numbers, torque: Numbers) -> Numbers:
@@ -315,10 +334,12 @@ class PlacedChain:
             qd: Joint velocities, shape (n, ...).
             torque: Torque of controller, operator and environment, shape (n, ...), in N m.
         """
-        bias = self.required_torque(theta, qd, qd, np.zeros_like(qd))
+        no_acceleration = np.zeros_like(qd)
+        bias = self.required_torque(theta, qd, qd, no_acceleration)
         applied = torque + self._compute_stop_torque(qd)
         M = self.inertia_matrix(theta)
-        return solve_columns(M, applied - bias)
+        net_torque = applied - bias
+        return solve_columns(M, net_torque)
 
     def _compute_stop_torque(self, qd: Numbers) -> Numbers:
         """Returns the torque of the joints' end stops, springs with dampers, shape (n, ...)."""
@@ -328,13 +349,17 @@ class PlacedChain:
         total: Numbers = np.zeros_like(q)
         for name, sign in (("lower", 1.0), ("upper", -1.0)):
             limit = self._get_per_joint(name)
-            is_beyond = sign * (limit - q.real) > 0.0
+            depth = sign * (limit - q.real)
+            is_beyond = depth > 0.0
             stop_position = np.where(is_beyond, limit, 0.0)
             spring = stiffness * (stop_position - q)
-            push = spring - damping * qd
+            damper = damping * qd
+            push = spring - damper
             # a stop pushes and never pulls
-            pushes_back = is_beyond & (sign * push.real > 0.0)
-            total = total + np.where(pushes_back, push, 0.0)
+            points_back = sign * push.real > 0.0
+            pushes_back = is_beyond & points_back
+            stop_torque = np.where(pushes_back, push, 0.0)
+            total = total + stop_torque
         return total
 
     def end_effector_position(self) -> Numbers:
@@ -342,7 +367,8 @@ class PlacedChain:
         last = self._links[-1]
         tip_m = np.array(self._chain.tip_m)
         tip = _repeat_columns(tip_m, self._columns)
-        return last.place_m + multiply_columns(last.R_base, tip)
+        tip_offset_m = multiply_columns(last.R_base, tip)
+        return last.place_m + tip_offset_m
 
     def end_effector_orientation(self) -> Numbers:
         """Returns the orientation of the end effector in the base, shape (3, 3, ...)."""
@@ -363,7 +389,8 @@ class PlacedChain:
 
         Its axes are those of the base, and its shape is (6, n, ...).
         """
-        return self._move_to_tip(self._links[-1].J)
+        last = self._links[-1]
+        return self._move_to_tip(last.J)
 
     def pose_jacobian_rate(self, qd: Numbers) -> Numbers:
         """Returns the time derivative of the end effector's Jacobian during a motion.
@@ -379,18 +406,23 @@ class PlacedChain:
         """
         last = self._links[-1]
         V_last = multiply_columns(last.J, qd)
-        rate = np.zeros(last.J.shape, np.result_type(last.J, qd))
+        number_type = np.result_type(last.J, qd)
+        rate = np.zeros(last.J.shape, number_type)
+        columns = qd.shape[1:]
         for k, link in enumerate(self._links):
             rate = _multiply(link.X, rate)
             V = multiply_columns(link.J, qd)
             V_cross = _cross_motion(V)
-            S = _repeat_columns(link.S, qd.shape[1:])
-            rate[:, k] += multiply_columns(V_cross, S)
+            S = _repeat_columns(link.S, columns)
+            axis_rate = multiply_columns(V_cross, S)
+            rate[:, k] += axis_rate
         V_last_cross = _cross_motion(V_last)
-        rate = rate - _multiply(V_last_cross, last.J)
+        frame_motion = _multiply(V_last_cross, last.J)
+        rate = rate - frame_motion
         rate = self._move_to_tip(rate)
 
-        angular_velocity = multiply_columns(last.R_base, V_last[3:])
+        link_angular_velocity = V_last[3:]
+        angular_velocity = multiply_columns(last.R_base, link_angular_velocity)
         spin = build_cross_matrix(angular_velocity)
         J = self.pose_jacobian()
         linear = _multiply(spin, J[:3])
@@ -401,11 +433,14 @@ class PlacedChain:
     def _move_to_tip(self, columns: Numbers) -> Numbers:
         """Returns spatial velocities of the last link at the tip and along base axes."""
         R = self._links[-1].R_base
-        tip_cross = build_cross_matrix(np.array(self._chain.tip_m))
+        tip_m = np.array(self._chain.tip_m)
+        tip_cross = build_cross_matrix(tip_m)
         angular = columns[3:]
         lever_term = np.einsum("ab,bn...->an...", tip_cross, angular)
         linear = columns[:3] - lever_term
-        return np.concatenate([_multiply(R, linear), _multiply(R, angular)])
+        base_linear = _multiply(R, linear)
+        base_angular = _multiply(R, angular)
+        return np.concatenate([base_linear, base_angular])
 
 
 def _multiply_inertia_units(motion: Numbers) -> Numbers:
@@ -422,9 +457,11 @@ def _transform_velocities(R: Numbers, p: Numbers) -> Numbers:
         p: Origin of the link in that frame, shape (3, ...), in m.
     """
     R_transposed = _transpose(R)
-    lever = _multiply(R_transposed, build_cross_matrix(p))
+    p_cross = build_cross_matrix(p)
+    lever = _multiply(R_transposed, p_cross)
     columns = p.shape[1:]
-    X = np.zeros((6, 6, *columns), np.result_type(R, p))
+    number_type = np.result_type(R, p)
+    X = np.zeros((6, 6, *columns), number_type)
     X[:3, :3] = R_transposed
     X[3:, 3:] = R_transposed
     X[:3, 3:] = -lever
@@ -456,14 +493,18 @@ def _place_joint(joint: ChainJoint, q: Numbers) -> tuple[Numbers, Numbers]:
     R_0 = np.array(joint.rotation)
     axis = np.array(joint.axis)
     columns = np.shape(q)
+    origin_m = np.array(joint.origin_m)
     R = _repeat_columns(R_0, columns)
-    p = _repeat_columns(np.array(joint.origin_m), columns)
+    p = _repeat_columns(origin_m, columns)
     if joint.prismatic:
-        shift = np.multiply.outer(R_0 @ axis, q)
+        direction = R_0 @ axis
+        shift = np.multiply.outer(direction, q)
         return R, p + shift
     K = build_cross_matrix(axis)
-    sine_term = np.multiply.outer(R_0 @ K, np.sin(q))
-    cosine_term = np.multiply.outer(R_0 @ K @ K, 1.0 - np.cos(q))
+    R_0_K = R_0 @ K
+    sine_term = np.multiply.outer(R_0_K, np.sin(q))
+    cosine_factor = 1.0 - np.cos(q)
+    cosine_term = np.multiply.outer(R_0_K @ K, cosine_factor)
     return R + sine_term + cosine_term, p
 
 
@@ -483,18 +524,25 @@ def rotation_from_vector(vector: Numbers) -> Numbers:
     """
     square = np.sum(vector * vector, axis=0)
     is_small = square.real < _SMALL
-    angle = np.sqrt(np.where(is_small, 1.0, square))
-    # sin(x) / x and (1 - cos(x)) / x^2
-    sine_series = 1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0))
-    cosine_series = 0.5 - square / 24.0 * (1.0 - square / 30.0 * (1.0 - square / 56.0))
+    regular_square = np.where(is_small, 1.0, square)
+    angle = np.sqrt(regular_square)
+    # sin(x) / x and (1 - cos(x)) / x^2, with the inner factors of their series
+    sine_inner = 1.0 - square / 20.0 * (1.0 - square / 42.0)
+    cosine_inner = 1.0 - square / 30.0 * (1.0 - square / 56.0)
+    sine_series = 1.0 - square / 6.0 * sine_inner
+    cosine_series = 0.5 - square / 24.0 * cosine_inner
     sine_quotient = np.sin(angle) / angle
-    cosine_quotient = (1.0 - np.cos(angle)) / angle**2
+    versine = 1.0 - np.cos(angle)
+    cosine_quotient = versine / angle**2
     sine_factor = np.where(is_small, sine_series, sine_quotient)
     cosine_factor = np.where(is_small, cosine_series, cosine_quotient)
     K = build_cross_matrix(vector)
     K_squared = _multiply(K, K)
-    identity = _add_axes(np.eye(3), (3, 3), vector.ndim - 1)
-    rotation: Numbers = identity + sine_factor * K + cosine_factor * K_squared
+    column_axes = vector.ndim - 1
+    identity = _add_axes(np.eye(3), (3, 3), column_axes)
+    sine_term = sine_factor * K
+    cosine_term = cosine_factor * K_squared
+    rotation: Numbers = identity + sine_term + cosine_term
     return rotation
 
 
@@ -511,25 +559,31 @@ def vector_from_rotation(R: Numbers) -> Numbers:
     v = quaternion[1:]
     square = np.sum(v * v, axis=0)
     is_small = square.real < _SMALL
-    sine = np.sqrt(np.where(is_small, 1.0, square))
+    regular_square = np.where(is_small, 1.0, square)
+    sine = np.sqrt(regular_square)
 
     # series of 2 atan(t) / sine, with t = tan(angle / 2)
     small_w = np.where(is_small, w, 1.0)
     small_square = np.where(is_small, square, 0.0)
     t_square = small_square / small_w**2
-    series = 1.0 - t_square * (1.0 / 3.0 - t_square * (1.0 / 5.0 - t_square / 7.0))
+    series_tail = 1.0 / 5.0 - t_square / 7.0
+    series_inner = 1.0 / 3.0 - t_square * series_tail
+    series = 1.0 - t_square * series_inner
     small_factor = 2.0 / small_w * series
 
     # the arctangent of a ratio of at most 1, so that no part of it divides by zero
     is_below = sine.real <= w.real
     nonzero_w = np.where(w == 0.0, 1.0, w)
     divisor = np.where(is_below, nonzero_w, sine)
-    ratio = np.where(is_below, sine, w) / divisor
+    dividend = np.where(is_below, sine, w)
+    ratio = dividend / divisor
     arctangent = np.arctan(ratio)
-    half_angle = np.where(is_below, arctangent, 0.5 * np.pi - arctangent)
+    complement = 0.5 * np.pi - arctangent
+    half_angle = np.where(is_below, arctangent, complement)
 
-    factor = 2.0 * half_angle / sine
-    vector: Numbers = np.where(is_small, small_factor, factor) * v
+    large_factor = 2.0 * half_angle / sine
+    factor = np.where(is_small, small_factor, large_factor)
+    vector: Numbers = factor * v
     return vector
 
 
@@ -552,12 +606,17 @@ def _find_quaternion(R: Numbers) -> Numbers:
     xz = R[0, 2] + R[2, 0]
     yz = R[1, 2] + R[2, 1]
 
+    # four times the squares of w, x, y and z
+    square_w = 1.0 + xx + yy + zz
+    square_x = 1.0 + xx - yy - zz
+    square_y = 1.0 - xx + yy - zz
+    square_z = 1.0 - xx - yy + zz
     products = np.array(
         [
-            [1.0 + xx + yy + zz, x, y, z],
-            [x, 1.0 + xx - yy - zz, xy, xz],
-            [y, xy, 1.0 - xx + yy - zz, yz],
-            [z, xz, yz, 1.0 - xx - yy + zz],
+            [square_w, x, y, z],
+            [x, square_x, xy, xz],
+            [y, xy, square_y, yz],
+            [z, xz, yz, square_z],
         ]
     )
 
@@ -615,16 +674,21 @@ def evaluate_reference(shares: Array, site_pose: Numbers, shared: Sequence[Numbe
     if len(site_pose) == POSITION:
         return np.asarray(position)
 
-    R = rotation_from_vector(site_pose[POSITION:])
+    site_rotation = site_pose[POSITION:]
+    R = rotation_from_vector(site_rotation)
     weighted = []
     for share, pose in followed:
-        R_peer = rotation_from_vector(pose[POSITION:])
-        weighted.append(share * relative_rotation_vector(R_peer, R))
+        peer_rotation = pose[POSITION:]
+        R_peer = rotation_from_vector(peer_rotation)
+        rotation = relative_rotation_vector(R_peer, R)
+        weighted.append(share * rotation)
     difference = np.asarray(sum(weighted))
-    reference = _multiply(rotation_from_vector(-difference), R)
+    turn_back = rotation_from_vector(-difference)
+    reference = _multiply(turn_back, R)
     # zero times the site's pose gives the position the same number of columns
     columns = np.asarray(position) + 0.0 * site_pose[:POSITION]
-    return np.concatenate([columns, vector_from_rotation(reference)])
+    orientation = vector_from_rotation(reference)
+    return np.concatenate([columns, orientation])
 
 
 class Following(NamedTuple):
@@ -672,7 +736,8 @@ class Following(NamedTuple):
         """
         if self.J is None:
             return force
-        return multiply_columns(_transpose(self.J), force)
+        J_transposed = _transpose(self.J)
+        return multiply_columns(J_transposed, force)
 
     def from_joints(self, torque: Numbers) -> Numbers:
         """Converts a joint torque to the corresponding force on the end effector.
@@ -739,7 +804,8 @@ def share_pose(task: TaskSetup, arm: PlacedChain) -> Numbers:
     if len(task.axes) == POSITION:
         return position
     orientation = arm.end_effector_orientation()
-    return np.concatenate([position, vector_from_rotation(orientation)])
+    rotation = vector_from_rotation(orientation)
+    return np.concatenate([position, rotation])
 
 
 def follow_in_task(
@@ -777,11 +843,14 @@ def follow_in_task(
 
     scales = np.array([task.scale] * POSITION + [1.0] * POSITION)
     scale_rows = _add_axes(scales[:m], (m, 1), column_axes)
-    full_J = scale_rows * arm.pose_jacobian()[:m]
-    full_J_rate = scale_rows * arm.pose_jacobian_rate(qd)[:m]
+    unscaled_J = arm.pose_jacobian()[:m]
+    unscaled_J_rate = arm.pose_jacobian_rate(qd)[:m]
+    full_J = scale_rows * unscaled_J
+    full_J_rate = scale_rows * unscaled_J_rate
     xd = multiply_columns(full_J, qd)
 
-    axes = _add_axes(np.array(task.axes), (m,), column_axes)
+    task_axes = np.array(task.axes)
+    axes = _add_axes(task_axes, (m,), column_axes)
     e = axes * _subtract_poses(x, x_des)
     ed = axes * (xd - xd_des)
     axis_rows = axes[:, np.newaxis]
@@ -791,7 +860,8 @@ def follow_in_task(
 
     preferred = np.array(task.posture or site.q0)
     posture = _add_axes(preferred, (-1,), column_axes)
-    psi = -task.posture_rate * (q - posture)
+    posture_error = q - posture
+    psi = -task.posture_rate * posture_error
     psi_d = -task.posture_rate * qd
     v, a = find_task_reference(
         J=J,
@@ -820,8 +890,10 @@ def _subtract_poses(x: Numbers, x_des: Numbers) -> Numbers:
         return e
     # zero times x gives x_des the same number of columns
     columns_of_x_des = x_des + 0.0 * x
-    R = rotation_from_vector(x[POSITION:])
-    R_des = rotation_from_vector(columns_of_x_des[POSITION:])
+    rotation = x[POSITION:]
+    desired_rotation = columns_of_x_des[POSITION:]
+    R = rotation_from_vector(rotation)
+    R_des = rotation_from_vector(desired_rotation)
     turn = relative_rotation_vector(R_des, R)
     return np.concatenate([e[:POSITION], turn])
 
@@ -843,7 +915,8 @@ def _damp(task: TaskSetup, J: Numbers) -> tuple[Numbers, float]:
     # ones on the diagonal of the axes that are not followed keep the matrix regular
     is_free = 1.0 - np.array(task.axes)
     free_axes = _add_axes(np.diag(is_free), (m, m), column_axes)
-    A = np.einsum("an...,bn...->ab...", J, J) + free_axes
+    J_J_transposed = np.einsum("an...,bn...->ab...", J, J)
+    A = J_J_transposed + free_axes
     A_followed = A[followed][:, followed]
     # NumPy expects matrices on the last two axes
     matrices = np.moveaxis(A_followed, (0, 1), (-2, -1))
@@ -856,6 +929,8 @@ def _damp(task: TaskSetup, J: Numbers) -> tuple[Numbers, float]:
     inverse_trace = np.trace(inverses, axis1=-2, axis2=-1)
     bound = 1.0 / inverse_trace
     limit = task.singular_value**2
-    damping = np.where(bound.real < limit, limit - bound, 0.0)
+    is_damped = bound.real < limit
+    damping = np.where(is_damped, limit - bound, 0.0)
     identity = _add_axes(np.eye(m), (m, m), column_axes)
-    return A + damping * identity, float(bound.real.min())
+    least_bound = float(bound.real.min())
+    return A + damping * identity, least_bound
