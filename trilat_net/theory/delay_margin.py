@@ -156,8 +156,10 @@ def set_common_delay(loop: LinearLoop, delay_s: float) -> LinearLoop:
     """
     if not loop.delayed:
         return loop
-    delayed_A = np.sum([term.A for term in loop.delayed], axis=0)
-    delayed_B = np.sum([term.B for term in loop.delayed], axis=0)
+    state_matrices = [term.A for term in loop.delayed]
+    input_matrices = [term.B for term in loop.delayed]
+    delayed_A = np.sum(state_matrices, axis=0)
+    delayed_B = np.sum(input_matrices, axis=0)
     if delay_s == 0.0:
         A = loop.A + delayed_A
         B = loop.B + delayed_B
@@ -187,7 +189,8 @@ def find_delay_margin(loop: LinearLoop) -> DelayMargin:
     delays_s = [crossing.delay_s for crossing in crossings]
     first_s = min(delays_s, default=0.2)
     start_s = 0.5 * min(first_s, 0.2)
-    unstable_roots = _count_unstable_roots(set_common_delay(loop, start_s))
+    start_loop = set_common_delay(loop, start_s)
+    unstable_roots = _count_unstable_roots(start_loop)
 
     # Walk through the crossings. Each one may end or begin a stable interval.
     intervals: list[DelayInterval] = []
@@ -248,7 +251,8 @@ def find_axis_crossings(loop: LinearLoop) -> tuple[list[AxisCrossing], bool]:
         every frequency, so that roots are on the axis for every delay. There are no crossings
         then.
     """
-    pencil, *_ = characteristic_roots.find_moving_part(set_common_delay(loop, 1.0))
+    common_loop = set_common_delay(loop, 1.0)
+    pencil, *_ = characteristic_roots.find_moving_part(common_loop)
     if not len(pencil.delays):
         return [], False
     with characteristic_roots.limit_blas_threads():
@@ -264,7 +268,8 @@ def find_axis_crossings(loop: LinearLoop) -> tuple[list[AxisCrossing], bool]:
         is_outside = moduli > _OUTSIDE
         counts = is_outside.sum(axis=1)
         crossings = []
-        for n in np.flatnonzero(np.diff(counts)):
+        changes = np.diff(counts)
+        for n in np.flatnonzero(changes):
             low = float(grid[n])
             high = float(grid[n + 1])
             crossings += sweep.find_crossings(low, high)
@@ -276,8 +281,9 @@ def _merge_crossings(crossings: Sequence[AxisCrossing]) -> list[AxisCrossing]:
     merged: list[AxisCrossing] = []
     for crossing in sorted(crossings):
         if merged and _is_same_crossing(merged[-1], crossing):
-            pairs = merged[-1].pairs + crossing.pairs
-            merged[-1] = merged[-1]._replace(pairs=pairs)
+            last = merged[-1]
+            pairs = last.pairs + crossing.pairs
+            merged[-1] = last._replace(pairs=pairs)
         else:
             merged.append(crossing)
     return sorted(merged)
@@ -309,8 +315,9 @@ class _FrequencySweep:
         self._delayed = pencil.delayed_states
         self._rate_matrix = pencil.rate_matrix
         self._Ad = Ad[:, self._delayed]
-        norm_bound = np.linalg.norm(A, 2) + np.linalg.norm(Ad, 2)
-        self._highest = float(norm_bound)
+        norm = np.linalg.norm(A, 2)
+        delayed_norm = np.linalg.norm(Ad, 2)
+        self._highest = float(norm + delayed_norm)
         modes_without_links = np.linalg.eigvals(A)
         modes_without_delay = np.linalg.eigvals(A + Ad)
         modes = np.concatenate([modes_without_links, modes_without_delay])
@@ -324,9 +331,13 @@ class _FrequencySweep:
         modes = self._modes[oscillates]
         centres = np.abs(modes.imag)[:, np.newaxis]
         widths = np.abs(modes.real)[:, np.newaxis]
-        near_modes = centres + widths * np.linspace(-3, 3, 13)
-        points = np.unique(np.concatenate([even, near_modes.ravel()]))
-        is_within = (points >= even[0]) & (points <= even[-1])
+        offsets = np.linspace(-3, 3, 13)
+        near_modes = centres + widths * offsets
+        candidates = np.concatenate([even, near_modes.ravel()])
+        points = np.unique(candidates)
+        is_above = points >= even[0]
+        is_below = points <= even[-1]
+        is_within = is_above & is_below
         grid: Array = points[is_within]
         return grid
 
@@ -341,7 +352,8 @@ class _FrequencySweep:
         """
         s = 1j * omega[:, np.newaxis, np.newaxis]
         delta = s * self._rate_matrix - self._A
-        Ad = np.broadcast_to(self._Ad, (len(omega), *self._Ad.shape))
+        shape = (len(omega), *self._Ad.shape)
+        Ad = np.broadcast_to(self._Ad, shape)
         G = np.linalg.solve(delta, Ad)
         delayed_rows = G[:, self._delayed, :]
         return np.linalg.eigvals(delayed_rows).astype(np.complex128)
@@ -359,7 +371,8 @@ class _FrequencySweep:
             The number of eigenvalues of G(j w) outside the unit circle, shape (K,).
         """
         moduli = np.abs(self.compute_eigenvalues(omega))
-        counts: NDArray[np.int64] = (moduli > _OUTSIDE).sum(axis=1)
+        is_outside = moduli > _OUTSIDE
+        counts: NDArray[np.int64] = is_outside.sum(axis=1)
         return counts
 
     def find_crossings(self, low: float, high: float) -> list[AxisCrossing]:
@@ -398,7 +411,8 @@ class _FrequencySweep:
                 break
 
         omega = 0.5 * (low + high)
-        return self._list_delays(omega, int(ends[0] - ends[1]))
+        pairs = int(ends[0] - ends[1])
+        return self._list_delays(omega, pairs)
 
     def _list_delays(self, omega: float, pairs: int) -> list[AxisCrossing]:
         """Lists the delays at which roots are on the imaginary axis at a frequency.
@@ -415,12 +429,15 @@ class _FrequencySweep:
         nearest = values[by_distance[: abs(pairs)]]
 
         sign = 1 if pairs > 0 else -1
-        most_turns = int(MAX_COMMON_DELAY_S * omega / (2.0 * math.pi))
+        full_turn = 2.0 * math.pi
+        most_turns = int(MAX_COMMON_DELAY_S * omega / full_turn)
         crossings = []
         for value in nearest:
-            phase = math.atan2(value.imag, value.real) % (2.0 * math.pi)
+            phase = math.atan2(value.imag, value.real) % full_turn
             for turn in range(most_turns + 2):
-                delay_s = (phase + 2.0 * math.pi * turn) / omega
+                angle = phase + full_turn * turn
+                delay_s = angle / omega
                 if 0.0 < delay_s <= MAX_COMMON_DELAY_S:
-                    crossings.append(AxisCrossing(delay_s, omega, sign))
+                    crossing = AxisCrossing(delay_s, omega, sign)
+                    crossings.append(crossing)
         return crossings

@@ -196,8 +196,12 @@ def _compute_gauss_newton_step(
     delayed_matrices = [term.A for term in loop.delayed]
     effects = np.hstack([loop.A, *delayed_matrices])
     is_moved = effects.any(axis=1)
-    is_speed = [name.rpartition(".")[2].startswith("qd") for name in loop.names]
-    free = np.flatnonzero(is_moved & ~np.array(is_speed))
+    is_speed = []
+    for name in loop.names:
+        _, _, state = name.rpartition(".")
+        is_speed.append(state.startswith("qd"))
+    is_free = is_moved & ~np.array(is_speed)
+    free = np.flatnonzero(is_free)
     free_columns = loop.static_matrix[:, free]
     solution = np.linalg.lstsq(free_columns, -residual, rcond=_FLAT)
     step = np.zeros(len(loop.names))
@@ -219,8 +223,9 @@ def _shift_equilibrium(
     theta_hat = np.array(rest.theta_hat)
     for n, site in enumerate(conditions.sites):
         layout = lay_out_arguments(site)
-        states = np.zeros(len(masks[n]))
-        states[masks[n]] = site_steps[n]
+        mask = masks[n]
+        states = np.zeros(len(mask))
+        states[mask] = site_steps[n]
         q[n, : layout.joints] += states[layout.q]
         theta_hat[n, : layout.parameters] += states[layout.estimate]
     return rest._replace(q=q, theta_hat=theta_hat)
@@ -316,7 +321,8 @@ def _compute_deviation(
         q = q_deviation[n, : layout.joints]
         estimate = estimate_deviation[n, : layout.parameters]
         velocities = np.zeros(layout.joints)
-        states.append(np.concatenate([q, velocities, estimate]))
+        site_states = np.concatenate([q, velocities, estimate])
+        states.append(site_states)
     return _select_loop_states(conditions, states)
 
 
@@ -340,7 +346,8 @@ def _project_on_zero_roots(loop: linear_loop.LinearLoop, deviation: Array) -> Ar
     inner = W_D @ V
     if np.linalg.cond(inner) > 1.0 / _FLAT:
         return None
-    coordinates = np.linalg.solve(inner, W_D @ deviation)
+    projected = W_D @ deviation
+    coordinates = np.linalg.solve(inner, projected)
     return V @ coordinates
 
 

@@ -72,7 +72,8 @@ class Minima(NamedTuple):
     @property
     def least_hz(self) -> float:
         """The frequency at which the curve has its least value, in Hz."""
-        w_rad_s = self.w_rad_s[self.values.argmin()]
+        least_index = self.values.argmin()
+        w_rad_s = self.w_rad_s[least_index]
         return float(w_rad_s / (2.0 * np.pi))
 
 
@@ -91,7 +92,8 @@ def build_frequency_grid(low_hz: float, high_hz: float, delay_s: float) -> Array
     low = 2.0 * np.pi * low_hz
     high = 2.0 * np.pi * high_hz
     decades = np.log10(high / low)
-    count = max(2, round(_PER_DECADE * decades) + 1)
+    steps = round(_PER_DECADE * decades)
+    count = max(2, steps + 1)
     points = np.geomspace(low, high, count)
     if delay_s > 0.0:
         phase_step = np.pi / (delay_s * _PER_TURN)
@@ -115,10 +117,12 @@ def find_resolved_hz(low_hz: float, high_hz: float, delay_s: float) -> float:
         delay_s: The longest delay T, in s.
     """
     step_hz = (high_hz - low_hz) / _MAX_POINTS
-    if 8.0 * step_hz * delay_s <= 1.0:
+    turns_per_step = 8.0 * step_hz * delay_s
+    if turns_per_step <= 1.0:
         return high_hz
     # relative step of the logarithmic axis
-    relative_step = float(10.0 ** (1.0 / _PER_DECADE) - 1.0)
+    ratio = 10.0 ** (1.0 / _PER_DECADE)
+    relative_step = float(ratio - 1.0)
     return 1.0 / (8.0 * delay_s * relative_step)
 
 
@@ -166,14 +170,18 @@ def _refine(
     for _ in range(_ROUNDS):
         left = w_rad_s[:-1]
         right = w_rad_s[1:]
-        is_divisible = right > left * (1.0 + _CLOSEST)
+        closest_right = left * (1.0 + _CLOSEST)
+        is_divisible = right > closest_right
         coarse = find_coarse(values) & is_divisible
-        if not coarse.any() or len(w_rad_s) > 2 * _MAX_POINTS:
+        has_too_many_points = len(w_rad_s) > 2 * _MAX_POINTS
+        if has_too_many_points or not coarse.any():
             break
-        middles = np.sqrt(left * right)[coarse]
+        all_middles = np.sqrt(left * right)
+        middles = all_middles[coarse]
         indices = np.flatnonzero(coarse) + 1
         w_rad_s = np.insert(w_rad_s, indices, middles)
-        values = np.insert(values, indices, function(middles), axis=0)
+        middle_values = function(middles)
+        values = np.insert(values, indices, middle_values, axis=0)
     return w_rad_s, values
 
 
@@ -219,7 +227,9 @@ def find_minima(
         return tolerance(w) if tolerance is not None else np.zeros(len(w))
 
     def evaluate(w: Array) -> Array:
-        return np.stack([curve(w), find_rounding(w)], axis=1)
+        values = curve(w)
+        rounding = find_rounding(w)
+        return np.stack([values, rounding], axis=1)
 
     def evaluate_upper(w: Array) -> Array:
         return curve(w) + find_rounding(w)
@@ -246,8 +256,10 @@ def _find_steps_at_minima(curve_and_rounding: Array) -> NDArray[np.bool_]:
     right = values[2:]
     is_minimum = (middle <= left) & (middle <= right)
     rise = np.maximum(left, right) - middle
-    size = np.maximum(np.abs(middle), abs(values.min()))
-    limit = np.maximum(_SETTLED * size, rounding[1:-1])
+    depth = abs(values.min())
+    size = np.maximum(np.abs(middle), depth)
+    settled_rise = _SETTLED * size
+    limit = np.maximum(settled_rise, rounding[1:-1])
     is_coarse = is_minimum & (rise > limit)
     # the steps on both sides of such a point; the ends of the grid are no minima
     at_points = np.concatenate([[False], is_coarse, [False]])
@@ -270,7 +282,8 @@ def _find_bands_below(
         level: The level.
     """
     is_below = values < level
-    edge_steps = np.flatnonzero(is_below[1:] != is_below[:-1])
+    crosses_level = is_below[1:] != is_below[:-1]
+    edge_steps = np.flatnonzero(crosses_level)
     low = w_rad_s[edge_steps]
     high = w_rad_s[edge_steps + 1]
     is_low_below = is_below[edge_steps]

@@ -73,7 +73,8 @@ class SiteJacobian(NamedTuple):
         """
         rates = self.rates
         samples = np.vstack([rates.x, rates.xd, rates.reflected])
-        return samples[:, : self.layout.states]
+        state_count = self.layout.states
+        return samples[:, :state_count]
 
 
 class DelayedTerm(NamedTuple):
@@ -150,23 +151,29 @@ def gather_site_arguments(conditions: OperatingConditions, rest: Equilibrium) ->
     layouts = [site_dynamics.lay_out_arguments(site) for site in conditions.sites]
     arguments = [np.zeros(layout.arguments) for layout in layouts]
     references = compute_references(conditions, rest)
-    for i, (layout, x) in enumerate(zip(layouts, arguments, strict=True)):
-        x[layout.q] = rest.q[i][: layout.joints]
-        x[layout.estimate] = rest.theta_hat[i][: layout.parameters]
+    site_arguments = list(zip(layouts, arguments, strict=True))
+    for i, (layout, x) in enumerate(site_arguments):
+        q = rest.q[i]
+        theta_hat = rest.theta_hat[i]
+        x[layout.q] = q[: layout.joints]
+        x[layout.estimate] = theta_hat[: layout.parameters]
         x[layout.q_des] = references[i]
 
     # the peers' torques follow from the arguments so far
-    reflected = [rates.reflected for rates in conditions.evaluate_rates(arguments)]
+    all_rates = conditions.evaluate_rates(arguments)
+    reflected = [rates.reflected for rates in all_rates]
     peer_torques = conditions.alpha @ reflected
-    for i, (layout, x) in enumerate(zip(layouts, arguments, strict=True)):
+    for i, (layout, x) in enumerate(site_arguments):
         x[layout.peer_torque] = peer_torques[i]
         peers = [j for j in range(len(arguments)) if j != i]
+        m = layout.coordinates
+        qd = np.zeros(m)
         for index in range(layout.peers):
             j = peers[index]
-            q = rest.q[j][: layout.coordinates]
-            qd = np.zeros(layout.coordinates)
+            q = rest.q[j]
+            torque = -reflected[j]
             sample = layout.peer_sample(index)
-            x[sample] = np.concatenate([q, qd, -reflected[j]])
+            x[sample] = np.concatenate([q[:m], qd, torque])
     return arguments
 
 
@@ -185,7 +192,8 @@ def compute_shared_poses(conditions: OperatingConditions, rest: Equilibrium) -> 
     poses = []
     for site, q in zip(conditions.sites, rest.q, strict=True):
         joint_positions = q[: site.layout.joints]
-        poses.append(site_dynamics.compute_shared_pose(site, joint_positions))
+        pose = site_dynamics.compute_shared_pose(site, joint_positions)
+        poses.append(pose)
     return poses
 
 
@@ -203,7 +211,8 @@ def compute_references(conditions: OperatingConditions, rest: Equilibrium) -> li
     """
     poses = compute_shared_poses(conditions, rest)
     if not conditions.sites[0].layout.task:
-        return list(conditions.alpha @ np.array(poses))
+        references = conditions.alpha @ np.array(poses)
+        return list(references)
     pairs = zip(conditions.alpha, poses, strict=True)
     return [evaluate_reference(shares, pose, poses) for shares, pose in pairs]
 
@@ -230,9 +239,12 @@ def differentiate_references(
     poses = compute_shared_poses(conditions, rest)
     for i, shares in enumerate(conditions.alpha):
         followed = np.flatnonzero(shares).tolist()
+        m = len(poses[i])
+        identity = np.eye(m)
         for j in followed:
-            derivatives[i, j] = shares[j] * np.eye(len(poses[i]))
-        has_orientation = len(poses[i]) > POSITION and conditions.sites[i].layout.task
+            derivatives[i, j] = shares[j] * identity
+        layout = conditions.sites[i].layout
+        has_orientation = m > POSITION and layout.task
         if not has_orientation:
             continue
 
@@ -240,9 +252,11 @@ def differentiate_references(
             columns = []
             for pose in poses:
                 zeros = np.zeros(len(pose))
-                columns.append(pose[:, np.newaxis] + zeros)
+                repeated_pose = pose[:, np.newaxis] + zeros
+                columns.append(repeated_pose)
             unit_steps = np.eye(len(poses[j]))
-            columns[j] = columns[j] + 1j * site_dynamics.COMPLEX_STEP * unit_steps
+            imaginary_steps = 1j * site_dynamics.COMPLEX_STEP * unit_steps
+            columns[j] = columns[j] + imaginary_steps
             reference = evaluate_reference(shares, columns[i], columns)
             derivatives[i, j] = reference.imag / site_dynamics.COMPLEX_STEP
     return derivatives
@@ -275,10 +289,12 @@ def compute_couplings(
         m = layout.coordinates
         zero = np.zeros((m, m))
         share = conditions.alpha[i, j] * np.eye(m)
-        coupling = block_diag(references.get((i, j), zero), share, share)
+        reference = references.get((i, j), zero)
+        coupling = block_diag(reference, share, share)
 
         if layout.peers:
-            samples = np.zeros((layout.peers, len(coupling), len(coupling)))
+            length = len(coupling)
+            samples = np.zeros((layout.peers, length, length))
             # tau_x in a sample is the torque of the arm, and not the torque ON the arm
             signs = np.repeat([1.0, 1.0, -1.0], m)
             # the site itself is not among its peers
@@ -341,16 +357,21 @@ def differentiate_rates(
         rates = site_dynamics.differentiate_site_rates(site, x)
         if conditions.has_forms:
             # the memory of such a law supplies the torque that holds the arm at rest
+            external = layout.external_torque
             qdd = site_dynamics.evaluate_site_rates(site, x).qdd
-            inverse_inertia = rates.qdd[:, layout.external_torque]
-            x[layout.external_torque] -= np.linalg.solve(inverse_inertia, qdd)
+            inverse_inertia = rates.qdd[:, external]
+            holding_torque = np.linalg.solve(inverse_inertia, qdd)
+            x[external] -= holding_torque
             rates = site_dynamics.differentiate_site_rates(site, x)
         if (i, i) in references:
             # chain rule: the reference depends on the site's own orientation
-            reference_by_state = references[i, i] @ rates.x[:, : layout.states]
+            state_count = layout.states
+            pose_by_state = rates.x[:, :state_count]
+            reference_by_state = references[i, i] @ pose_by_state
             for derivative in rates:
                 by_reference = derivative[:, layout.q_des]
-                derivative[:, : layout.states] += by_reference @ reference_by_state
+                indirect_effect = by_reference @ reference_by_state
+                derivative[:, :state_count] += indirect_effect
 
         jacobian = _select_states(site, layout, rates, all_estimates=all_estimates)
         jacobians.append(jacobian)
@@ -367,7 +388,8 @@ def _select_states(
     """Returns a site's derivatives with respect to the states that the loop keeps."""
     motion = _name_motion(layout.joints)
     if isinstance(site.law_factory, NumericLaw):
-        return SiteJacobian(layout, rates, (*motion, *site.law_factory.names))
+        memory = site.law_factory.names
+        return SiteJacobian(layout, rates, (*motion, *memory))
     if not site_dynamics.has_estimate(site):
         no_combination = np.zeros((0, layout.parameters))
         return _replace_estimate(layout, rates, no_combination, ())
@@ -385,7 +407,8 @@ def _select_states(
     joints = sorted(pivots[:rank].tolist())
     names = tuple(f"gravity{joint + 1}" for joint in joints)
     jacobian = _replace_estimate(layout, rates, effect[joints], names)
-    return jacobian._replace(omitted_states=layout.parameters - len(joints))
+    omitted_states = layout.parameters - len(joints)
+    return jacobian._replace(omitted_states=omitted_states)
 
 
 def _name_motion(joints: int) -> tuple[str, ...]:
@@ -412,11 +435,14 @@ def _replace_estimate(
     """
     estimate_by_z = np.linalg.pinv(T)
 
+    estimate = layout.estimate
+
     def convert(derivative: Array) -> Array:
         """Returns a derivative by the new states."""
-        motion = derivative[:, : layout.estimate.start]
-        by_z = derivative[:, layout.estimate] @ estimate_by_z
-        inputs = derivative[:, layout.estimate.stop :]
+        motion = derivative[:, : estimate.start]
+        by_estimate = derivative[:, estimate]
+        by_z = by_estimate @ estimate_by_z
+        inputs = derivative[:, estimate.stop :]
         return np.hstack([motion, by_z, inputs])
 
     converted = site_dynamics.SiteRates(*map(convert, rates))
@@ -473,28 +499,37 @@ def linearise_loop(
     input_effects = []
     for i, site in enumerate(sites):
         layout = site.layout
+        rates = site.rates
         joints = layout.joints
+        site_states = states[i]
+        site_ports = ports[i]
         first_velocity = layout.qd.start
         position_rate = np.eye(joints, layout.arguments, first_velocity)
-        derivative = np.vstack([position_rate, site.rates.qdd, site.rates.estimate])
-        A[states[i], states[i]] = derivative[:, : layout.states]
-        B[states[i], ports[i]] = derivative[:, layout.external_torque]
-        C[ports[i], states[i]] = np.eye(joints, layout.states, first_velocity)
-        input_effects.append(derivative[:, layout.inputs])
+        derivative = np.vstack([position_rate, rates.qdd, rates.estimate])
+        A[site_states, site_states] = derivative[:, : layout.states]
+        B[site_states, site_ports] = derivative[:, layout.external_torque]
+        C[site_ports, site_states] = np.eye(joints, layout.states, first_velocity)
+        input_effect = derivative[:, layout.inputs]
+        input_effects.append(input_effect)
 
     terms: dict[float, tuple[Array, Array]] = {}
-    for (i, j), coupling in compute_couplings(conditions, rest, sites).items():
+    couplings = compute_couplings(conditions, rest, sites)
+    for (i, j), coupling in couplings.items():
         delay_s = float(conditions.age_s[i, j])
         if delay_s not in terms:
             terms[delay_s] = (np.zeros_like(A), np.zeros_like(B))
         late_A, late_B = terms[delay_s]
         peer = sites[j]
+        peer_layout = peer.layout
         effect = input_effects[i] @ coupling
-        late_A[states[i], states[j]] += effect @ peer.output
+        effect_of_states = effect @ peer.output
+        late_A[states[i], states[j]] += effect_of_states
         # the torque on the peer's joints is reflected without a state in between
-        effect_of_torque = effect[:, 2 * peer.layout.coordinates :]
-        reflected_by_port = peer.rates.reflected[:, peer.layout.external_torque]
-        late_B[states[i], ports[j]] += effect_of_torque @ reflected_by_port
+        first_torque = 2 * peer_layout.coordinates
+        effect_of_torque = effect[:, first_torque:]
+        reflected_by_port = peer.rates.reflected[:, peer_layout.external_torque]
+        effect_of_ports = effect_of_torque @ reflected_by_port
+        late_B[states[i], ports[j]] += effect_of_ports
 
     loop = LinearLoop(
         names=_name_states(conditions, sites),
@@ -529,7 +564,8 @@ def _name_ports(
     """Returns the names of a quantity of all joints, such as "m1.tau1" for the kind "tau"."""
     names = []
     for name, site in zip(conditions.names, sites, strict=True):
-        names += [f"{name}.{kind}{joint + 1}" for joint in range(site.layout.joints)]
+        numbers = range(1, site.layout.joints + 1)
+        names += [f"{name}.{kind}{number}" for number in numbers]
     return tuple(names)
 
 
@@ -542,7 +578,8 @@ def _sort_terms(terms: dict[float, tuple[Array, Array]]) -> tuple[DelayedTerm, .
     delayed = []
     for delay_s in sorted(terms):
         A, B = terms[delay_s]
-        delayed.append(DelayedTerm(delay_s, A, B))
+        term = DelayedTerm(delay_s, A, B)
+        delayed.append(term)
     return tuple(delayed)
 
 
@@ -569,7 +606,8 @@ def add_law_forms(
     inertias = []
     for site in sites:
         inverse_inertia = site.rates.qdd[:, site.layout.external_torque]
-        inertias.append(np.linalg.inv(inverse_inertia))
+        inertia = np.linalg.inv(inverse_inertia)
+        inertias.append(inertia)
 
     forms = conditions.find_forms(inertias)
     blocks, names = _index_form_states(conditions, forms, loop)
@@ -582,10 +620,12 @@ def add_law_forms(
         return zero_A, zero_B
 
     terms = {0.0: make_zeros()}
-    for delay_s, A, B in (DelayedTerm(0.0, loop.A, loop.B), *loop.delayed):
+    undelayed = DelayedTerm(0.0, loop.A, loop.B)
+    for delay_s, A, B in (undelayed, *loop.delayed):
         late_A, late_B = terms.setdefault(delay_s, make_zeros())
-        late_A[: len(A), : len(A)] = A
-        late_B[: len(B)] = B
+        old_count = len(A)
+        late_A[:old_count, :old_count] = A
+        late_B[:old_count] = B
     for i, form in enumerate(forms):
         if form is not None:
             _add_form(conditions, sites, blocks=blocks, i=i, form=form, terms=terms)
@@ -597,6 +637,7 @@ def add_law_forms(
         if form is None:
             continue
         acceleration = blocks[i, "qd"]
+        identity = np.eye(len(sites[i].rates.qdd))
         for j in form.list_receivers():
             signal = blocks[i, ("to", j)]
             E[signal] = 0.0
@@ -604,11 +645,12 @@ def add_law_forms(
                 for A, B in terms.values():
                     A[signal] = A[acceleration]
                     B[signal] = B[acceleration]
-            undelayed_A[signal, signal] -= np.eye(len(sites[i].rates.qdd))
+            undelayed_A[signal, signal] -= identity
 
     A, B = terms.pop(0.0)
     outputs, old_states = loop.C.shape
-    new_columns = np.zeros((outputs, state_count - old_states))
+    added_states = state_count - old_states
+    new_columns = np.zeros((outputs, added_states))
     return loop._replace(
         names=tuple(names),
         A=A,
@@ -632,7 +674,8 @@ def _index_form_states(
     """Returns the positions of the states of all laws' signals, and the names of all states."""
     blocks: _StateBlocks = {}
     names = list(loop.names)
-    for i, (site_name, form) in enumerate(zip(conditions.names, forms, strict=True)):
+    named_forms = zip(conditions.names, forms, strict=True)
+    for i, (site_name, form) in enumerate(named_forms):
         joints = conditions.sites[i].layout.joints
         for kind in ("q", "qd"):
             first = names.index(f"{site_name}.{kind}1")
@@ -642,10 +685,11 @@ def _index_form_states(
         labels: dict[BlockKey, str] = {state: state for state in form.states}
         for j in form.list_receivers():
             labels["to", j] = f"to_{conditions.names[j]}_"
+        numbers = range(1, joints + 1)
         for signal, label in labels.items():
             first = len(names)
             blocks[i, signal] = slice(first, first + joints)
-            names += [f"{site_name}.{label}{joint + 1}" for joint in range(joints)]
+            names += [f"{site_name}.{label}{number}" for number in numbers]
     return blocks, names
 
 
@@ -702,20 +746,28 @@ def _add_form(
             rows = blocks[i, row]
             block = gain
         if column == "tau_h":
-            motion = slice(blocks[i, "q"].start, blocks[i, "qd"].stop)
+            q_columns = blocks[i, "q"]
+            qd_columns = blocks[i, "qd"]
+            motion = slice(q_columns.start, qd_columns.stop)
             torque_on_arm = site.rates.external + site.rates.held
-            A[rows, motion] += block @ torque_on_arm[:, : layout.qd.stop]
-            B[rows, ports[i]] += block @ torque_on_arm[:, external]
+            torque_by_motion = torque_on_arm[:, : layout.qd.stop]
+            torque_by_input = torque_on_arm[:, external]
+            A[rows, motion] += block @ torque_by_motion
+            B[rows, ports[i]] += block @ torque_by_input
         elif column in ("q_des", "qd_des"):
             signal = str(column).removesuffix("_des")
-            for j in np.flatnonzero(conditions.alpha[i]).tolist():
+            shares = conditions.alpha[i]
+            for j in np.flatnonzero(shares).tolist():
                 late_A = find_delayed_matrix(j)
                 columns = blocks[j, signal]
-                late_A[rows, columns] += conditions.alpha[i, j] * block
+                late_A[rows, columns] += shares[j] * block
         elif isinstance(column, tuple):
             sender = column[1]
-            if (sender, ("to", i)) in blocks:
+            sent_signal = (sender, ("to", i))
+            if sent_signal in blocks:
                 late_A = find_delayed_matrix(sender)
-                late_A[rows, blocks[sender, ("to", i)]] += block
+                columns = blocks[sent_signal]
+                late_A[rows, columns] += block
         else:
-            A[rows, blocks[i, column]] += block
+            columns = blocks[i, column]
+            A[rows, columns] += block

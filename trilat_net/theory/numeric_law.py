@@ -103,7 +103,10 @@ class NumericLaw:
         joints = self._layout.joints
         q0 = np.array(setup.q0)
         zeros = np.zeros(joints)
-        peers = [np.concatenate([link.q0, zeros, zeros]) for link in setup.links]
+        peers = []
+        for link in setup.links:
+            sample = np.concatenate([link.q0, zeros, zeros])
+            peers.append(sample)
         parts = [q0, zeros, self.memory, q0, zeros, zeros, *peers, zeros]
         arguments = np.concatenate(parts)
         previous = np.concatenate([zeros, q0])
@@ -114,8 +117,9 @@ class NumericLaw:
         if not self._uses_previous_tick:
             return
         self.memory = np.concatenate([self.memory, previous])
+        numbers = range(1, joints + 1)
         for name in ("tau_before", "q_before"):
-            self.names += tuple(f"{name}[{joint + 1}]" for joint in range(joints))
+            self.names += tuple(f"{name}[{number}]" for number in numbers)
 
     @property
     def _memory_slice(self) -> slice:
@@ -193,7 +197,8 @@ class NumericLaw:
         torque, rate = self._evaluate_rates(arguments)
         columns = []
         for n, value in enumerate(arguments):
-            half_step = _STEP * max(1.0, abs(float(value)))
+            size = max(1.0, abs(float(value)))
+            half_step = _STEP * size
             upper = arguments.copy()
             lower = arguments.copy()
             upper[n] = value + half_step
@@ -219,7 +224,8 @@ class NumericLaw:
         if self._uses_previous_tick:
             previous = memory[self._remembered_count :]
         else:
-            previous = np.concatenate([np.zeros(joints), q])
+            no_torque = np.zeros(joints)
+            previous = np.concatenate([no_torque, q])
         output = self._evaluate_tick(x, previous)
         torque = output[:joints]
         next_memory = output[joints:]
@@ -244,8 +250,13 @@ class NumericLaw:
         row.q[:] = x[:n]
         row.qd[:] = x[n : 2 * n]
         references = x[references_start:peers_start]
-        row.q_des[:], row.qd_des[:], row.felt[:] = np.split(references, 3)
-        row.tau_before[:], row.q_before[:] = np.split(previous, 2)
+        q_des, qd_des, felt = np.split(references, 3)
+        row.q_des[:] = q_des
+        row.qd_des[:] = qd_des
+        row.felt[:] = felt
+        tau_before, q_before = np.split(previous, 2)
+        row.tau_before[:] = tau_before
+        row.q_before[:] = q_before
         row.on_arm[:] = x[len(x) - n :]
 
         arrays.links["used"] = _TICK - 1
@@ -253,7 +264,10 @@ class NumericLaw:
         for j, link in enumerate(arrays.links):
             first = peers_start + sample_length * j
             sample = x[first : first + sample_length]
-            link["q"][:], link["qd"][:], link["tau_x"][:] = np.split(sample, 3)
+            q, qd, tau_x = np.split(sample, 3)
+            link["q"][:] = q
+            link["qd"][:] = qd
+            link["tau_x"][:] = tau_x
 
         if arrays.chain is None:
             # also computes the regressor, for gravity
@@ -262,7 +276,8 @@ class NumericLaw:
             chain_stages.place_chain(row, arrays.chain)
 
         memory_start = self._memory_slice.start
-        remembered = x[memory_start : memory_start + self._remembered_count]
+        remembered_end = memory_start + self._remembered_count
+        remembered = x[memory_start:remembered_end]
         self._plugged_law.restore(remembered.tolist())
         time_ns = tick_ns(_TICK, self._rate_hz)
         memory = self._plugged_law.compute(_TICK, time_ns)
@@ -275,6 +290,7 @@ def _name_memory(law: Any, count: int) -> tuple[str, ...]:
         return tuple(f"memory[{n + 1}]" for n in range(count))
     names = []
     for attribute in list_remembered(law):
-        size = np.size(getattr(law, attribute))
-        names += [f"{attribute}[{n + 1}]" for n in range(size)]
+        value = getattr(law, attribute)
+        numbers = range(1, np.size(value) + 1)
+        names += [f"{attribute}[{number}]" for number in numbers]
     return tuple(names)

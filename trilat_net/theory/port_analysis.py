@@ -124,15 +124,21 @@ def build_proof_output(
     for i, site in enumerate(sites):
         Lambda = np.broadcast_to(site.gains.Lambda, site.layout.shared)
         ports = port_response.find_site_ports(loop, site.name)
-        for port, joint in zip(ports, list_followed_axes(site), strict=True):
-            C[port, loop.names.index(f"{site.name}.q{joint}")] += Lambda[joint - 1]
+        followed = list_followed_axes(site)
+        for port, joint in zip(ports, followed, strict=True):
+            gain = Lambda[joint - 1]
+            position = loop.names.index(f"{site.name}.q{joint}")
+            C[port, position] += gain
             for j in np.flatnonzero(conditions.alpha[i]):
-                if joint not in list_followed_axes(sites[j]):
+                peer = sites[j]
+                if joint not in list_followed_axes(peer):
                     continue
-                position = loop.names.index(f"{sites[j].name}.q{joint}")
-                factor = Lambda[joint - 1] * conditions.alpha[i, j]
-                delayed[float(conditions.age_s[i, j])][port, position] -= factor
-    return port_response.LoopOutput(C, tuple(sorted(delayed.items())))
+                peer_position = loop.names.index(f"{peer.name}.q{joint}")
+                factor = gain * conditions.alpha[i, j]
+                delay_s = float(conditions.age_s[i, j])
+                delayed[delay_s][port, peer_position] -= factor
+    delayed_terms = sorted(delayed.items())
+    return port_response.LoopOutput(C, tuple(delayed_terms))
 
 
 def compute_proof_weights(conditions: OperatingConditions) -> Array:
@@ -414,15 +420,15 @@ def _locate_hands(
                 "but a hand was measured along a different number of axes"
             )
 
-        place = np.zeros((len(J), len(loop.inputs)))
+        tip_by_ports = np.zeros((len(J), len(loop.inputs)))
         if site.layout.task:
             # the ports are axes already
             for axis, port in zip(list_followed_axes(site), ports, strict=True):
                 if axis <= len(J):
-                    place[axis - 1, port] = 1.0
+                    tip_by_ports[axis - 1, port] = 1.0
         else:
-            place[:, ports] = J
-        places.append(place)
+            tip_by_ports[:, ports] = J
+        places.append(tip_by_ports)
     return _HeldHands([hands] * len(places), places)
 
 
@@ -651,7 +657,8 @@ def move_ports_to_end_effectors(
     for site, x in zip(conditions.sites, arguments, strict=True):
         layout = lay_out_arguments(site)
         followed = list_followed_axes(site)
-        full_J = compute_following(site, place_arm(site, x[layout.q]), x).J
+        arm = place_arm(site, x[layout.q])
+        full_J = compute_following(site, arm, x).J
         assert full_J is not None
         J: Array = full_J[[n - 1 for n in followed]]
         N = null_space(J)

@@ -116,7 +116,8 @@ class HandMatrices(NamedTuple):
         mass_term = 1j * w * self.M
         stiffness_term = 1j * self.K / w
         Z: Complex = mass_term + self.B - stiffness_term
-        return 0.5 * (Z + _conjugate_transpose(Z))
+        Z_H = _conjugate_transpose(Z)
+        return 0.5 * (Z + Z_H)
 
 
 def _conjugate_transpose(Y: Complex) -> Complex:
@@ -166,18 +167,25 @@ def check_against_hands(
         Z += _conjugate_transpose(Z)
         resistances = []
         for hands, J in zip(held, places, strict=True):
-            at_ports = [2.0 * J.T @ hand.compute_resistance(w) @ J for hand in hands]
+            at_ports = []
+            for hand in hands:
+                resistance = hand.compute_resistance(w)
+                port_resistance = 2.0 * J.T @ resistance @ J
+                at_ports.append(port_resistance)
             resistances.append(at_ports)
         least_per_choice = []
         for choice in product(*resistances):
-            eigenvalues = np.linalg.eigvalsh(Z + sum(choice))
+            held_Z = Z + sum(choice)
+            eigenvalues = np.linalg.eigvalsh(held_Z)
             least_per_choice.append(eigenvalues[:, 0])
         least: Array = np.min(least_per_choice, axis=0)
         return least
 
     def find_tolerance(w: Array) -> Array:
-        Z: Complex = np.linalg.inv(response(w)).astype(np.complex128)
-        return EIGENVALUE_ROUNDING * _find_frobenius_norm(Z)
+        Y = response(w)
+        Z: Complex = np.linalg.inv(Y).astype(np.complex128)
+        norm = _find_frobenius_norm(Z)
+        return EIGENVALUE_ROUNDING * norm
 
     return find_minima(find_least, w_rad_s, tolerance=find_tolerance)
 
@@ -212,7 +220,8 @@ def find_least_eigenvalue(Y: Complex) -> Array:
     Returns:
         Eigenvalues, shape (F,).
     """
-    eigenvalues = np.linalg.eigvalsh(Y + _conjugate_transpose(Y))
+    hermitian_sum = Y + _conjugate_transpose(Y)
+    eigenvalues = np.linalg.eigvalsh(hermitian_sum)
     # eigvalsh sorts them in rising order
     least = eigenvalues[..., 0]
     return np.asarray(least, dtype=np.float64)
@@ -238,9 +247,11 @@ def find_lacking_damping(Y: Complex, w_rad_s: Array) -> float:
     Z = np.linalg.inv(Y).astype(np.complex128)
     lacking = -0.5 * find_least_eigenvalue(Z)
     lowest_w = w_rad_s[0]
+    higher_w = _LOW_BAND * lowest_w
     at_lowest = lacking[0]
-    at_higher = float(np.interp(_LOW_BAND * lowest_w, w_rad_s, lacking))
-    grows_without_bound = at_lowest > 0.0 and at_lowest > 2.0 * at_higher
+    at_higher = float(np.interp(higher_w, w_rad_s, lacking))
+    doubled = 2.0 * at_higher
+    grows_without_bound = at_lowest > 0.0 and at_lowest > doubled
     if grows_without_bound:
         return np.inf
     largest = float(lacking.max())
@@ -274,17 +285,21 @@ def check_passivity(
         return Y if weights is None else weight_response(Y, weights)
 
     def find_least(w: Array) -> Array:
-        return find_least_eigenvalue(evaluate_weighted(w))
+        weighted = evaluate_weighted(w)
+        return find_least_eigenvalue(weighted)
 
     def find_tolerance(w: Array) -> Array:
         Y = response(w)
-        return EIGENVALUE_ROUNDING * _find_frobenius_norm(Y)
+        norm = _find_frobenius_norm(Y)
+        return EIGENVALUE_ROUNDING * norm
 
     minima = find_minima(find_least, w_rad_s, tolerance=find_tolerance)
     Y = evaluate_weighted(minima.w_rad_s)
     largest_singular_value = np.linalg.norm(Y, 2, axis=(1, 2))
     size = np.asarray(largest_singular_value, dtype=np.float64)
-    lacking = find_lacking_damping(Y, minima.w_rad_s) if minima.below else 0.0
+    lacking = 0.0
+    if minima.below:
+        lacking = find_lacking_damping(Y, minima.w_rad_s)
     return Passivity(minima, size, lacking)
 
 
@@ -307,7 +322,8 @@ def llewellyn_parameter(Y: Complex) -> Array:
     smallest = 1e-30 * norm**2
     size = np.maximum(np.abs(transmission), smallest)
     numerator = 2.0 * y11 * y22 - transmission.real
-    parameter: Array = np.minimum(numerator / size, MAX_LLEWELLYN)
+    quotient = numerator / size
+    parameter: Array = np.minimum(quotient, MAX_LLEWELLYN)
     limit = -EIGENVALUE_ROUNDING * norm
     first_is_active = y11 < limit
     second_is_active = y22 < limit
@@ -332,7 +348,8 @@ def llewellyn_rounding(Y: Complex) -> Array:
     y21 = Y[:, 1, 0]
     norm = _find_frobenius_norm(Y)
     smallest = 1e-30 * norm**2
-    size = np.maximum(np.abs(y12 * y21), smallest)
+    transmission = np.abs(y12 * y21)
+    size = np.maximum(transmission, smallest)
     relative_error = 1e-12 * norm**2 / size
     return EIGENVALUE_ROUNDING + relative_error
 
@@ -402,7 +419,8 @@ def find_best_weights(Y: Complex, owner: NDArray[np.int64]) -> BestWeights:
     centre = np.zeros((count, free))
     best = np.zeros((count, free))
     ball = _LOG_REACH**2 * free * np.eye(free)
-    ellipsoids = np.broadcast_to(ball, (count, free, free)).copy()
+    shape = (count, free, free)
+    ellipsoids = np.broadcast_to(ball, shape).copy()
     margin = np.full(count, -np.inf)
     # the mean of the eigenvalues, which no weights change, bounds the least of them
     trace = np.trace(scaled, axis1=1, axis2=2)
@@ -411,7 +429,9 @@ def find_best_weights(Y: Complex, owner: NDArray[np.int64]) -> BestWeights:
     active = np.arange(count)
 
     for _ in range(_MAX_ROUNDS):
-        value, slope = _evaluate_margin(scaled[active], centre[active], owner)
+        active_Y = scaled[active]
+        active_centre = centre[active]
+        value, slope = _evaluate_margin(active_Y, active_centre, owner)
         is_better = value > margin[active]
         improved = active[is_better]
         margin[improved] = value[is_better]
@@ -421,17 +441,20 @@ def find_best_weights(Y: Complex, owner: NDArray[np.int64]) -> BestWeights:
         squared_gain = np.einsum("fi,fi->f", slope, direction)
         # largest possible gain within the ellipsoid
         gain = np.sqrt(np.maximum(squared_gain, 0.0))
-        size = np.maximum(np.abs(margin[active]), 1e-6)
+        active_margin = margin[active]
+        size = np.maximum(np.abs(active_margin), 1e-6)
         can_gain = gain > _WEIGHT_TOLERANCE * size
-        reserve = bound[active] - margin[active]
+        reserve = bound[active] - active_margin
         can_gain &= reserve > EIGENVALUE_ROUNDING
         active = active[can_gain]
         if not len(active) or free == 0:
             break
 
-        step = direction[can_gain] / gain[can_gain, np.newaxis]
+        gain_column = gain[can_gain, np.newaxis]
+        step = direction[can_gain] / gain_column
         centre[active] += step / (free + 1.0)
-        ellipsoids[active] = _shrink_ellipsoids(ellipsoids[active], step)
+        active_ellipsoids = ellipsoids[active]
+        ellipsoids[active] = _shrink_ellipsoids(active_ellipsoids, step)
     # the first site's weight is 1
     first_site = np.zeros((count, 1))
     log_weights = np.concatenate([first_site, best], axis=1)
@@ -448,22 +471,27 @@ def _shrink_ellipsoids(ellipsoids: Array, step: Array) -> Array:
     n = step.shape[1]
     if n == 1:
         return ellipsoids / 4.0
-    outer = step[:, :, np.newaxis] * step[:, np.newaxis, :]
+    rows = step[:, :, np.newaxis]
+    columns = step[:, np.newaxis, :]
+    outer = rows * columns
     flattened = ellipsoids - 2.0 / (n + 1.0) * outer
-    shrunk: Array = n**2 / (n**2 - 1.0) * flattened
+    scale = n**2 / (n**2 - 1.0)
+    shrunk: Array = scale * flattened
     return shrunk
 
 
 def _scale_sites(Y: Complex, owner: NDArray[np.int64]) -> Complex:
     """Returns the admittance with each site's diagonal block scaled to norm 1."""
     size = np.ones(Y.shape[:2])
-    for site in range(int(owner.max()) + 1):
+    sites = int(owner.max()) + 1
+    for site in range(sites):
         ports = np.flatnonzero(owner == site)
         rows = Y[:, ports]
         block = rows[:, :, ports]
         norm = _find_frobenius_norm(block)
         size[:, ports] = norm[:, np.newaxis]
-    root = np.sqrt(np.maximum(size, 1e-300))
+    positive_size = np.maximum(size, 1e-300)
+    root = np.sqrt(positive_size)
     row_roots = root[:, :, np.newaxis]
     column_roots = root[:, np.newaxis, :]
     scaled: Complex = Y / (row_roots * column_roots)
@@ -490,12 +518,15 @@ def _evaluate_margin(
     all_log_weights = np.concatenate([first_site, log_weights], axis=1)
     port_weights = np.exp(all_log_weights[:, owner])
     W = weight_response(Y, port_weights)
-    eigenvalues, eigenvectors = np.linalg.eigh(W + _conjugate_transpose(W))
+    W_H = _conjugate_transpose(W)
+    eigenvalues, eigenvectors = np.linalg.eigh(W + W_H)
 
     v = eigenvectors[:, :, 0]
     v_conj = np.conj(v)
-    W_v = (W @ v[:, :, np.newaxis])[:, :, 0]
-    v_conj_W = (v_conj[:, np.newaxis, :] @ W)[:, 0, :]
+    column = v[:, :, np.newaxis]
+    row = v_conj[:, np.newaxis, :]
+    W_v = (W @ column)[:, :, 0]
+    v_conj_W = (row @ W)[:, 0, :]
     per_port = (v_conj * W_v).real
     per_port -= (v_conj_W * v).real
 

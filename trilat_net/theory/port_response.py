@@ -84,14 +84,16 @@ class LoopOutput(NamedTuple):
         """
         total = _repeat_matrix(self.C, len(s))
         for delay_s, C in self.delayed:
-            total += _evaluate_shift(s, delay_s) * C
+            shift = _evaluate_shift(s, delay_s)
+            total += shift * C
         return total
 
 
 def _repeat_matrix(matrix: Array, count: int) -> Complex:
     """Returns complex copies of a matrix of shape (p, m), shape (count, p, m)."""
     shape = (count, *matrix.shape)
-    copies: Complex = np.broadcast_to(matrix.astype(np.complex128), shape).copy()
+    complex_matrix = matrix.astype(np.complex128)
+    copies: Complex = np.broadcast_to(complex_matrix, shape).copy()
     return copies
 
 
@@ -125,14 +127,16 @@ class PoleAtZero(NamedTuple):
         at zero, the pole is simple. Its residue is a symmetric matrix without negative
         eigenvalues.
         """
-        differences = np.abs(self.residue - self.residue.T)
+        residue = self.residue
+        differences = np.abs(residue - residue.T)
         asymmetry = differences.max(initial=0.0)
-        size = np.abs(self.residue).max(initial=0.0)
-        if self.order > 1 or asymmetry > _NEGLIGIBLE * size:
+        size = np.abs(residue).max(initial=0.0)
+        tolerance = _NEGLIGIBLE * size
+        if self.order > 1 or asymmetry > tolerance:
             return False
-        eigenvalues = np.linalg.eigvalsh(self.residue)
+        eigenvalues = np.linalg.eigvalsh(residue)
         least = eigenvalues.min(initial=0.0)
-        return bool(least >= -_NEGLIGIBLE * size)
+        return bool(least >= -tolerance)
 
 
 def evaluate_transfer(
@@ -159,24 +163,27 @@ def evaluate_transfer(
         m torques.
     """
     output = LoopOutput(loop.C) if output is None else output
+    count = len(s)
     outputs = len(output.C)
     inputs = loop.B.shape[1]
-    response = np.zeros((len(s), outputs, inputs), np.complex128)
+    response = np.zeros((count, outputs, inputs), np.complex128)
     E = np.eye(len(loop.A))
     if loop.E is not None:
         E = np.diag(loop.E)
 
-    for first in range(0, len(s), _BATCH):
+    for first in range(0, count, _BATCH):
         end = first + _BATCH
         batch = s[first:end]
-        left = batch[:, np.newaxis, np.newaxis] * E - loop.A
+        rate_term = batch[:, np.newaxis, np.newaxis] * E
+        left = rate_term - loop.A
         right = _repeat_matrix(loop.B, len(batch))
         for term in loop.delayed:
             shift = _evaluate_shift(batch, term.delay_s)
             left -= shift * term.A
             right += shift * term.B
         state = np.linalg.solve(left, right)
-        response[first:end] = output.evaluate(batch) @ state
+        output_matrix = output.evaluate(batch)
+        response[first:end] = output_matrix @ state
     return response
 
 
@@ -199,7 +206,8 @@ def build_admittance(loop: LinearLoop) -> PortResponse:
         )
 
     def evaluate_admittance(w_rad_s: Array) -> Complex:
-        return evaluate_transfer(loop, to_imaginary_axis(w_rad_s))
+        s = to_imaginary_axis(w_rad_s)
+        return evaluate_transfer(loop, s)
 
     return evaluate_admittance
 
@@ -245,7 +253,10 @@ def find_site_ports(loop: LinearLoop, site: str) -> list[int]:
     Raises:
         UsageError: The loop has no such site.
     """
-    ports = [n for n, name in enumerate(loop.inputs) if parse_port_site(name) == site]
+    ports = []
+    for n, name in enumerate(loop.inputs):
+        if parse_port_site(name) == site:
+            ports.append(n)
     if not ports:
         sites = ", ".join(list_port_sites(loop))
         raise UsageError(f"there is no site {site!r} among the ports; the sites are {sites}")
@@ -258,7 +269,8 @@ def parse_port_joint(port: str) -> int:
     Args:
         port: Name of the port. For "m1.tau2" the number is 2.
     """
-    return int(port.rpartition("tau")[2])
+    _, _, number = port.rpartition("tau")
+    return int(number)
 
 
 def group_ports_by_joint(loop: LinearLoop) -> dict[int, list[int]]:
@@ -294,7 +306,8 @@ def select_ports(response: PortResponse, ports: list[int]) -> PortResponse:
 
 def find_longest_delay_s(loop: LinearLoop) -> float:
     """Returns the longest delay of a loop, in s. 0 if it has no delay."""
-    return max((term.delay_s for term in loop.delayed), default=0.0)
+    delays_s = [term.delay_s for term in loop.delayed]
+    return max(delays_s, default=0.0)
 
 
 def find_pole_at_zero(loop: LinearLoop) -> PoleAtZero:
@@ -314,15 +327,18 @@ def find_pole_at_zero(loop: LinearLoop) -> PoleAtZero:
     """
     angles = 2j * math.pi * np.arange(_CIRCLE_POINTS) / _CIRCLE_POINTS
     unit_circle = np.exp(angles)
-    values = evaluate_transfer(loop, ZERO_ROOT_RADIUS_PER_S * unit_circle)
+    small_circle = ZERO_ROOT_RADIUS_PER_S * unit_circle
+    values = evaluate_transfer(loop, small_circle)
     circle = unit_circle[:, np.newaxis, np.newaxis]
     # the coefficient of 1 / s^k is the mean of Y(s) s^k over the circle
     coefficients = {}
     for power in range(1, _HIGHEST_POWER + 1):
-        mean = (values * circle**power).mean(axis=0)
+        products = values * circle**power
+        mean = products.mean(axis=0)
         coefficients[power] = mean.real
 
-    least = _NEGLIGIBLE * np.abs(values).max(initial=0.0)
+    largest = np.abs(values).max(initial=0.0)
+    least = _NEGLIGIBLE * largest
     powers = []
     for power, coefficient in coefficients.items():
         size = np.abs(coefficient).max(initial=0.0)
@@ -358,19 +374,24 @@ def clamp_site(loop: LinearLoop, site: str) -> LinearLoop:
     speeds = []
     angles = []
     for port in ports:
-        speeds.append(loop.names.index(loop.outputs[port]))
+        speed_name = loop.outputs[port]
         angle_name = loop.inputs[port].replace(".tau", ".q")
+        speeds.append(loop.names.index(speed_name))
         angles.append(loop.names.index(angle_name))
     removed = {*speeds, *angles}
     kept = [n for n in range(len(loop.names)) if n not in removed]
-    terms = [DelayedTerm(0.0, loop.A, loop.B), *loop.delayed]
+    undelayed_term = DelayedTerm(0.0, loop.A, loop.B)
+    terms = [undelayed_term, *loop.delayed]
     acceleration_block = np.ix_(speeds, ports)
-    if any(term.B[acceleration_block].any() for term in loop.delayed):
-        raise UsageError(
-            "clamped sites that reflect force onto each other do not have a finite response: "
-            f"{site}"
-        )
-    inertia = np.linalg.inv(loop.B[acceleration_block])
+    for term in loop.delayed:
+        reflected = term.B[acceleration_block]
+        if reflected.any():
+            raise UsageError(
+                "clamped sites that reflect force onto each other do not have a finite "
+                f"response: {site}"
+            )
+    inverse_inertia = loop.B[acceleration_block]
+    inertia = np.linalg.inv(inverse_inertia)
     sums: dict[float, DelayedTerm] = {}
 
     def add_term(delay_s: float, A: Array, B: Array) -> None:
@@ -385,29 +406,38 @@ def clamp_site(loop: LinearLoop, site: str) -> LinearLoop:
         """
         key = round(delay_s, 12)
         if key in sums:
-            A = sums[key].A + A
-            B = sums[key].B + B
+            previous = sums[key]
+            A = previous.A + A
+            B = previous.B + B
         sums[key] = DelayedTerm(key, A, B)
 
     clamp_torques = []
     for term in terms:
         by_state = term.A[speeds]
         by_torque = term.B[speeds][:, other_ports]
-        clamp = DelayedTerm(term.delay_s, A=-inertia @ by_state, B=-inertia @ by_torque)
+        clamp_by_state = -inertia @ by_state
+        clamp_by_torque = -inertia @ by_torque
+        clamp = DelayedTerm(term.delay_s, clamp_by_state, clamp_by_torque)
         clamp_torques.append(clamp)
     for term in terms:
-        add_term(term.delay_s, term.A, term.B[:, other_ports])
+        other_effect = term.B[:, other_ports]
+        add_term(term.delay_s, term.A, other_effect)
         effect = term.B[:, ports]
         if not effect.any():
             continue
         for clamp in clamp_torques:
             delay_s = term.delay_s + clamp.delay_s
-            add_term(delay_s, effect @ clamp.A, effect @ clamp.B)
+            effect_of_state = effect @ clamp.A
+            effect_of_torque = effect @ clamp.B
+            add_term(delay_s, effect_of_state, effect_of_torque)
     kept_terms = []
+    kept_block = np.ix_(kept, kept)
     for delay_s in sorted(sums):
         total = sums[delay_s]
-        kept_A = total.A[np.ix_(kept, kept)]
-        kept_terms.append(DelayedTerm(delay_s, kept_A, total.B[kept]))
+        kept_A = total.A[kept_block]
+        kept_B = total.B[kept]
+        kept_term = DelayedTerm(delay_s, kept_A, kept_B)
+        kept_terms.append(kept_term)
     undelayed, *delayed = kept_terms
     active_terms = [term for term in delayed if term.A.any() or term.B.any()]
     return LinearLoop(
@@ -511,21 +541,26 @@ class Transparency(NamedTuple):
         target = np.log(2.0 * np.pi * frequency_hz)
         log_free = np.log(np.abs(self.free))
         log_clamped = np.log(np.abs(self.clamped))
-        free = np.interp(target, log_w, log_free)
-        clamped = np.interp(target, log_w, log_clamped)
-        return float(np.exp(free)), float(np.exp(clamped))
+        log_free_at_target = np.interp(target, log_w, log_free)
+        log_clamped_at_target = np.interp(target, log_w, log_clamped)
+        free = float(np.exp(log_free_at_target))
+        clamped = float(np.exp(log_clamped_at_target))
+        return free, clamped
 
     def _average_magnitude(self, Z: Complex) -> float:
         """Returns the mean magnitude of an impedance over the band, on logarithmic axes."""
         low, high = (2.0 * np.pi * edge for edge in self.band_hz)
         # the edges of the band belong to it, up to rounding
-        is_above = self.w_rad_s >= low * (1.0 - 1e-9)
-        is_below = self.w_rad_s <= high * (1.0 + 1e-9)
+        w_rad_s = self.w_rad_s
+        is_above = w_rad_s >= low * (1.0 - 1e-9)
+        is_below = w_rad_s <= high * (1.0 + 1e-9)
         inside = is_above & is_below
-        log_magnitudes = np.log(np.abs(Z[inside]))
-        log_w = np.log(self.w_rad_s[inside])
+        magnitudes = np.abs(Z[inside])
+        log_magnitudes = np.log(magnitudes)
+        log_w = np.log(w_rad_s[inside])
         width = log_w[-1] - log_w[0]
-        mean = np.trapezoid(log_magnitudes, log_w) / width
+        integral = np.trapezoid(log_magnitudes, log_w)
+        mean = integral / width
         return float(np.exp(mean))
 
 
@@ -549,7 +584,8 @@ def measure_transparency(loop: LinearLoop, at: str, of: str) -> tuple[Transparen
     """
     low, high = _SHOWN_HZ
     decades = np.log10(high / low)
-    points = np.geomspace(low, high, 1 + round(_PER_DECADE * decades))
+    steps = round(_PER_DECADE * decades)
+    points = np.geomspace(low, high, 1 + steps)
     frequencies_hz = np.union1d(points, TRANSPARENCY_BAND_HZ)
     w_rad_s = 2.0 * np.pi * frequencies_hz
 
@@ -560,8 +596,10 @@ def measure_transparency(loop: LinearLoop, at: str, of: str) -> tuple[Transparen
         )
     clamped_loop = clamp_site(loop, of)
     clamped_ports = find_site_ports(clamped_loop, at)
-    evaluate_free = select_ports(build_admittance(loop), ports)
-    evaluate_clamped = select_ports(build_admittance(clamped_loop), clamped_ports)
+    free_admittance = build_admittance(loop)
+    clamped_admittance = build_admittance(clamped_loop)
+    evaluate_free = select_ports(free_admittance, ports)
+    evaluate_clamped = select_ports(clamped_admittance, clamped_ports)
     free = evaluate_free(w_rad_s)
     clamped = evaluate_clamped(w_rad_s)
 

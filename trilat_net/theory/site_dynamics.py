@@ -330,9 +330,13 @@ def _evaluate_known_gravity_law(
     known_parameters = np.broadcast_to(gains.known, site.theta.shape)
     theta = _as_columns(known_parameters, q)
     G = arm.gravity_torque(theta)
-    pull = Kd * following.ed
-    pull = pull + K * following.e - k_f * x[layout.peer_torque]
-    torque: Array = G - d * qd - following.to_joints(pull)
+    error_damper = Kd * following.ed
+    spring = K * following.e
+    reflected = k_f * x[layout.peer_torque]
+    pull = error_damper + spring - reflected
+    pull_torque = following.to_joints(pull)
+    damper = d * qd
+    torque: Array = G - damper - pull_torque
     return torque
 
 
@@ -372,17 +376,23 @@ def _evaluate_adaptive_law(
         v = -Lambda * q
         a = -Lambda * qd
         r = qd + Lambda * q
-        reference_r = x[layout.qd_des] + Lambda * x[layout.q_des]
+        position_part = Lambda * x[layout.q_des]
+        reference_r = x[layout.qd_des] + position_part
         pull = pull - Kp * reference_r
 
     model_torque = arm.required_torque(estimate, qd, v, a)
-    tau = model_torque - Kp * r - following.to_joints(pull)
-    robust_torque = rho * r / np.sqrt(r * r + width * width)
-    unknown_friction = (1.0 - known) * arm.friction_torque(v)
+    damper = Kp * r
+    pull_torque = following.to_joints(pull)
+    tau = model_torque - damper - pull_torque
+    magnitude = np.sqrt(r * r + width * width)
+    robust_torque = rho * r / magnitude
+    friction = arm.friction_torque(v)
+    unknown_friction = (1.0 - known) * friction
     tau = tau - robust_torque - unknown_friction
 
     Y = arm.regressor_matrix(qd, v, a)
-    gradient = multiply_columns(np.swapaxes(Y, 0, 1), r)
+    Y_transposed = np.swapaxes(Y, 0, 1)
+    gradient = multiply_columns(Y_transposed, r)
     rate = -Gamma * gradient
     is_blocked = _is_at_bound(site, estimate, rate)
     return tau, np.where(is_blocked, 0.0, rate)
@@ -465,13 +475,18 @@ def _evaluate_actor(
     else:
         surface_point = _as_columns(actor.a, q)
         normal = _as_columns(actor.b, q)
-        depth = np.sum((surface_point - position) * normal, axis=0)
+        offset = surface_point - position
+        depth = np.sum(offset * normal, axis=0)
         outward_speed = np.sum(velocity * normal, axis=0)
-        push = stiffness[0] * depth - damping[0] * outward_speed
+        wall_spring = stiffness[0] * depth
+        wall_damper = damping[0] * outward_speed
+        push = wall_spring - wall_damper
         # a wall pushes and never pulls
-        touches = (depth.real > 0.0) & (push.real > 0.0)
+        is_inside = depth.real > 0.0
+        touches = is_inside & (push.real > 0.0)
         force = np.where(touches, push, 0.0) * normal
-    return multiply_columns(np.swapaxes(J, 0, 1), force)
+    J_transposed = np.swapaxes(J, 0, 1)
+    return multiply_columns(J_transposed, force)
 
 
 def _evaluate_model(actor: TorqueSource, position: Numbers, velocity: Numbers) -> Numbers:
