@@ -79,10 +79,13 @@ def solve_columns(A: Numbers, b: Numbers) -> Numbers:
     Returns:
         The solutions y, shape (m, ...).
     """
+    # numpy expects the matrices on the last two axes
     matrices = np.moveaxis(A, (0, 1), (-2, -1))
-    right_sides = np.moveaxis(b, 0, -1)[..., np.newaxis]
+    vectors = np.moveaxis(b, 0, -1)
+    right_sides = vectors[..., np.newaxis]
     solutions = np.linalg.solve(matrices, right_sides)
-    return np.moveaxis(solutions[..., 0], -1, 0)
+    y = solutions[..., 0]
+    return np.moveaxis(y, -1, 0)
 
 
 @dataclass(frozen=True)
@@ -115,12 +118,15 @@ class PlacedArm:
             theta: The five dynamic parameters of the arm, which combine masses, lengths and
                 inertias as in Eq. (24), shape (5, ...).
         """
-        bend = theta[1] * np.cos(self.q[1])
+        q_2 = self.q[1]
+        bend = theta[1] * np.cos(q_2)
         M_11 = theta[0] + 2.0 * bend
         M_12 = theta[2] + bend
         # 0 M_12 gives this entry as many columns as the others have
         M_22 = theta[2] + 0.0 * M_12
-        return np.array([[M_11, M_12], [M_12, M_22]])
+        row_1 = [M_11, M_12]
+        row_2 = [M_12, M_22]
+        return np.array([row_1, row_2])
 
     def coriolis_matrix(self, theta: Numbers, qd: Numbers) -> Numbers:
         """Returns the Coriolis matrix C(q, qd), shape (2, 2, ...), in kg m^2/s.
@@ -133,14 +139,17 @@ class PlacedArm:
             theta: Dynamic parameters of the arm, shape (5, ...).
             qd: Joint velocities, shape (2, ...), in rad/s.
         """
-        h = -theta[1] * np.sin(self.q[1])
+        q_2 = self.q[1]
+        h = -theta[1] * np.sin(q_2)
         qd_1, qd_2 = qd
         C_11 = h * qd_2
         C_12 = h * (qd_1 + qd_2)
         C_21 = -h * qd_1
         # zero, with as many columns as the other entries have
         C_22 = 0.0 * h * qd_1
-        return np.array([[C_11, C_12], [C_21, C_22]])
+        row_1 = [C_11, C_12]
+        row_2 = [C_21, C_22]
+        return np.array([row_1, row_2])
 
     def gravity_torque(self, theta: Numbers) -> Numbers:
         """Returns the torque G(q) that holds the arm against gravity, shape (2, ...), in N m.
@@ -149,8 +158,10 @@ class PlacedArm:
             theta: Dynamic parameters of the arm, shape (5, ...).
         """
         q_1, q_2 = self.q
-        G_2 = theta[4] * self.g_m_s2 * np.cos(q_1 + q_2)
-        G_1 = theta[3] * self.g_m_s2 * np.cos(q_1) + G_2
+        weight_1 = theta[3] * self.g_m_s2
+        weight_2 = theta[4] * self.g_m_s2
+        G_2 = weight_2 * np.cos(q_1 + q_2)
+        G_1 = weight_1 * np.cos(q_1) + G_2
         return np.array([G_1, G_2])
 
     def required_torque(
@@ -189,8 +200,11 @@ class PlacedArm:
             a: Reference accelerations of the joints, shape (2, ...), in rad/s^2.
         """
         columns = self.q.shape[1:]
-        units = np.multiply.outer(np.eye(5), np.ones(columns))
-        torques = [self.required_torque(unit, qd, v, a) for unit in units]
+        ones = np.ones(columns)
+        torques = []
+        for unit_parameters in np.multiply.outer(np.eye(5), ones):
+            unit_torque = self.required_torque(unit_parameters, qd, v, a)
+            torques.append(unit_torque)
         return np.stack(torques, axis=1)
 
     def friction_torque(self, v: Numbers) -> Numbers:
@@ -221,8 +235,8 @@ class PlacedArm:
     def end_effector_position(self) -> Numbers:
         """Returns the position of the end effector from the base, shape (2, ...), in m."""
         l1_m, l2_m = self.lengths_m
-        inner = self.q[0]
-        outer = self.q[0] + self.q[1]
+        inner, q_2 = self.q
+        outer = inner + q_2
         x = l1_m * np.cos(inner) + l2_m * np.cos(outer)
         y = l1_m * np.sin(inner) + l2_m * np.sin(outer)
         return np.array([x, y])
@@ -231,7 +245,8 @@ class PlacedArm:
         """Returns the Jacobian of the end effector's position, shape (2, 2, ...), in m/rad."""
         x, y = self.end_effector_position()
         l2_m = self.lengths_m[1]
-        outer = self.q[0] + self.q[1]
+        q_1, q_2 = self.q
+        outer = q_1 + q_2
         row_x = [-y, -l2_m * np.sin(outer)]
         row_y = [x, l2_m * np.cos(outer)]
         return np.array([row_x, row_y])
@@ -399,7 +414,9 @@ class PlanarArmRows(NamedTuple):
         Returns:
             Torque, shape (K, 2).
         """
-        return self.place(q).gravity_torque(self.theta).T
+        arm = self.place(q)
+        torque = arm.gravity_torque(self.theta)
+        return torque.T
 
     def potential_energy(self, q: Array) -> Array:
         """Returns the potential energy of the arm in each of K poses, in J.
@@ -414,8 +431,10 @@ class PlanarArmRows(NamedTuple):
             Energy, shape (K,).
         """
         q_1, q_2 = q.T
-        inner = self.theta[3] * np.sin(q_1)
-        outer = self.theta[4] * np.sin(q_1 + q_2)
+        theta_4 = self.theta[3]
+        theta_5 = self.theta[4]
+        inner = theta_4 * np.sin(q_1)
+        outer = theta_5 * np.sin(q_1 + q_2)
         energy: Array = self.g * (inner + outer)
         return energy
 
@@ -464,7 +483,8 @@ class PlanarArmRows(NamedTuple):
         """
         angles_to_down = []
         for link_angle in np.cumsum(q):
-            angle = math.remainder(link_angle + math.pi / 2.0, math.tau)
+            turned_angle = link_angle + math.pi / 2.0
+            angle = math.remainder(turned_angle, math.tau)
             angles_to_down.append(abs(angle))
         return max(angles_to_down)
 
@@ -609,7 +629,9 @@ class ChainArmRows(NamedTuple):
         The entries are True for the mass m and the first moment m c of every link, where c is
         its centre of mass.
         """
-        return np.arange(len(self.theta)) % LINK_PARAMETERS < 4
+        indices = np.arange(len(self.theta))
+        index_in_link = indices % LINK_PARAMETERS
+        return index_in_link < 4
 
     @property
     def _rows(self) -> RowArray:
@@ -623,8 +645,9 @@ class ChainArmRows(NamedTuple):
 
     def _replace_in_joints(self, **values: Any) -> "ChainArmRows":
         """Returns the same chain with some values of every joint replaced."""
-        joints = tuple(joint._replace(**values) for joint in self.chain.joints)
-        return self._replace(chain=self.chain._replace(joints=joints))
+        joints = [joint._replace(**values) for joint in self.chain.joints]
+        chain = self.chain._replace(joints=tuple(joints))
+        return self._replace(chain=chain)
 
     def weightless(self) -> "ChainArmRows":
         """Returns the same chain without gravity and Coulomb friction.
@@ -633,7 +656,8 @@ class ChainArmRows(NamedTuple):
         that the effects of parts of a motion can be computed separately and added.
         """
         bare = self._replace_in_joints(coulomb=0.0)
-        weightless_chain = bare.chain._replace(gravity_m_s2=(0.0, 0.0, 0.0))
+        no_gravity = (0.0, 0.0, 0.0)
+        weightless_chain = bare.chain._replace(gravity_m_s2=no_gravity)
         return bare._replace(chain=weightless_chain)
 
     def without_drives(self) -> "ChainArmRows":
@@ -726,7 +750,8 @@ class ChainArmRows(NamedTuple):
         Returns:
             Gradient Y'r with respect to the 10 n parameters, shape (K, 10 n).
         """
-        gradient = np.zeros((len(q), len(self.theta)))
+        poses = len(q)
+        gradient = np.zeros((poses, len(self.theta)))
         _put_gradients(
             chain=self._rows,
             gravity=np.array(self.chain.gravity_m_s2),
@@ -764,9 +789,10 @@ class ChainArmRows(NamedTuple):
             Its Jacobian, velocity above angular velocity, shape (K, 6, n).
             Potential energy, shape (K,), in J.
         """
-        position = np.zeros((len(q), 3))
-        J = np.zeros((len(q), 6, q.shape[1]))
-        energy = np.zeros(len(q))
+        poses, joints = q.shape
+        position = np.zeros((poses, 3))
+        J = np.zeros((poses, 6, joints))
+        energy = np.zeros(poses)
         _put_end_effectors(
             chain=self._rows,
             theta=self.theta,
@@ -816,8 +842,10 @@ class ChainArmRows(NamedTuple):
         """
         stiffness = self._column("stop_stiffness")
         damping = self._column("stop_damping")
-        below = np.maximum(self._column("lower") - q, 0.0)
-        above = np.maximum(q - self._column("upper"), 0.0)
+        lower = self._column("lower")
+        upper = self._column("upper")
+        below = np.maximum(lower - q, 0.0)
+        above = np.maximum(q - upper, 0.0)
 
         damping_torque = damping * qd
         push_up = np.maximum(stiffness * below - damping_torque, 0.0)
@@ -892,7 +920,9 @@ class ChainArmRows(NamedTuple):
         share = (energy_j - lowest_j) / range_j
         # a pendulum's share of its potential energy is (1 - cos(angle)) / 2
         cosine = 1.0 - 2.0 * share
-        return math.acos(min(max(cosine, -1.0), 1.0))
+        # rounding errors may exceed the range of a cosine
+        valid_cosine = min(max(cosine, -1.0), 1.0)
+        return math.acos(valid_cosine)
 
     def _find_pose_energy(self, q: Array) -> float:
         """Returns the potential energy in one pose, in J."""
@@ -911,7 +941,8 @@ class ChainArmRows(NamedTuple):
         for joint in np.tile(revolute, _ENERGY_SWEEPS):
             poses = np.tile(q, (3, 1))
             poses[:, joint] = (0.0, 0.5 * np.pi, np.pi)
-            at_0, at_90, at_180 = self.potential_energy(poses).tolist()
+            energies = self.potential_energy(poses)
+            at_0, at_90, at_180 = energies.tolist()
             mean = 0.5 * (at_0 + at_180)
             b = at_0 - mean
             c = at_90 - mean
@@ -954,7 +985,8 @@ def joint_positions_m(arm: ArmModel, q: Array) -> Array:
     """
     if arm.chain is not None:
         return _chain_positions_m(arm.chain, q)
-    points = np.zeros((len(q), 1 + JOINTS, 2))
+    points_per_pose = 1 + JOINTS
+    points = np.zeros((len(q), points_per_pose, 2))
     for pose, angles in zip(points, q, strict=True):
         pose[1:] = forward_kinematics(arm.lengths_m, angles)
     return points
@@ -989,10 +1021,13 @@ def upright_axes(chain: ChainSetup) -> Array:
     """
     gravity = np.array(chain.gravity_m_s2)
     size = float(np.linalg.norm(gravity))
-    up = -gravity / size if size else np.array([0.0, 0.0, 1.0])
+    up = np.array([0.0, 0.0, 1.0])
+    if size:
+        up = -gravity / size
     # the first axis that is not nearly vertical: x, unless gravity acts along x
     is_vertical = np.abs(up) > 0.9
-    axis = np.eye(3)[int(np.argmin(is_vertical))]
+    axis_index = int(np.argmin(is_vertical))
+    axis = np.eye(3)[axis_index]
     vertical_part = (axis @ up) * up
     forward = axis - vertical_part
     forward /= np.linalg.norm(forward)
@@ -1043,7 +1078,8 @@ def stack_regressors(arm: ChainArmRows, states: int) -> Array:
     # a regressor's columns are the torques of unit parameters
     state = np.repeat(np.arange(states), count)
     unit_parameters = np.tile(np.eye(count), (states, 1))
-    torque = arm.without_drives().law_torque(
+    links = arm.without_drives()
+    torque = links.law_torque(
         theta_hat=unit_parameters,
         q=q[state],
         qd=qd[state],
@@ -1069,7 +1105,8 @@ def _find_chain_base(chain: ChainSetup, learnt: tuple[bool, ...]) -> BaseParamet
     W = regressors[:, list(learnt)]
     indices = np.flatnonzero(learnt)
     norm = float(np.linalg.norm(W))
-    least_size = DEPENDENT_SHARE * norm / np.sqrt(W.shape[1])
+    root_of_columns = np.sqrt(W.shape[1])
+    least_size = DEPENDENT_SHARE * norm / root_of_columns
 
     Q = np.zeros((len(W), 0))
     kept = []
@@ -1082,12 +1119,14 @@ def _find_chain_base(chain: ChainSetup, learnt: tuple[bool, ...]) -> BaseParamet
             Q = np.column_stack([Q, rest / size])
             kept.append(p)
 
-    factors = np.linalg.lstsq(W[:, kept], W, rcond=None)[0]
+    independent = W[:, kept]
+    factors = np.linalg.lstsq(independent, W, rcond=None)[0]
     contributes = np.abs(factors) > DEPENDENT_SHARE
     kept_indices = indices[kept]
-    combination = np.zeros((len(kept), len(learnt)))
+    base_count = len(kept)
+    combination = np.zeros((base_count, len(learnt)))
     combination[:, indices] = np.where(contributes, factors, 0.0)
-    combination[:, kept_indices] = np.eye(len(kept))
+    combination[:, kept_indices] = np.eye(base_count)
     return BaseParameters(kept_indices, combination)
 
 
@@ -1124,16 +1163,19 @@ def find_pseudo_inertias(theta: Array) -> Array:
     links = theta.reshape(-1, LINK_PARAMETERS)
     mass = links[:, 0]
     moment = links[:, 1:4]
-    xx, xy, yy, xz, yz, zz = links[:, 4:].T
+    inertias = links[:, 4:]
+    xx, xy, yy, xz, yz, zz = inertias.T
     row_x = [xx, xy, xz]
     row_y = [xy, yy, yz]
     row_z = [xz, yz, zz]
     inertia = np.array([row_x, row_y, row_z])
     inertia_of_link = inertia.transpose(2, 0, 1)
     half_trace = 0.5 * (xx + yy + zz)
-    S = half_trace[:, np.newaxis, np.newaxis] * np.eye(3) - inertia_of_link
+    half_trace_of_link = half_trace[:, np.newaxis, np.newaxis]
+    S = half_trace_of_link * np.eye(3) - inertia_of_link
 
-    pseudo_inertias = np.zeros((len(links), 4, 4))
+    count = len(links)
+    pseudo_inertias = np.zeros((count, 4, 4))
     pseudo_inertias[:, :3, :3] = S
     pseudo_inertias[:, :3, 3] = moment
     pseudo_inertias[:, 3, :3] = moment
@@ -1152,4 +1194,7 @@ def find_consistent_links(theta: Array) -> list[bool]:
     """
     pseudo_inertias = find_pseudo_inertias(theta)
     eigenvalues = np.linalg.eigvalsh(pseudo_inertias)
-    return [bool(values.min() > 0.0) for values in eigenvalues]
+    least_eigenvalues = eigenvalues.min(axis=1)
+    is_positive_definite = least_eigenvalues > 0.0
+    consistent: list[bool] = is_positive_definite.tolist()
+    return consistent

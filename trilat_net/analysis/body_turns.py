@@ -43,6 +43,7 @@ class BodyTurns:
         for body, pose in enumerate(poses):
             if body not in self._signs:
                 self._signs[body] = QuaternionSigns(w=0)
+            signs = self._signs[body]
             quaternion = pose[POSITION:]
-            quaternion[:] = self._signs[body].align(quaternion.tolist())
+            quaternion[:] = signs.align(quaternion.tolist())
         return poses.ravel()

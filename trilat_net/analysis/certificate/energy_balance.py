@@ -49,6 +49,8 @@ ZERO_ENERGY_J = 1e-12
 """Rounding error of an energy that is zero, in J."""
 EXTERNAL_SOURCES = ("hands", "walls", "stops")
 """Sources of work outside the loop: operators, environments, and the stops of joints."""
+_EnergyKey = tuple[str, str]
+"""Kind and name of an energy, such as ("dissipation", "damping")."""
 
 
 @dataclass(frozen=True)
@@ -84,8 +86,10 @@ class SiteEnergy:
         These periods do not count in the energy balance.
         """
         known_views = [view.known for view in self.followed.values()]
-        known = [self.motion.records.known_periods, *known_views]
-        return np.asarray(np.logical_and.reduce(known))
+        known_periods = self.motion.records.known_periods
+        known = [known_periods, *known_views]
+        is_judged = np.logical_and.reduce(known)
+        return np.asarray(is_judged)
 
     @cached_property
     def residual(self) -> Array:
@@ -97,7 +101,8 @@ class SiteEnergy:
         """
         dissipated = [kind.total for kind in self.dissipation.values()]
         worked = [source.total for source in self.work.values()]
-        change = np.diff(self.parts.total) + self.transfer.total
+        change_of_energy = np.diff(self.parts.total)
+        change = change_of_energy + self.transfer.total
         change += np.sum(dissipated, axis=0)
         change -= np.sum(worked, axis=0)
         return _accumulate(change, self.judged)
@@ -121,10 +126,12 @@ class SiteEnergy:
         the arm follows it, is ever different from zero.
         """
         alpha = self.motion.dominance.alpha
+        peers = self.motion.peers
         followed = {}
-        for j, (peer, view) in enumerate(self.motion.peers.items()):
-            if alpha[:, j].any():
-                followed[peer] = view
+        for j, peer in enumerate(peers):
+            alpha_of_peer = alpha[:, j]
+            if alpha_of_peer.any():
+                followed[peer] = peers[peer]
         return followed
 
     @property
@@ -152,10 +159,12 @@ class SiteEnergy:
         for view in self.followed.values():
             is_known = view.delayed.known & view.now.known
             known.append(is_known)
-        known_rows = np.flatnonzero(np.logical_and.reduce(known))
+        all_known = np.logical_and.reduce(known)
+        known_rows = np.flatnonzero(all_known)
         if not len(known_rows):
             return np.inf
-        return float(self.motion.records.t_s[known_rows[0]])
+        first_row = known_rows[0]
+        return float(self.motion.records.t_s[first_row])
 
     @cached_property
     def uncertainty(self) -> float:
@@ -181,20 +190,25 @@ class SiteEnergy:
         powers = [increment.left for increment in dissipated]
         powers += [-increment.left for increment in worked]
         power = np.sum(powers, axis=0)
-        curvature = np.diff(power[self.judged], 2)
-        rule_error = float(np.abs(curvature).sum()) / 6.0
+        judged_power = power[self.judged]
+        curvature = np.diff(judged_power, 2)
+        total_curvature = float(np.abs(curvature).sum())
+        rule_error = total_curvature / 6.0
         return rule_error + self._estimate_coupled_error()
 
     def _estimate_coupled_error(self) -> float:
         """Returns the energy of changes of r times changes of the torques, in J."""
         records = self.motion.records
-        change_of_r = self.motion.ends.r_right - self.motion.ends.r_left
+        ends = self.motion.ends
+        change_of_r = ends.r_right - ends.r_left
         coupled = 0.0
         for torque in (records.tau, records.tau_x):
             change_of_torque = np.diff(torque, axis=0)
-            product = (change_of_r * change_of_torque).sum(axis=1)
-            energy = _accumulate(records.h_s * product, self.judged)
-            coupled += 2.0 * float(np.abs(energy).max())
+            products = change_of_r * change_of_torque
+            amounts = records.h_s * products.sum(axis=1)
+            energy = _accumulate(amounts, self.judged)
+            largest_energy = float(np.abs(energy).max())
+            coupled += 2.0 * largest_energy
         return coupled
 
 
@@ -205,8 +219,10 @@ def _accumulate(amounts: Array, judged: Bools | None = None) -> Array:
         amounts: Amount in each period, shape (K - 1,).
         judged: True for each period that counts. None if all periods count.
     """
-    counted = amounts if judged is None else np.where(judged, amounts, 0.0)
-    return np.concatenate([[0.0], np.cumsum(counted)])
+    if judged is not None:
+        amounts = np.where(judged, amounts, 0.0)
+    sums = np.cumsum(amounts)
+    return np.concatenate([[0.0], sums])
 
 
 def compute_site_energies(log: Log) -> dict[str, SiteEnergy]:
@@ -226,7 +242,9 @@ def compute_site_energies(log: Log) -> dict[str, SiteEnergy]:
             valid.
     """
     records = align_records(log, common=True)
-    pasts = {site: PeerTrajectory(site_records) for site, site_records in records.items()}
+    pasts = {}
+    for site, site_records in records.items():
+        pasts[site] = PeerTrajectory(site_records)
     dominance = partial(trace_dominance, log)
     energies = derive_site_energies(log.scenario, records, pasts, dominance)
     if not energies or len(find_common_times(energies)) < 2:
@@ -256,12 +274,19 @@ def derive_site_energies(
         The energies, by name of the site.
     """
     energies = {}
-    constants = {site: energy_terms.derive_site_constants(scenario, site) for site in records}
-    axes = [c.axes for c in constants.values() if c.axes]
+    constants = {}
+    followed_axes = []
+    for site in records:
+        c = energy_terms.derive_site_constants(scenario, site)
+        constants[site] = c
+        if c.axes:
+            followed_axes.append(c.axes)
     common_axes: tuple[float, ...] = ()
-    if axes:
+    if followed_axes:
         # 1 along the axes that all sites follow
-        common_axes = tuple(np.prod(axes, axis=0).tolist())
+        products = np.prod(followed_axes, axis=0)
+        common_axes = tuple(products.tolist())
+    transferred_axes = np.array(common_axes or 1.0)
 
     for site, site_records in records.items():
         peers = {}
@@ -280,7 +305,7 @@ def derive_site_energies(
             motion=motion,
             parts=energy_terms.evaluate_functional(motion),
             dissipation=energy_terms.compute_dissipation(motion),
-            transfer=energy_terms.compute_transfer(motion, np.array(common_axes or 1.0)),
+            transfer=energy_terms.compute_transfer(motion, transferred_axes),
             work=energy_terms.compute_work(motion),
             sampling=energy_terms.compute_sampling_work(motion),
         )
@@ -410,8 +435,11 @@ class EnergyBalance:
         It is the largest magnitude that the total energy V, or the work of any source, reaches
         during the run.
         """
-        energies = [self.V, *self.work.values()]
-        return max(float(np.abs(energy).max()) for energy in energies)
+        largest = []
+        for energy in [self.V, *self.work.values()]:
+            magnitudes = np.abs(energy)
+            largest.append(float(magnitudes.max()))
+        return max(largest)
 
     def _accumulate_judged(self, values: Array) -> Array:
         """Returns the sum of a quantity's changes over the judged periods, shape (T,)."""
@@ -438,12 +466,13 @@ def compute_energy_balance(
     beta_columns = []
     sites = {}
     unjudged = np.zeros(len(times))
-    sums: dict[tuple[str, str], Array] = {}
+    sums: dict[_EnergyKey, Array] = {}
     for n, (site, energy) in enumerate(energies.items()):
         records = energy.motion.records
         t_s = records.t_s
         # sites with the same ticks share their weights
-        grid = (records.first, len(records.known), records.rate_hz)
+        count = len(records.known)
+        grid = (records.first, count, records.rate_hz)
         if grid not in weights_by_grid:
             weights_by_grid[grid] = _trace_weights(
                 energies, records, paper_weights=paper_weights
@@ -452,17 +481,20 @@ def compute_energy_balance(
         beta_left, beta_right = weights_by_grid[grid]
         left = beta_left[:, n]
         right = beta_right[:, n]
-        for key, amounts in _weigh_site(energy, left, right).items():
+        weighted = _weigh_site(energy, left, right)
+        for key, amounts in weighted.items():
             resampled = _resample(times, t_s, amounts)
             if key in sums:
                 resampled = sums[key] + resampled
             sums[key] = resampled
         beta_columns.append(_resample(times, t_s, left))
-        sites[site] = _resample(times, t_s, left * energy.parts.total)
+        weighted_V = left * energy.parts.total
+        sites[site] = _resample(times, t_s, weighted_V)
 
         is_unjudged = (~energy.judged).astype(np.float64)
         unjudged_periods = _accumulate(is_unjudged)
-        unjudged += np.abs(_resample(times, t_s, unjudged_periods))
+        resampled_periods = _resample(times, t_s, unjudged_periods)
+        unjudged += np.abs(resampled_periods)
 
     judged: Bools = np.diff(unjudged) == 0.0
     all_judged = bool(judged.all())
@@ -486,11 +518,14 @@ def compute_energy_balance(
                 selected[name] = _accumulate(np.diff(energy), judged)
         return selected
 
+    parts = {}
+    for name in FunctionalParts._fields:
+        parts[name] = sums["parts", name]
     return EnergyBalance(
         t_s=times,
         beta=np.stack(beta_columns, axis=1),
         sites=sites,
-        parts={name: sums["parts", name] for name in FunctionalParts._fields},
+        parts=parts,
         dissipation=select("dissipation"),
         work=select("work"),
         sampling=select("sampling")[""],
@@ -499,7 +534,7 @@ def compute_energy_balance(
     )
 
 
-def _weigh_site(energy: SiteEnergy, left: Array, right: Array) -> dict[tuple[str, str], Array]:
+def _weigh_site(energy: SiteEnergy, left: Array, right: Array) -> dict[_EnergyKey, Array]:
     """Returns a site's weighted contributions to the balance, at its own ticks.
 
     A change of the weight itself does work on V, along a ramp and at a step. That work is
@@ -522,7 +557,8 @@ def _weigh_site(energy: SiteEnergy, left: Array, right: Array) -> dict[tuple[str
         return _accumulate(at_start + at_end)
 
     weighted = {}
-    for name, part in energy.parts._asdict().items():
+    parts = energy.parts._asdict()
+    for name, part in parts.items():
         weighted["parts", name] = left * part
     for name, increment in energy.dissipation.items():
         weighted["dissipation", name] = weigh(increment)
@@ -550,7 +586,8 @@ def _resample(times: Array, t_s: Array, values: Array) -> Array:
         t_s: Times of the values, shape (K,), in s.
         values: The values, shape (K,).
     """
-    if len(t_s) == len(times) and t_s[0] == times[0]:
+    has_same_length = len(t_s) == len(times)
+    if has_same_length and t_s[0] == times[0]:
         return values
     return np.interp(times, t_s, values)
 
@@ -578,8 +615,9 @@ def _trace_weights(
     beta_by_matrix: dict[bytes, Array] = {}
 
     def compute_beta(t_s: Array, ahead_s: float) -> Array:
+        count = len(t_s)
         if paper_weights:
-            return np.ones((len(t_s), len(Kd)))
+            return np.ones((count, len(Kd)))
         different_s = t_s[:1] if is_constant else t_s
         alpha = _interpolate_dominance(energies, different_s, ahead_s)
         # equal matrices must be equal in their bytes, and adding 0.0 turns -0.0 into 0.0
@@ -594,10 +632,13 @@ def _trace_weights(
                 beta_by_matrix[key] = compute_lyapunov_weights(square, Kd).beta
             betas.append(beta_by_matrix[key])
         beta = np.array(betas)[matrix_index.ravel()]
-        return np.tile(beta, (len(t_s), 1)) if is_constant else beta
+        if is_constant:
+            return np.tile(beta, (count, 1))
+        return beta
 
     at_ticks = compute_beta(records.t_s, 0.0)
-    at_period_ends = compute_beta(records.t_s[:-1], records.h_s)
+    period_starts_s = records.t_s[:-1]
+    at_period_ends = compute_beta(period_starts_s, records.h_s)
     return at_ticks, at_period_ends
 
 
@@ -614,15 +655,18 @@ def _interpolate_dominance(
         ahead_s: Time by which a ramp in progress is extrapolated, in s.
     """
     names = list(energies)
-    alpha = np.zeros((len(t_s), len(names), len(names)))
+    sites = len(names)
+    alpha = np.zeros((len(t_s), sites, sites))
     for i, energy in enumerate(energies.values()):
         records = energy.motion.records
         dominance = energy.motion.dominance
-        position = (t_s - records.t_s[0]) * records.rate_hz
+        elapsed_s = t_s - records.t_s[0]
+        position = elapsed_s * records.rate_hz
 
         tick_before = np.floor(position + 1e-5)
         last_row = len(records.known) - 1
-        row = np.clip(tick_before, 0, last_row).astype(np.int64)
+        recorded_tick = np.clip(tick_before, 0, last_row)
+        row = recorded_tick.astype(np.int64)
         since_tick = np.maximum(position - row, 0.0)
         later_s = since_tick / records.rate_hz + ahead_s
 
@@ -658,7 +702,8 @@ def find_dominance_matrices(energies: Mapping[str, SiteEnergy]) -> Array:
         change_of_rate = np.diff(dominance.rate, axis=0, prepend=0.0)
         ramp_rows = np.flatnonzero(change_of_rate.any(axis=1))
         is_step = dominance.alpha[1:] != dominance.before
-        step_rows = np.flatnonzero(is_step.any(axis=1)) + 1
+        periods_with_step = np.flatnonzero(is_step.any(axis=1))
+        step_rows = periods_with_step + 1
         times.append(t_s[ramp_rows])
         times.append(t_s[step_rows])
     return _interpolate_dominance(energies, np.concatenate(times))
@@ -679,5 +724,6 @@ def rise_above_minimum(values: Array) -> Array:
 
 def _sum(columns: Mapping[str, Array]) -> Array:
     """Returns the sum of curves at each time, shape (T,)."""
-    total: Array = np.sum(list(columns.values()), axis=0)
+    curves = list(columns.values())
+    total: Array = np.sum(curves, axis=0)
     return total

@@ -54,7 +54,19 @@ RATE_TOLERANCE = 1e-12
 It is a share of the largest torque.
 """
 JUMP_TOLERANCE = 1e-12
-"""Largest change of e, in rad, or of its derivative, in rad/s, that is no jump."""
+"""Changes of e, in rad, or of its derivative, in rad/s, count as jumps if they are larger."""
+_GAIN_NAMES = (
+    "Lambda",
+    "Kp",
+    "Kd",
+    "Gamma",
+    "low",
+    "high",
+    "rho",
+    "width",
+    "friction",
+)
+"""Names of the gains that `SiteConstants` takes from the settings of the control law."""
 
 
 class SiteConstants(NamedTuple):
@@ -130,7 +142,8 @@ class SiteConstants(NamedTuple):
     @property
     def unknown_friction(self) -> Array:
         """Fraction of each joint's friction that the law does not compensate, shape (n,)."""
-        unit_speeds = np.ones((1, len(self.Kp)))
+        joints = len(self.Kp)
+        unit_speeds = np.ones((1, joints))
         friction_torque = self.arm.friction(unit_speeds)[0]
         has_friction = friction_torque != 0.0
         share: Array = (1.0 - self.friction) * has_friction
@@ -154,24 +167,26 @@ def derive_site_constants(scenario: Scenario, site: str) -> SiteConstants:
         scenario: The description of the experiment, which defines the gains.
         site: Name of the site, the process that runs one arm.
     """
-    spec = scenario.sites[site]
     arm = build_arm_rows(scenario, site)
     gains = scenario.gains(site)
+    limits = scenario.sites[site].limits
     gain_arrays = {}
-    for name in ("Lambda", "Kp", "Kd", "Gamma", "low", "high", "rho", "width", "friction"):
-        gain_arrays[name] = np.array(getattr(gains, name))
+    for name in _GAIN_NAMES:
+        gain = getattr(gains, name)
+        gain_arrays[name] = np.array(gain)
 
     axes: tuple[float, ...] = ()
     if arm.task is not None:
         axes = arm.task.axes
+        followed_axes = np.array(axes)
         for name in ("Lambda", "Kd"):
-            gain_arrays[name] = np.array(axes) * gain_arrays[name]
+            gain_arrays[name] = followed_axes * gain_arrays[name]
     return SiteConstants(
         **gain_arrays,
         arm=arm,
         axes=axes,
-        tau_limit=np.asarray(spec.limits.tau_limit_nm, dtype=np.float64),
-        tau_rate=np.asarray(spec.limits.motion.tau_rate, dtype=np.float64),
+        tau_limit=np.asarray(limits.tau_limit_nm, dtype=np.float64),
+        tau_rate=np.asarray(limits.motion.tau_rate, dtype=np.float64),
     )
 
 
@@ -258,7 +273,8 @@ class SiteMotion:
         e and the gain Lambda in 1/s.
         """
         records = self.records
-        v, _ = self.following.compute_reference(slice(None), records.e, records.ed)
+        all_rows = slice(None)
+        v, _ = self.following.compute_reference(all_rows, records.e, records.ed)
         return records.qd - v
 
     @cached_property
@@ -270,7 +286,8 @@ class SiteMotion:
         joint velocity minus the reference velocity.
         """
         records = self.records
-        v, a = self.following.compute_reference(slice(None), records.e, records.ed)
+        all_rows = slice(None)
+        v, a = self.following.compute_reference(all_rows, records.e, records.ed)
         return self.constants.arm.gradient(
             q=records.q,
             qd=records.qd,
@@ -345,7 +362,8 @@ class SiteMotion:
         robust = c.robust_torque(r)
         tau: Array = model - c.Kp * r - damping - robust
         # `model` compensates all of the friction
-        uncompensated = (1.0 - c.friction) * c.arm.friction(v)
+        uncompensated_share = 1.0 - c.friction
+        uncompensated = uncompensated_share * c.arm.friction(v)
         return tau - uncompensated
 
     @property
@@ -378,7 +396,8 @@ class SiteMotion:
             return lower, upper
 
         torque_before_start = np.zeros(shape[1])
-        previous_torque = np.vstack([torque_before_start, records.tau[:-1]])
+        earlier_torques = records.tau[:-1]
+        previous_torque = np.vstack([torque_before_start, earlier_torques])
         change_limit = records.h_s * limits.tau_rate
         largest_change = np.broadcast_to(change_limit, shape).copy()
         if records.first != 0:
@@ -417,9 +436,12 @@ class SiteMotion:
         """
         records = self.records
         dominance = self.dominance
-        following = records.follows[:-1] & records.follows[1:]
+        is_following_left = records.follows[:-1]
+        is_following_right = records.follows[1:]
+        following = is_following_left & is_following_right
+        # for all joints
         follows_at_both = following[:, np.newaxis]
-        follows_at_left = records.follows[:-1, np.newaxis]
+        follows_at_left = is_following_left[:, np.newaxis]
 
         # the reference of Eq. (6) and its derivative at the end of the period, before any jump
         q_terms = []
@@ -441,8 +463,10 @@ class SiteMotion:
         qd_des_followed = np.sum(qd_terms, axis=0)
 
         qd_des_left = records.qd_des[:-1]
-        qd_des_right = np.where(follows_at_left, qd_des_followed, records.qd_des[1:])
-        rise_of_q_des = 0.5 * records.h_s * (qd_des_left + qd_des_right)
+        qd_des_next = records.qd_des[1:]
+        qd_des_right = np.where(follows_at_left, qd_des_followed, qd_des_next)
+        half_s = 0.5 * records.h_s
+        rise_of_q_des = half_s * (qd_des_left + qd_des_right)
         q_des_ruled = records.q_des[:-1] + rise_of_q_des
         q_des_right = np.where(follows_at_left, q_des_followed, q_des_ruled)
 
@@ -454,7 +478,8 @@ class SiteMotion:
         rule = np.where(follows_at_both, 0.0, jump_of_q_des)
         jump_of_e = link.sum(axis=0) + dominance_jump + rule
 
-        jump_of_r = self.following.compute_jump_of_r(slice(1, None), jump_of_e)
+        rows_after_jumps = slice(1, None)
+        jump_of_r = self.following.compute_jump_of_r(rows_after_jumps, jump_of_e)
         r_next = self.r[1:]
         e_next = records.e[1:]
         return PeriodEnds(
@@ -509,12 +534,15 @@ def evaluate_functional(site: SiteMotion) -> FunctionalParts:
     c = site.constants
     r = site.r
     momentum = c.arm.multiply_inertia(records.q, r)
-    r_M_r = (r * momentum).sum(axis=1)
+    r_M_r = _dot_rows(r, momentum)
 
-    parameter_error = (records.theta_hat - c.theta)[:, c.adapts]
-    scaled_squares = parameter_error**2 / c.Gamma[c.adapts]
+    parameter_error = records.theta_hat - c.theta
+    adapted_error = parameter_error[:, c.adapts]
+    adapted_Gamma = c.Gamma[c.adapts]
+    scaled_squares = adapted_error**2 / adapted_Gamma
     stiffness = c.Lambda * c.Kd
-    e_K_e = (stiffness * records.e**2).sum(axis=1)
+    squared_e = records.e**2
+    e_K_e = _dot_rows(stiffness, squared_e)
 
     delay_terms = []
     for j, view in enumerate(site.peers.values()):
@@ -526,6 +554,18 @@ def evaluate_functional(site: SiteMotion) -> FunctionalParts:
         position=0.5 * e_K_e,
         delay=np.sum(delay_terms, axis=0),
     )
+
+
+def _dot_rows(x: Array, y: Array) -> Array:
+    """Returns the scalar product of two vectors in each of K rows, shape (K,).
+
+    Args:
+        x: The first vector of each row, shape (K, n), or (n,) for all rows.
+        y: The second vector of each row, shape (K, n).
+    """
+    products = x * y
+    sums: Array = products.sum(axis=1)
+    return sums
 
 
 def _energy_in_transit(c: SiteConstants, view: DelayedPeer) -> Array:
@@ -585,6 +625,19 @@ def _trapezoid(
     return Increment(half_s * left, half_s * right, jump)
 
 
+def _integrate_power(site: SiteMotion, power: Array, jump: Array | None = None) -> Increment:
+    """Integrates a power that is known at every record, shape (K,), over every tick period.
+
+    Args:
+        site: Motion of the site, with K records.
+        power: The power, shape (K,), in W.
+        jump: Energy of the jump after each period, shape (K - 1,), in J. None for no energy.
+    """
+    left = power[:-1]
+    right = power[1:]
+    return _trapezoid(site, left, right, jump)
+
+
 def _jump_alone(amount: Array) -> Increment:
     """Returns amounts of energy that all belong to the jumps at the ends of periods."""
     zero = np.zeros(len(amount))
@@ -622,26 +675,29 @@ def compute_dissipation(site: SiteMotion) -> dict[str, Increment]:
     ends = site.ends
     dominance = site.dominance
     rate = records.shared_rate
-    left = np.zeros(len(records.known) - 1)
+    rate_left = rate[:-1]
+    rate_right = rate[1:]
+    periods = len(records.known) - 1
+    left = np.zeros(periods)
     right = left
     for j, view in enumerate(site.peers.values()):
-        difference_left = rate[:-1] - view.delayed.qd[:-1]
-        difference_right = rate[1:] - view.delayed_end.qd
+        difference_left = rate_left - view.delayed.qd[:-1]
+        difference_right = rate_right - view.delayed_end.qd
         squared_left = _weighted_square(c, difference_left)
         squared_right = _weighted_square(c, difference_right)
-        left = left + 0.5 * dominance.alpha[:-1, j] * squared_left
-        right = right + 0.5 * dominance.before[:, j] * squared_right
+        half_alpha_left = 0.5 * dominance.alpha[:-1, j]
+        half_alpha_right = 0.5 * dominance.before[:, j]
+        left = left + half_alpha_left * squared_left
+        right = right + half_alpha_right * squared_right
 
     def damping_power(r: Array) -> Array:
         torque = c.Kp * r + c.robust_torque(r)
-        power: Array = (r * torque).sum(axis=1)
-        return power
+        return _dot_rows(r, torque)
 
     def friction_power(r: Array, qd: Array) -> Array:
         friction = c.arm.friction(qd)
         torque = friction - c.arm.friction(qd - r)
-        power: Array = (r * torque).sum(axis=1)
-        return power
+        return _dot_rows(r, torque)
 
     damping_left = damping_power(ends.r_left)
     damping_right = damping_power(ends.r_right)
@@ -653,8 +709,10 @@ def compute_dissipation(site: SiteMotion) -> dict[str, Increment]:
         open_axes = 1.0 - np.array(site.common)
         dissipation["open axes"] = compute_transfer(site, open_axes)
 
-    friction_left = friction_power(ends.r_left, records.qd[:-1])
-    friction_right = friction_power(ends.r_right, records.qd[1:])
+    qd_left = records.qd[:-1]
+    qd_right = records.qd[1:]
+    friction_left = friction_power(ends.r_left, qd_left)
+    friction_right = friction_power(ends.r_right, qd_right)
     if friction_left.any() or friction_right.any():
         dissipation["friction"] = _trapezoid(site, friction_left, friction_right)
     return dissipation
@@ -674,7 +732,8 @@ def compute_transfer(site: SiteMotion, axes: Array) -> Increment:
             The shape () applies to all coordinates.
     """
     dominance = site.dominance
-    c = site.constants._replace(Kd=axes * site.constants.Kd)
+    Kd_of_axes = axes * site.constants.Kd
+    c = site.constants._replace(Kd=Kd_of_axes)
     site_power = 0.5 * _weighted_square(c, site.records.shared_rate)
     left = site_power[:-1]
     right = site_power[1:]
@@ -712,7 +771,8 @@ def compute_work(site: SiteMotion) -> dict[str, Increment]:
         "walls": torque_work(site, torque.environment_now, torque.environment_held),
     }
     if stops.any():
-        work["stops"] = torque_work(site, stops, np.zeros_like(stops))
+        no_torque = np.zeros_like(stops)
+        work["stops"] = torque_work(site, stops, no_torque)
 
     for j, peer in enumerate(site.peers):
         work[f"{peer}->{records.site}"] = link_work(site, j)
@@ -741,8 +801,8 @@ def torque_work(site: SiteMotion, now: Array, held: Array) -> Increment:
     """
     torque_left = now[:-1] + held[:-1]
     torque_right = now[1:] + held[:-1]
-    power_left = (site.ends.r_left * torque_left).sum(axis=1)
-    power_right = (site.ends.r_right * torque_right).sum(axis=1)
+    power_left = _dot_rows(site.ends.r_left, torque_left)
+    power_right = _dot_rows(site.ends.r_right, torque_right)
     return _trapezoid(site, power_left, power_right)
 
 
@@ -763,7 +823,9 @@ def link_work(site: SiteMotion, j: int) -> Increment:
         j: Index of the peer.
     """
     view = list(site.peers.values())[j]
-    integral_of_squares = view.delayed_end.squares - view.delayed.squares[1:]
+    squares_before_jump = view.delayed_end.squares
+    squares_after_jump = view.delayed.squares[1:]
+    integral_of_squares = squares_before_jump - squares_after_jump
     stored = 0.5 * integral_of_squares @ site.constants.Kd
     jump = _energy_of_jump(site, site.ends.link[j])
     alpha = site.dominance.before[:, j]
@@ -792,7 +854,8 @@ def dominance_change_work(site: SiteMotion) -> Increment:
     ends = site.ends
     if dominance.constant:
         return _zero_increment(site)
-    left = np.zeros(len(records.known) - 1)
+    periods = len(records.known) - 1
+    left = np.zeros(periods)
     right = left
     jump = _energy_of_jump(site, ends.dominance)
     qd_left = records.shared_rate[:-1]
@@ -800,19 +863,22 @@ def dominance_change_work(site: SiteMotion) -> Increment:
 
     for j, view in enumerate(site.peers.values()):
         stored = _energy_in_transit(c, view)
-        integral_at_end = view.now.squares[1:] - view.delayed_end.squares
+        squares_at_end = view.now.squares[1:]
+        integral_at_end = squares_at_end - view.delayed_end.squares
         stored_at_end = 0.5 * integral_at_end @ c.Kd
         alpha_rate = dominance.rate[:-1, j]
         followed_rate = np.where(ends.following, alpha_rate, 0.0)
         q_left = view.delayed.q[:-1]
         q_right = view.delayed_end.q
-        ramp_left = (qd_left * c.Kd * q_left).sum(axis=1)
-        ramp_right = (qd_right * c.Kd * q_right).sum(axis=1)
+        ramp_left = _dot_rows(qd_left * c.Kd, q_left)
+        ramp_right = _dot_rows(qd_right * c.Kd, q_right)
         left = left + alpha_rate * stored[:-1]
         left = left + followed_rate * ramp_left
         right = right + alpha_rate * stored_at_end
         right = right + followed_rate * ramp_right
-        alpha_step = dominance.alpha[1:, j] - dominance.before[:, j]
+        alpha_next = dominance.alpha[1:, j]
+        alpha_right = dominance.before[:, j]
+        alpha_step = alpha_next - alpha_right
         jump = jump + alpha_step * stored[1:]
     return _trapezoid(site, left, right, jump)
 
@@ -837,7 +903,8 @@ def stale_rule_work(site: SiteMotion) -> Increment:
     for j, view in enumerate(site.peers.values()):
         alpha_left = dominance.alpha[:-1, j, np.newaxis]
         alpha_right = dominance.before[:, j, np.newaxis]
-        left_terms.append(alpha_left * view.delayed.qd[:-1])
+        delayed_qd_left = view.delayed.qd[:-1]
+        left_terms.append(alpha_left * delayed_qd_left)
         right_terms.append(alpha_right * view.delayed_end.qd)
     # the rule replaces the reference velocity that Eq. (6) would have
     replaced_left = ends.qd_des_left - np.sum(left_terms, axis=0)
@@ -845,8 +912,10 @@ def stale_rule_work(site: SiteMotion) -> Increment:
 
     rate = site.records.shared_rate
     Kd = site.constants.Kd
-    left = (rate[:-1] * Kd * replaced_left).sum(axis=1)
-    right = (rate[1:] * Kd * replaced_right).sum(axis=1)
+    rate_left = rate[:-1]
+    rate_right = rate[1:]
+    left = _dot_rows(rate_left * Kd, replaced_left)
+    right = _dot_rows(rate_right * Kd, replaced_right)
     jump = _energy_of_jump(site, ends.rule)
     return _trapezoid(
         site,
@@ -873,8 +942,8 @@ def torque_limit_work(site: SiteMotion) -> Increment:
     if len(rows):
         difference = records.tau[rows] - site.law_torque(rows)
         r = site.r[rows]
-        power[rows] = (r * difference).sum(axis=1)
-    return _trapezoid(site, power[:-1], power[1:])
+        power[rows] = _dot_rows(r, difference)
+    return _integrate_power(site, power)
 
 
 def unknown_friction_work(site: SiteMotion) -> Increment:
@@ -891,14 +960,16 @@ def unknown_friction_work(site: SiteMotion) -> Increment:
     c = site.constants
     ends = site.ends
 
+    uncompensated_share = 1.0 - c.friction
+
     def power(r: Array, qd: Array) -> Array:
         friction = c.arm.friction(qd - r)
-        products = r * (1.0 - c.friction) * friction
-        power: Array = -products.sum(axis=1)
-        return power
+        return -_dot_rows(r * uncompensated_share, friction)
 
-    left = power(ends.r_left, records.qd[:-1])
-    right = power(ends.r_right, records.qd[1:])
+    qd_left = records.qd[:-1]
+    qd_right = records.qd[1:]
+    left = power(ends.r_left, qd_left)
+    right = power(ends.r_right, qd_right)
     return _trapezoid(site, left, right)
 
 
@@ -919,11 +990,13 @@ def singular_pose_work(site: SiteMotion) -> Increment:
         site: Motion of the site.
     """
     ends = site.ends
-    e_right = 2.0 * ends.e_middle - site.records.e[1:]
+    e_left = site.records.e[:-1]
+    e_next = site.records.e[1:]
+    e_right = 2.0 * ends.e_middle - e_next
     left = _singular_pose_power(
         site=site,
         rows=slice(0, -1),
-        e=site.records.e[:-1],
+        e=e_left,
         qd_des=ends.qd_des_left,
         r=ends.r_left,
     )
@@ -958,11 +1031,11 @@ def _singular_pose_power(
     c = site.constants
     velocity_error, acceleration_error = site.following.compute_damping_deviation(rows, e)
     ed = records.shared_rate[rows] - qd_des
-    products = velocity_error * c.Kd * ed
-    power: Array = -products.sum(axis=1)
+    power = -_dot_rows(velocity_error * c.Kd, ed)
     if acceleration_error.any():
-        momentum = c.arm.multiply_inertia(records.q[rows], r)
-        power = power + (momentum * acceleration_error).sum(axis=1)
+        q = records.q[rows]
+        momentum = c.arm.multiply_inertia(q, r)
+        power = power + _dot_rows(momentum, acceleration_error)
     return power
 
 
@@ -1012,23 +1085,32 @@ def estimate_work(site: SiteMotion) -> Increment:
 
     change = np.diff(parameter_error, axis=0)
     is_unchanged = (change == 0.0).all(axis=1)
-    is_frozen = np.concatenate([[False], is_unchanged]) & site.rests
-    is_frozen = is_frozen[:, np.newaxis]
-    is_at_edge = (theta_hat <= c.low) | (theta_hat >= c.high)
-    is_held = is_at_edge[1:] & c.adapts & ~is_frozen[1:]
-    is_fixed = (parameter_error != 0.0) & (~c.adapts | is_frozen)
+    keeps_estimates = np.concatenate([[False], is_unchanged])
+    is_frozen_row = keeps_estimates & site.rests
+    is_frozen = is_frozen_row[:, np.newaxis]
+    is_at_low = theta_hat <= c.low
+    is_at_high = theta_hat >= c.high
+    is_at_edge = is_at_low | is_at_high
+    is_adapting = c.adapts & ~is_frozen
+    is_held = is_at_edge[1:] & is_adapting[1:]
+    is_wrong = parameter_error != 0.0
+    is_fixed = is_wrong & ~is_adapting
     if not (is_held.any() or is_fixed.any()):
         return _zero_increment(site)
     # the step of Eq. (15) would be -h Gamma Y'r; the box changed it by `correction`
     correction = change + records.h_s * c.Gamma * site.mean_Yr
-    mean_error = 0.5 * (parameter_error[:-1] + parameter_error[1:])
+    error_left = parameter_error[:-1]
+    error_right = parameter_error[1:]
+    mean_error = 0.5 * (error_left + error_right)
     with np.errstate(divide="ignore", invalid="ignore"):
         box_work = mean_error * correction / c.Gamma
-    jump = np.where(is_held, box_work, 0.0).sum(axis=1)
+    held_work = np.where(is_held, box_work, 0.0)
+    jump = held_work.sum(axis=1)
 
-    fixed_power = site.Yr * parameter_error
-    power = np.where(is_fixed, fixed_power, 0.0).sum(axis=1)
-    return _trapezoid(site, power[:-1], power[1:], jump)
+    error_power = site.Yr * parameter_error
+    fixed_power = np.where(is_fixed, error_power, 0.0)
+    power = fixed_power.sum(axis=1)
+    return _integrate_power(site, power, jump)
 
 
 def compute_sampling_work(site: SiteMotion) -> Increment:
@@ -1054,17 +1136,19 @@ def compute_sampling_work(site: SiteMotion) -> Increment:
     u = held[:-1]
     tau_right, Yr_right = _evaluate_before_jump(site)
 
-    mean_tau = 0.5 * (records.tau[:-1] + tau_right)
+    tau_left = records.tau[:-1]
+    mean_tau = 0.5 * (tau_left + tau_right)
     torque_error = u - mean_tau
     mean_r = 0.5 * (ends.r_left + ends.r_right)
-    torque_power = (mean_r * torque_error).sum(axis=1)
+    torque_power = _dot_rows(mean_r, torque_error)
     torque_part = records.h_s * torque_power
 
     parameter_error = (records.theta_hat - c.theta) * c.adapts
     error_sum = parameter_error[1:] + parameter_error[:-1]
     trapezoid_Yr = 0.5 * (site.Yr[:-1] + Yr_right)
     Yr_error = trapezoid_Yr - site.mean_Yr
-    estimate_part = 0.5 * records.h_s * (error_sum * Yr_error).sum(axis=1)
+    half_s = 0.5 * records.h_s
+    estimate_part = half_s * _dot_rows(error_sum, Yr_error)
     return _jump_alone(torque_part + estimate_part)
 
 
@@ -1084,7 +1168,8 @@ def _evaluate_before_jump(site: SiteMotion) -> tuple[Array, Array]:
     e_right = 2.0 * ends.e_middle - e_next
     ed_right = records.shared_rate[1:] - ends.qd_des_right
     jump_of_e = np.abs(e_right - e_next)
-    jump_of_rate = np.abs(ends.qd_des_right - records.qd_des[1:])
+    qd_des_next = records.qd_des[1:]
+    jump_of_rate = np.abs(ends.qd_des_right - qd_des_next)
     jumps = jump_of_e + jump_of_rate > JUMP_TOLERANCE
     periods = np.flatnonzero(jumps.any(axis=1))
 
@@ -1104,7 +1189,8 @@ def _evaluate_before_jump(site: SiteMotion) -> tuple[Array, Array]:
     law_torque = site.control_torque(rows, e, ed, r)
     limited_torque = np.clip(law_torque, -c.tau_limit, c.tau_limit)
     # a torque at its rate limit, or of a resting site, does not move with a jump of e
-    has_rate_limit = np.any(np.isfinite(c.tau_rate))
+    is_finite = np.isfinite(c.tau_rate)
+    has_rate_limit = np.any(is_finite)
     is_rate_limited = site.limited.any(axis=1) & has_rate_limit
     is_bound = site.rests | is_rate_limited
     keeps_torque = is_bound[rows, np.newaxis]
@@ -1131,8 +1217,9 @@ def _energy_of_jump(site: SiteMotion, de: Array) -> Array:
         return np.zeros(len(de))
     q_next = site.records.q[1:]
     momentum = c.arm.multiply_inertia(q_next, ends.r_middle)
-    dr = site.following.compute_jump_of_r(slice(1, None), de)
-    potential_change = c.Kd * ends.e_middle * c.Lambda * de
-    change: Array = (momentum * dr).sum(axis=1)
-    change += potential_change.sum(axis=1)
+    rows_after_jumps = slice(1, None)
+    dr = site.following.compute_jump_of_r(rows_after_jumps, de)
+    change = _dot_rows(momentum, dr)
+    restoring_force = c.Kd * ends.e_middle * c.Lambda
+    change += _dot_rows(restoring_force, de)
     return change

@@ -26,6 +26,7 @@ from ...errors import count_nouns
 from ...fields import suggest_nearest
 from ...log.log_reader import Log
 from ...results import Result
+from ...scenario import Scenario
 from ...scenario.arms import TASK_AXES
 from ..run_view import RunView
 from ..site_signals import follows_in_task_space
@@ -39,8 +40,18 @@ from .static_windows import JointLoad, SharingRatio, StiffnessEstimate
 for _module in pkgutil.iter_modules(import_module(__package__).__path__):
     import_module(f"{__package__}.{_module.name}")
 
-_ALONG_AXES = {"N m": "N", "rad": "m", "N m/rad": "N/m", "N m s/rad": "N s/m"}
+_ALONG_AXES = {
+    "N m": "N",
+    "rad": "m",
+    "N m/rad": "N/m",
+    "N m s/rad": "N s/m",
+}
 """Units of quantities along an axis, by the units of the same quantities of a joint."""
+
+_SubjectValues = dict[str, MetricValues]
+"""Metrics of the subjects of a kind, such as all sites, by name of the subject."""
+_JsonEntry = dict[str, Any]
+"""Plain values of a load, a ratio or a response, by key."""
 
 METRICS_JSON_VERSION = 1
 """Version of the JSON: keys may be added, but no key is removed or changes its meaning."""
@@ -147,12 +158,17 @@ class LogMetrics(Result):
         content["windows_at_rest"] = None if window_count is None else int(window_count)
         content |= _details_to_json(self)
         content["unknown"] = self._list_reasons()
-        return {key: _replace_not_finite(value) for key, value in content.items()}
+        finite_content: dict[str, Any] = _replace_not_finite(content)
+        return finite_content
 
     @property
-    def _subjects(self) -> dict[str, dict[str, MetricValues]]:
+    def _subjects(self) -> dict[str, _SubjectValues]:
         """The metrics by name of the subject, for each kind of subject but the run."""
-        return {"sites": self.sites, "links": self.links, "walls": self.walls}
+        return {
+            "sites": self.sites,
+            "links": self.links,
+            "walls": self.walls,
+        }
 
     def _list_reasons(self) -> dict[str, str]:
         """Returns the reason for each missing number, by the path of the number in the JSON."""
@@ -176,14 +192,15 @@ class LogMetrics(Result):
         rows = []
         for description, metric in self._list_values():
             if metric.applies:
-                row = {**description, "value": metric.value, "why": metric.why}
-                rows.append(row)
+                result = {"value": metric.value, "why": metric.why}
+                rows.append(description | result)
         return rows
 
     def _list_values(self) -> Iterator[tuple[dict[str, str], Metric]]:
         """Yields each metric with a description of its quantity and its subject."""
         for quantity in quantities():
-            for subject, metric in self.values_of(quantity).items():
+            values_by_subject = self.values_of(quantity)
+            for subject, metric in values_by_subject.items():
                 description = {
                     "group": quantity.group,
                     "key": quantity.key,
@@ -203,8 +220,9 @@ class LogMetrics(Result):
         """
         if quantity.of == "run":
             return {"": self.run[quantity.key]}
-        metrics_by_name: dict[str, MetricValues] = getattr(self, f"{quantity.of}s")
-        return {name: metrics[quantity.key] for name, metrics in metrics_by_name.items()}
+        key = quantity.key
+        metrics_by_name = self._subjects[f"{quantity.of}s"]
+        return {name: metrics[key] for name, metrics in metrics_by_name.items()}
 
     def run_value(self, quantity: Quantity) -> Metric:
         """Returns one number of a quantity for the whole run.
@@ -248,8 +266,9 @@ def reduce_to_run(quantity: Quantity, values_by_subject: Mapping[str, Metric]) -
         why = "; ".join(different_reasons) or f"there is no {quantity.of}"
         return Metric(None, why, applies=False)
 
-    reduced = sum(numbers) if quantity.reduction == "sum" else max(numbers)
-    return Metric(reduced)
+    if quantity.reduction == "sum":
+        return Metric(sum(numbers))
+    return Metric(max(numbers))
 
 
 # overflow and NaN do not warn: a metric that is not finite becomes a reason
@@ -272,11 +291,9 @@ def compute_log_metrics(log: Log) -> LogMetrics:
 
     axes: tuple[str, ...] = ()
     if follows_in_task_space(log):
-        axes = TASK_AXES[: scenario.arms[log.sites[0]].counts.shared]
-    joint_names = set()
-    for site, arm in scenario.arms.items():
-        has_file = bool(scenario.sites[site].arm.urdf)
-        joint_names.add(arm.joint_names if has_file else ())
+        first_site = log.sites[0]
+        axis_count = scenario.arms[first_site].counts.shared
+        axes = TASK_AXES[:axis_count]
 
     return LogMetrics(
         log=Path(log.source).name,
@@ -294,13 +311,22 @@ def compute_log_metrics(log: Log) -> LogMetrics:
         stiffness=static_windows.estimate_stiffness(view),
         responses=estimate_impedances(view),
         axes=axes,
-        joint_names=joint_names.pop() if len(joint_names) == 1 else (),
+        joint_names=_find_common_joint_names(scenario),
     )
 
 
-def _measure_subjects(
-    view: RunView, wanted: Iterable[Measure]
-) -> dict[str, dict[str, MetricValues]]:
+def _find_common_joint_names(scenario: Scenario) -> tuple[str, ...]:
+    """Returns the joints' names if the files of all arms have the same names, otherwise ()."""
+    all_names: set[tuple[str, ...]] = set()
+    for site, arm in scenario.arms.items():
+        has_file = bool(scenario.sites[site].arm.urdf)
+        all_names.add(arm.joint_names if has_file else ())
+    if len(all_names) != 1:
+        return ()
+    return all_names.pop()
+
+
+def _measure_subjects(view: RunView, wanted: Iterable[Measure]) -> dict[str, _SubjectValues]:
     """Computes metrics for all subjects.
 
     Args:
@@ -310,12 +336,15 @@ def _measure_subjects(
     Returns:
         The metrics by kind of subject, name of the subject, and key.
     """
-    values: dict[str, dict[str, MetricValues]] = {}
+    values: dict[str, _SubjectValues] = {}
     for kind in ("run", "site", "link", "wall"):
-        values[kind] = {name: {} for name in view.list_subjects(kind)}
+        subjects = view.list_subjects(kind)
+        values[kind] = {name: {} for name in subjects}
     for measure in wanted:
-        for name, metrics in values[measure.of].items():
-            metrics.update(measure.measure(view, name))
+        metrics_by_name = values[measure.of]
+        for name, metrics in metrics_by_name.items():
+            measured = measure.measure(view, name)
+            metrics.update(measured)
     return values
 
 
@@ -328,7 +357,9 @@ def find_quantity(key: str) -> Quantity:
     known = {quantity.key: quantity for quantity in quantities()}
     if key not in known:
         nearest = suggest_nearest(key, list(known))
-        raise KeyError(f"no metric {key!r}{nearest}; docs/metrics.md has them all")
+        raise KeyError(
+            f"there is no metric {key!r}{nearest}; docs/metrics.md lists all metrics"
+        )
     return known[key]
 
 
@@ -369,7 +400,7 @@ def _details_to_json(metrics: LogMetrics) -> dict[str, Any]:
 
     In task space the entries have an axis in place of the joint, and the units of this axis.
     """
-    details: dict[str, list[dict[str, Any]]] = {
+    details: dict[str, list[_JsonEntry]] = {
         "levers": [_load_to_json(load) for load in metrics.joint_loads],
         "force_sharing": [_sharing_to_json(ratio) for ratio in metrics.sharing_ratios],
         "stiffness": [estimate._asdict() for estimate in metrics.stiffness],
@@ -385,35 +416,36 @@ def _details_to_json(metrics: LogMetrics) -> dict[str, Any]:
     if metrics.joint_names:
         for entries in details.values():
             for entry in entries:
-                number = entry["joint"]
-                entry["joint_name"] = metrics.joint_names[number - 1]
+                index = entry["joint"] - 1
+                entry["joint_name"] = metrics.joint_names[index]
     return details
 
 
-def _load_to_json(load: JointLoad) -> dict[str, Any]:
+def _load_to_json(load: JointLoad) -> _JsonEntry:
     """Returns the load of a joint as plain values."""
     content = load._asdict()
     content["weight"] = _values_to_json(load.weight)
     return content | _value_and_reason("imbalance", load.imbalance)
 
 
-def _sharing_to_json(ratio: SharingRatio) -> dict[str, Any]:
+def _sharing_to_json(ratio: SharingRatio) -> _JsonEntry:
     """Returns a force sharing as plain values."""
     content = ratio._asdict()
     content["off"] = ratio.off
     return content | _value_and_reason("expected_nm", ratio.expected_nm)
 
 
-def _impedance_to_json(metrics: LogMetrics, estimate: ImpedanceEstimate) -> dict[str, Any]:
+def _impedance_to_json(metrics: LogMetrics, estimate: ImpedanceEstimate) -> _JsonEntry:
     """Returns an estimated impedance as plain values, with the units of its coordinate."""
     unit = metrics.unit(estimate.unit, estimate.joint)
+    spectrum = estimate.spectrum
     content = estimate._asdict()
     content["ratio"] = _response_to_json(estimate.ratio, unit)
-    content["spectrum"] = [_response_to_json(response, unit) for response in estimate.spectrum]
+    content["spectrum"] = [_response_to_json(response, unit) for response in spectrum]
     return content
 
 
-def _name_axis(metrics: LogMetrics, entry: dict[str, Any]) -> dict[str, Any]:
+def _name_axis(metrics: LogMetrics, entry: _JsonEntry) -> _JsonEntry:
     """Returns an entry of a joint, renamed to that of an axis, with the units of this axis."""
     number = entry.pop("joint")
     renamed = {"axis": metrics.label(number)}
@@ -433,12 +465,15 @@ def _name_along_axis(key: str) -> str:
     return key
 
 
-def _response_to_json(response: FrequencyResponse, unit: str) -> dict[str, Any]:
+def _response_to_json(response: FrequencyResponse, unit: str) -> _JsonEntry:
     """Returns a response as plain values."""
-    return {**response._asdict(), "why": response.why or None, "unit": unit}
+    content = response._asdict()
+    content["why"] = response.why or None
+    content["unit"] = unit
+    return content
 
 
-def _value_and_reason(key: str, value: Metric) -> dict[str, Any]:
+def _value_and_reason(key: str, value: Metric) -> _JsonEntry:
     """Returns the number of a metric under a key, and the reason if the number is missing."""
     return {key: value.value, "why": value.why or None}
 
@@ -497,7 +532,8 @@ class MetricComparison(NamedTuple):
         Raises:
             KeyError: No row has this key.
         """
-        return {row.quantity.key: row for row in self.rows}[key]
+        row_by_key = {row.quantity.key: row for row in self.rows}
+        return row_by_key[key]
 
 
 def compare_metrics(logs: Sequence[Log], names: Sequence[str] = ()) -> MetricComparison:
@@ -516,8 +552,10 @@ def compare_metrics(logs: Sequence[Log], names: Sequence[str] = ()) -> MetricCom
         entries = tuple(metrics.run_value(quantity) for metrics in measured)
         if any(entry.applies for entry in entries):
             rows.append(ComparisonRow(quantity, entries))
-    columns = tuple(names) or tuple(Path(log.source).stem for log in logs)
-    return MetricComparison(columns, tuple(rows))
+    columns = list(names)
+    if not columns:
+        columns = [Path(log.source).stem for log in logs]
+    return MetricComparison(tuple(columns), tuple(rows))
 
 
 def comparison_to_json(comparison: MetricComparison) -> dict[str, Any]:
@@ -531,14 +569,13 @@ def comparison_to_json(comparison: MetricComparison) -> dict[str, Any]:
     rows = []
     for row in comparison.rows:
         quantity = row.quantity
-        rows.append(
-            {
-                "key": quantity.key,
-                "name": quantity.name,
-                "unit": quantity.unit,
-                "group": quantity.group,
-                "values": list(row.values),
-                "unknown": [entry.why or None for entry in row.entries],
-            }
-        )
+        content = {
+            "key": quantity.key,
+            "name": quantity.name,
+            "unit": quantity.unit,
+            "group": quantity.group,
+            "values": list(row.values),
+            "unknown": [entry.why or None for entry in row.entries],
+        }
+        rows.append(content)
     return {"columns": list(comparison.columns), "rows": rows}
