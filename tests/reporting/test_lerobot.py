@@ -135,7 +135,7 @@ def test_a_program_that_is_named_is_another_one(tmp_path: Path) -> None:
     frames = read(exported(tmp_path, log(), program="a"))
     assert not frames["intervention"].any()
     assert np.array_equal(frames["action"].to_numpy(), frames["action.a"].to_numpy())
-    with pytest.raises(UsageError, match="the program holds one of a, b, not 'c'"):
+    with pytest.raises(UsageError, match="the program can hold the arm of a or b, not of 'c'"):
         Exporter("lerobot", tmp_path / "other", settings={"program": "c"}).export(log())
 
 

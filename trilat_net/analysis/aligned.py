@@ -174,7 +174,9 @@ class AlignedRecords(NamedTuple):
 
         The shape is (K - 1,), because K ticks bound K - 1 periods.
         """
-        return self.known[:-1] & self.known[1:]
+        is_known_at_start = self.known[:-1]
+        is_known_at_end = self.known[1:]
+        return is_known_at_start & is_known_at_end
 
     def known_at_end(self, length_s: float) -> Bools:
         """Marks the rows in the last seconds of the run that are recorded, not interpolated.
@@ -208,7 +210,8 @@ def hold_torque(tau: Array, limit_nm: Array | float, *, digital: bool) -> Array:
     """
     held = tau.copy()
     if not digital:
-        extrapolated = 1.5 * tau[1:] - 0.5 * tau[:-1]
+        previous_tau = tau[:-1]
+        extrapolated = 1.5 * tau[1:] - 0.5 * previous_tau
         held[1:] = np.clip(extrapolated, -limit_nm, limit_nm)
     return held
 
@@ -230,8 +233,9 @@ def align_records(log: Log, *, common: bool = False) -> dict[str, AlignedRecords
     """
     rows_by_site: dict[str, Ints] = {}
     for site in log.sites:
-        _, first_of_tick = np.unique(log[site].tick, return_index=True)
-        modes = log[site].mode[first_of_tick]
+        part = log[site]
+        _, first_of_tick = np.unique(part.tick, return_index=True)
+        modes = part.mode[first_of_tick]
         rows_by_site[site] = first_of_tick[modes != "diverged"]
 
     aligned = {}
@@ -240,7 +244,8 @@ def align_records(log: Log, *, common: bool = False) -> dict[str, AlignedRecords
             if len(rows):
                 aligned[site] = _fill_tick_grid(log.scenario, log[site], rows)
         return aligned
-    if min(map(len, rows_by_site.values())) < 2:
+    row_counts = [len(rows) for rows in rows_by_site.values()]
+    if min(row_counts) < 2:
         return {}
 
     first_times_s = []
@@ -253,8 +258,10 @@ def align_records(log: Log, *, common: bool = False) -> dict[str, AlignedRecords
     if end_s <= max(first_times_s):
         return {}
     for site, rows in rows_by_site.items():
-        last_tick = int(np.floor(end_s * log[site].rate_hz + 1e-6))
-        records = _fill_tick_grid(log.scenario, log[site], rows, last_tick)
+        part = log[site]
+        end_tick = end_s * part.rate_hz
+        last_tick = int(np.floor(end_tick + 1e-6))
+        records = _fill_tick_grid(log.scenario, part, rows, last_tick)
         if len(records.known) < 2:
             return {}
         aligned[site] = records
@@ -325,7 +332,8 @@ def _fill_tick_grid(
         end = max(first, min(last, end))
     grid = np.arange(first, end + 1)
     # index of the last record at or before each tick
-    previous = np.searchsorted(tick, grid, side="right") - 1
+    next_row = np.searchsorted(tick, grid, side="right")
+    previous = next_row - 1
     known: Bools = tick[previous] == grid
 
     spec = scenario.sites[part.name]
@@ -401,7 +409,8 @@ class PeerTrajectory:
         squared_rate = records.shared_rate**2
         sums = squared_rate[1:] + squared_rate[:-1]
         steps = 0.5 * records.h_s * sums
-        start = np.zeros((1, squared_rate.shape[1]))
+        columns = squared_rate.shape[1]
+        start = np.zeros((1, columns))
         running_sums = np.cumsum(steps, axis=0)
         self._squares: Array = np.vstack([start, running_sums])
 
@@ -423,8 +432,10 @@ class PeerTrajectory:
         position = np.where(is_at_tick, nearest, position)
         last_period = len(records.known) - 2
         period = np.floor(position)
-        row = np.clip(period, 0, last_period).astype(np.int64)
-        x = np.clip(position - row, 0.0, 1.0)[:, np.newaxis]
+        known_period = np.clip(period, 0, last_period)
+        row = known_period.astype(np.int64)
+        fraction = np.clip(position - row, 0.0, 1.0)
+        x = fraction[:, np.newaxis]
 
         qa = records.shared[row]
         qb = records.shared[row + 1].copy()
@@ -432,7 +443,9 @@ class PeerTrajectory:
         vb = records.shared_rate[row + 1]
         # rotation vectors of different branches must not be interpolated
         if records.x.shape[1] == POSE:
-            qb[:, POSITION:] = choose_nearest_vectors(qb[:, POSITION:], qa[:, POSITION:])
+            vectors_a = qa[:, POSITION:]
+            vectors_b = qb[:, POSITION:]
+            qb[:, POSITION:] = choose_nearest_vectors(vectors_b, vectors_a)
 
         quadratic = 3 * (qb - qa) - h * (2 * va + vb)
         cubic = 2 * (qa - qb) + h * (va + vb)
@@ -443,10 +456,11 @@ class PeerTrajectory:
         mean_square = squared_a + 0.5 * x * (squared_b - squared_a)
         squares = self._squares[row] + h * x * mean_square
 
-        fraction = x[:, 0]
         known_a = records.known[row] | (fraction == 1.0)
         known_b = records.known[row + 1] | (fraction == 0.0)
-        known = known_a & known_b & ((position >= 0.0) | (records.first == 0))
+        # the arm rests before a session whose start is recorded
+        is_after_start = (position >= 0.0) | (records.first == 0)
+        known = known_a & known_b & is_after_start
 
         q = np.where(x == 1.0, qb, q)  # exactly the record, which the polynomial rounds
         is_before = position < 0.0
@@ -505,7 +519,8 @@ def view_delayed_peer(records: AlignedRecords, past: PeerTrajectory) -> DelayedP
     sample_s = used / past.records.rate_hz
     stamp_s = np.where(has_sample, sample_s, _BEFORE_EPOCH_S)
     # the stamp moves at rate one over the period after a tick
-    next_stamp_s = np.where(has_sample, stamp_s + records.h_s, _BEFORE_EPOCH_S)
+    moved_stamp_s = stamp_s + records.h_s
+    next_stamp_s = np.where(has_sample, moved_stamp_s, _BEFORE_EPOCH_S)
     return DelayedPeer(
         now=past.evaluate(records.t_s),
         delayed=past.evaluate(stamp_s),
@@ -527,7 +542,8 @@ def find_latest_rows(records: AlignedRecords, t_s: Array) -> tuple[Ints, Bools]:
         For each time, True if that tick was recorded, and False if its row is interpolated or
         outside the records, shape (K,).
     """
-    tick = np.floor(t_s * records.rate_hz + 1e-6).astype(np.int64)
+    position = t_s * records.rate_hz
+    tick = np.floor(position + 1e-6).astype(np.int64)
     row = tick - records.first
     row_count = len(records.known)
     is_inside = (row >= 0) & (row < row_count)

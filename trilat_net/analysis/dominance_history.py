@@ -184,7 +184,10 @@ def find_user_shares(scenario: Scenario, alpha: Array, program: str = "") -> Use
     slave, users = find_users(scenario)
     program = program or users[-1]
     if program not in users:
-        raise UsageError(f"the program holds one of {', '.join(users)}, not {program!r}")
+        possible_users = " or ".join(users)
+        raise UsageError(
+            f"the program can hold the arm of {possible_users}, not of {program!r}"
+        )
 
     peers = scenario.peers(slave)
     columns = [peers.index(user) for user in users]
@@ -213,14 +216,16 @@ def find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:
     """
     part = log[site]
     peer_count = len(part.peers)
-    lost = np.zeros((len(t_s), peer_count), dtype=bool)
+    times = len(t_s)
+    lost = np.zeros((times, peer_count), dtype=bool)
     if not log.scenario.sites[site].on_stale.rule.degrades or not len(part):
         return lost
 
     first = part.layout.count_life_memory(peer_count)
     is_lost = part.memory(first, peer_count) != 0.0
     # the newest record at each time
-    rows_after = np.searchsorted(part.t_s, t_s + RAMP_TIME_TOLERANCE_S, side="right")
+    latest_s = t_s + RAMP_TIME_TOLERANCE_S
+    rows_after = np.searchsorted(part.t_s, latest_s, side="right")
     rows = rows_after - 1
     recorded = rows >= 0
     lost[recorded] = is_lost[rows[recorded]]
@@ -239,7 +244,8 @@ def list_losses(log: Log) -> list[str]:
     sentences = []
     for site in log.sites:
         part = log[site]
-        lost = find_lost_peers(log, site, part.t_s).astype(int)
+        is_lost = find_lost_peers(log, site, part.t_s)
+        lost = is_lost.astype(int)
         times_s = part.t_s
         if len(part):
             end_s = part.t_s[-1] + 1.0 / part.rate_hz
@@ -248,8 +254,10 @@ def list_losses(log: Log) -> list[str]:
         for j, peer in enumerate(part.peers):
             # a loss begins where an edge is positive, and ends where it is negative
             edges = np.diff(lost[:, j], prepend=0, append=0)
-            starts_s = times_s[np.flatnonzero(edges > 0)]
-            ends_s = times_s[np.flatnonzero(edges < 0)]
+            start_rows = np.flatnonzero(edges > 0)
+            end_rows = np.flatnonzero(edges < 0)
+            starts_s = times_s[start_rows]
+            ends_s = times_s[end_rows]
             for from_s, to_s in zip(starts_s, ends_s, strict=True):
                 sentence = f"{site} without {peer} {from_s:.4g} to {to_s:.4g} s"
                 sentences.append(sentence)
@@ -302,7 +310,8 @@ def drop_finished_ramps(
     # the last ramp that has started may still be in progress
     finished = sorted_ramps[: started - 1]
     remaining = sorted_ramps[started - 1 :]
-    turn_s = np.array([remaining[0].start_ns * 1e-9])
+    last_start_s = remaining[0].start_ns * 1e-9
+    turn_s = np.array([last_start_s])
     history = evaluate_ramps(start, finished, turn_s, 0.0)
     return history.alpha[0], remaining
 
@@ -328,11 +337,13 @@ def evaluate_ramps(
     after = start
     start_s = 0.0
     end_s = 0.0
-    for ramp in sorted(ramps, key=lambda ramp: ramp.start_ns):
+    sorted_ramps = sorted(ramps, key=lambda ramp: ramp.start_ns)
+    for ramp in sorted_ramps:
         next_start_s = ramp.start_ns * 1e-9
         share = 1.0
         if next_start_s < end_s:
-            share = (next_start_s - start_s) / (end_s - start_s)
+            elapsed_s = next_start_s - start_s
+            share = elapsed_s / (end_s - start_s)
         interpolated = before + (after - before) * share
         # exact factors at the end of a finished ramp, which interpolation would round
         before = after if share == 1.0 else interpolated
@@ -352,7 +363,9 @@ def evaluate_ramps(
             alpha[is_climbing] = before + slope * since_start_s
             rate[is_climbing] = slope
 
-    at_period_ends = alpha[:-1] + h_s * rate[:-1]
+    alpha_left = alpha[:-1]
+    rate_left = rate[:-1]
+    at_period_ends = alpha_left + h_s * rate_left
     return DominanceHistory(alpha, rate, at_period_ends)
 
 

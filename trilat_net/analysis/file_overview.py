@@ -99,12 +99,14 @@ class FileInventory:
         self._messages: defaultdict[str, _Messages] = defaultdict(
             lambda: _Messages(array("Q"), array("Q"), array("Q"))
         )
-        total_bytes = sum(path.stat().st_size for path in paths if path.is_file())
+        files = [path for path in paths if path.is_file()]
+        total_bytes = sum(path.stat().st_size for path in files)
         bytes_before = 0
         for path in paths:
             file_progress = shift_progress(progress, bytes_before, total_bytes)
             with reading(path) as stream:
-                self._read_file(path, McapReader(stream, str(path), file_progress))
+                reader = McapReader(stream, str(path), file_progress)
+                self._read_file(path, reader)
             bytes_before += path.stat().st_size
 
     def _read_file(self, path: Path, reader: McapReader) -> None:
@@ -179,8 +181,9 @@ class FileInventory:
         )
         channel = self._channel_infos.get(topic, unknown)
 
-        log_ns = np.frombuffer(self._messages[topic].log_ns, dtype=np.uint64)
-        sizes = np.frombuffer(self._messages[topic].size, dtype=np.uint64)
+        messages = self._messages[topic]
+        log_ns = np.frombuffer(messages.log_ns, dtype=np.uint64)
+        sizes = np.frombuffer(messages.size, dtype=np.uint64)
         first_ns = int(log_ns.min()) if len(log_ns) else None
         last_ns = int(log_ns.max()) if len(log_ns) else None
         span_s = 0.0
@@ -259,9 +262,11 @@ class FileOverview(Result):
 
     def headline(self) -> str:
         """Returns the names of the files and the number of their messages, in one line."""
-        messages = sum(channel["messages"] for channel in self.facts["channels"].values())
+        channels = self.facts["channels"].values()
+        messages = sum(channel["messages"] for channel in channels)
+        message_count = count_nouns(messages, "message")
         paths = ", ".join(file["path"] for file in self.facts["files"])
-        return f"{paths}: {count_nouns(messages, 'message')}"
+        return f"{paths}: {message_count}"
 
     def to_dict(self) -> JsonObject:
         """Returns the content as plain values, with the keys of `trilat log info --json`."""
@@ -493,8 +498,9 @@ def compute_percentiles(
     array = np.asarray(values)
     if not array.size:
         return None
-    percentiles = (np.percentile(array, list(shares.values())) / unit).tolist()
-    return dict(zip(shares, percentiles, strict=True))
+    percentages = list(shares.values())
+    percentiles = np.percentile(array, percentages) / unit
+    return dict(zip(shares, percentiles.tolist(), strict=True))
 
 
 def count_executed_ticks(log: Log, site: str) -> int | None:
@@ -509,10 +515,11 @@ def count_executed_ticks(log: Log, site: str) -> int | None:
     Returns:
         The number in the last such event. None if the site published none.
     """
-    end_ticks = [
-        event.ticks for event in log.events if event.kind == "end" and event.member == site
-    ]
-    return end_ticks[-1] if end_ticks else None
+    ticks = None
+    for event in log.events:
+        if event.kind == "end" and event.member == site:
+            ticks = event.ticks
+    return ticks
 
 
 def count_overruns(part: SiteLog) -> int:
@@ -521,12 +528,17 @@ def count_overruns(part: SiteLog) -> int:
     Args:
         part: Log of the site.
     """
-    return int(np.count_nonzero(part.late_us >= 1e6 / part.rate_hz))
+    period_us = 1e6 / part.rate_hz
+    is_overrun = part.late_us >= period_us
+    return int(np.count_nonzero(is_overrun))
 
 
 def _parse_number(text: str) -> int | None:
     """Parses a number of at most 19 decimal digits. Returns None for any other text."""
-    return int(text) if text.isascii() and text.isdigit() and len(text) < 20 else None
+    is_number = text.isascii() and text.isdigit()
+    if is_number and len(text) < 20:
+        return int(text)
+    return None
 
 
 def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
@@ -613,12 +625,14 @@ def _summarise_site(log: Log, site: str, twin: Log | None) -> JsonObject:
     ticks = expected if executed is None else executed
     late_us = compute_percentiles(part.late_us, _LATENESS_PERCENTILES)
     busy_us = compute_percentiles(part.busy_us)
-    at_limit = np.abs(part.tau) >= spec.limits.tau_limit_nm
+    tau_limit_nm = spec.limits.tau_limit_nm
+    at_limit = np.abs(part.tau) >= tau_limit_nm
 
     moved_max_rad = None
     moved_end_rad = None
     if len(displacement):
-        moved_max_rad = np.abs(displacement).max(axis=0).tolist()
+        largest_displacement = np.abs(displacement).max(axis=0)
+        moved_max_rad = largest_displacement.tolist()
         moved_end_rad = displacement[-1].tolist()
 
     return {

@@ -162,7 +162,8 @@ def largest_remaining_error(part: SiteLog) -> Array:
         Largest error, shape (K,). It never rises.
     """
     largest = largest_magnitude(joint_errors(part))
-    from_the_end = np.maximum.accumulate(largest[::-1])
+    reversed_largest = largest[::-1]
+    from_the_end = np.maximum.accumulate(reversed_largest)
     return from_the_end[::-1]
 
 
@@ -265,7 +266,8 @@ def extreme_rows(values: Array, buckets: int) -> Ints:
     filled_buckets = -(-rows // size)
     # the last bucket is filled up with its last row, which changes no extreme
     filled_rows = np.arange(filled_buckets * size)
-    index = np.minimum(filled_rows, rows - 1).reshape(-1, size)
+    valid_rows = np.minimum(filled_rows, rows - 1)
+    index = valid_rows.reshape(-1, size)
     bucket = np.arange(filled_buckets)
 
     ends = np.array([0, rows - 1])
@@ -273,8 +275,10 @@ def extreme_rows(values: Array, buckets: int) -> Ints:
     for column in range(columns):
         block = values[index, column]
         missing = np.isnan(block)
-        lowest = np.where(missing, np.inf, block).argmin(1)
-        highest = np.where(missing, -np.inf, block).argmax(1)
+        above_missing = np.where(missing, np.inf, block)
+        below_missing = np.where(missing, -np.inf, block)
+        lowest = above_missing.argmin(1)
+        highest = below_missing.argmax(1)
         keep.append(index[bucket, lowest])
         keep.append(index[bucket, highest])
     return np.unique(np.concatenate(keep))
@@ -315,8 +319,9 @@ def decimate(
     nan_position = np.searchsorted(keep, before_gap) + 1
     nan_tick = tick[before_gap] + 1
     nan_t_s = t_s[before_gap] + period_s
+    kept_values = values[keep]
     return DecimatedTrace(
         tick=np.insert(tick[keep], nan_position, nan_tick),
         t_s=np.insert(t_s[keep], nan_position, nan_t_s),
-        values=np.insert(values[keep], nan_position, np.nan, axis=0),
+        values=np.insert(kept_values, nan_position, np.nan, axis=0),
     )

@@ -199,7 +199,7 @@ def compute_source_torque(
         force = source.model.effort(t_s, position, speed)
         torque = _map_to_joints(J, force)
     else:
-        raise ValueError(f"{kind.name} is no function of the state")
+        raise ValueError(f"{kind.name} is not a function of the state")
 
     is_active = _is_active(source, t_s)
     return np.where(is_active[:, np.newaxis], torque, 0.0)

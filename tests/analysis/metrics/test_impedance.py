@@ -60,7 +60,10 @@ def test_one_push_is_not_enough() -> None:
 
 def test_what_nobody_drives_and_what_was_not_recorded_are_named() -> None:
     x = noise(1)
-    assert strongest(0.0 * x, x, x, EVERYTHING, RATE_HZ, 1e-3).why == "nothing drives it"
+    assert (
+        strongest(0.0 * x, x, x, EVERYTHING, RATE_HZ, 1e-3).why
+        == "the drive is too weak at every frequency"
+    )
     gaps = EVERYTHING.copy()
     gaps[::700] = False
     assert "no 4 s are recorded" in strongest(x, x, x, gaps, RATE_HZ, 1e-3).why

@@ -390,7 +390,7 @@ def test_any_metric_may_be_expected_of_run_and_log() -> None:
     [
         (
             {"chater_nm": [0, 1]},
-            "expect.metrics.chater_nm: no metric 'chater_nm'; did you mean 'chatter_nm'",
+            "expect.metrics.chater_nm: there is no metric 'chater_nm'; did you mean 'chatter_nm'",
         ),
         (
             {"chatter_nm": [2, 1]},

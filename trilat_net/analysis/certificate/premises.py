@@ -85,7 +85,8 @@ MAX_LISTED_NAMES = 4
 NO_COMMON_TIME = "there is no time at which every site has records"
 NO_PERIOD = "there is no period whose records are complete"
 _ORIENTATIONS_TEXT = (
-    "it follows orientations, whose ed is no derivative of e, so that V has terms of no sign"
+    "the arm follows orientations, for which ed is not the derivative of e, "
+    "so that dV/dt has terms of either sign"
 )
 
 
@@ -281,7 +282,9 @@ def _check_parameters(run: RunFacts) -> Premise:
         low = constants.low
         high = constants.high
         if ((theta < low) | (theta > high)).any():
-            faults.append(f"{site}: theta is outside the box that its estimates are held in")
+            faults.append(
+                f"{site}: theta is outside the box in which the law keeps its estimates"
+            )
 
         gains = run.log.scenario.sites[site].control.gains(theta)
         first_estimate = np.clip(gains.theta_hat0, low, high)
@@ -289,7 +292,7 @@ def _check_parameters(run: RunFacts) -> Premise:
         if is_wrong_forever.any():
             faults.append(f"{site}: a parameter is neither learnt nor known")
         if constants.unknown_friction.any():
-            faults.append(f"{site}: its law does not compensate all friction of the joints")
+            faults.append(f"{site}: the law does not compensate all friction of the joints")
 
     if faults:
         return Premise("parameters", False, _join_limited(faults))

@@ -142,13 +142,15 @@ class RecordWindow:
         row = tick - self.first
         for name, columns in self._columns.items():
             self._floats[row, columns] = getattr(record, name)
-        self._used[row] = [record.used.get(peer, -1) for peer in self.peers]
+        used = record.used
+        self._used[row] = [used.get(peer, -1) for peer in self.peers]
         if self._glides and record.mode in RESTING_MODES:
             self._last_resting_tick = max(self._last_resting_tick, tick)
 
         ticks_since_rest = tick - self._last_resting_tick
         self._known[row] = True
-        self._rests[row] = 0 <= ticks_since_rest <= RESUMING_S * self.rate_hz
+        resuming_ticks = RESUMING_S * self.rate_hz
+        self._rests[row] = 0 <= ticks_since_rest <= resuming_ticks
         self._follows[row] = record.mode == "run" and self._is_unlimited(record)
         self.newest = max(self.newest, tick)
         return True
@@ -190,7 +192,9 @@ class RecordWindow:
         Returns:
             The records. `known` is False for the missing ones.
         """
-        part = slice(first - self.first, last + 1 - self.first)
+        first_row = first - self.first
+        end_row = last + 1 - self.first
+        part = slice(first_row, end_row)
         known = self._known[part].copy()
         floats = self._floats[part]
         used = self._used[part]
@@ -205,8 +209,9 @@ class RecordWindow:
                 known_values = column[known_rows]
                 column[:] = np.interp(ticks, known_rows, known_values)
             # other values than numbers are those of the last record before the gap
-            preceding = np.searchsorted(known_rows, ticks, side="right") - 1
-            last_known = known_rows[np.maximum(preceding, 0)]
+            next_known = np.searchsorted(known_rows, ticks, side="right")
+            preceding = np.maximum(next_known - 1, 0)
+            last_known = known_rows[preceding]
             used = used[last_known]
             follows = follows[last_known]
             rests = rests[last_known]
@@ -214,13 +219,16 @@ class RecordWindow:
         columns: dict[str, Any] = {}
         for name, span in self._columns.items():
             columns[name] = floats[:, span]
+        used_by_peer = {}
+        for n, peer in enumerate(self.peers):
+            used_by_peer[peer] = used[:, n]
         return AlignedRecords(
             site=self.site,
             rate_hz=self.rate_hz,
             first=first,
             known=known,
             follows=follows,
-            used={peer: used[:, n] for n, peer in enumerate(self.peers)},
+            used=used_by_peer,
             axes=self._axes,
             rests=rests,
             **columns,
@@ -259,7 +267,8 @@ class RunningEnergy:
 
     def __init__(self, scenario: Scenario, windows: Mapping[str, RecordWindow]) -> None:
         self.reason = explain_no_functional(scenario)
-        degrades = any(spec.on_stale.rule.degrades for spec in scenario.sites.values())
+        rules = [spec.on_stale.rule for spec in scenario.sites.values()]
+        degrades = any(rule.degrades for rule in rules)
         if degrades and not self.reason:
             self.reason = "shares change when a peer is lost: `trilat certify` computes V"
         self._scenario = scenario
@@ -330,8 +339,10 @@ class RunningEnergy:
         """
         tick_spans = {}
         for site, window in self._windows.items():
-            first = int(np.ceil(begin_s * window.rate_hz - 1e-6))
-            last = int(np.floor(end_s * window.rate_hz + 1e-6))
+            begin_ticks = begin_s * window.rate_hz
+            end_ticks = end_s * window.rate_hz
+            first = int(np.ceil(begin_ticks - 1e-6))
+            last = int(np.floor(end_ticks + 1e-6))
             if last - first < 1:
                 return None
             tick_spans[site] = (first, last)
@@ -371,11 +382,13 @@ class RunningEnergy:
         # for each site, the first tick whose sample a peer may still use
         oldest_used = {}
         for site, (first, last) in tick_spans.items():
-            records[site] = self._windows[site].rows(first, last)
+            window = self._windows[site]
+            records[site] = window.rows(first, last)
             oldest_used[site] = first
         for site_records in records.values():
             for peer, used in site_records.used.items():
-                oldest = max(int(used.min()) - 2, 0)
+                least_used = int(used.min())
+                oldest = max(least_used - 2, 0)
                 oldest_used[peer] = min(oldest_used[peer], oldest)
 
         pasts = {}

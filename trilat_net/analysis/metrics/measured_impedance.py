@@ -113,17 +113,17 @@ def estimate_responses(
     length = round(SEGMENT_S * rate_hz)
     starts = _find_segments(usable, length)
     if not starts:
-        reason = f"no {SEGMENT_S:g} s are recorded in which nobody else drives"
+        reason = f"the log has no stretch of {SEGMENT_S:g} s in which nobody else drives"
         return [FrequencyResponse(why=reason)]
 
     D = _compute_spectra(drive, starts, length)
     power = (np.abs(D) ** 2).mean(axis=0)
     if not np.isfinite(power).all():
-        return [FrequencyResponse(why="its numbers are too large")]
+        return [FrequencyResponse(why="the numbers of the drive are too large")]
 
     strongest = int(power.argmax())
     if math.sqrt(2.0 * power[strongest]) < least:
-        return [FrequencyResponse(why="nothing drives it")]
+        return [FrequencyResponse(why="the drive is too weak at every frequency")]
     least_power = max(0.5 * least**2, _DRIVEN_SHARE**2 * power[strongest])
     driven = np.flatnonzero(power >= least_power)
 

@@ -41,7 +41,7 @@ class Metric(NamedTuple):
 MetricValues = dict[str, Metric]
 """Metrics of one subject, by the keys of their quantities."""
 
-_NOT_FINITE = "it is no finite number"
+_NOT_FINITE = "the number is not finite"
 
 
 def metric(value: float | None, why: str = _NOT_FINITE) -> Metric:

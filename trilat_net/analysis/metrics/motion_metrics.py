@@ -154,7 +154,7 @@ def measure_spread(view: RunView, _run: str) -> MetricValues:
         keys=_SPREADS,
         differences=spread,
         at_end=sites[0].t_s[known] > end_s - END_WINDOW_S,
-        why_not_at_end="no instant of the last second of which every site has a record",
+        why_not_at_end="in the last second there is no time at which every site has a record",
     )
 
 
@@ -486,7 +486,7 @@ def measure_parameter_error(view: RunView, site: str) -> MetricValues:
 
     metrics["theta_slope_per_s"] = metric(slope, "less than two records in the last 5 s")
     metrics["unphysical_links"] = Metric(
-        None, "it is no chain, of ten parameters a link", applies=False
+        None, "the arm is not a chain with ten parameters per link", applies=False
     )
     if base is not None:
         metrics["unphysical_links"] = metric(base.consistent_last.count(False))
@@ -503,7 +503,7 @@ def measure_parameter_error(view: RunView, site: str) -> MetricValues:
     why = "the gains of learning are not known"
     if gains.law is Law.ADAPTIVE:
         energies = _compute_parameter_energy(arm, learnt, np.array(gains.Gamma), errors)
-        why = "it is no finite number"
+        why = "the number is not finite"
 
     distances = np.linalg.norm(errors, axis=1)
     for end, distance, energy in zip(("first", "last"), distances, energies, strict=True):

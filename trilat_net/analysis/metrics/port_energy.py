@@ -35,7 +35,7 @@ from ..following import build_following
 from ..run_view import RunView
 from .measures import ENERGY, Metric, MetricValues, Quantity, measures, metric, unavailable
 
-_NO_FRICTION = Metric(None, "its joints have no friction", applies=False)
+_NO_FRICTION = Metric(None, "the joints have no friction", applies=False)
 
 
 def held_work(torque: Array, q: Array) -> Array:
@@ -66,7 +66,9 @@ def trapezoid_work(torque: Array, q: Array) -> Array:
     Returns:
         Work in each period, shape (K - 1,), in J.
     """
-    mean_torque = 0.5 * (torque[:-1] + torque[1:])
+    torque_left = torque[:-1]
+    torque_right = torque[1:]
+    mean_torque = 0.5 * (torque_left + torque_right)
     return held_work(mean_torque, q)
 
 
@@ -86,7 +88,9 @@ def held_control_torque(records: AlignedRecords, scenario: Scenario) -> Array:
     spec = scenario.sites[records.site]
     tau = records.tau
     if spec.plant != "simulated":
-        return 0.5 * (tau[:-1] + tau[1:])
+        tau_left = tau[:-1]
+        tau_right = tau[1:]
+        return 0.5 * (tau_left + tau_right)
     tau_limit = np.asarray(spec.limits.tau_limit_nm)
     digital = Scheme[scenario.scheme.upper()] is Scheme.DIGITAL
     held = hold_torque(tau, tau_limit, digital=digital)
@@ -172,13 +176,13 @@ def measure_port_energy(view: RunView, site: str) -> MetricValues:
     metrics = {
         "controller_j": metric(controller[-1]),
         "hands_j": metric(operator[-1]),
-        "hands_most_j": metric(max(0.0, float(operator.max()))),
+        "hands_most_j": _measure_most(operator),
     }
     if spec.environment or stop_torque.any():
         metrics["walls_j"] = metric(walls[-1])
-        metrics["walls_most_j"] = metric(max(0.0, float(walls.max())))
+        metrics["walls_most_j"] = _measure_most(walls)
     else:
-        no_walls = Metric(None, "the scenario has no environment here", applies=False)
+        no_walls = Metric(None, "the scenario has no environment at this site", applies=False)
         metrics["walls_j"] = no_walls
         metrics["walls_most_j"] = no_walls
 
@@ -191,10 +195,17 @@ def measure_port_energy(view: RunView, site: str) -> MetricValues:
 
     energy = mechanical_energy(arm, records)
     gained = accumulate(np.diff(energy))
-    unaccounted = np.abs(gained - controller - operator - walls + friction)
+    unaccounted = gained - controller - operator - walls + friction
+    largest_unaccounted = np.abs(unaccounted).max()
     metrics["mechanical_j"] = metric(gained[-1])
-    metrics["unaccounted_j"] = metric(float(unaccounted.max()))
+    metrics["unaccounted_j"] = metric(float(largest_unaccounted))
     return metrics
+
+
+def _measure_most(energy: Array) -> Metric:
+    """Returns the metric of the largest energy over time, but at least 0, in J."""
+    largest = float(energy.max())
+    return metric(max(0.0, largest))
 
 
 @measures(
@@ -241,7 +252,8 @@ def measure_delay_energy(view: RunView, link: str) -> MetricValues:
         return unavailable(ENERGY, "no two records in a row", of="link")
 
     peer_view = view_delayed_peer(records, PeerTrajectory(peer_records))
-    known = peer_view.delayed.known & peer_view.now.known & records.follows
+    is_peer_known = peer_view.delayed.known & peer_view.now.known
+    known = is_peer_known & records.follows
     judged = records.known_periods & known[:-1] & known[1:]
     if not judged.any():
         return unavailable(ENERGY, "no period rests on records of both sites", of="link")
@@ -262,7 +274,7 @@ def measure_delay_energy(view: RunView, link: str) -> MetricValues:
     injected = np.cumsum(judged_work)
     return {
         "delay_j": metric(injected[-1]),
-        "delay_most_j": metric(max(0.0, float(injected.max()))),
+        "delay_most_j": _measure_most(injected),
     }
 
 
@@ -337,9 +349,11 @@ def _compute_reflected_lag(records: AlignedRecords, peer_records: AlignedRecords
         peer_torque = peer_records.wrench
 
     used = records.used[peer_records.site]
-    has_arrived = (used >= 0)[:, np.newaxis]
+    is_used = used >= 0
+    has_arrived = is_used[:, np.newaxis]
     last_row = len(peer_records.known) - 1
-    row = np.clip(used - peer_records.first, 0, last_row)
+    row_of_peer = used - peer_records.first
+    row = np.clip(row_of_peer, 0, last_row)
     arrived = np.where(has_arrived, -peer_torque[row], 0.0)
 
     columns = [

@@ -596,5 +596,7 @@ def _find_holding_stiffness(scenario: Scenario, site: str) -> tuple[Array, str]:
     axes = np.array(scenario.arms[site].axes or 1.0)
     is_free = axes == 0.0
     is_held = (K > 0.0) | is_free
-    why = "" if is_held.all() else "nothing holds its e"
+    why = ""
+    if not is_held.all():
+        why = "the law has no stiffness along a coordinate that the site follows"
     return np.where(is_free, np.nan, K), why

@@ -105,7 +105,8 @@ def measure_authority(view: RunView, site: str) -> MetricValues:
     if isinstance(shared, Metric):
         return unavailable(USERS, shared.why, of="site", applies=shared.applies)
     if site not in users:
-        return unavailable(USERS, "its hand is no user's", of="site", applies=False)
+        why = "the arm of this site is not the master arm of a user"
+        return unavailable(USERS, why, of="site", applies=False)
 
     records = view.sites[site].records
     torque = view.sites[site].torque
