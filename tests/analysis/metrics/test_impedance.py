@@ -66,7 +66,7 @@ def test_what_nobody_drives_and_what_was_not_recorded_are_named() -> None:
     )
     gaps = EVERYTHING.copy()
     gaps[::700] = False
-    assert "no 4 s are recorded" in strongest(x, x, x, gaps, RATE_HZ, 1e-3).why
+    assert "no stretch of 4 s" in strongest(x, x, x, gaps, RATE_HZ, 1e-3).why
 
 
 def test_in_a_closed_loop_the_driver_decides_whose_impedance() -> None:
