@@ -91,8 +91,8 @@ class RecordBatch(NamedTuple):
         Args:
             t_ns: The time, in ns. A record at exactly this time is not returned.
         """
-        first = np.searchsorted(self.t_ns, t_ns, side="right")
-        return self._slice(int(first), None)
+        first = int(np.searchsorted(self.t_ns, t_ns, side="right"))
+        return self._slice(first, None)
 
     def between(self, from_ns: int, to_ns: int) -> "RecordBatch":
         """Returns the records within an interval of time.
@@ -101,9 +101,9 @@ class RecordBatch(NamedTuple):
             from_ns: Start of the interval, in ns, which belongs to the interval.
             to_ns: End of the interval, in ns, which does not belong to it.
         """
-        first = np.searchsorted(self.t_ns, from_ns)
-        stop = np.searchsorted(self.t_ns, to_ns)
-        return self._slice(int(first), int(stop))
+        first = int(np.searchsorted(self.t_ns, from_ns))
+        stop = int(np.searchsorted(self.t_ns, to_ns))
+        return self._slice(first, stop)
 
     def reduce(self, into: Array = NO_BUCKETS) -> Array:
         """Adds these records to a compact summary, from which the end of a run is judged.
@@ -119,11 +119,18 @@ class RecordBatch(NamedTuple):
             The summary that includes these records, see `reduce_to_buckets`.
         """
         bucket = self.t_ns * BUCKETS_PER_S // NS_PER_S
-        return reduce_to_buckets(bucket=bucket, e=self.e, qd=self.qd, q=self.q, into=into)
+        return reduce_to_buckets(
+            bucket=bucket,
+            e=self.e,
+            qd=self.qd,
+            q=self.q,
+            into=into,
+        )
 
     def _slice(self, first: int, stop: int | None) -> "RecordBatch":
         """Returns the records from index `first` up to, but not including, index `stop`."""
-        return RecordBatch._make(column[first:stop] for column in self)
+        columns = [column[first:stop] for column in self]
+        return RecordBatch._make(columns)
 
 
 def join_batches(batches: Sequence[RecordBatch]) -> RecordBatch:
@@ -132,8 +139,11 @@ def join_batches(batches: Sequence[RecordBatch]) -> RecordBatch:
     Args:
         batches: Batches in the order of time, at least one.
     """
-    columns = zip(*batches, strict=True)
-    return RecordBatch._make(np.concatenate(parts) for parts in columns)
+    columns = []
+    for parts in zip(*batches, strict=True):
+        column = np.concatenate(parts)
+        columns.append(column)
+    return RecordBatch._make(columns)
 
 
 def _build_batch(axes: Sequence[float], t_ns: Ints, used: Ints, *vectors: Array) -> RecordBatch:
@@ -150,8 +160,17 @@ def _build_batch(axes: Sequence[float], t_ns: Ints, used: Ints, *vectors: Array)
             the end effector is empty if the sites agree on joint angles.
     """
     q, qd, q_des, tau, tau_x, x = vectors
-    e = compute_task_errors(x, q_des, axes) if x.size else q - q_des
-    return RecordBatch(t_ns=t_ns, q=q, qd=qd, e=e, tau=tau, tau_x=tau_x, used=used)
+    in_task_space = x.size > 0
+    e = compute_task_errors(x, q_des, axes) if in_task_space else q - q_des
+    return RecordBatch(
+        t_ns=t_ns,
+        q=q,
+        qd=qd,
+        e=e,
+        tau=tau,
+        tau_x=tau_x,
+        used=used,
+    )
 
 
 def run_in_batches(
@@ -179,30 +198,37 @@ def run_in_batches(
         records = pending[name]
         if not records:
             return
-        t_ns = np.array([record.t_ns for record in records], dtype=np.int64)
-        used = np.array([record.used for record in records], dtype=np.int64)
+        times_ns = [record.t_ns for record in records]
+        samples_in_use = [record.used for record in records]
+        t_ns = np.array(times_ns, dtype=np.int64)
+        used = np.array(samples_in_use, dtype=np.int64)
         vectors = []
         for key in _VECTORS:
             rows = [getattr(record, key) for record in records]
             vectors.append(np.array(rows))
         axes = scenario.arms[name].axes
-        receivers[name](_build_batch(axes, t_ns, used, *vectors))
+        batch = _build_batch(axes, t_ns, used, *vectors)
+        receive = receivers[name]
+        receive(batch)
         records.clear()
 
     with process.pause_gc():
         for site, _, output in virtual.execute_virtual(scenario):
             sites[site.name] = site
-            pending[site.name].append(output)
-            if len(pending[site.name]) == BATCH_RECORDS:
+            site_records = pending[site.name]
+            site_records.append(output)
+            if len(site_records) == BATCH_RECORDS:
                 flush(site.name)
-            if output.mode is Mode.DIVERGED and diverged_at_s is None:
+            has_diverged = output.mode is Mode.DIVERGED
+            if has_diverged and diverged_at_s is None:
                 diverged_at_s = output.t_ns / NS_PER_S
     for name in pending:
         flush(name)
 
     late_samples = 0
     for site in sites.values():
-        late_samples += sum(count.late for count in site.counts())
+        for count in site.counts():
+            late_samples += count.late
     return diverged_at_s, late_samples
 
 
@@ -222,20 +248,34 @@ def run_compiled_in_batches(
         The time at which the first site left the limits of its arm, in s. None if no site did.
     """
     run = FusedRun(scenario, keep=BATCH_RECORDS + 1)
-    columns = {name: scenario.layout(name).columns() for name in scenario.names}
-    fastest_hz = max(spec.rate_hz for spec in scenario.sites.values())
+    columns_of_site = {}
+    for name in scenario.names:
+        layout = scenario.layout(name)
+        columns_of_site[name] = layout.columns()
+    rates_hz = [spec.rate_hz for spec in scenario.sites.values()]
+    fastest_hz = max(rates_hz)
     # In this time no site produces more records than the run keeps.
     period_s = BATCH_RECORDS / fastest_hz
     no_columns = slice(0, 0)  # for vectors that the site does not have
     while run.ran_s < scenario.duration_s and run.diverged_s is None:
-        run.advance_to(min(run.ran_s + period_s, scenario.duration_s))
-        for name, (t_ns, rows) in zip(scenario.names, run.pop_records(), strict=True):
+        end_s = min(run.ran_s + period_s, scenario.duration_s)
+        run.advance_to(end_s)
+        records_of_sites = run.pop_records()
+        for name, site_records in zip(scenario.names, records_of_sites, strict=True):
+            t_ns, rows = site_records
             if not len(t_ns):
                 continue
-            vectors = [rows[:, columns[name].get(key, no_columns)] for key in _VECTORS]
-            used = np.zeros((len(t_ns), 0), np.int64)
+            columns = columns_of_site[name]
+            vectors = []
+            for key in _VECTORS:
+                vector_columns = columns.get(key, no_columns)
+                vectors.append(rows[:, vector_columns])
+            no_samples = (len(t_ns), 0)
+            used = np.zeros(no_samples, np.int64)
             axes = scenario.arms[name].axes
-            receivers[name](_build_batch(axes, t_ns, used, *vectors))
+            batch = _build_batch(axes, t_ns, used, *vectors)
+            receive = receivers[name]
+            receive(batch)
     return run.diverged_s
 
 
@@ -252,9 +292,14 @@ def run_whole(scenario: Scenario) -> tuple[dict[str, RecordBatch], RunEnd]:
     batches: dict[str, list[RecordBatch]] = {name: [] for name in scenario.names}
     receivers = {name: batches[name].append for name in batches}
     diverged_s = run_compiled_in_batches(scenario, receivers)
-    records = {name: join_batches(site_batches) for name, site_batches in batches.items()}
-    buckets = [batch.reduce() for batch in records.values()]
-    last_tau_x = [batch.tau_x[-1] for batch in records.values()]
+    records = {}
+    buckets = []
+    last_tau_x = []
+    for name, site_batches in batches.items():
+        site_records = join_batches(site_batches)
+        records[name] = site_records
+        buckets.append(site_records.reduce())
+        last_tau_x.append(site_records.tau_x[-1])
     trace = RunTrace(buckets, last_tau_x, diverged_s)
     return records, classify_run_end(scenario, trace)
 
@@ -327,7 +372,8 @@ class WindowStats:
             tip = self._arm.place_end_effector(inside.q, inside.qd)
             t_s = inside.t_ns / NS_PER_S
             forces = [wall_force(wall, t_s, tip) for wall in self._walls]
-            self._add_wall_force(np.sum(forces, axis=0))
+            total_force = np.sum(forces, axis=0)
+            self._add_wall_force(total_force)
 
     def _raise_peak(self, key: str, values: Array) -> None:
         """Raises a peak to the largest absolute value, if this is larger.
@@ -336,8 +382,9 @@ class WindowStats:
             key: Name of the peak.
             values: New values, of any shape.
         """
+        previous = self._peaks[key]
         largest = float(np.abs(values).max())
-        self._peaks[key] = max(self._peaks[key], largest)
+        self._peaks[key] = max(previous, largest)
 
     def _add_wall_force(self, force: Array) -> None:
         """Updates the statistics of the force that the walls of the site exert on its arm.
@@ -349,13 +396,18 @@ class WindowStats:
         """
         touches = force > 0.0
         # A contact that exists in the first record of the window is not a hit.
-        was_touching = touches[0] if self._was_touching is None else self._was_touching
+        was_touching = self._was_touching
+        if was_touching is None:
+            was_touching = touches[0]
         previous = np.append(was_touching, touches[:-1])
-        self._hits += int((touches & ~previous).sum())
+        begins_contact = touches & ~previous
+        squares = force * force
+        peak = float(force.max())
+        self._hits += int(begins_contact.sum())
         self._was_touching = bool(touches[-1])
         self._force_sum += float(force.sum())
-        self._force_squares += float((force * force).sum())
-        self._force_peak = max(self._force_peak, float(force.max()))
+        self._force_squares += float(squares.sum())
+        self._force_peak = max(self._force_peak, peak)
 
     def compute_ranges(self) -> dict[str, Range]:
         """Returns the smallest and the largest value of each quantity in this interval of time.
@@ -373,12 +425,15 @@ class WindowStats:
             return {}
 
         ranges = {}
-        angles = zip(self._q_least.tolist(), self._q_most.tolist(), strict=True)
+        least_rad = self._q_least.tolist()
+        most_rad = self._q_most.tolist()
+        angles = zip(least_rad, most_rad, strict=True)
         for n, (least, most) in enumerate(angles, 1):
             ranges[f"q{n}_rad"] = Range(least, most)
 
         single_values = dict(self._peaks)
-        pushes_nm = (self._push_sum / self._records).tolist()
+        mean_push = self._push_sum / self._records
+        pushes_nm = mean_push.tolist()
         for n, push_nm in enumerate(pushes_nm, 1):
             single_values[f"push{n}_mean_nm"] = push_nm
         mean_n = self._force_sum / self._records
@@ -423,21 +478,27 @@ class SiteStats:
     """
 
     def __init__(self, scenario: Scenario, site: str) -> None:
-        peer_rates = [scenario.sites[peer].rate_hz for peer in scenario.peers(site)]
+        peer_rates = []
+        for peer in scenario.peers(site):
+            peer_spec = scenario.sites[peer]
+            peer_rates.append(peer_spec.rate_hz)
+        peer_count = len(peer_rates)
         self._peer_rates = np.array(peer_rates, dtype=np.int64)
-        self._synchronised_rad = scenario.expect.synchronised_rad
-        self.windows = [
-            WindowStats(window, scenario, site) if window.site in ("", site) else None
-            for window in scenario.expect.windows
-        ]
+        expect = scenario.expect
+        self._synchronised_rad = expect.synchronised_rad
+        self.windows: list[WindowStats | None] = []
+        for window in expect.windows:
+            applies = window.site in ("", site)
+            stats = WindowStats(window, scenario, site) if applies else None
+            self.windows.append(stats)
         self.records = 0
         self.peak_error_rad = 0.0
         self.peak_torque_nm = 0.0
         self.peak_speed_rad_s = 0.0
         self.unsynchronised_ns = -1
-        self.age_max_ms = np.zeros(len(peer_rates))
-        self._age_sum_ms = np.zeros(len(peer_rates))
-        self._age_records = np.zeros(len(peer_rates), dtype=np.int64)
+        self.age_max_ms = np.zeros(peer_count)
+        self._age_sum_ms = np.zeros(peer_count)
+        self._age_records = np.zeros(peer_count, dtype=np.int64)
         self._squares = np.zeros(1)
         self._buckets = NO_BUCKETS
         self._tail: list[RecordBatch] = []
@@ -455,14 +516,19 @@ class SiteStats:
         largest_error = error.max(axis=1)
         torque_nm = np.abs(rows.tau)
         speed_rad_s = np.abs(rows.qd)
+        batch_error_rad = float(largest_error.max())
+        batch_torque_nm = float(torque_nm.max())
+        batch_speed_rad_s = float(speed_rad_s.max())
+        squares = error * error
         self.records += len(largest_error)
-        self.peak_error_rad = max(self.peak_error_rad, float(largest_error.max()))
-        self.peak_torque_nm = max(self.peak_torque_nm, float(torque_nm.max()))
-        self.peak_speed_rad_s = max(self.peak_speed_rad_s, float(speed_rad_s.max()))
-        self._squares = self._squares + (error * error).sum(axis=0)
+        self.peak_error_rad = max(self.peak_error_rad, batch_error_rad)
+        self.peak_torque_nm = max(self.peak_torque_nm, batch_torque_nm)
+        self.peak_speed_rad_s = max(self.peak_speed_rad_s, batch_speed_rad_s)
+        self._squares = self._squares + squares.sum(axis=0)
         unsynchronised = np.flatnonzero(largest_error >= self._synchronised_rad)
         if len(unsynchronised):
-            self.unsynchronised_ns = int(rows.t_ns[unsynchronised[-1]])
+            last = unsynchronised[-1]
+            self.unsynchronised_ns = int(rows.t_ns[last])
 
         self._add_ages(rows)
         self._buckets = rows.reduce(self._buckets)
@@ -483,9 +549,11 @@ class SiteStats:
         """
         is_known = rows.used >= 0
         sent_ns = rows.used * NS_PER_S // self._peer_rates
-        age_ms = (rows.t_ns[:, None] - sent_ns) * 1e-6
+        age_ns = rows.t_ns[:, None] - sent_ns
+        age_ms = age_ns * 1e-6
         age_ms[~is_known] = 0.0
-        self.age_max_ms = np.maximum(self.age_max_ms, age_ms.max(axis=0))
+        batch_max_ms = age_ms.max(axis=0)
+        self.age_max_ms = np.maximum(self.age_max_ms, batch_max_ms)
         self._age_sum_ms += age_ms.sum(axis=0)
         self._age_records += is_known.sum(axis=0)
 
@@ -494,7 +562,8 @@ class SiteStats:
         """Nominal time of the last record, in ns. It is -1 before the first record."""
         if not self._tail:
             return -1
-        return int(self._tail[-1].t_ns[-1])
+        last_batch = self._tail[-1]
+        return int(last_batch.t_ns[-1])
 
     @property
     def rms_error_rad(self) -> float:
@@ -502,7 +571,8 @@ class SiteStats:
 
         It is computed for each joint, and the largest of these values is returned.
         """
-        mean_square = self._squares.max() / max(1, self.records)
+        records = max(1, self.records)
+        mean_square = self._squares.max() / records
         return float(np.sqrt(mean_square))
 
     @property
@@ -515,11 +585,13 @@ class SiteStats:
         record_counts = self._age_records.tolist()
         largest_ms = self.age_max_ms.tolist()
         ages = []
-        for sum_ms, count, most_ms in zip(sums_ms, record_counts, largest_ms, strict=True):
+        statistics = zip(sums_ms, record_counts, largest_ms, strict=True)
+        for sum_ms, count, most_ms in statistics:
             if count:
-                ages.append(LinkAge(mean_ms=sum_ms / count, max_ms=most_ms))
+                age = LinkAge(mean_ms=sum_ms / count, max_ms=most_ms)
             else:
-                ages.append(LinkAge(mean_ms=None, max_ms=None))
+                age = LinkAge(mean_ms=None, max_ms=None)
+            ages.append(age)
         return ages
 
     def end(self, end_ns: int) -> RecordBatch:
@@ -529,7 +601,9 @@ class SiteStats:
             end_ns: Time of the run's last record, in ns. If the records of this arm end earlier
                 than others, fewer records are returned.
         """
-        return join_batches(self._tail).since(end_ns - _END_NS)
+        rows = join_batches(self._tail)
+        start_ns = end_ns - _END_NS
+        return rows.since(start_ns)
 
     @property
     def buckets(self) -> Array:
@@ -537,14 +611,16 @@ class SiteStats:
 
         A row has the extreme values of a short interval of time, see `RecordBatch.reduce`.
         """
-        return self._buckets[: self.last_ns // _BUCKET_NS + 1]
+        last_bucket = self.last_ns // _BUCKET_NS
+        return self._buckets[: last_bucket + 1]
 
     @property
     def tau_x(self) -> Array:
         """Torque of operator and environment in the last record, in N m, shape (n,)."""
         if not self._tail:
             return np.zeros(1)
-        last_tau_x: Array = self._tail[-1].tau_x[-1]
+        last_batch = self._tail[-1]
+        last_tau_x: Array = last_batch.tau_x[-1]
         return last_tau_x
 
 
@@ -620,16 +696,23 @@ def compute_run_metrics(
     Returns:
         The metrics of the run. A metric that the run cannot give is None.
     """
-    with_records = {name: stats for name, stats in site_stats.items() if stats.records}
+    with_records = {}
+    buckets = []
+    last_tau_x = []
+    for name, stats in site_stats.items():
+        if stats.records:
+            with_records[name] = stats
+        buckets.append(stats.buckets)
+        last_tau_x.append(stats.tau_x)
     all_ran = len(with_records) == len(site_stats)
-    buckets = [stats.buckets for stats in site_stats.values()]
-    last_tau_x = [stats.tau_x for stats in site_stats.values()]
     trace = RunTrace(buckets, last_tau_x, diverged_at_s)
 
     synchronised_at_s = None
     if all_ran:
-        synchronised_at_s = _find_synchronisation_s(list(with_records.values()))
-    end_ns = max((stats.last_ns for stats in with_records.values()), default=0)
+        all_stats = list(with_records.values())
+        synchronised_at_s = _find_synchronisation_s(all_stats)
+    last_times_ns = [stats.last_ns for stats in with_records.values()]
+    end_ns = max(last_times_ns, default=0)
     durations_s = []
     ends = []
     end_errors_rad = []
@@ -640,8 +723,10 @@ def compute_run_metrics(
         durations_s.append(stats.last_ns / NS_PER_S + period_s)
         end = stats.end(end_ns)
         ends.append(end)
-        end_errors_rad.append(float(np.abs(end.e).max(initial=0.0)))
-        last_pose_rad = stats.end(stats.last_ns).q[-1]
+        end_error_rad = np.abs(end.e).max(initial=0.0)
+        end_errors_rad.append(float(end_error_rad))
+        last_second = stats.end(stats.last_ns)
+        last_pose_rad = last_second.q[-1]
         end_poses_rad[name] = tuple(last_pose_rad.tolist())
 
     ages = {}
@@ -712,16 +797,20 @@ def _merge_windows(windows: Sequence[WindowStats | None]) -> dict[str, Range]:
     Returns:
         Ranges by the keys of a window of [expect].
     """
-    site_ranges = [window.compute_ranges() for window in windows if window is not None]
+    site_ranges = []
+    for window in windows:
+        if window is not None:
+            ranges = window.compute_ranges()
+            site_ranges.append(ranges)
     if len(site_ranges) == 1:
         return site_ranges[0]
     merged = {}
     for key in ALL_SITES_QUANTITIES:
         if all(key in ranges for ranges in site_ranges):
-            merged[key] = Range(
-                least=max(ranges[key].least for ranges in site_ranges),
-                most=max(ranges[key].most for ranges in site_ranges),
-            )
+            key_ranges = [ranges[key] for ranges in site_ranges]
+            least = max(key_range.least for key_range in key_ranges)
+            most = max(key_range.most for key_range in key_ranges)
+            merged[key] = Range(least, most)
     return merged
 
 
@@ -745,12 +834,16 @@ def _compute_end_spread_rad(ends: Sequence[RecordBatch]) -> float | None:
         return None
 
     first_common_ns = max(end.t_ns[0] for end in ends)
-    times_ns = ends[0].t_ns[ends[0].t_ns >= first_common_ns]
+    first_site_ns = ends[0].t_ns
+    times_ns = first_site_ns[first_site_ns >= first_common_ns]
     poses = []
     for end in ends:
-        latest = np.searchsorted(end.t_ns, times_ns, side="right") - 1
+        next_indices = np.searchsorted(end.t_ns, times_ns, side="right")
+        latest = next_indices - 1
         poses.append(end.q[latest])
-    spread: Array = np.max(poses, axis=0) - np.min(poses, axis=0)
+    largest = np.max(poses, axis=0)
+    smallest = np.min(poses, axis=0)
+    spread: Array = largest - smallest
     return float(spread.max(initial=0.0))
 
 
@@ -773,7 +866,8 @@ def measure_virtual_run(scenario: Scenario) -> RunMetrics:
     missing = 0
     if diverged_at_s is None:
         expected = sum(scenario.ticks(name) for name in scenario.names)
-        missing = expected - sum(stats.records for stats in site_stats.values())
+        recorded = sum(stats.records for stats in site_stats.values())
+        missing = expected - recorded
     return compute_run_metrics(
         scenario,
         site_stats,
@@ -797,12 +891,16 @@ def measure_log(log: Log, expect: Expect | None = None) -> RunMetrics:
     scenario = log.scenario
     if expect is not None:
         scenario = msgspec.structs.replace(scenario, expect=expect)
-    ticks_at_end = {event.member: event.ticks for event in log.events if event.kind == "end"}
+    ticks_at_end = {}
+    for event in log.events:
+        if event.kind == "end":
+            ticks_at_end[event.member] = event.ticks
     diverged_at_s = log.diverged_s
     site_stats = {name: SiteStats(scenario, name) for name in log.sites}
     missing = 0
     for name, stats in site_stats.items():
         site_log = log[name]
+        used_by_peer = [site_log.used[peer] for peer in site_log.peers]
         batch = RecordBatch(
             t_ns=site_log.t_ns,
             q=site_log.q,
@@ -810,7 +908,7 @@ def measure_log(log: Log, expect: Expect | None = None) -> RunMetrics:
             e=site_log.e,
             tau=site_log.tau,
             tau_x=site_log.tau_x,
-            used=np.array([site_log.used[peer] for peer in site_log.peers]).T,
+            used=np.array(used_by_peer).T,
         )
         stats.add(batch)
         expected = scenario.ticks(name)
@@ -819,7 +917,10 @@ def measure_log(log: Log, expect: Expect | None = None) -> RunMetrics:
             expected = ticks_at_end.get(name, 0)
         missing += max(0, expected - len(site_log))
 
-    late_samples = sum(sample.arrived_tick is not None for sample in find_absent_samples(log))
+    late_samples = 0
+    for sample in find_absent_samples(log):
+        if sample.arrived_tick is not None:
+            late_samples += 1
     metrics = compute_run_metrics(
         scenario,
         site_stats,
@@ -873,7 +974,8 @@ def evaluate_expectations(expect: Expect, metrics: RunMetrics) -> list[Expectati
     for key in _LIMITS:
         limit = getattr(expect, key)
         if limit is not None:
-            outcomes.append(_compare_with_limit(key, _read_metric(key, metrics), limit))
+            measured = _read_metric(key, metrics)
+            outcomes.append(_compare_with_limit(key, measured, limit))
 
     outcomes += _evaluate_poses(expect, metrics)
     if expect.no_gaps:
@@ -897,7 +999,8 @@ def _evaluate_stability(expect: Expect, metrics: RunMetrics) -> Iterator[Expecta
         expected = Stability.STABLE if expects_stable else Stability.NOT_STABLE
         measured = f"{end.stability}: {end.text}"
         limit = str(expects_stable).lower()
-        yield ExpectationResult("stable", end.stability is expected, measured, limit)
+        held = end.stability is expected
+        yield ExpectationResult("stable", held, measured, limit)
 
 
 _LIMITS = tuple(key for key in field_names(Expect) if re.search("_(max|min|by)(_|$)", key))
@@ -916,7 +1019,8 @@ def _read_metric(key: str, metrics: RunMetrics) -> float | None:
     """
     is_age = key.endswith("_ms")
     if not is_age:
-        name = re.sub("_(max|min)", "", key).replace("_by_", "_at_")
+        without_bound = re.sub("_(max|min)", "", key)
+        name = without_bound.replace("_by_", "_at_")
         value: float | None = getattr(metrics, name)
         return value
 
@@ -972,15 +1076,18 @@ def _evaluate_poses(expect: Expect, metrics: RunMetrics) -> Iterator[Expectation
         if reached is None:
             yield ExpectationResult(key, False, "never", limit)
             continue
-        distances_rad = [abs(a - b) for a, b in zip(reached, expected, strict=True)]
+        distances_rad = []
+        for angle, expected_angle in zip(reached, expected, strict=True):
+            distances_rad.append(abs(angle - expected_angle))
         error_rad = max(distances_rad)
+        margin_rad = tolerance_rad - error_rad
         angles = ", ".join(f"{angle:.4f}" for angle in reached)
         yield ExpectationResult(
             key=key,
             held=error_rad <= tolerance_rad,
             measured=f"({angles}) rad",
             limit=limit,
-            margin=(tolerance_rad - error_rad) / tolerance_rad,
+            margin=margin_rad / tolerance_rad,
         )
 
 
@@ -992,18 +1099,21 @@ def _evaluate_windows(expect: Expect, metrics: RunMetrics) -> Iterator[Expectati
         for key, limits in window.limits:
             name = f"{key}{site} {period}"  # as in "wall_mean_n s 9-15 s"
             _, unit = split_unit(key)
-            yield _compare_with_range(name, ranges.get(key), limits, unit)
+            measured = ranges.get(key)
+            yield _compare_with_range(name, measured, limits, unit)
 
 
 def _evaluate_metrics(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
     """Yields the outcome of each limited metric of docs/metrics.md."""
     for key, limits in expect.metrics.items():
         value, reason, _ = metrics.metrics[key]
+        measured = None if value is None else Range(value, value)
+        quantity = find_quantity(key)
         yield _compare_with_range(
             name=f"metrics.{key}",
-            measured=None if value is None else Range(value, value),
+            measured=measured,
             limits=limits,
-            unit=find_quantity(key).unit,
+            unit=quantity.unit,
             missing_text=reason,
         )
 
@@ -1034,13 +1144,16 @@ def _compare_with_range(
         return ExpectationResult(name, False, missing_text, limit_text)
     distinct_values = dict.fromkeys(measured)  # a single value is printed once
     text = " to ".join(f"{value:.4g}" for value in distinct_values)
-    distance = min(measured.least - least, most - measured.most)
+    distance_to_lower = measured.least - least
+    distance_to_upper = most - measured.most
+    distance = min(distance_to_lower, distance_to_upper)
     half_width = 0.5 * (most - least)
+    is_single_value = measured.least == measured.most
     return ExpectationResult(
         key=name,
         held=distance >= 0.0,
         measured=f"{text} {unit}".rstrip(),
         limit=limit_text,
         margin=distance / half_width if half_width else None,
-        value=measured.most if measured.least == measured.most else None,
+        value=measured.most if is_single_value else None,
     )
