@@ -189,7 +189,9 @@ class ReachTask:
             direction = random.normal(size=dimensions)
             # The root makes the density uniform over the area or the volume.
             relative_radius = random.uniform() ** (1.0 / dimensions)
-            offset_m = self._radius_m * relative_radius * direction / np.linalg.norm(direction)
+            distance_m = self._radius_m * relative_radius
+            length = np.linalg.norm(direction)
+            offset_m = distance_m * direction / length
             position_m = start_m + offset_m
             if scene.can_reach(self._site, position_m):
                 break
@@ -313,8 +315,9 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         render_mode: str | None = None,
         flat: bool = False,
     ) -> None:
-        if render_mode not in (None, *self.metadata["render_modes"]):
-            modes = ", ".join(self.metadata["render_modes"])
+        render_modes = self.metadata["render_modes"]
+        if render_mode not in (None, *render_modes):
+            modes = ", ".join(render_modes)
             raise UsageError(f"render_mode must be {modes} or None, not {render_mode!r}")
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": rate_hz}
@@ -327,22 +330,29 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         self._vary = vary
         self._leads = leads
         self.task: EpisodeTask = task or ReachTask(leads)
-        self._base = self._prepare(load_scenario(scenario, set, duration_s=duration_s))
-        tick_rate_hz = self._base.sites[user].rate_hz
+        loaded = load_scenario(scenario, set, duration_s=duration_s)
+        self._base = self._prepare(loaded)
+        user_spec = self._base.sites[user]
+        tick_rate_hz = user_spec.rate_hz
         if tick_rate_hz % rate_hz:
             raise UsageError(f"rate_hz must divide the tick rate of {user}, {tick_rate_hz}")
         self._ticks_per_step = tick_rate_hz // rate_hz
 
-        hand = self._build_hand_site(self._base).describe()
+        hand_site = self._build_hand_site(self._base)
+        hand = hand_site.describe()
         limit = hand.limit if hand.mode == "force" else self._find_reach()
         dtype = np.float32 if flat else np.float64
         self._action_limit = limit
         self._action_size = hand.size
-        self.action_space: Any = spaces.Box(-limit, limit, (hand.size,), dtype)
+        shape = (hand.size,)
+        self.action_space: Any = spaces.Box(-limit, limit, shape, dtype)
 
         self._begin(self._base)
-        self.task.begin(np.random.default_rng(0), self._build_scene())
-        self._dict_space = self._build_dict_space(self._build_scene())
+        random = np.random.default_rng(0)
+        first_scene = self._build_scene()
+        self.task.begin(random, first_scene)
+        scene_with_goal = self._build_scene()
+        self._dict_space = self._build_dict_space(scene_with_goal)
         self.observation_space: Any = self._dict_space
         self.observation_names: list[str] = []
         if flat:
@@ -358,7 +368,8 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         """
         bounds = {"alpha": 1.0, "grip": 1.0, "goal": self.task.bound}
         boxes: dict[str, Any] = {}
-        for name, values in self._observe(scene).items():
+        parts = self._observe(scene)
+        for name, values in parts.items():
             bound = bounds.get(name, FAR)
             boxes[name] = spaces.Box(-bound, bound, values.shape, np.float64)
         return spaces.Dict(boxes)
@@ -378,18 +389,20 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         hand = spec.find_live_hand(is_open=True) or LiveHand()
         if self._mode:
             hand = replace(hand, mode=self._mode)
-        sites = {**scenario.sites, self._user: replace(spec, hands=(hand,))}
+        sites = dict(scenario.sites)
+        sites[self._user] = replace(spec, hands=(hand,))
         # The values that the removed operators would draw at random are removed too.
-        drawn = {
-            key: distribution
-            for key, distribution in scenario.drawn.items()
-            if f"{self._user}.hands" not in key
-        }
+        removed_keys = f"{self._user}.hands"
+        drawn = dict(scenario.drawn)
+        for key in scenario.drawn:
+            if removed_keys in key:
+                del drawn[key]
         return replace(scenario, sites=sites, drawn=drawn)
 
     def _build_hand_site(self, scenario: Scenario) -> HandSite:
         """Returns the site and the settings of the operator that applies the actions."""
-        hand = scenario.sites[self._user].find_live_hand()
+        spec = scenario.sites[self._user]
+        hand = spec.find_live_hand()
         assert hand is not None
         return HandSite(
             scenario=scenario,
@@ -407,12 +420,14 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         """
         arm = self._base.arms[self._user]
         spec = self._base.sites[self._user]
-        if self._build_hand_site(self._base).spec.mode == "joint":
+        hand_site = self._build_hand_site(self._base)
+        if hand_site.spec.mode == "joint":
             return 2.0 * math.pi
         if arm.chain is None:
             return float(sum(arm.lengths_m))
         # The reach of a chain is not known in closed form. This bound is generous.
-        start_distance_m = float(np.linalg.norm(arm.end_effector(spec.q0_rad)))
+        start_m = arm.end_effector(spec.q0_rad)
+        start_distance_m = float(np.linalg.norm(start_m))
         return 1.5 * start_distance_m + 1.0
 
     def _begin(self, scenario: Scenario) -> None:
@@ -424,11 +439,13 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         self.scenario = scenario
         self._k = 0
         self._actions = list[Array]()
-        self._player = ActedHand(self._build_hand_site(scenario), self._actions)
+        hand_site = self._build_hand_site(scenario)
+        self._player = ActedHand(hand_site, self._actions)
         self._plants = make_plant_players(scenario)
         hands = {self._user: self._player}
+        ticks = [scenario.ticks(name) for name in scenario.names]
         self._run = FusedRun(scenario, keep=1, hands=hands, plants=self._plants)
-        self._run.plan([scenario.ticks(name) for name in scenario.names])
+        self._run.plan(ticks)
         self._ticks = scenario.ticks(self._user)
         self._tick_rate_hz = scenario.sites[self._user].rate_hz
 
@@ -442,22 +459,28 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
             arm = arms[name]
             angles_rad = row[: arm.counts.joints]  # rows are as long as that of the longest arm
             q[name] = angles_rad
-            positions_m[name] = np.array(arm.end_effector(angles_rad.tolist()))
+            position_m = arm.end_effector(angles_rad.tolist())
+            positions_m[name] = np.array(position_m)
 
         bodies = {}
         for site, plant in self._plants.items():
+            body_names = self.scenario.bodies_m(site)
             poses = np.reshape(plant.state.bodies, (-1, 7))
-            bodies[site] = dict(zip(self.scenario.bodies_m(site), poses, strict=True))
+            bodies[site] = dict(zip(body_names, poses, strict=True))
 
-        user_arrays = self._run.arrays(names.index(self._user))
+        user_index = names.index(self._user)
+        user_arrays = self._run.arrays(user_index)
+        view = self._player.view(self._k, user_arrays)
+        leading_arm = arms[self._leads]
+        is_chain = leading_arm.chain is not None
         return Scene(
             t_s=self._k / self._tick_rate_hz,
             q=q,
             end_effector_m=positions_m,
-            view=self._player.view(self._k, user_arrays),
+            view=view,
             bodies=bodies,
             can_reach=partial(self._can_reach, q),
-            draws=MOST_DRAWS[arms[self._leads].chain is not None],
+            draws=MOST_DRAWS[is_chain],
         )
 
     def _can_reach(self, q: Mapping[str, Array], site: str, position_m: Array) -> bool:
@@ -468,7 +491,9 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
             site: Name of the site.
             position_m: The position, in m.
         """
-        return can_reach(self.scenario.arms[site], q[site], position_m)
+        arm = self.scenario.arms[site]
+        start_rad = q[site]
+        return can_reach(arm, start_rad, position_m)
 
     def _format_observation(self, scene: Scene) -> Any:
         """Returns the user's observation of a state, in the form of the observation space."""
@@ -476,7 +501,8 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         if not self._flat:
             return parts
         arrays = [np.ravel(parts[name]) for name in self._dict_space]
-        return np.concatenate(arrays).astype(np.float32)
+        numbers = np.concatenate(arrays)
+        return numbers.astype(np.float32)
 
     def _observe(self, scene: Scene) -> dict[str, Array]:
         """Returns the parts of the user's observation of a state, by name.
@@ -485,6 +511,11 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         """
         view = scene.view
         peers = view.peers
+        peer_q = [peer.q for peer in peers]
+        peer_qd = [peer.qd for peer in peers]
+        peer_tau_x = [peer.tau_x for peer in peers]
+        alpha = [peer.alpha for peer in peers]
+        age_s = [peer.age_s for peer in peers]
         parts = {
             "q": view.q,
             "qd": view.qd,
@@ -492,15 +523,16 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
             "q_des": view.q_des,
             "tau_x": view.tau_x,
             "target": view.target,
-            "peer_q": np.array([peer.q for peer in peers]),
-            "peer_qd": np.array([peer.qd for peer in peers]),
-            "peer_tau_x": np.array([peer.tau_x for peer in peers]),
-            "alpha": np.array([peer.alpha for peer in peers]),
-            "age_s": np.array([peer.age_s for peer in peers]),
+            "peer_q": np.array(peer_q),
+            "peer_qd": np.array(peer_qd),
+            "peer_tau_x": np.array(peer_tau_x),
+            "alpha": np.array(alpha),
+            "age_s": np.array(age_s),
             "grip": np.array([view.grip]),
             "goal": np.array(self.task.goal, dtype=np.float64),
         }
-        if self._base.arms[self._user].shares_pose:
+        user_arm = self._base.arms[self._user]
+        if user_arm.shares_pose:
             # A rotation vector jumps where it passes half a turn.
             parts["q_des"] = expand_poses(parts["q_des"])
             parts["peer_q"] = expand_poses(parts["peer_q"])
@@ -519,14 +551,18 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
             succeeded: True if the task is done.
         """
         leading_site = self.scenario.names.index(self._leads)
-        links = np.asarray(self._run.arrays(leading_site).links)
+        leading_arrays = self._run.arrays(leading_site)
+        links = np.asarray(leading_arrays.links)
         peers = self.scenario.peers(self._leads)
-        dominance = dict(zip(peers, links["alpha"].tolist(), strict=True))
+        factors = links["alpha"].tolist()
+        dominance = dict(zip(peers, factors, strict=True))
         user_dominance = dominance.get(self._user, 0.0)
-        teachers = {name: factor for name, factor in dominance.items() if name != self._user}
+        teachers = dict(dominance)
+        teachers.pop(self._user, None)
         teacher = max(teachers, key=lambda name: teachers[name], default=self._user)
+        teacher_dominance = teachers.get(teacher, 0.0)
         return {
-            "is_intervention": teachers.get(teacher, 0.0) > user_dominance,
+            "is_intervention": teacher_dominance > user_dominance,
             "teleop_action": scene.end_effector_m[teacher],
             "dominance": dominance,
             "t_s": scene.t_s,
@@ -554,13 +590,17 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         overrides = {}
         for key, values in self._vary.items():
             overrides[key] = _draw(self.np_random, values)
-        overrides["seed"] = int(self.np_random.integers(2**31))
+        seed_of_run = self.np_random.integers(2**31)
+        overrides["seed"] = int(seed_of_run)
         overrides |= options or {}
-        self._begin(load_scenario(self._base, overrides))
+        scenario = load_scenario(self._base, overrides)
+        self._begin(scenario)
         scene = self._build_scene()
         self.task.begin(self.np_random, scene)
         self._runs = True
-        return self._format_observation(scene), self._describe_step(scene, succeeded=False)
+        observation = self._format_observation(scene)
+        info = self._describe_step(scene, succeeded=False)
+        return observation, info
 
     def step(self, action: Array) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Applies an action and advances the episode by one step.
@@ -591,10 +631,12 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
 
         scene = self._build_scene()
         result = self.task.judge(scene)
-        judgement = Judgement(*result) if isinstance(result, tuple) else Judgement(result)
+        has_flags = isinstance(result, tuple)
+        judgement = Judgement(*result) if has_flags else Judgement(result)
         diverged = self._run.diverged_s is not None
         terminated = judgement.succeeded or judgement.failed or diverged
-        has_next_step = self._k + self._ticks_per_step <= self._ticks
+        next_k = self._k + self._ticks_per_step
+        has_next_step = next_k <= self._ticks
         truncated = not (terminated or has_next_step)
         self._runs = not (terminated or truncated)
         info = self._describe_step(scene, succeeded=judgement.succeeded)
@@ -616,12 +658,12 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
             content = f"an array of shape {values.shape}"
             if values.ndim == 1:
                 content = count_nouns(values.size, "number")
-            raise UsageError(
-                f"an action must have {self._action_size} numbers, but this one has {content}"
-            )
+            size = count_nouns(self._action_size, "number")
+            raise UsageError(f"an action must have {size}, but this one has {content}")
         if not np.isfinite(values).all():
             raise UsageError(f"the action {values.tolist()} is not finite")
-        return np.clip(values, -self._action_limit, self._action_limit)
+        limit = self._action_limit
+        return np.clip(values, -limit, limit)
 
     def render(self) -> Any:
         """Draws the arms and the goal as a picture of the present state.
@@ -635,7 +677,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         if self.render_mode is None:
             return None
         if not (self._runs or self._actions):
-            raise EpisodeError("there is no episode to be drawn: call reset first")
+            raise EpisodeError("there is no episode to draw: call reset first")
         # imported here, because the import of Matplotlib takes a second
         from ..reporting.episode_picture import EpisodePicture, is_position
 
@@ -643,9 +685,11 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
             self._picture = EpisodePicture(self.scenario, self._leads)
         scene = self._build_scene()
         goal = None
-        if is_position(self.task.goal, scene.end_effector_m[self._leads]):
+        end_effector_m = scene.end_effector_m[self._leads]
+        if is_position(self.task.goal, end_effector_m):
             goal = self.task.goal
-        return self._picture.draw(scene.q, scene.bodies, goal, f"t = {scene.t_s:.2f} s")
+        title = f"t = {scene.t_s:.2f} s"
+        return self._picture.draw(scene.q, scene.bodies, goal, title)
 
     def save(self, path: str | Path, *, force: bool = False) -> Path:
         """Writes the steps of the episode so far to a log, which can be verified.
@@ -665,12 +709,14 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         """
         if not self._actions:
             raise UsageError("an episode has no log before its first step")
-        player = ActedHand(self._build_hand_site(self.scenario), self._actions)
+        hand_site = self._build_hand_site(self.scenario)
+        player = ActedHand(hand_site, self._actions)
         hands = {self._user: player.track}
         elapsed_s = self._k / self._tick_rate_hz
         scenario = replace(self.scenario, duration_s=elapsed_s)
-        record_virtual(scenario, Path(path), force=force, hands=hands)
-        return Path(path)
+        log_path = Path(path)
+        record_virtual(scenario, log_path, force=force, hands=hands)
+        return log_path
 
 
 def _flatten_space(parts: spaces.Dict) -> spaces.Box:
@@ -679,9 +725,14 @@ def _flatten_space(parts: spaces.Dict) -> spaces.Box:
     Args:
         parts: Space of observations in the form of a dictionary.
     """
-    boxes = [box for box in parts.values() if isinstance(box, spaces.Box)]
-    low = np.concatenate([np.ravel(box.low) for box in boxes])
-    high = np.concatenate([np.ravel(box.high) for box in boxes])
+    lows = []
+    highs = []
+    for box in parts.values():
+        if isinstance(box, spaces.Box):
+            lows.append(np.ravel(box.low))
+            highs.append(np.ravel(box.high))
+    low = np.concatenate(lows)
+    high = np.concatenate(highs)
     return spaces.Box(
         low=low.astype(np.float32),
         high=high.astype(np.float32),
@@ -697,7 +748,8 @@ def _name_numbers(parts: spaces.Dict) -> list[str]:
     """
     names = []
     for part, box in parts.items():
-        for indices in np.ndindex(box.shape or ()):
+        shape = box.shape or ()
+        for indices in np.ndindex(shape):
             subscripts = [f"[{index}]" for index in indices]
             names.append(part + "".join(subscripts))
     return names
@@ -711,9 +763,11 @@ def _draw(random: np.random.Generator, values: Sequence[Any]) -> Any:
         values: A tuple of two numbers, which are bounds, or a sequence of possible values.
     """
     are_numbers = all(isinstance(value, int | float) for value in values)
-    if isinstance(values, tuple) and len(values) == 2 and are_numbers:
+    is_pair = isinstance(values, tuple) and len(values) == 2
+    if is_pair and are_numbers:
         return float(random.uniform(*values))
-    return values[int(random.integers(len(values)))]
+    index = int(random.integers(len(values)))
+    return values[index]
 
 
 make_env = TeleoperationEnv

@@ -143,7 +143,8 @@ def draw_stability_map(
     rows = math.ceil(count / columns)
     caption = _wrap_caption(fixed, form)
     panel_height_in = _choose_panel_height_in(plane, columns)
-    height_in = 0.95 + rows * panel_height_in + _CAPTION_LINE_IN * len(caption)
+    caption_height_in = _CAPTION_LINE_IN * len(caption)
+    height_in = 0.95 + rows * panel_height_in + caption_height_in
     shares_labels = columns * rows > 1
     has_colour_bar = plane.judged_by_twins or plane.seeds > 1
 
@@ -165,27 +166,31 @@ def draw_stability_map(
             if len(title) > title_letters:
                 title = title.replace(", ", ",\n")
             axes.set_title(title)
+        has_y_axis = bool(plane.y.key)
         for n, axes in enumerate(grid[:count]):
             _set_scale(axes, plane)
             is_left = n % columns == 0
             is_bottom = n + columns >= count
-            axes.tick_params(labelleft=is_left and bool(plane.y.key))
+            axes.tick_params(labelleft=is_left and has_y_axis)
             axes.tick_params(labelbottom=is_bottom)
 
         if shares_labels:
             figure.supxlabel(plane.x.label, fontsize=8.0, **x_label_options)
             figure.supylabel(plane.y.label, fontsize=8.0)
         else:
-            grid[0].set_xlabel(plane.x.label)
-            grid[0].set_ylabel(plane.y.label)
+            first_axes = grid[0]
+            first_axes.set_xlabel(plane.x.label)
+            first_axes.set_ylabel(plane.y.label)
         if has_colour_bar:
             _draw_colour_bar(figure, grid, plane)
         _draw_legend(figure, plane, lines)
 
         # Drawing computes the layout. The resulting size of a cell decides whether the counts
         # fit into it.
-        figure.draw(FigureCanvasAgg(figure).get_renderer())  # type: ignore[no-untyped-call]
-        if plane.seeds > 1 and not plane.judged_by_twins:
+        canvas = FigureCanvasAgg(figure)
+        figure.draw(canvas.get_renderer())  # type: ignore[no-untyped-call]
+        shows_shares = plane.seeds > 1 and not plane.judged_by_twins
+        if shows_shares:
             for axes, panel in zip(grid, plane.panels, strict=False):
                 _draw_counts(axes, plane, panel)
     return figure
@@ -229,8 +234,10 @@ def _wrap_caption(fixed: Sequence[str], form: FigureSize) -> list[str]:
     if not fixed:
         return []
     width = round(_CAPTION_LETTERS_PER_IN * form.width_in)
-    texts = [f"not swept: {'; '.join(fixed)}", FAIR_COMPARISON]
-    return [line for text in texts for line in textwrap.wrap(text, width)]
+    gains = "; ".join(fixed)
+    gain_lines = textwrap.wrap(f"not swept: {gains}", width)
+    comparison_lines = textwrap.wrap(FAIR_COMPARISON, width)
+    return [*gain_lines, *comparison_lines]
 
 
 def _write_caption(
@@ -248,12 +255,14 @@ def _write_caption(
     Returns:
         The position of the top of the caption, as a fraction of the height.
     """
-    top = (_CAPTION_LINE_IN * len(caption) + 0.04) / height_in
+    caption_height_in = _CAPTION_LINE_IN * len(caption) + 0.04
+    top = caption_height_in / height_in
     reserved = top
     if shares_labels:
         reserved += _SHARED_LABEL_IN / height_in
+    panel_rectangle = (0.0, reserved, 1.0, 1.0 - reserved)
     engine: Any = figure.get_layout_engine()
-    engine.set(rect=(0.0, reserved, 1.0, 1.0 - reserved))
+    engine.set(rect=panel_rectangle)
     figure.text(
         x=0.01,
         y=0.02 / height_in,
@@ -303,8 +312,11 @@ def _draw_cells(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
         most_frequent = panel.counts.argmax(axis=2)
         values = np.ma.masked_where(panel.runs == 0, most_frequent)
         count = len(CELL_CLASSES)
-        palette = ListedColormap([CLASS_COLOURS[verdict] for verdict in CELL_CLASSES])
-        colours = {"cmap": palette, "norm": BoundaryNorm(np.arange(count + 1) - 0.5, count)}
+        class_colours = [CLASS_COLOURS[verdict] for verdict in CELL_CLASSES]
+        palette = ListedColormap(class_colours)
+        class_borders = np.arange(count + 1) - 0.5
+        norm = BoundaryNorm(class_borders, count)
+        colours = {"cmap": palette, "norm": norm}
 
     x = _compute_borders(plane.x)
     y = _compute_borders(plane.y)
@@ -315,7 +327,8 @@ def _hatch_undecided(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
     """Hatches the undecided cells. Neighbouring cells of a row form one rectangle."""
     x = _compute_borders(plane.x)
     y = _compute_borders(plane.y)
-    for row, undecided in enumerate(_find_undecided(plane, panel)):
+    undecided_rows = _find_undecided(plane, panel)
+    for row, undecided in enumerate(undecided_rows):
         bottom = y[row]
         top = y[row + 1]
         for first, stop in _list_stretches(undecided):
@@ -334,13 +347,15 @@ def _draw_verdict_edges(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
 
 def _find_position(axis: PlaneAxis, value: float) -> float:
     """Returns the position at which a value is drawn, interpolated between the axis values."""
-    return float(np.interp(value, axis.values, axis.positions))
+    position = np.interp(value, axis.values, axis.positions)
+    return float(position)
 
 
 def _list_stretches(flags: Array) -> list[tuple[int, int]]:
     """Returns the ranges of consecutive True values in a row, as pairs (first, last + 1)."""
     padded = np.concatenate([[False], flags, [False]])
-    changes = np.flatnonzero(padded[1:] != padded[:-1]).tolist()
+    is_change = padded[1:] != padded[:-1]
+    changes = np.flatnonzero(is_change).tolist()
     firsts = changes[::2]
     stops = changes[1::2]
     return list(zip(firsts, stops, strict=True))
@@ -364,9 +379,10 @@ def _draw_line(axes: Axes, plane: MapPlane, line: MapLine) -> None:
     # A border at zero may coincide with the first position. Only one of the two is kept.
     keep_x = np.diff(x, append=np.inf) > 0.0
     keep_y = np.diff(y, append=np.inf) > 0.0
-    kept_excess = np.ma.masked_invalid(excess[np.ix_(keep_y, keep_x)])
+    kept_cells = np.ix_(keep_y, keep_x)
+    kept_excess = np.ma.masked_invalid(excess[kept_cells])
 
-    look = _LINE_STYLES[line.rank % len(_LINE_STYLES)]
+    look = _find_line_style(line)
     contour = axes.contour(
         x[keep_x],
         y[keep_y],
@@ -379,10 +395,18 @@ def _draw_line(axes: Axes, plane: MapPlane, line: MapLine) -> None:
     contour.set(linestyle=look["linestyle"], path_effects=halo)
 
 
+def _find_line_style(line: MapLine) -> dict[str, Any]:
+    """Returns the style of a line, which follows from its rank."""
+    style_index = line.rank % len(_LINE_STYLES)
+    return _LINE_STYLES[style_index]
+
+
 def _extend_positions(axis: PlaneAxis) -> Array:
     """Returns the positions of the values of an axis, between the two borders of the panel."""
     borders = _compute_borders(axis)
-    return np.concatenate([borders[:1], axis.positions, borders[-1:]])
+    first_border = borders[:1]
+    last_border = borders[-1:]
+    return np.concatenate([first_border, axis.positions, last_border])
 
 
 def _extrapolate_rows(rows: Array, positions: Array) -> Array:
@@ -392,9 +416,13 @@ def _extrapolate_rows(rows: Array, positions: Array) -> Array:
         rows: The field, shape (n, m).
         positions: Positions of the rows of the result, shape (n + 2,).
     """
+    reversed_rows = rows[::-1]
+    reversed_positions = positions[::-1]
     before = _extrapolate_row(rows[:2], positions[:3])
-    after = _extrapolate_row(rows[:-3:-1], positions[:-4:-1])
-    return np.concatenate([before[np.newaxis], rows, after[np.newaxis]])
+    after = _extrapolate_row(reversed_rows[:2], reversed_positions[:3])
+    row_before = before[np.newaxis]
+    row_after = after[np.newaxis]
+    return np.concatenate([row_before, rows, row_after])
 
 
 def _extrapolate_row(rows: Array, positions: Array) -> Array:
@@ -406,7 +434,10 @@ def _extrapolate_row(rows: Array, positions: Array) -> Array:
     """
     outside, near, far = positions
     near_row, far_row = rows
-    extrapolated: Array = near_row + (far_row - near_row) * (outside - near) / (far - near)
+    difference = far_row - near_row
+    offset = outside - near
+    spacing = far - near
+    extrapolated: Array = near_row + difference * offset / spacing
     return extrapolated
 
 
@@ -422,8 +453,10 @@ def _find_undecided(plane: MapPlane, panel: MapPanel) -> Any:
     has_runs = panel.runs > 0
     if plane.judged_by_twins:
         return has_runs & np.isnan(panel.exponents_per_s)
-    undecided = panel.counts[:, :, CELL_CLASSES.index(CellClass.UNDECIDED)]
-    return has_runs & (2 * undecided >= panel.runs)
+    class_index = CELL_CLASSES.index(CellClass.UNDECIDED)
+    undecided = panel.counts[:, :, class_index]
+    half_or_more = 2 * undecided >= panel.runs
+    return has_runs & half_or_more
 
 
 def _compute_borders(axis: PlaneAxis) -> Array:
@@ -435,12 +468,15 @@ def _compute_borders(axis: PlaneAxis) -> Array:
         Positions, shape (n + 1,) for n values.
     """
     positions = axis.positions
+    first = positions[0]
     if len(positions) == 1:
-        return np.array([positions[0] - 0.5, positions[0] + 0.5])
-    ends = 1.5 * positions[[0, -1]] - 0.5 * positions[[1, -2]]
+        return np.array([first - 0.5, first + 0.5])
+    outer = positions[[0, -1]]
+    inner = positions[[1, -2]]
+    ends = 1.5 * outer - 0.5 * inner
     middles = 0.5 * (positions[1:] + positions[:-1])
     borders: Array = np.concatenate([ends[:1], middles, ends[1:]])
-    if axis.is_evenly_spaced and positions[0] >= 0.0:
+    if axis.is_evenly_spaced and first >= 0.0:
         return np.maximum(borders, 0.0)
     return borders
 
@@ -471,10 +507,12 @@ def _set_ticks(axis: Axis, plane_axis: PlaneAxis) -> None:
     themselves.
     """
     if plane_axis.is_evenly_spaced:
-        axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 2.5, 4, 5, 10]))
+        round_steps = [1, 2, 2.5, 4, 5, 10]
+        axis.set_major_locator(MaxNLocator(5, steps=round_steps))
         return
+    positions = list(plane_axis.positions)
     texts = [f"{value:g}" for value in plane_axis.values]
-    axis.set_major_locator(FixedLocator(list(plane_axis.positions)))
+    axis.set_major_locator(FixedLocator(positions))
     axis.set_major_formatter(FixedFormatter(texts))
 
 
@@ -488,10 +526,12 @@ def _find_exponent_limit(plane: MapPlane) -> float:
     magnitudes = np.abs(np.concatenate(exponents))
     quantile = float(np.nanquantile(magnitudes, 0.8))
     least = max(quantile, 1e-6)
-    decade = 10.0 ** math.floor(math.log10(least))
+    power = math.floor(math.log10(least))
+    decade = 10.0**power
     for step in (1.0, 2.0, 5.0):
-        if step * decade >= least * (1.0 - 1e-9):  # also if both are equal up to rounding
-            return step * decade
+        limit = step * decade
+        if limit >= least * (1.0 - 1e-9):  # also if both are equal up to rounding
+            return limit
     return 10.0 * decade
 
 
@@ -518,10 +558,16 @@ def _draw_colour_bar(figure: Figure, grid: Sequence[Axes], plane: MapPlane) -> N
         pointed = "neither"
 
     bar = figure.colorbar(
-        colours, ax=list(grid), fraction=0.05, pad=0.02, aspect=30, extend=pointed
+        colours,
+        ax=list(grid),
+        fraction=0.05,
+        pad=0.02,
+        aspect=30,
+        extend=pointed,
     )
     if plane.judged_by_twins:
-        bar.set_ticks([-limit, -0.5 * limit, 0.0, 0.5 * limit, limit])
+        half = 0.5 * limit
+        bar.set_ticks([-limit, -half, 0.0, half, limit])
     bar.set_label(label)
     bar.outline.set_linewidth(0.6)
 
@@ -533,9 +579,12 @@ def _draw_counts(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
     """
     extent = axes.get_window_extent()
     dpi = axes.figure.dpi
-    cell_width_pt = 72.0 * extent.width / dpi / len(plane.x.values)
-    cell_height_pt = 72.0 * extent.height / dpi / len(plane.y.values)
-    letters = 2 * len(str(plane.seeds)) + 1
+    panel_width_pt = 72.0 * extent.width / dpi
+    panel_height_pt = 72.0 * extent.height / dpi
+    cell_width_pt = panel_width_pt / len(plane.x.values)
+    cell_height_pt = panel_height_pt / len(plane.y.values)
+    digits = len(str(plane.seeds))
+    letters = 2 * digits + 1
     text_width_pt = letters * _DIGIT_WIDTH * _COUNT_PT
     text_height_pt = 1.2 * _COUNT_PT
     if cell_width_pt < text_width_pt or cell_height_pt < text_height_pt:
@@ -567,11 +616,13 @@ def _draw_legend(figure: Figure, plane: MapPlane, lines: Sequence[Sequence[MapLi
     handles: list[Any] = []
     if plane.judged_by_twins:
         if any(find_map_edges(plane, panel) for panel in plane.panels):
-            handles.append(Line2D([], [], label="edge of the verdicts", **_VERDICT_EDGE))
+            edge_handle = Line2D([], [], label="edge of the verdicts", **_VERDICT_EDGE)
+            handles.append(edge_handle)
     elif plane.seeds == 1:
         handles += _list_class_handles(plane)
 
-    if any(_find_undecided(plane, panel).any() for panel in plane.panels):
+    undecided_by_panel = [_find_undecided(plane, panel) for panel in plane.panels]
+    if any(undecided.any() for undecided in undecided_by_panel):
         if plane.judged_by_twins:
             label = "no exponent"
         elif plane.seeds > 1:
@@ -582,19 +633,24 @@ def _draw_legend(figure: Figure, plane: MapPlane, lines: Sequence[Sequence[MapLi
         handles.append(Patch(label=label, **look))
 
     # Panels may share a line, which has one entry.
-    line_of_label = {line.label: line for panel_lines in lines for line in panel_lines}
+    line_of_label = {}
+    for panel_lines in lines:
+        for line in panel_lines:
+            line_of_label[line.label] = line
     for label, line in line_of_label.items():
-        look = _LINE_STYLES[line.rank % len(_LINE_STYLES)]
+        look = _find_line_style(line)
         handles.append(Line2D([], [], label=label, **look))
     style.place_legend(figure, handles, handlelength=1.6)
 
 
 def _list_class_handles(plane: MapPlane) -> list[Patch]:
     """Returns the legend entries of the classes that occur in a map, except "undecided"."""
-    counts = sum(panel.counts.sum(axis=(0, 1)) for panel in plane.panels)
+    counts_of_panels = [panel.counts.sum(axis=(0, 1)) for panel in plane.panels]
+    counts = sum(counts_of_panels)
     handles = []
     for verdict, count in zip(CELL_CLASSES, counts, strict=True):
-        if count and verdict is not CellClass.UNDECIDED:
+        is_decided = verdict is not CellClass.UNDECIDED
+        if count and is_decided:
             patch = Patch(
                 label=verdict.value,
                 facecolor=CLASS_COLOURS[verdict],
@@ -628,11 +684,13 @@ def write_map(chart: StabilityMap, folder: Path, width_in: float = COLUMN_IN) ->
     """
     form = make_print_size(width_in)
     figure = draw_stability_map(chart.plane, chart.lines, form, chart.fixed)
-    picture_paths = [folder / f"map.{suffix}" for suffix in ("png", "svg", "pdf")]
+    picture_names = ("map.png", "map.svg", "map.pdf")
+    picture_paths = [folder / name for name in picture_names]
     page_path = folder / "map.md"
     for path in picture_paths:
         style.write_figure(figure, path, _DPI)
-    write_whole(page_path, build_map_page(chart, picture_paths[0].name))
+    page = build_map_page(chart, picture_names[0])
+    write_whole(page_path, page)
     return [*picture_paths, page_path]
 
 
@@ -650,11 +708,17 @@ def build_map_page(chart: StabilityMap, picture: str) -> str:
         The text of the page.
     """
     commands = "\n".join(chart.commands)
-    parts = [f"# {chart.title}", f"```sh\n{commands}\n```", f"![map]({picture})"]
-    parts.append(tabulate_classes(chart.plane).markdown())
+    class_table = tabulate_classes(chart.plane)
+    parts = [
+        f"# {chart.title}",
+        f"```sh\n{commands}\n```",
+        f"![map]({picture})",
+        class_table.markdown(),
+    ]
     notes = _list_notes(chart)
     if notes:
-        parts.append("\n".join(f"- {note}" for note in notes))
+        note_lines = [f"- {note}" for note in notes]
+        parts.append("\n".join(note_lines))
     for panel, lines in zip(chart.plane.panels, chart.lines, strict=True):
         table = tabulate_edges(chart.plane, panel, lines)
         if table.rows:
@@ -666,13 +730,17 @@ def build_map_page(chart: StabilityMap, picture: str) -> str:
 
 def _list_notes(chart: StabilityMap) -> list[str]:
     """Returns the notes of a map's page, on the lines and on the gains that were not swept."""
-    origins = [f"{line.text}: {line.about}" for lines in chart.lines for line in lines]
+    origins = []
+    for lines in chart.lines:
+        for line in lines:
+            origin = f"{line.text}: {line.about}"
+            origins.append(origin)
     notes = [*dict.fromkeys(origins), *chart.remarks]
     notes += [f"gains that were not swept: {text}" for text in chart.fixed]
     if chart.fixed:
-        notes.append(
-            FAIR_COMPARISON.replace("trilat compare --tune", "`trilat compare --tune`")
-        )
+        command = "trilat compare --tune"
+        comparison = FAIR_COMPARISON.replace(command, f"`{command}`")
+        notes.append(comparison)
     return notes
 
 
@@ -684,8 +752,10 @@ def tabulate_classes(plane: MapPlane) -> TextTable:
     """
     rows = []
     for panel in plane.panels:
+        title = panel.title or "all"
         counts = panel.counts.sum(axis=(0, 1)).tolist()
-        rows.append((panel.title or "all", *map(str, counts)))
+        count_texts = map(str, counts)
+        rows.append((title, *count_texts))
     return TextTable(("runs", *CELL_CLASSES), rows)
 
 
@@ -715,18 +785,24 @@ def tabulate_edges(plane: MapPlane, panel: MapPanel, lines: Sequence[MapLine]) -
     verdict_edges = find_map_edges(plane, panel)
     edges = verdict_edges
     if plane.judged_by_twins:
-        measured = [line for line in lines if line.rank < 0]
-        edges = [crossing for line in measured for crossing in _list_crossings(line, plane)]
+        edges = []
+        for line in lines:
+            is_measured = line.rank < 0
+            if is_measured:
+                edges += _list_crossings(line, plane)
 
     rows = []
     for x, edge in edges:
-        row = [f"{x:g}", _format_edge(edge), "below" if edge.stable_below else "above"]
+        stable_side = "below" if edge.stable_below else "above"
+        row = [f"{x:g}", _format_edge(edge), stable_side]
         if plane.judged_by_twins:
             column_edges = [other for other_x, other in verdict_edges if other_x == x]
-            row.append(_format_nearest_edge(edge.low, column_edges))
+            nearest_text = _format_nearest_edge(edge.low, column_edges)
+            row.append(nearest_text)
         column = plane.x.values.index(x)
         for line in theory:
-            row += _compare_with_line(edge, line.crossings(column, plane.y))
+            crossings = line.crossings(column, plane.y)
+            row += _compare_with_line(edge, crossings)
         rows.append(tuple(row))
     return TextTable(tuple(heads), rows)
 
@@ -737,10 +813,12 @@ def _list_crossings(line: MapLine, plane: MapPlane) -> Iterator[tuple[float, Sta
     Each crossing comes with the value of x of its column.
     """
     for column, x in enumerate(plane.x.values):
-        for value in line.crossings(column, plane.y):
+        crossings = line.crossings(column, plane.y)
+        for value in crossings:
             above = int(np.searchsorted(plane.y.values, value))
             below = max(above - 1, 0)
-            stable_below = bool(line.excess[below, column] > 0.0)
+            excess_below = line.excess[below, column]
+            stable_below = bool(excess_below > 0.0)
             yield x, StabilityEdge(value, value, stable_below)
 
 
