@@ -175,12 +175,17 @@ class ArmGains(Result):
             f"{self.arm}: {self.sites} equal arms, {self.law}, {self.rate_hz} Hz, "
             f"{self.delay}, damping ratio {self.damping:g}, margin {self.margin:g}"
         )
-        header = [key.replace("_", " ") for key in self.joints[0]]
-        rows = [[_format_cell(value) for value in joint.values()] for joint in self.joints]
+        first_joint = self.joints[0]
+        header = [key.replace("_", " ") for key in first_joint]
+        rows = []
+        for joint in self.joints:
+            row = [_format_cell(value) for value in joint.values()]
+            rows.append(row)
         yield TextTable(header, rows, align="lr")
         yield from self._describe_edge()
         for run in self.runs:
-            mark = MARKS["ok" if run["agrees"] else "fail"]
+            outcome = "ok" if run["agrees"] else "fail"
+            mark = MARKS[outcome]
             yield MarkedText(mark, _describe_run(run))
         yield "to paste above the first table of a scenario:"
         yield self.line
@@ -188,20 +193,23 @@ class ArmGains(Result):
     def _describe_edge(self) -> Iterator[str]:
         """Yields the lines that describe the edge and the sampled-data limit."""
         edge = self.edge
-        motion = CharacteristicRoot(0j, 1, tuple(edge["moves"])).description
+        moves = tuple(edge["moves"])
+        root = CharacteristicRoot(0j, 1, moves)
         yield (
             f"edge: K = {edge['k_per_s2']:.4g} /s^2 times inertia "
-            f"({motion}; {edge['omega_rad_s']:.4g} rad/s)"
+            f"({root.description}; {edge['omega_rad_s']:.4g} rad/s)"
         )
         continuous = "none"
-        if edge["continuous_per_s2"] is not None:
-            continuous = f"{edge['continuous_per_s2']:.4g}"
+        continuous_per_s2 = edge["continuous_per_s2"]
+        if continuous_per_s2 is not None:
+            continuous = f"{continuous_per_s2:.4g}"
         yield (
             f"  {edge['constant_per_s2']:.4g} with a constant delay of {self.age_ms:.4g} ms; "
             f"{continuous} in continuous time; the {edge['bound']} bounds K"
         )
         yield f"  damping swings from tick to tick from {edge['limit_per_s2']:.4g} on"
-        yield f"  least in the pose {', '.join(f'{q:.3g}' for q in edge['pose'])}"
+        angles = ", ".join(f"{q:.3g}" for q in edge["pose"])
+        yield f"  least in the pose {angles}"
 
 
 def _format_cell(value: Any) -> str:
@@ -244,7 +252,8 @@ def _read_delay(delay: str | float) -> tuple[dict[str, Any], str]:
     text = str(delay).strip()
     match = _DELAY.fullmatch(text)
     if match:
-        delay_ms = float(match[1]) * _UNIT_MS[match[2]]
+        unit_ms = _UNIT_MS[match[2]]
+        delay_ms = float(match[1]) * unit_ms
         return {"delay_ms": delay_ms}, f"{delay_ms:g} ms each way"
 
     path = Path(text.removeprefix("measured:"))
@@ -259,7 +268,8 @@ def _read_delay(delay: str | float) -> tuple[dict[str, Any], str]:
 
     medians_ms = {}
     try:
-        for name in open_log(path).scenario.links:
+        log = open_log(path)
+        for name in log.scenario.links:
             delays_ms = [delay_ms for _, delay_ms in read_link_delays(path, name)]
             medians_ms[name] = float(np.median(delays_ms))
     except ValueError as error:
@@ -305,13 +315,17 @@ def _build_loop(
         raise UsageError(f"--sites must be 2 or 3, not {sites}")
 
     names = _SITES[sites]
-    gains = {gain: _NO_GAIN for gain in ("K", "d", "Kd") if gain in BUILT_IN[law].tune}
-    dominance_factor = 1.0 / (sites - 1)
+    tuned_gains = BUILT_IN[law].tune
+    gains = {gain: _NO_GAIN for gain in ("K", "d", "Kd") if gain in tuned_gains}
+    peer_count = sites - 1
+    dominance_factor = 1.0 / peer_count
     roles = {}
     dominance = {}
     for name in names:
-        roles[name] = {"role": "slave" if name == "s" else "master"}
-        dominance[name] = {peer: dominance_factor for peer in names if peer != name}
+        role = "slave" if name == "s" else "master"
+        roles[name] = {"role": role}
+        peers = [peer for peer in names if peer != name]
+        dominance[name] = dict.fromkeys(peers, dominance_factor)
     tables = {
         "name": "tune",
         "duration_s": _SHORTEST_S,
@@ -324,7 +338,8 @@ def _build_loop(
         "dominance": dominance,
     }
     scenario = load_scenario(tables, overrides)
-    if getattr(scenario.controls[0], "gravity", 1.0) != 1.0:
+    control = scenario.controls[0]
+    if getattr(control, "gravity", 1.0) != 1.0:
         raise UsageError(
             "--set control.gravity: gravity must be exact here, because only then is every "
             "pose an equilibrium"
@@ -356,14 +371,18 @@ def _draw_poses(scenario: Scenario, count: int, seed: int) -> Array:
     model = read_arm(first_site.arm, scenario.urdf)
     for joint in model.joints:
         half_range = _HALF_SLIDE_M if joint.kind == "prismatic" else _HALF_TURN
-        middle = min(max(joint.lower, 0.0), joint.upper)
+        at_least_lower = max(joint.lower, 0.0)
+        middle = min(at_least_lower, joint.upper)
         lower = max(joint.lower, middle - half_range)
         upper = min(joint.upper, middle + half_range)
         ranges.append((lower, upper))
     low, high = np.transpose(ranges)
-    random = np.random.Generator(np.random.Philox(seed))
-    fractions = random.uniform(_SLACK, 1.0 - _SLACK, (count, len(low)))
-    return np.asarray(low + (high - low) * fractions)
+    bits = np.random.Philox(seed)
+    random = np.random.Generator(bits)
+    shape = (count, len(low))
+    fractions = random.uniform(_SLACK, 1.0 - _SLACK, shape)
+    width = high - low
+    return np.asarray(low + width * fractions)
 
 
 class _GainSearch:
@@ -390,7 +409,12 @@ class _GainSearch:
     """
 
     def __init__(
-        self, scenario: Scenario, poses: Array, margin: float, damping: float, quantile: float
+        self,
+        scenario: Scenario,
+        poses: Array,
+        margin: float,
+        damping: float,
+        quantile: float,
     ) -> None:
         self._scenario = scenario
         self._poses = poses
@@ -407,17 +431,21 @@ class _GainSearch:
             ages = np.concatenate(ages_by_link)
             age_ticks = float(np.quantile(ages, quantile, method="higher"))
             self.constant_conditions = self.fix_age(age_ticks / self.rate_hz)
-        self.age_s = float(self.constant_conditions.age_s.max())
+        largest_age_s = self.constant_conditions.age_s.max()
+        self.age_s = float(largest_age_s)
         # The heaviest mass is stable up to k = (2 zeta / T)^2, where T is the age. At this k
         # the damping must keep its margin to the sampled-data limit.
-        self._least_k = (2.0 * self._damping / self.age_s) ** 2
+        omega_rad_s = 2.0 * self._damping / self.age_s
+        self._least_k = omega_rad_s**2
 
-        model = scenario.arms[scenario.names[0]]
+        first_site = scenario.names[0]
+        model = scenario.arms[first_site]
         largest_factor = 1.0 if scenario.scheme == "second_order" else 2.0
         # A motion swings from tick to tick if its damping per inertia exceeds this value.
         self._largest_damping_per_s = largest_factor * self.rate_hz
         self._M = [model.inertia(q) for q in poses]
-        self.inertia: Array = np.max([np.diag(M) for M in self._M], axis=0)
+        diagonals = [np.diag(M) for M in self._M]
+        self.inertia: Array = np.max(diagonals, axis=0)
         self._fit_inertia()
 
     def _fit_inertia(self) -> None:
@@ -428,10 +456,12 @@ class _GainSearch:
         in the lightest motion. Since another motion may then be the lightest, this is repeated
         in small steps.
         """
-        divisor = 2.0 * self._damping * math.sqrt(self._least_k) * self._margin
+        damping_per_inertia = 2.0 * self._damping * math.sqrt(self._least_k)
+        divisor = damping_per_inertia * self._margin
         allowed_ratio = self._largest_damping_per_s / divisor
         ratio, participation = self._find_lightest()
-        while ratio > allowed_ratio * (1.0 + _EDGE_TOLERANCE):
+        largest_ratio = allowed_ratio * (1.0 + _EDGE_TOLERANCE)
+        while ratio > largest_ratio:
             exponents = participation / participation.max()
             step = max(allowed_ratio / ratio, _FITTING_STEP)
             self.inertia = self.inertia * step**exponents
@@ -451,7 +481,9 @@ class _GainSearch:
             scaled = root * np.linalg.inv(M) * root[:, np.newaxis]
             decompositions.append(np.linalg.eigh(scaled))
         values, vectors = max(decompositions, key=lambda pair: float(pair[0][-1]))
-        return float(values[-1]), vectors[:, -1] ** 2
+        largest_ratio = float(values[-1])
+        lightest_motion = vectors[:, -1]
+        return largest_ratio, lightest_motion**2
 
     def fix_age(self, age_s: float) -> OperatingConditions:
         """Returns the linear model of the loop with the same delay for all received data.
@@ -463,7 +495,8 @@ class _GainSearch:
         Args:
             age_s: The age of all samples, in s.
         """
-        ages_s: Array = np.where(self.conditions.age_s > 0.0, age_s, 0.0)
+        has_delay = self.conditions.age_s > 0.0
+        ages_s: Array = np.where(has_delay, age_s, 0.0)
         return self.conditions._replace(age_s=ages_s, varying=False)
 
     def build_law(self, k: float, stiffness_divisor: float = 1.0) -> Any:
@@ -486,16 +519,20 @@ class _GainSearch:
         default_damping = {}
         for name in ("d", "Kd"):
             if name in law.kind.tune:
-                default_damping[name] = getattr(law.kind, name)[0]
+                defaults = getattr(law.kind, name)
+                default_damping[name] = defaults[0]
         default_sum = sum(default_damping.values())
-        damping_scale = 2.0 * self._damping * math.sqrt(k) * self.inertia / default_sum
+        damping_sum = 2.0 * self._damping * math.sqrt(k) * self.inertia
+        damping_scale = damping_sum / default_sum
 
-        gains = {"K": k / stiffness_divisor * self.inertia}
+        stiffness = k / stiffness_divisor * self.inertia
+        gains = {"K": stiffness}
         for name, default in default_damping.items():
             gains[name] = default * damping_scale
         rounded = {}
         for name, values in gains.items():
-            rounded[name] = tuple(float(f"{value:.4g}") for value in values)
+            texts = [f"{value:.4g}" for value in values]
+            rounded[name] = tuple(map(float, texts))
         return msgspec.structs.replace(law, **rounded)
 
     def find_root(
@@ -515,11 +552,15 @@ class _GainSearch:
         Returns:
             The root. If the loop has no roots, a root with a large negative real part.
         """
-        sites = tuple(site._replace(gains=law.linear_gains(site.theta)) for site in loop.sites)
+        sites = []
+        for site in loop.sites:
+            gains = law.linear_gains(site.theta)
+            sites.append(site._replace(gains=gains))
         poses = np.tile(pose, (len(sites), 1))
         theta = np.array([site.theta for site in sites])
         rest = Equilibrium(poses, theta, "a pose", 0.0)
-        root = find_rightmost_root(loop._replace(sites=sites), rest, sampled=sampled)
+        loop_with_gains = loop._replace(sites=tuple(sites))
+        root = find_rightmost_root(loop_with_gains, rest, sampled=sampled)
         if root is None:
             return CharacteristicRoot(complex(_NO_ROOT_PER_S), 1, ())
         return root
@@ -559,13 +600,15 @@ class _GainSearch:
         log_steps = np.arange(24) * math.log(2.0)
         if loop.varying:
             small_steps = np.arange(15) * math.log(1.1)
-            log_steps = np.append(small_steps, math.log(4.0) + log_steps)
+            large_steps = math.log(4.0) + log_steps
+            log_steps = np.append(small_steps, large_steps)
 
         for pose in poses:
 
             def growth(log_k: float, pose: Array = pose) -> float:
                 law = self.build_law(math.exp(log_k))
-                return self.find_root(law, pose, loop, sampled=sampled).s.real
+                root = self.find_root(law, pose, loop, sampled=sampled)
+                return root.s.real
 
             candidates: Iterable[float] = math.log(start) + log_steps
             if edge != math.inf:
@@ -578,7 +621,8 @@ class _GainSearch:
             low = next((log_k for log_k in lower_candidates if growth(log_k) <= 0.0), None)
             if low is None:
                 raise UsageError(f"--arm: no gains are stable in the pose {pose.tolist()}")
-            edge = math.exp(brentq(growth, low, high, xtol=_EDGE_TOLERANCE))
+            log_edge = brentq(growth, low, high, xtol=_EDGE_TOLERANCE)
+            edge = math.exp(log_edge)
             worst_pose = pose
         return edge, worst_pose
 
@@ -607,23 +651,31 @@ class _GainSearch:
         continuous = math.inf
         if delay_s > 0.0:  # without a delay the loop is passive in continuous time
             fixed = self.fix_age(delay_s)
-            continuous, _ = self.find_least_edge(fixed, [pose], self._least_k, sampled=False)
+            continuous, _ = self.find_least_edge(
+                loop=fixed,
+                poses=[pose],
+                start=self._least_k,
+                sampled=False,
+            )
         k = constant
         if varies:
             k, _ = self.find_least_edge(self.conditions, [pose], 0.5 * constant)
 
         lightest, _ = self._find_lightest()
-        limit = (self._largest_damping_per_s / (2.0 * self._damping * lightest)) ** 2
-        root = self.find_root(self.build_law(k), pose, self.conditions)
+        damping_factor = 2.0 * self._damping * lightest
+        limit = (self._largest_damping_per_s / damping_factor) ** 2
+        law = self.build_law(k)
+        root = self.find_root(law, pose, self.conditions)
         limit_with_margin = limit / self._margin**2
+        lower_edge = min(k, constant)
         # m was fitted to the limit at the least k, up to rounding.
-        tick_rate_bounds = limit_with_margin < 1.001 * max(self._least_k, min(k, constant))
+        tick_rate_bounds = limit_with_margin < 1.001 * max(self._least_k, lower_edge)
         return {
             "k_per_s2": k,
             "constant_per_s2": constant,
             "continuous_per_s2": finite_or_none(continuous),
             "limit_per_s2": limit,
-            "used_per_s2": min(k, constant, limit_with_margin),
+            "used_per_s2": min(lower_edge, limit_with_margin),
             "omega_rad_s": root.s.imag,
             "moves": list(root.states),
             "pose": pose.tolist(),
@@ -645,12 +697,14 @@ class _GainSearch:
             Pairs of a delay, in s, and the value of k, in 1/s^2.
         """
         longest_ticks = max(4.0 * self.age_s * self.rate_hz, 8.0)
-        ages_ticks = np.round(np.geomspace(1.0, longest_ticks, _CURVE_POINTS))
+        geometric_ticks = np.geomspace(1.0, longest_ticks, _CURVE_POINTS)
+        ages_ticks = np.round(geometric_ticks)
         ages_s = np.unique(ages_ticks) / self.rate_hz
         curve = []
         for age_s in ages_s:
+            loop = self.fix_age(age_s)
             start = (2.0 * self._damping / age_s) ** 2
-            k, _ = self.find_least_edge(self.fix_age(age_s), [pose], start)
+            k, _ = self.find_least_edge(loop, [pose], start)
             curve.append((float(age_s), k))
         return curve
 
@@ -675,35 +729,43 @@ class _GainSearch:
             The run as an entry of `ArmGains.runs`, with the simulated and the predicted growth
             rate.
         """
-        predicted_per_s = self.find_root(law, pose, self.conditions).s.real
+        root = self.find_root(law, pose, self.conditions)
+        predicted_per_s = root.s.real
         sites = {}
         for n, (name, spec) in enumerate(self._scenario.sites.items()):
-            start = pose + push * (n == 0)  # only the first arm is displaced
+            is_first = n == 0
+            start = pose + push * is_first  # only the first arm is displaced
             q0_rad = tuple(start.tolist())
             sites[name] = msgspec.structs.replace(spec, control=law, q0_rad=q0_rad)
-        run = FusedRun(msgspec.structs.replace(self._scenario, sites=sites))
+        scenario = msgspec.structs.replace(self._scenario, sites=sites)
+        run = FusedRun(scenario)
 
         slowest_per_s = max(abs(predicted_per_s), _SETTLES / _LONGEST_S)
         first_s = max(_SHORTEST_S, _SETTLES / slowest_per_s)
         durations_s = first_s * 2.0 ** np.arange(_EXTENSIONS)
         for end_s in durations_s.tolist():
             run.advance_to(end_s)
-            speed = np.max([site[:, 1] for site in run.maxima], axis=0)
+            speeds = [site[:, 1] for site in run.maxima]
+            speed = np.max(speeds, axis=0)
             t_s = np.arange(len(speed)) / BUCKETS_PER_S
             floor = _STILL * speed.max()
-            fit = fit_envelopes(t_s, speed[:, np.newaxis], floor, falls_first=True)[0]
+            speed_column = speed[:, np.newaxis]
+            fits = fit_envelopes(t_s, speed_column, floor, falls_first=True)
+            fit = fits[0]
             diverged = run.diverged_s is not None
             if diverged or fit.trend in _IS_STABLE:
                 break
 
         stable = False if diverged else _IS_STABLE.get(fit.trend)
+        rate_per_s = None if diverged else finite_or_none(fit.rate_per_s)
+        predicts_decay = predicted_per_s < 0.0
         return {
             "share": share,
             "predicted_per_s": predicted_per_s,
-            "rate_per_s": None if diverged else finite_or_none(fit.rate_per_s),
+            "rate_per_s": rate_per_s,
             "ran_s": run.ran_s,
             "stable": stable,
-            "agrees": stable is (predicted_per_s < 0.0),
+            "agrees": stable is predicts_decay,
         }
 
 
@@ -778,14 +840,20 @@ def tune_arm(
     pose = np.array(edge["pose"])
     tuned_law = search.build_law(edge["used_per_s2"], margin)
 
-    random = np.random.Generator(np.random.Philox(seed))
-    push = _PUSH * random.uniform(0.5, 1.0, len(pose))
+    bits = np.random.Philox(seed)
+    random = np.random.Generator(bits)
+    relative_push = random.uniform(0.5, 1.0, len(pose))
+    push = _PUSH * relative_push
     laws: list[tuple[float | None, Any]] = [(None, tuned_law)]
-    laws += [(share, search.build_law(share * edge["k_per_s2"])) for share in SHARES]
+    for share in SHARES:
+        law_near_edge = search.build_law(share * edge["k_per_s2"])
+        laws.append((share, law_near_edge))
     runs = list[dict[str, Any]]()
+    steps = 1 + len(laws)
     for run_share, run_law in laws:
-        progress(1 + len(runs), 1 + len(laws))
-        runs.append(search.confirm(run_law, run_share, pose, push))
+        progress(1 + len(runs), steps)
+        run = search.confirm(run_law, run_share, pose, push)
+        runs.append(run)
 
     gains = {}
     assignments = []
@@ -793,9 +861,11 @@ def tune_arm(
         if name in tuned_law.kind.tune:
             values = list(getattr(tuned_law, name))
             gains[name] = values
-            assignments.append(f"{name} = {msgspec.json.encode(values).decode()}")
+            text = msgspec.json.encode(values).decode()
+            assignments.append(f"{name} = {text}")
     tuned_run = runs[0]
-    agree = tuned_run["stable"] is True and all(run["agrees"] for run in runs)
+    tuned_is_stable = tuned_run["stable"] is True
+    agree = tuned_is_stable and all(run["agrees"] for run in runs)
     return ArmGains(
         arm=Path(arm).name,
         law=law,
@@ -824,9 +894,12 @@ def _tabulate_joints(
         inertia: Inertia m of each joint, shape (n,).
         gains: Values of each gain, one per joint, by the name of the gain.
     """
-    model = scenario.arms[scenario.names[0]]
+    first_site = scenario.names[0]
+    model = scenario.arms[first_site]
     errors = np.divide(model.efforts, gains["K"]).tolist()
-    units = zip(model.joint_units("N m"), model.joint_units("rad"), strict=True)
+    effort_units = model.joint_units("N m")
+    angle_units = model.joint_units("rad")
+    units = zip(effort_units, angle_units, strict=True)
     columns = {
         "joint": model.joint_names,
         "inertia": inertia.tolist(),

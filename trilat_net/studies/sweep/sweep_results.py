@@ -73,7 +73,8 @@ class SweepResults(Result):
 
         The first lines describe the sweep, the others summarise its results.
         """
-        yield from (*describe_sweep_plan(self.plan), *summarize_sweep(self))
+        yield from describe_sweep_plan(self.plan)
+        yield from summarize_sweep(self)
 
     def to_rows(self) -> Sequence[ResultRow]:
         """Returns the table of all runs, one row per run, ordered by cell and then by seed.
@@ -123,15 +124,20 @@ def build_result_rows(plan: SweepPlan, entries: Sequence[CellRun]) -> list[Resul
     Returns:
         One row per run, ordered by cell and then by seed.
     """
-    seed_rank = {seed: rank for rank, seed in enumerate(plan.seeds)}
+    seed_rank = {seed: index for index, seed in enumerate(plan.seeds)}
     runs_of_cell = Counter(entry.cell for entry in entries)
-    ordered = sorted(entries, key=lambda entry: (entry.cell, seed_rank[entry.seed]))
+
+    def rank(entry: CellRun) -> tuple[int, int]:
+        """Returns the position of a run in the table: its cell, then its seed."""
+        return entry.cell, seed_rank[entry.seed]
+
     rows: list[ResultRow] = []
-    for entry in ordered:
+    for entry in sorted(entries, key=rank):
         # The log of a cell with a single run needs no seed in its name.
         has_several_runs = runs_of_cell[entry.cell] > 1
         suffix = f"-seed-{entry.seed}" if has_several_runs else ""
-        rows.append(_build_row(plan, entry, f"cell-{entry.cell}{suffix}.mcap"))
+        log = f"cell-{entry.cell}{suffix}.mcap"
+        rows.append(_build_row(plan, entry, log))
     return rows
 
 
@@ -152,9 +158,11 @@ def _build_row(plan: SweepPlan, entry: CellRun, log: str) -> ResultRow:
         log=log,
     )
     axis_keys = [axis.key for axis in plan.axes]
+    axis_values = dict(zip(axis_keys, cell.values, strict=True))
+    scenario_text = apply_diff(entry.scenario, plan.base.text)
     return {
         "cell": cell.number,
-        **dict(zip(axis_keys, cell.values, strict=True)),
+        **axis_values,
         "law": entry.law,
         "seed": entry.seed,
         "random": entry.random,
@@ -162,7 +170,7 @@ def _build_row(plan: SweepPlan, entry: CellRun, log: str) -> ResultRow:
         **msgspec.to_builtins(entry.outcome),
         "scenario_sha256": entry.sha256,
         "command": command,
-        "scenario": apply_diff(entry.scenario, plan.base.text),
+        "scenario": scenario_text,
     }
 
 
@@ -180,12 +188,14 @@ def build_sim_command(
     """
     kept_overrides = list[str]()
     for override in (*plan.overrides, *overrides):
-        key = override.partition("=")[0].strip()
+        key, _, _ = override.partition("=")
         # Seed and duration have their own options in the command.
-        if key not in ("seed", "duration_s"):
+        if key.strip() not in ("seed", "duration_s"):
             kept_overrides.append(override)
-    options = ["--seed", str(seed), "--duration", f"{duration_s:.12g}", "-o", log]
-    return format_command("sim", plan.written.label, *set_options(kept_overrides), *options)
+    source = plan.written.label
+    set_arguments = set_options(kept_overrides)
+    run_arguments = ["--seed", str(seed), "--duration", f"{duration_s:.12g}"]
+    return format_command("sim", source, *set_arguments, *run_arguments, "-o", log)
 
 
 def reproduction_duration_s(plan: SweepPlan, outcome: CellResult) -> float:
@@ -227,7 +237,10 @@ def encode_results(plan: SweepPlan, rows: Sequence[ResultRow]) -> str:
     column_types = _list_result_columns(plan)
     lines = []
     for row in rows:
-        line = {name: _format_cell(row[name], kind) for name, kind in column_types.items()}
+        line = {}
+        for name, kind in column_types.items():
+            value = row[name]
+            line[name] = _format_cell(value, kind)
         changes = diff_lines(row["scenario"], plan.base.text)
         line[_SCENARIO_COLUMN] = json.dumps(changes, ensure_ascii=False)
         lines.append(line)
@@ -241,7 +254,8 @@ def _list_result_columns(plan: SweepPlan) -> dict[str, type]:
     """
     column_types = {**_list_axis_columns(plan), "seed": int, "random": bool}
     # All fields of a result are numbers, except those whose types are corrected below.
-    column_types |= dict.fromkeys((*plan.metrics, *CellResult.__struct_fields__), float)
+    number_columns = (*plan.metrics, *CellResult.__struct_fields__)
+    column_types |= dict.fromkeys(number_columns, float)
     text_columns = ("verdict", "motion", "reasons", "scenario_sha256", "command")
     column_types |= dict.fromkeys(text_columns, str)
     return column_types | {"extended": int}
@@ -249,8 +263,11 @@ def _list_result_columns(plan: SweepPlan) -> dict[str, type]:
 
 def _list_axis_columns(plan: SweepPlan) -> dict[str, type]:
     """Returns the columns that identify a cell: its number, its axis values and its law."""
-    axis_types = {axis.key: float if axis.numeric else str for axis in plan.axes}
-    return {"cell": int, **axis_types, "law": str}
+    column_types: dict[str, type] = {"cell": int}
+    for axis in plan.axes:
+        column_types[axis.key] = float if axis.numeric else str
+    column_types["law"] = str
+    return column_types
 
 
 def _format_cell(value: Any, kind: type) -> str:
@@ -296,9 +313,10 @@ def read_results(path: Path) -> SweepResults:
     Raises:
         UsageError: There are no results, they cannot be read, or the sweep has not finished.
     """
-    file = path / RESULTS_FILE if path.is_dir() else path
+    is_folder = path.is_dir()
+    file = path / RESULTS_FILE if is_folder else path
     if not file.is_file():
-        hint = f"; continue it with: trilat sweep --resume {path}" if path.is_dir() else ""
+        hint = f"; continue it with: trilat sweep --resume {path}" if is_folder else ""
         raise UsageError(f"{file}: there are no results of a sweep{hint}")
     plan_file = file.with_name(PLAN_FILE)
     if not plan_file.is_file():
@@ -306,14 +324,16 @@ def read_results(path: Path) -> SweepResults:
             f"{file}: contains no results of a sweep: there is no {PLAN_FILE} next to this file"
         )
     try:
-        plan = plan_from_json(json.loads(plan_file.read_text(encoding="utf-8")))
+        plan_text = plan_file.read_text(encoding="utf-8")
+        plan = plan_from_json(json.loads(plan_text))
     except (OSError, ValueError, KeyError, TypeError):
         raise UsageError(f"{plan_file}: cannot be read as the plan of a sweep") from None
 
     csv.field_size_limit(_LONGEST_CELL)
     try:
         with file.open(encoding="utf-8", newline="") as stream:
-            lines = list(csv.DictReader(stream, strict=True))
+            reader = csv.DictReader(stream, strict=True)
+            lines = list(reader)
         rows = [_read_row(line, plan) for line in lines]
     except KeyError as error:
         raise UsageError(
@@ -331,10 +351,14 @@ def _read_row(line: Mapping[str, str], plan: SweepPlan) -> ResultRow:
         line: Texts of the line, by column.
         plan: The sweep: its scenario, axes, control laws and seeds.
     """
+    row = {}
     column_types = _list_result_columns(plan)
-    row = {name: _parse_cell(line[name], kind) for name, kind in column_types.items()}
+    for name, kind in column_types.items():
+        text = line[name]
+        row[name] = _parse_cell(text, kind)
     changes = json.loads(line[_SCENARIO_COLUMN])
-    return {**row, "scenario": apply_diff(changes, plan.base.text)}
+    row["scenario"] = apply_diff(changes, plan.base.text)
+    return row
 
 
 GRID_POINTS_FILE = "places.csv"
@@ -397,7 +421,8 @@ def list_totals(plan: SweepPlan) -> list[str]:
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
     """
-    return list(dict.fromkeys((*RunTotals._fields, *plan.metrics)))
+    keys = (*RunTotals._fields, *plan.metrics)
+    return list(dict.fromkeys(keys))
 
 
 def collect_grid_points(results: SweepResults) -> list[GridPoint]:
@@ -414,7 +439,8 @@ def collect_grid_points(results: SweepResults) -> list[GridPoint]:
     rows_of_cell: dict[tuple[int, str], list[ResultRow]] = {}
     for row in results.rows:
         cell_and_law = (row["cell"], row["law"])
-        rows_of_cell.setdefault(cell_and_law, []).append(row)
+        cell_rows = rows_of_cell.setdefault(cell_and_law, [])
+        cell_rows.append(row)
 
     points = []
     totals = list_totals(results.plan)
@@ -426,11 +452,12 @@ def collect_grid_points(results: SweepResults) -> list[GridPoint]:
         for key in totals:
             values = [row.get(key) for row in rows_within_limits]
             means.append(mean_interval(values))
+        class_counts = [counts[verdict.value] for verdict in CellClass]
         point = GridPoint(
             cell=cell,
             law=law,
             values=results.plan.cell(cell).values,
-            counts=tuple(counts[verdict.value] for verdict in CellClass),
+            counts=tuple(class_counts),
             means=tuple(means),
         )
         points.append(point)
@@ -458,15 +485,18 @@ def encode_grid_points(plan: SweepPlan, points: Sequence[GridPoint]) -> str:
 
     lines = []
     for point in points:
-        stable_share = point.stable / point.decided if point.decided else None
+        decided = point.decided
+        stable_share = point.stable / decided if decided else None
         # The values must stand in the order of the columns above.
         values: list[Any] = [point.cell, *point.values, point.law]
         values += [sum(point.counts), *point.counts]
         values += [stable_share, *point.interval]
         for mean in point.means:
             values += mean or (None, None)
-        columns = zip(column_types.items(), values, strict=True)
-        lines.append({name: _format_cell(value, kind) for (name, kind), value in columns})
+        line = {}
+        for (name, kind), value in zip(column_types.items(), values, strict=True):
+            line[name] = _format_cell(value, kind)
+        lines.append(line)
     return encode_csv(lines, list(column_types))
 
 
@@ -489,13 +519,16 @@ def describe_sweep_plan(plan: SweepPlan) -> list[str]:
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.
     """
-    sizes = " x ".join(str(len(axis.texts)) for axis in plan.axes) or "1"
+    axis_sizes = [str(len(axis.texts)) for axis in plan.axes]
+    sizes = " x ".join(axis_sizes) or "1"
     laws = f" x laws {', '.join(plan.laws)}" if plan.laws else ""
-    if len(plan.seeds) == 1:
+    seed_count = len(plan.seeds)
+    if seed_count == 1:
         seeds = f"seed {plan.seeds[0]}"
     else:
-        seeds = f"{count_nouns(len(plan.seeds), 'seed')} each where anything is random"
-    lines = [f"{plan.base.name}: {count_nouns(plan.cells, 'cell')} ({sizes}{laws}), {seeds}"]
+        seeds = f"{count_nouns(seed_count, 'seed')} each where anything is random"
+    cells = count_nouns(plan.cells, "cell")
+    lines = [f"{plan.base.name}: {cells} ({sizes}{laws}), {seeds}"]
 
     for axis in plan.axes:
         texts = axis.texts
@@ -525,9 +558,11 @@ def summarize_sweep(results: SweepResults) -> Iterator[str]:
     """
     rows = results.rows
     counts = Counter(row["verdict"] for row in rows)
-    verdicts = ", ".join(f"{counts[verdict.value]} {verdict.value}" for verdict in CellClass)
+    verdict_texts = [f"{counts[verdict.value]} {verdict.value}" for verdict in CellClass]
+    verdicts = ", ".join(verdict_texts)
     runs = count_nouns(len(rows), "run")
-    yield f"{runs} of {count_nouns(results.plan.cells, 'cell')}: {verdicts}"
+    cells = count_nouns(results.plan.cells, "cell")
+    yield f"{runs} of {cells}: {verdicts}"
 
     extended = [row for row in rows if row["extended"]]
     if extended:
@@ -563,10 +598,12 @@ def _list_ranges(plan: SweepPlan, rows: Sequence[ResultRow]) -> list[str]:
     Returns:
         Texts such as "RMS e 0.012 to 0.4 rad", without the quantities that no run has.
     """
-    metrics = map(find_quantity, plan.metrics)
-    quantities = {metric.key: (metric.name, metric.unit) for metric in metrics}
+    quantities = {}
+    for metric in map(find_quantity, plan.metrics):
+        quantities[metric.key] = (metric.name, metric.unit)
+    quantities |= _TOTALS
     ranges = []
-    for key, (name, unit) in {**quantities, **_TOTALS}.items():
+    for key, (name, unit) in quantities.items():
         values = _list_values(rows, key)
         if values:
             text = f"{name} {min(values):.3g} to {max(values):.3g} {unit}"
@@ -576,7 +613,8 @@ def _list_ranges(plan: SweepPlan, rows: Sequence[ResultRow]) -> list[str]:
 
 def _list_values(rows: Sequence[ResultRow], key: str) -> list[float]:
     """Returns the values of one column, without the rows in which the value is missing."""
-    return [row[key] for row in rows if row.get(key) is not None]
+    values = [row.get(key) for row in rows]
+    return [value for value in values if value is not None]
 
 
 def _summarize_seeds(results: SweepResults) -> Iterator[str]:
@@ -605,7 +643,8 @@ def _summarize_seeds(results: SweepResults) -> Iterator[str]:
             f"95 % interval {low:.0f} to {high:.0f} %"
         )
     if len(doubtful) > _MAX_DOUBTFUL_SHOWN:
-        yield f"  and {len(doubtful) - _MAX_DOUBTFUL_SHOWN} more, all in {GRID_POINTS_FILE}"
+        hidden = len(doubtful) - _MAX_DOUBTFUL_SHOWN
+        yield f"  and {hidden} more, all in {GRID_POINTS_FILE}"
 
 
 def list_next_commands(folder: Path) -> list[str]:
@@ -646,7 +685,9 @@ def build_reproduce_command(
         text, source_folder = read_source(source)
         written = plan.written._replace(text=text, folder=source_folder)
         current_plan = plan._replace(written=written)
-        digest = current_plan.scenario(*overrides, f"seed={row['seed']}").sha256
+        seed = f"seed={row['seed']}"
+        current_scenario = current_plan.scenario(*overrides, seed)
+        digest = current_scenario.sha256
     except ScenarioError:
         digest = ""  # the source is missing or is no longer valid
     if digest == row["scenario_sha256"]:
