@@ -32,7 +32,8 @@ def wilson_interval(successes: int, runs: int) -> tuple[float, float]:
 
     if runs == 0:
         return 0.0, 1.0
-    low, high = binomtest(successes, runs).proportion_ci(method="wilson")
+    test = binomtest(successes, runs)
+    low, high = test.proportion_ci(method="wilson")
     return float(low), float(high)
 
 
@@ -67,6 +68,8 @@ def mean_interval(values: Sequence[float | None]) -> MeanInterval | None:
     # Imported here, because the import takes long.
     from scipy.special import stdtrit
 
-    standard_error = float(np.std(known, ddof=1) / np.sqrt(count))
+    deviation = np.std(known, ddof=1)
+    standard_error = float(deviation / np.sqrt(count))
     quantile = float(stdtrit(count - 1, 0.975))
-    return MeanInterval(mean=float(np.mean(known)), half=quantile * standard_error)
+    mean = float(np.mean(known))
+    return MeanInterval(mean, half=quantile * standard_error)

@@ -60,7 +60,8 @@ class LogComparison(Result):
         """
         names = {log.scenario.name for log in self.logs}
         if len(names) > 1:
-            yield f"logs of different scenarios: {', '.join(sorted(names))}"
+            sorted_names = ", ".join(sorted(names))
+            yield f"logs of different scenarios: {sorted_names}"
         if self.differences:
             header = ("differs", *self.metrics.columns)
             rows = [(str(difference), *difference.values) for difference in self.differences]
@@ -78,14 +79,16 @@ class LogComparison(Result):
 
         reasons = list(self._explain_missing_values())
         yield from reasons[:_MOST_REASONS]
-        if len(reasons) > _MOST_REASONS:
-            yield f"and {len(reasons) - _MOST_REASONS} more, which --json names"
+        hidden = len(reasons) - _MOST_REASONS
+        if hidden > 0:
+            yield f"and {hidden} more, which --json names"
 
     def _explain_missing_values(self) -> Iterator[str]:
         """Yields a sentence for each metric that applies to a log but has no value."""
         for row in self.metrics.rows:
             for name, entry in zip(self.metrics.columns, row.entries, strict=True):
-                if entry.value is None and entry.applies:
+                is_missing = entry.value is None
+                if is_missing and entry.applies:
                     yield f"{name}: no {row.quantity.name}: {entry.why}"
 
     def to_dict(self) -> dict[str, Any]:
@@ -121,8 +124,10 @@ class LogComparison(Result):
         """
         rows = []
         for row in self.metrics.rows:
+            quantity = row.quantity
             values = dict(zip(self.metrics.columns, row.values, strict=True))
-            rows.append({"key": row.quantity.key, "unit": row.quantity.unit, **values})
+            cells = {"key": quantity.key, "unit": quantity.unit, **values}
+            rows.append(cells)
         return rows
 
 
@@ -147,17 +152,20 @@ def compare(*logs: str | Path | Log) -> LogComparison:
         raise UsageError(
             "name at least two logs; or a scenario, as in: trilat compare --tune free"
         )
-    names = name_columns([Path(log.sources[0]) for log in opened])
+    files = [Path(log.sources[0]) for log in opened]
+    names = name_columns(files)
     remarks = {}
     for name, log in zip(names, opened, strict=True):
-        verdict = describe_judgement(certify_run(log))
+        judgement = certify_run(log)
+        verdict = describe_judgement(judgement)
         remarks[name] = [verdict, *check_final_posture(log)]
     metrics = compare_metrics(opened, names)
+    scenarios = [log.scenario for log in opened]
 
     return LogComparison(
         logs=tuple(opened),
         metrics=metrics,
-        differences=list(compare_scenarios([log.scenario for log in opened])),
+        differences=list(compare_scenarios(scenarios)),
         means=average_repeats(opened, metrics),
         remarks=remarks,
     )
@@ -174,7 +182,11 @@ def name_columns(files: Sequence[Path]) -> list[str]:
     """
     most_parts = max(len(file.parts) for file in files)
     for depth in range(1, most_parts + 1):
-        names = ["/".join(file.with_suffix("").parts[-depth:]) for file in files]
+        names = []
+        for file in files:
+            parts = file.with_suffix("").parts
+            name = "/".join(parts[-depth:])
+            names.append(name)
         if len(set(names)) == len(names):
             return names
     # Some files are the same, or differ only in their suffix.
@@ -217,7 +229,8 @@ def _tabulate_quantities(
     for group, members in groupby(metrics.rows, key=lambda row: row.quantity.group):
         rows.append([group])
         for row in members:
-            cells = [f"  {row.quantity.name}", row.quantity.unit or "-"]
+            quantity = row.quantity
+            cells = [f"  {quantity.name}", quantity.unit or "-"]
             cells += [format_number(value, 4) for value in row.values]
             if means:
                 cells.append(str(mean_by_row[row] or "-"))

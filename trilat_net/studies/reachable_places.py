@@ -43,12 +43,14 @@ def can_reach(arm: ArmModel, start_rad: Sequence[float] | Array, position_m: Arr
     """
     if arm.chain is not None:
         start = np.array(start_rad, dtype=np.float64)
-        return _find_pose(arm, start, np.asarray(position_m))
+        target_m = np.asarray(position_m)
+        return _find_pose(arm, start, target_m)
     first_m, second_m = arm.lengths_m
     length_m = first_m + second_m
     farthest_m = length_m - PLANAR_MARGIN * length_m
     nearest_m = abs(first_m - second_m)
-    return nearest_m <= math.hypot(*position_m) <= farthest_m
+    distance_m = math.hypot(*position_m)
+    return nearest_m <= distance_m <= farthest_m
 
 
 def _find_pose(arm: ArmModel, q: Array, position_m: Array) -> bool:
@@ -67,18 +69,22 @@ def _find_pose(arm: ArmModel, q: Array, position_m: Array) -> bool:
         True if a pose was found.
     """
     assert arm.chain is not None
-    lower = np.array([joint.lower for joint in arm.chain.joints])
-    upper = np.array([joint.upper for joint in arm.chain.joints])
+    joints = arm.chain.joints
+    lower = np.array([joint.lower for joint in joints])
+    upper = np.array([joint.upper for joint in joints])
     for _ in range(_STEPS):
         end_effector_m = np.array(arm.end_effector(q.tolist()))
         error_m = position_m - end_effector_m
-        if float(np.linalg.norm(error_m)) <= FOUND_WITHIN_M:
+        distance_m = float(np.linalg.norm(error_m))
+        if distance_m <= FOUND_WITHIN_M:
             return True
 
         J = _compute_jacobian(arm, q, end_effector_m)
-        damped = J @ J.T + _DAMPING * np.eye(len(end_effector_m))
+        identity = np.eye(len(end_effector_m))
+        damped = J @ J.T + _DAMPING * identity
         step = J.T @ np.linalg.solve(damped, error_m)
-        largest_rad = max(float(np.abs(step).max()), 1e-12)  # avoids a division by zero
+        largest_rad = float(np.abs(step).max())
+        largest_rad = max(largest_rad, 1e-12)  # avoids a division by zero
         step *= min(1.0, _LARGEST_STEP_RAD / largest_rad)
         q = np.clip(q + step, lower, upper)
     return False
@@ -92,10 +98,13 @@ def _compute_jacobian(arm: ArmModel, q: Array, end_effector_m: Array) -> Array:
         q: Joint positions, shape (n,).
         end_effector_m: Position of the end effector at `q`, shape (m,), in m.
     """
-    jacobian = np.empty((len(end_effector_m), len(q)))
-    for joint in range(len(q)):
+    joint_count = len(q)
+    shape = (len(end_effector_m), joint_count)
+    jacobian = np.empty(shape)
+    for joint in range(joint_count):
         probe = q.copy()
         probe[joint] += _PROBE_RAD
         probe_m = np.array(arm.end_effector(probe.tolist()))
-        jacobian[:, joint] = (probe_m - end_effector_m) / _PROBE_RAD
+        motion_m = probe_m - end_effector_m
+        jacobian[:, joint] = motion_m / _PROBE_RAD
     return jacobian

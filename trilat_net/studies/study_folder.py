@@ -66,14 +66,19 @@ def format_toml_value(value: Any) -> str:
     """
     value = name_law_classes(value)
     if isinstance(value, Mapping):
-        entries = [f"{key} = {format_toml_value(entry)}" for key, entry in value.items()]
+        entries = []
+        for key, entry in value.items():
+            entry_text = format_toml_value(entry)
+            entries.append(f"{key} = {entry_text}")
         return f"{{{', '.join(entries)}}}"
     if isinstance(value, list | tuple):
-        return f"[{', '.join(map(format_toml_value, value))}]"
+        items = map(format_toml_value, value)
+        return f"[{', '.join(items)}]"
     if isinstance(value, float) and float(f"{value:g}") == value:
         return f"{value:g}"
     try:
-        return tomli_w.dumps({"v": value}).removeprefix("v = ").removesuffix("\n")
+        assignment = tomli_w.dumps({"v": value})
+        return assignment.removeprefix("v = ").removesuffix("\n")
     except TypeError:
         raise ScenarioError(
             f"{value!r:.80} cannot be a value in a scenario: scenarios contain TOML values only"
@@ -94,7 +99,8 @@ def describe_program() -> tuple[str, dict[str, str]]:
         program and of the packages that compute the results.
     """
     provenance = collect_provenance()
-    return compute_fingerprint(), {name: provenance[name] for name in _VERSIONS}
+    versions = {name: provenance[name] for name in _VERSIONS}
+    return compute_fingerprint(), versions
 
 
 def build_resume_hint(*arguments: str) -> str:
@@ -172,7 +178,8 @@ class RunJournal(Generic[E]):
             text, tab, digits = line.rpartition(b"\t")
             if tab and digits == b"%08x" % self._checksum(text):
                 # The module json is used, because msgspec does not accept infinity.
-                entry = msgspec.convert(json.loads(text), kind)
+                values = json.loads(text)
+                entry = msgspec.convert(values, kind)
                 self.done.setdefault((entry.cell, entry.seed), entry)
         self._file = extend_file(path)
         if content and not content.endswith(b"\n"):
@@ -200,8 +207,10 @@ class RunJournal(Generic[E]):
         """
         if (entry.cell, entry.seed) in self.done:
             return
-        text = json.dumps(msgspec.to_builtins(entry), separators=(",", ":")).encode()
-        self._write(b"%s\t%08x\n" % (text, self._checksum(text)))
+        values = msgspec.to_builtins(entry)
+        text = json.dumps(values, separators=(",", ":")).encode()
+        checksum = self._checksum(text)
+        self._write(b"%s\t%08x\n" % (text, checksum))
         self.done[entry.cell, entry.seed] = entry
 
     def run_pending(
@@ -239,14 +248,16 @@ class RunJournal(Generic[E]):
         """
         try:
             # On a full disk, write() returns a smaller number of bytes without an error.
-            if self._file.write(data) != len(data):
+            written = self._file.write(data)
+            if written != len(data):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         except OSError as error:
             raise describe_write_error(self._path, error, self._remedy) from None
 
     def _checksum(self, text: bytes) -> int:
         """Returns the CRC-32 of the study's identification and the text of a line."""
-        return zlib.crc32(text, zlib.crc32(self._study.encode()))
+        study_checksum = zlib.crc32(self._study.encode())
+        return zlib.crc32(text, study_checksum)
 
 
 class StudyFolder(NamedTuple, Generic[P, E]):

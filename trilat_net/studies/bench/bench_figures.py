@@ -66,8 +66,8 @@ def list_figures_with_values(results: BenchResults) -> list[str]:
     """
     names = []
     for name in FIGURES_OF_BENCH:
-        fields = _collect_fields(results, name).values()
-        if any(np.isfinite(field).any() for field in fields):
+        fields = _collect_fields(results, name)
+        if any(np.isfinite(field).any() for field in fields.values()):
             names.append(name)
     return names
 
@@ -101,7 +101,8 @@ def draw_bench(results: BenchResults, name: str) -> Figure:
     links = results.plan.links
     fields = _collect_fields(results, name)
     is_share = not quantity
-    scale = Normalize(0.0, 1.0) if is_share else _choose_scale(list(fields.values()))
+    task_fields = list(fields.values())
+    scale = Normalize(0.0, 1.0) if is_share else _choose_scale(task_fields)
     law_counts = [len(field) for field in fields.values()]
     panels_height = sum(_HEAD_IN / 2 + _ROW_IN * count for count in law_counts)
     size = make_print_size(_WIDTH_IN)
@@ -126,7 +127,9 @@ def draw_bench(results: BenchResults, name: str) -> Figure:
             _label_laws(axes, results, task)
             _mark_cells(axes, results, task)
             axes.set_title(task)
-        panels[-1].set_xticks(range(len(links)), links, rotation=90, fontsize=_TEXT_PT)
+        lowest_panel = panels[-1]
+        columns = range(len(links))
+        lowest_panel.set_xticks(columns, links, rotation=90, fontsize=_TEXT_PT)
         # All panels have the same scale, so the last image stands for all of them.
         figure.colorbar(image, ax=list(panels), label=label, fraction=0.03)
     return figure
@@ -138,11 +141,17 @@ def _choose_scale(fields: list[Array]) -> Normalize:
     Args:
         fields: The numbers of the panels. NaN is ignored.
     """
-    numbers = np.concatenate([field[np.isfinite(field)].ravel() for field in fields])
+    numbers_of_fields = []
+    for field in fields:
+        is_number = np.isfinite(field)
+        numbers_of_fields.append(field[is_number].ravel())
+    numbers = np.concatenate(numbers_of_fields)
     smallest = float(numbers.min()) if numbers.size else 0.1
     largest = float(numbers.max()) if numbers.size else 1.0
     # a logarithmic scale needs limits above 0
-    return LogNorm(max(smallest, 1e-6), max(largest, 2e-6))
+    lower = max(smallest, 1e-6)
+    upper = max(largest, 2e-6)
+    return LogNorm(lower, upper)
 
 
 def _list_laws(results: BenchResults, task: str) -> list[tuple[str, str]]:
@@ -151,7 +160,12 @@ def _list_laws(results: BenchResults, task: str) -> list[tuple[str, str]]:
     Returns:
         Pairs of the name of a law and the form of the suite in which it runs.
     """
-    return [(law, form) for law, form in results.plan.laws if any(results.select(task, law))]
+    rows = []
+    for law, form in results.plan.laws:
+        has_results = any(results.select(task, law))
+        if has_results:
+            rows.append((law, form))
+    return rows
 
 
 def _collect(results: BenchResults, task: str, quantity: str) -> Array:
@@ -167,12 +181,14 @@ def _collect(results: BenchResults, task: str, quantity: str) -> Array:
     """
     laws = _list_laws(results, task)
     links = results.plan.links
-    field = np.full((len(laws), len(links)), np.nan)
+    shape = (len(laws), len(links))
+    field = np.full(shape, np.nan)
     for result in results.select(task):
         number = _compute_number(result, quantity)
         if number is not None:
-            row = laws.index((result.cell.law, result.cell.form))
-            column = links.index(result.cell.link)
+            cell = result.cell
+            row = laws.index((cell.law, cell.form))
+            column = links.index(cell.link)
             field[row, column] = number
     return field
 
@@ -197,7 +213,8 @@ def _label_laws(axes: Axes, results: BenchResults, task: str) -> None:
     """Writes the names of the laws beside the rows of a task's panel."""
     laws = _list_laws(results, task)
     labels = [name_law(law, form) for law, form in laws]
-    axes.set_yticks(range(len(laws)), labels, fontsize=_TEXT_PT)
+    rows = range(len(laws))
+    axes.set_yticks(rows, labels, fontsize=_TEXT_PT)
     axes.grid(visible=False)
     axes.set_facecolor(_NONE)
 
@@ -207,10 +224,18 @@ def _mark_cells(axes: Axes, results: BenchResults, task: str) -> None:
     laws = _list_laws(results, task)
     links = results.plan.links
     for result in results.select(task):
-        x = [links.index(result.cell.link)]
-        y = [laws.index((result.cell.law, result.cell.form))]
+        cell = result.cell
+        x = [links.index(cell.link)]
+        y = [laws.index((cell.law, cell.form))]
         if result.count(Stability.NOT_STABLE):
-            axes.plot(x, y, marker="x", color="#ffffff", markersize=3.0, markeredgewidth=0.8)
+            axes.plot(
+                x,
+                y,
+                marker="x",
+                color="#ffffff",
+                markersize=3.0,
+                markeredgewidth=0.8,
+            )
         elif result.stable < len(result.runs):
             axes.plot(x, y, marker=".", color="#ffffff", markersize=2.0)
 
@@ -240,7 +265,11 @@ def write_bench(results: BenchResults, folder: Path, command: str) -> list[Path]
     for name, text in texts.items():
         write_whole(folder / name, text)
 
-    figures = {folder / f"bench-{name}.png": name for name in names}
-    for path, name in figures.items():
-        style.write_figure(draw_bench(results, name), path, style.REPORT_DPI)
-    return [*(folder / name for name in texts), *figures]
+    figure_paths = []
+    for name in names:
+        path = folder / f"bench-{name}.png"
+        figure = draw_bench(results, name)
+        style.write_figure(figure, path, style.REPORT_DPI)
+        figure_paths.append(path)
+    text_paths = [folder / name for name in texts]
+    return [*text_paths, *figure_paths]

@@ -147,7 +147,8 @@ def run_bench_task(item: BenchRunItem) -> BenchRun:
         # Errors and efforts of a run that ended early cannot be compared with those of others.
         return run
 
-    run = _measure(run, judged, TASKS[cell.task].duration_s)
+    task = TASKS[cell.task]
+    run = _measure(run, judged, task.duration_s)
     if cell.task == "contact" and not run.masked:
         stiffness_n_m = _estimate_stiffness(item, judged)
         run = msgspec.structs.replace(run, stiffness_n_m=stiffness_n_m)
@@ -194,7 +195,8 @@ def _lengthen(judged: _JudgedRun, twins: int) -> _JudgedRun:
     """
     if judged.diverged:
         return judged
-    rates = [judged.end.error.rate_per_s, judged.end.speed.rate_per_s]
+    end = judged.end
+    rates = [end.error.rate_per_s, end.speed.rate_per_s]
     rates += [push.rate_per_s for push in judged.twins.pushes if push.factor > 0.0]
     # A rate below 0 means decay. Its time constant is the inverse.
     time_constants_s = [-1.0 / rate for rate in rates if rate < 0.0]
@@ -248,17 +250,24 @@ def _measure(run: BenchRun, judged: _JudgedRun, duration_s: float) -> BenchRun:
         wall_forces += [wall_force(wall, t_s, tip) for wall in list_walls(spec)]
 
     # There are no maxima if the task has no wall.
-    last_quarters = [force[3 * len(force) // 4 :] for force in wall_forces]
+    peaks_n = [float(force.max()) for force in wall_forces]
+    final_means_n = []
+    for force in wall_forces:
+        start = 3 * len(force) // 4
+        last_quarter = force[start:]
+        final_means_n.append(float(last_quarter.mean()))
+    effort_nm = np.sqrt(np.mean(squared_efforts))
+    hand_nm = np.sqrt(np.mean(squared_hand_torques))
     return msgspec.structs.replace(
         run,
         bounded=_is_bounded(scenario, whole),
         energy_j=find_least_energy(whole),
         settled_s=_find_settled_s(whole),
         error_rad=_measure_error_rad(scenario, records),
-        effort_nm=float(np.sqrt(np.mean(squared_efforts))),
-        hand_nm=float(np.sqrt(np.mean(squared_hand_torques))),
-        wall_n=max((float(force.mean()) for force in last_quarters), default=None),
-        force_peak_n=max((float(force.max()) for force in wall_forces), default=None),
+        effort_nm=float(effort_nm),
+        hand_nm=float(hand_nm),
+        wall_n=max(final_means_n, default=None),
+        force_peak_n=max(peaks_n, default=None),
     )
 
 
@@ -270,9 +279,12 @@ def _is_bounded(scenario: Scenario, records: dict[str, RecordBatch]) -> bool:
         records: All records of the run, by site.
     """
     for name, record in records.items():
-        distance_rad = np.abs(record.q - scenario.sites[name].q0_rad)
+        start_rad = scenario.sites[name].q0_rad
+        distance_rad = np.abs(record.q - start_rad)
         speed_rad_s = np.abs(record.qd)
-        if distance_rad.max() > THROWN_RAD or speed_rad_s.max() > BOUND_RAD_S:
+        is_thrown = distance_rad.max() > THROWN_RAD
+        is_too_fast = speed_rad_s.max() > BOUND_RAD_S
+        if is_thrown or is_too_fast:
             return False
     return True
 
@@ -295,7 +307,8 @@ def _compute_hand_torque(scenario: Scenario, name: str, record: RecordBatch) -> 
     torque: Array = -record.tau_x
     for source in scenario.sites[name].environment:
         if isinstance(source, ViscousEnvironment):
-            torque = torque + np.array(source.damping_nm_s_rad) * record.qd
+            damping = np.array(source.damping_nm_s_rad)
+            torque = torque + damping * record.qd
     return torque
 
 
@@ -317,9 +330,15 @@ def find_least_energy(records: dict[str, RecordBatch]) -> float:
     Returns:
         The minimum, in J. It is at most 0, because the net energy is 0 at the start.
     """
-    power = sum(-np.sum(record.tau_x * record.qd, axis=1) for record in records.values())
-    h_s = 1e-9 * np.diff(records[SLAVE].t_ns[:2])[0]
-    work = 0.5 * h_s * (power[1:] + power[:-1])
+    arm_powers = []
+    for record in records.values():
+        joint_power = record.tau_x * record.qd
+        arm_powers.append(-np.sum(joint_power, axis=1))
+    power = sum(arm_powers)
+    first_times_ns = records[SLAVE].t_ns[:2]
+    h_s = 1e-9 * np.diff(first_times_ns)[0]
+    power_sums = power[1:] + power[:-1]
+    work = 0.5 * h_s * power_sums
     energy = np.cumsum(np.concatenate([[0.0], work]))
     return float(energy.min())
 
@@ -336,10 +355,12 @@ def _find_settled_s(records: dict[str, RecordBatch]) -> float | None:
     """
     settled_s = 0.0
     for record in records.values():
-        distance_rad = np.abs(record.q - record.q[-1]).max(axis=1)
+        from_end_rad = np.abs(record.q - record.q[-1])
+        distance_rad = from_end_rad.max(axis=1)
         moving = np.flatnonzero(distance_rad > SETTLED_ERROR_RAD)
         if len(moving):
-            settled_s = max(settled_s, record.t_ns[moving[-1]] / NS_PER_S)
+            last_moving_s = record.t_ns[moving[-1]] / NS_PER_S
+            settled_s = max(settled_s, last_moving_s)
     end_s = records[SLAVE].t_ns[-1] / NS_PER_S
     return float(settled_s) if settled_s <= end_s - REST_S else None
 
@@ -362,11 +383,15 @@ def _estimate_stiffness(item: BenchRunItem, far: _JudgedRun) -> float | None:
     overrides = (*built.overrides, *format_settings(SHORTER_REACH))
     shorter = load_tuning_scenario(built.source, overrides)
     near = _judge(shorter.scenario, far.scenario.duration_s, twins=0)
-    if _find_settled_s(near.records) is None or _find_settled_s(far.records) is None:
+    near_settled_s = _find_settled_s(near.records)
+    far_settled_s = _find_settled_s(far.records)
+    if near_settled_s is None or far_settled_s is None:
         return None
     near_m, near_n = _measure_push(near)
     far_m, far_n = _measure_push(far)
-    return float((far_n - near_n) / (far_m - near_m))
+    force_n = far_n - near_n
+    distance_m = far_m - near_m
+    return float(force_n / distance_m)
 
 
 def _measure_push(judged: _JudgedRun) -> tuple[float, float]:
@@ -384,11 +409,15 @@ def _measure_push(judged: _JudgedRun) -> tuple[float, float]:
     """
     scenario = judged.scenario
     record = judged.records[USER]
-    record = record.since(record.t_ns[-1] - NS_PER_S)
-    tip = build_arm_rows(scenario, USER).place_end_effector(record.q, record.qd)
+    last_second_ns = record.t_ns[-1] - NS_PER_S
+    record = record.since(last_second_ns)
+    arm = build_arm_rows(scenario, USER)
+    tip = arm.place_end_effector(record.q, record.qd)
     torque = _compute_hand_torque(scenario, USER, record)
     J_transposed = np.swapaxes(tip.J, 1, 2)
-    force_x = np.linalg.solve(J_transposed, torque[:, :, np.newaxis])[:, 0, 0]
+    torque_columns = torque[:, :, np.newaxis]
+    force = np.linalg.solve(J_transposed, torque_columns)
+    force_x = force[:, 0, 0]
     position_x = tip.position[:, 0]
     return float(position_x.mean()), float(force_x.mean())
 
@@ -410,8 +439,10 @@ def _measure_error_rad(scenario: Scenario, records: dict[str, RecordBatch]) -> f
     alpha = evaluate_ramps(start, ramps, t_s, period_s).alpha  # dominance factors
     reference: Array = np.zeros_like(slave.q)
     for index, peer in enumerate(scenario.peers(SLAVE)):
-        reference = reference + alpha[:, index, None] * records[peer].q
-    return float(np.sqrt(np.mean((slave.q - reference) ** 2)))
+        weight = alpha[:, index, None]
+        reference = reference + weight * records[peer].q
+    error_rad = slave.q - reference
+    return float(np.sqrt(np.mean(error_rad**2)))
 
 
 ORIGIN_NAME = "origin.json"
@@ -509,11 +540,12 @@ def run_bench(
         _run_pending(journal, items, jobs, on, progress)
 
         if confirm:
-            repeated = [
-                item._replace(to_s=LONGEST_S)
-                for item in items
-                if journal.done[item.cell.key, item.seed].needs_confirmation
-            ]
+            repeated = []
+            for item in items:
+                run = journal.done[item.cell.key, item.seed]
+                if run.needs_confirmation:
+                    longer_item = item._replace(to_s=LONGEST_S)
+                    repeated.append(longer_item)
             _run_pending(journal, repeated, jobs, on, progress)
         return BenchResults(plan, journal.done)
 

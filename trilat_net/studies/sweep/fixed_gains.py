@@ -51,12 +51,15 @@ def _describe_laws(plan: SweepPlan, scenario: Scenario) -> Iterator[str]:
     sites_of_law: dict[tuple[str, str], list[str]] = {}
     for site, spec in scenario.sites.items():
         law = identify_law(spec.control)
-        gains = ", ".join(_format_gains(plan, site, spec.control)) or "none"
-        sites_of_law.setdefault((law, gains), []).append(site)
+        gain_texts = _format_gains(plan, site, spec.control)
+        gains = ", ".join(gain_texts) or "none"
+        sites = sites_of_law.setdefault((law, gains), [])
+        sites.append(site)
     for (law, gains), sites in sites_of_law.items():
         owner = law
         if len(sites) < len(scenario.sites):
-            owner = f"{law} of {', '.join(sites)}"
+            site_names = ", ".join(sites)
+            owner = f"{law} of {site_names}"
         yield f"{owner}: {gains}"
 
 

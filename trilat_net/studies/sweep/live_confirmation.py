@@ -119,7 +119,8 @@ def choose_cells_near_edges(
             raise UsageError(
                 f"every cell on the {side} side of an edge ran longer than {MAX_SESSION_S:g} s"
             )
-        selected += [row_of_index[index] for index in _select_nearest(candidates, count)]
+        indices = _select_nearest(candidates, count)
+        selected += [row_of_index[index] for index in indices]
     return selected
 
 
@@ -136,8 +137,10 @@ def _select_nearest(distances: Mapping[GridIndex, int], count: int) -> list[Grid
     limit = nearest[-1]
     near = [index for index, distance in distances.items() if distance <= limit]
     near.sort(key=_rank_along_edge)
-    spread = np.linspace(0, len(near) - 1, min(count, len(near)))
-    return [near[n] for n in spread.round().astype(int)]
+    selected_count = min(count, len(near))
+    spread = np.linspace(0, len(near) - 1, selected_count)
+    positions = spread.round().astype(int)
+    return [near[n] for n in positions]
 
 
 def _rank_along_edge(index: GridIndex) -> tuple[Any, ...]:
@@ -163,8 +166,10 @@ def confirm_cell(row: ResultRow, run: SessionRunner) -> ConfirmedCell:
     """
     virtual = CellClass(row["verdict"])
     extra_s = _EXTRA_S if row["diverged_s"] is not None else 0.0
-    duration_s = min(row["ran_s"] + extra_s, MAX_SESSION_S + _EXTRA_S)
-    scenario = msgspec.structs.replace(parse_scenario(row["scenario"]), duration_s=duration_s)
+    longest_s = MAX_SESSION_S + _EXTRA_S
+    duration_s = min(row["ran_s"] + extra_s, longest_s)
+    scenario = parse_scenario(row["scenario"])
+    scenario = msgspec.structs.replace(scenario, duration_s=duration_s)
     path, problems = run(scenario, f"cell-{row['cell']}")
 
     live = None
@@ -175,7 +180,8 @@ def confirm_cell(row: ResultRow, run: SessionRunner) -> ConfirmedCell:
     else:
         # A session in which an arm leaves its limits ends early and reports a problem. This is
         # how it should be, and the log counts.
-        if problems and end.behaviour is not EndBehaviour.DIVERGED:
+        has_diverged = end.behaviour is EndBehaviour.DIVERGED
+        if problems and not has_diverged:
             text = "; ".join(problems)
         else:
             text = end.text
@@ -205,12 +211,15 @@ def tabulate_confirmations(
         for key in axes:
             value = run[key]
             row.append(value if isinstance(value, str) else f"{value:g}")
+        live = "none" if confirmed.live is None else confirmed.live.value
+        agreement = "same" if confirmed.same else "DIFFERS"
+        log = "none" if confirmed.log is None else str(confirmed.log)
         row.append(str(run["seed"]))
         row.append(confirmed.virtual.value)
-        row.append("none" if confirmed.live is None else confirmed.live.value)
-        row.append("same" if confirmed.same else "DIFFERS")
+        row.append(live)
+        row.append(agreement)
         row.append(confirmed.text)
-        row.append("none" if confirmed.log is None else str(confirmed.log))
+        row.append(log)
         rows.append(tuple(row))
     return TextTable(tuple(heads), rows)
 
@@ -229,11 +238,13 @@ def _index_rows(rows: Sequence[ResultRow], axes: Sequence[str]) -> dict[GridInde
         values = {row[key] for row in rows}
         numbers = sorted(value for value in values if not isinstance(value, str))
         texts = sorted(value for value in values if isinstance(value, str))
-        ranks[key] = {value: rank for rank, value in enumerate([*numbers, *texts])}
+        ordered = [*numbers, *texts]
+        ranks[key] = {value: rank for rank, value in enumerate(ordered)}
     row_of_index: dict[GridIndex, ResultRow] = {}
     for row in rows:
         position = [ranks[key][row[key]] for key in axes]
-        row_of_index[*position, row.get("law"), row.get("seed")] = row
+        index = (*position, row.get("law"), row.get("seed"))
+        row_of_index[index] = row
     return row_of_index
 
 
@@ -252,7 +263,10 @@ def _compute_edge_distances(
     Returns:
         Distances by position. Runs without an opposite result along any axis are left out.
     """
-    stable = {index: CellClass(row["verdict"]).stable for index, row in row_of_index.items()}
+    stable = {}
+    for index, row in row_of_index.items():
+        verdict = CellClass(row["verdict"])
+        stable[index] = verdict.stable
 
     # A line contains the decided runs that differ in their position on one axis only.
     lines: dict[GridIndex, list[GridIndex]] = {}
@@ -260,17 +274,20 @@ def _compute_edge_distances(
         if is_stable is None:
             continue
         for axis in range(axis_count):
-            line = (axis, *index[:axis], *index[axis + 1 :])
-            lines.setdefault(line, []).append(index)
+            before = index[:axis]
+            after = index[axis + 1 :]
+            line = (axis, *before, *after)
+            line_indices = lines.setdefault(line, [])
+            line_indices.append(index)
 
     distances: dict[GridIndex, int] = {}
     for (axis, *_), indices in lines.items():
         for index in indices:
-            steps = [
-                abs(other[axis] - index[axis])
-                for other in indices
-                if stable[other] is not stable[index]
-            ]
+            steps = []
+            for other in indices:
+                is_opposite = stable[other] is not stable[index]
+                if is_opposite:
+                    steps.append(abs(other[axis] - index[axis]))
             if index in distances:
                 steps.append(distances[index])
             if steps:

@@ -139,7 +139,8 @@ class MapPanel(NamedTuple):
 
         The other runs are undecided, for example because they were too short.
         """
-        undecided = self.counts[:, :, CELL_CLASSES.index(CellClass.UNDECIDED)]
+        class_index = CELL_CLASSES.index(CellClass.UNDECIDED)
+        undecided = self.counts[:, :, class_index]
         return self.runs - undecided
 
     @property
@@ -225,17 +226,21 @@ def build_plane(
     values = {key: {row[key] for row in rows} for key in axes}
     plane_axes = []
     for key in drawn_keys:
-        axis = PlaneAxis(key, tuple(sorted(values[key])), label_axis(key, scenario))
-        plane_axes.append(axis)
+        axis_values = tuple(sorted(values[key]))
+        label = label_axis(key, scenario)
+        plane_axes.append(PlaneAxis(key, axis_values, label))
     if len(plane_axes) == 1:
-        plane_axes.append(PlaneAxis("", (0.0,), ""))
+        no_axis = PlaneAxis("", (0.0,), "")
+        plane_axes.append(no_axis)
     x, y = plane_axes
 
-    panel_keys = [key for key in axes if key not in drawn_keys and len(values[key]) > 1]
+    other_keys = [key for key in axes if key not in drawn_keys]
+    panel_keys = [key for key in other_keys if len(values[key]) > 1]
     rows_of_panel: dict[PanelSettings, list[Mapping[str, Any]]] = {}
     for row in rows:
         settings = tuple((key, row[key]) for key in panel_keys)
-        rows_of_panel.setdefault(settings, []).append(row)
+        panel_rows = rows_of_panel.setdefault(settings, [])
+        panel_rows.append(row)
     if len(rows_of_panel) > MAX_PANELS:
         raise UsageError(
             f"a map has at most {MAX_PANELS} panels, but {', '.join(panel_keys)} would give "
@@ -246,7 +251,8 @@ def build_plane(
     for settings, panel_rows in rows_of_panel.items():
         title = _format_panel_title(settings, scenario)
         counts, exponents_per_s = _collect_runs(panel_rows, x, y)
-        panels.append(MapPanel(title, settings, counts, exponents_per_s))
+        panel = MapPanel(title, settings, counts, exponents_per_s)
+        panels.append(panel)
     return MapPlane(scenario.name, x, y, tuple(panels))
 
 
@@ -264,7 +270,8 @@ def _collect_runs(
         The fields `counts` and `exponents_per_s` of `MapPanel`.
     """
     shape = (len(y.values), len(x.values))
-    counts: RunCounts = np.zeros((*shape, len(CELL_CLASSES)), dtype=np.int64)
+    counts_shape = (*shape, len(CELL_CLASSES))
+    counts: RunCounts = np.zeros(counts_shape, dtype=np.int64)
     exponents_per_s: Array = np.zeros(shape)
     column_of_x = {value: column for column, value in enumerate(x.values)}
     row_of_y = {value: row for row, value in enumerate(y.values)}
@@ -273,7 +280,8 @@ def _collect_runs(
     for run in rows:
         i = row_of_y[run[y.key]] if y.key else 0
         j = column_of_x[run[x.key]]
-        counts[i, j, index_of_class[run["verdict"]]] += 1
+        class_index = index_of_class[run["verdict"]]
+        counts[i, j, class_index] += 1
         exponent = run.get("exponent_per_s")
         # A run without an exponent makes the mean of its grid point NaN.
         exponents_per_s[i, j] += np.nan if exponent is None else exponent
@@ -351,8 +359,8 @@ def find_map_edges(plane: MapPlane, panel: MapPanel) -> list[tuple[float, Stabil
         is_stable = stable_share[decided] > 0.5
 
         # Compare each decided grid point with the next decided one.
-        changes = np.flatnonzero(is_stable[1:] != is_stable[:-1])
-        for n in changes:
+        is_change = is_stable[1:] != is_stable[:-1]
+        for n in np.flatnonzero(is_change):
             below, above = decided[n : n + 2].tolist()
             edge = StabilityEdge(
                 low=y[below],
@@ -458,19 +466,22 @@ def _evaluate_damping_criterion(scenario: Scenario) -> StabilityCriterion | None
         delay_ticks = math.ceil(delay_s * rate_hz - _ROUNDING)
         delays_ticks.append(max(1, delay_ticks))  # a sample is used in the next tick at best
     if len(K) == 2:
+        mean_delay_ticks = 0.5 * sum(delays_ticks)
+        pair_excess = _compute_pair_excess(K, d, mean_delay_ticks, rate_hz)
         return StabilityCriterion(
             symbol=r"$4\,d_1 d_2 = (T_1 + T_2)^2 K_1 K_2$",
             text="4 d1 d2 = (T1 + T2)² K1 K2",
             source=_DAMPING_SOURCE,
-            excess=_compute_pair_excess(K, d, 0.5 * sum(delays_ticks), rate_hz),
+            excess=pair_excess,
         )
 
     are_equal = len({*K}) == len({*d}) == len({*delays_ticks}) == 1
     least_eigenvalue = find_least_reversible(scenario.alpha)
     if not are_equal or least_eigenvalue is None:
         return None
-    ratio = _compute_required_ratio(least_eigenvalue, delays_ticks[0])
-    required_d = K[0] * ratio * delays_ticks[0] / rate_hz
+    common_delay_ticks = delays_ticks[0]
+    ratio = _compute_required_ratio(least_eigenvalue, common_delay_ticks)
+    required_d = K[0] * ratio * common_delay_ticks / rate_hz
     excess = d[0] - required_d
     if -least_eigenvalue < COMMON_MOTION_SHARE:
         return StabilityCriterion(
@@ -502,7 +513,9 @@ def _find_scalar_gains(spec: SiteSpec) -> tuple[float, float] | None:
     law: Any = spec.control
     if law.kind is not PD or law.gravity != 1.0:
         return None
-    if len({*law.K}) > 1 or len({*law.d}) > 1:
+    distinct_K = {*law.K}
+    distinct_d = {*law.d}
+    if len(distinct_K) > 1 or len(distinct_d) > 1:
         return None
     return law.K[0], law.d[0]
 
@@ -521,9 +534,11 @@ def _sample_unit_circle(delay_ticks: float) -> tuple[Array, Array, Array]:
     full_turn = min(2.0 * np.pi / delay_ticks, 3.0)
     first_turn = np.linspace(0.0, full_turn, 400)[1:]
     half_circle = np.linspace(0.0, np.pi, 400)[1:-1]
-    phi = np.concatenate([[1e-7 / delay_ticks], first_turn, half_circle])
+    first_angle = 1e-7 / delay_ticks
+    phi = np.concatenate([[first_angle], first_turn, half_circle])
     t = np.tan(0.5 * phi)
-    lag = 2.0 * t**3 / (1.0 + 3.0 * t**2)
+    denominator = 1.0 + 3.0 * t**2
+    lag = 2.0 * t**3 / denominator
     return phi, 2.0 * t, lag
 
 
@@ -540,8 +555,10 @@ def _compute_required_ratio(least_eigenvalue: float, delay_ticks: int) -> float:
     sine = np.sin(delay_ticks * phi)
     ratios = []
     for eigenvalue in (least_eigenvalue, 1.0):
-        damping = lag * (1.0 - eigenvalue * cosine) - eigenvalue * sine
-        ratios.append(damping / (w * delay_ticks))
+        lag_part = lag * (1.0 - eigenvalue * cosine)
+        damping = lag_part - eigenvalue * sine
+        ratio = damping / (w * delay_ticks)
+        ratios.append(ratio)
     return float(np.max(ratios))
 
 
@@ -560,11 +577,14 @@ def _compute_pair_excess(
     """
     phi, w, lag = _sample_unit_circle(mean_delay_ticks)
     w_rad_s = w * rate_hz
-    damping_1 = np.maximum(d[0] - K[0] * lag / w_rad_s, 0.0)
-    damping_2 = np.maximum(d[1] - K[1] * lag / w_rad_s, 0.0)
-    delayed = np.sin(mean_delay_ticks * phi) + lag * np.cos(mean_delay_ticks * phi)
+    K_1, K_2 = K
+    d_1, d_2 = d
+    damping_1 = np.maximum(d_1 - K_1 * lag / w_rad_s, 0.0)
+    damping_2 = np.maximum(d_2 - K_2 * lag / w_rad_s, 0.0)
+    delay_angle = mean_delay_ticks * phi
+    delayed = np.sin(delay_angle) + lag * np.cos(delay_angle)
     delay_s = np.abs(delayed) / w_rad_s
-    stiffness = math.sqrt(K[0] * K[1])
+    stiffness = math.sqrt(K_1 * K_2)
     excess = np.sqrt(damping_1 * damping_2) - stiffness * delay_s
     return float(2.0 * np.min(excess))
 
@@ -580,7 +600,8 @@ def _bound_least_inertia(arm: ArmModel) -> float:
     poses = np.array([[0.0, 0.0], [0.0, np.pi]])
     extreme_poses = PlacedArm(0.0, arm.lengths_m, poses)
     inertia_kg_m2 = extreme_poses.inertia_matrix(arm.theta).T
-    return float(np.linalg.eigvalsh(inertia_kg_m2).min())
+    eigenvalues = np.linalg.eigvalsh(inertia_kg_m2)
+    return float(eigenvalues.min())
 
 
 def _evaluate_sampling_criterion(scenario: Scenario) -> StabilityCriterion | None:
@@ -604,7 +625,8 @@ def _evaluate_sampling_criterion(scenario: Scenario) -> StabilityCriterion | Non
         h_s = 1.0 / spec.rate_hz
         if law.kind is not Adaptive or max(delays_s) > h_s:
             return None
-        required_kp = max(law.Gamma[_GRAVITY]) * spec.arm.g_m_s2**2 * h_s
+        largest_gain = max(law.Gamma[_GRAVITY])
+        required_kp = largest_gain * spec.arm.g_m_s2**2 * h_s
         site_excess.append(min(law.Kp) - required_kp)
     return StabilityCriterion(
         symbol=r"$\Gamma g^2 h = K_p$",
@@ -636,7 +658,8 @@ def _list_delays_s(scenario: Scenario) -> list[float] | None:
                 return None
             if link.random or link.loss or link.outages_s:
                 return None
-            delay_ms = max(link.moments().mean_ms, link.playout_ms)
+            moments = link.moments()
+            delay_ms = max(moments.mean_ms, link.playout_ms)
             delays_s.append(delay_ms / 1e3)
     return delays_s
 
@@ -683,10 +706,15 @@ class MapLine(NamedTuple):
         excess = self.excess
         lower = excess[:-1]
         upper = excess[1:]
-        corners = np.array([lower[:, :-1], lower[:, 1:], upper[:, :-1], upper[:, 1:]])
+        lower_left = lower[:, :-1]
+        lower_right = lower[:, 1:]
+        upper_left = upper[:, :-1]
+        upper_right = upper[:, 1:]
+        corners = np.array([lower_left, lower_right, upper_left, upper_right])
         has_values = np.isfinite(corners).all(axis=0)
         stable = (corners > 0.0).sum(axis=0)
-        crossed = has_values & (stable > 0) & (stable < len(corners))
+        some_are_stable = (stable > 0) & (stable < len(corners))
+        crossed = has_values & some_are_stable
         return bool(crossed.any())
 
     def crossings(self, column: int, y: PlaneAxis) -> list[float]:
@@ -707,7 +735,8 @@ class MapLine(NamedTuple):
         for n in _find_sign_changes(excess):
             step = values[n + 1] - values[n]
             change = excess[n] - excess[n + 1]
-            crossings.append(values[n] + step * excess[n] / change)
+            crossing = values[n] + step * excess[n] / change
+            crossings.append(crossing)
         return crossings
 
 
@@ -762,19 +791,24 @@ def trace_closed_form(load: PanelLoader, x: PlaneAxis, y: PlaneAxis) -> MapLine 
     for x_value in x.values:
 
         def evaluate(y_value: float, x_value: float = x_value) -> StabilityCriterion | None:
-            return evaluate_criterion(load(x_value, y_value))
+            scenario = load(x_value, y_value)
+            return evaluate_criterion(scenario)
 
         criteria = [evaluate(y_value) for y_value in y.values]
         applicable = [criterion for criterion in criteria if criterion is not None]
         if first_criterion is None and applicable:
             first_criterion = applicable[0]
-        excess = [np.nan if criterion is None else criterion.excess for criterion in criteria]
+        excess = []
+        for criterion in criteria:
+            value = np.nan if criterion is None else criterion.excess
+            excess.append(value)
         edges: dict[int, float] = {}
         for n in _find_sign_changes(excess):
             edge = find_criterion_edge(evaluate, y.values[n], y.values[n + 1])
             if edge is not None:
                 edges[n] = edge
-        columns.append(_place_zeros(y.values, excess, edges))
+        column = _place_zeros(y.values, excess, edges)
+        columns.append(column)
     if first_criterion is None:
         return None
 
@@ -809,7 +843,8 @@ def trace_linear_analysis(
     for column in columns:
         # A growth rate of -infinity means that nothing moves: the grid point is on no side.
         decay_per_s = [np.nan if np.isinf(rate) else -rate for rate in column.growth_per_s]
-        excess_columns.append(_place_zeros(y.values, decay_per_s, column.edges))
+        excess = _place_zeros(y.values, decay_per_s, column.edges)
+        excess_columns.append(excess)
         all_remarks.extend(column.remarks)
     remarks = list(dict.fromkeys(all_remarks))
     line = MapLine(
@@ -830,7 +865,8 @@ def _find_sign_changes(values: Sequence[float]) -> list[int]:
     indices = list[int]()
     for n, (value, following) in enumerate(pairwise(values)):
         finite = np.isfinite([value, following]).all()
-        if finite and (value > 0.0) != (following > 0.0):
+        sign_changes = (value > 0.0) != (following > 0.0)
+        if finite and sign_changes:
             indices.append(n)
     return indices
 
@@ -859,12 +895,15 @@ def _place_zeros(
     for n in _find_sign_changes(excess):
         if n in edges:
             low = values[n]
-            high = values[n + 1]
-            fraction = (edges[n] - low) / (high - low)
+            width = values[n + 1] - low
+            fraction = (edges[n] - low) / width
         else:
-            fraction = excess[n] / (excess[n] - excess[n + 1])
-        fraction = min(max(fraction, _ROUNDING), 1.0 - _ROUNDING)
-        placed[n + 1] = placed[n] * (1.0 - 1.0 / fraction)
+            change = excess[n] - excess[n + 1]
+            fraction = excess[n] / change
+        fraction = max(fraction, _ROUNDING)
+        fraction = min(fraction, 1.0 - _ROUNDING)
+        scale = 1.0 - 1.0 / fraction
+        placed[n + 1] = placed[n] * scale
     return placed
 
 
@@ -896,9 +935,12 @@ def find_criterion_edge(
 
     tolerance = 1e-8 * (high - low)
     try:
-        if (excess(low) > 0.0) == (excess(high) > 0.0):
+        met_at_low = excess(low) > 0.0
+        met_at_high = excess(high) > 0.0
+        if met_at_low == met_at_high:
             return None
-        return float(brentq(excess, low, high, xtol=tolerance, maxiter=_MAX_ROOT_STEPS))
+        edge = brentq(excess, low, high, xtol=tolerance, maxiter=_MAX_ROOT_STEPS)
+        return float(edge)
     except ScenarioError:
         return None
 
@@ -975,10 +1017,11 @@ def build_stability_map(
         return stability_map
 
     loaders = [make_panel_loader(plan, panel, x.key, y.key) for panel in plane.panels]
-    panel_lines = [
-        [trace_zero_exponent(panel), trace_closed_form(load, x, y)]
-        for panel, load in zip(plane.panels, loaders, strict=True)
-    ]
+    panel_lines = []
+    for panel, load in zip(plane.panels, loaders, strict=True):
+        measured_line = trace_zero_exponent(panel)
+        closed_form_line = trace_closed_form(load, x, y)
+        panel_lines.append([measured_line, closed_form_line])
     remarks = list[str]()
     if linearly:
         tasks = [(load, x_value, y) for load in loaders for x_value in x.values]
@@ -1050,4 +1093,6 @@ def load_grid_scenario(
     Raises:
         ScenarioError: The scenario is not valid with these values.
     """
-    return plan.scenario(*fixed, format_override(x, x_value), format_override(y, y_value))
+    x_override = format_override(x, x_value)
+    y_override = format_override(y, y_value)
+    return plan.scenario(*fixed, x_override, y_override)
