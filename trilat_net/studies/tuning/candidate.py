@@ -97,10 +97,12 @@ def check_comparable(scenario: Scenario) -> None:
     t_s = np.arange(0.0, scenario.duration_s, 1.0 / _POSE_SAMPLES_HZ)
     pose_rad = compute_consensus_pose(scenario, t_s)
     for spring in _list_springs(scenario, t_s):
-        pulls = spring.acts * (spring.stiffness_nm_rad > 0.0)
+        has_stiffness = spring.stiffness_nm_rad > 0.0
+        pulls = spring.acts * has_stiffness
         conflict_rad = np.abs(spring.target_rad - pose_rad) * pulls
         if conflict_rad.max(initial=0.0) > CONFLICT_RAD:
-            worst_s = t_s[conflict_rad.max(axis=1).argmax()]
+            largest_rad = conflict_rad.max(axis=1)
+            worst_s = t_s[largest_rad.argmax()]
             raise ScenarioError(
                 f"at {worst_s:g} s this hand pulls towards a different pose from the other "
                 "hands: no law can bring the arms together, so their distance says nothing "
@@ -153,25 +155,30 @@ def compute_consensus_pose(scenario: Scenario, t_s: Array) -> Array:
     """
     beta = left_perron_vector(scenario.alpha)
     weights = dict(zip(scenario.names, beta, strict=True))
-    weighted_starts = [
-        weights[name] * np.array(spec.q0_rad) for name, spec in scenario.sites.items()
-    ]
+    weighted_starts = []
+    for name, spec in scenario.sites.items():
+        q0_rad = np.array(spec.q0_rad)
+        weighted_starts.append(weights[name] * q0_rad)
     start_rad = np.sum(weighted_starts, axis=0)
 
-    stiffness = np.zeros((len(t_s), len(start_rad)))
-    torque = np.zeros((len(t_s), len(start_rad)))
+    shape = (len(t_s), len(start_rad))
+    stiffness = np.zeros(shape)
+    torque = np.zeros(shape)
     for spring in _list_springs(scenario, t_s):
-        weighted_stiffness = weights[spring.site] * spring.stiffness_nm_rad * spring.acts
+        weight = weights[spring.site]
+        weighted_stiffness = weight * spring.stiffness_nm_rad * spring.acts
         stiffness += weighted_stiffness
         torque += weighted_stiffness * spring.target_rad
     is_held = stiffness > 0.0
-    held_pose_rad = np.divide(torque, stiffness, where=is_held, out=np.zeros_like(torque))
+    no_pose_rad = np.zeros_like(torque)
+    held_pose_rad = np.divide(torque, stiffness, where=is_held, out=no_pose_rad)
 
     # A joint keeps the pose of the last time at which a spring held it. Row 0 is the start
     # pose, for joints that no spring has held yet.
     poses_rad = np.vstack([start_rad, held_pose_rad])
     row_numbers = np.arange(1, len(t_s) + 1)[:, np.newaxis]
-    last_held = np.maximum.accumulate(np.where(is_held, row_numbers, 0), axis=0)
+    held_rows = np.where(is_held, row_numbers, 0)
+    last_held = np.maximum.accumulate(held_rows, axis=0)
     return np.take_along_axis(poses_rad, last_held, axis=0)
 
 
@@ -322,7 +329,8 @@ def check_final_posture(log: Log) -> list[str]:
         return [f"{', '.join(diverged)} diverged: its figures end there"]
 
     warnings = []
-    end_s = min((float(part.t_s[-1]) for part in parts.values()), default=0.0)
+    end_times_s = [float(part.t_s[-1]) for part in parts.values()]
+    end_s = min(end_times_s, default=0.0)
     planned_s = log.scenario.duration_s
     if end_s <= planned_s - _SHORT_S:
         warnings.append(
@@ -369,7 +377,8 @@ def _warn_fallen(log: Log, end_poses_rad: dict[str, Array]) -> list[str]:
     end_s = min(float(log[site].t_s[-1]) for site in end_poses_rad)
     t_s = np.linspace(0.0, end_s, _POSE_SAMPLES)
     mean_rad = np.mean(list(end_poses_rad.values()), axis=0)
-    distance_rad = np.abs(mean_rad - compute_consensus_pose(scenario, t_s)[-1])
+    consensus_rad = compute_consensus_pose(scenario, t_s)
+    distance_rad = np.abs(mean_rad - consensus_rad[-1])
     joint = int(distance_rad.argmax())
     if distance_rad[joint] <= STRAYED_RAD:
         return []
@@ -433,7 +442,8 @@ def average_scores(scores: Sequence[CandidateScore]) -> CandidateScore:
     intervals = {}
     means = {}
     for field in _AVERAGED:
-        interval = mean_interval([getattr(score, field) for score in scores])
+        values = [getattr(score, field) for score in scores]
+        interval = mean_interval(values)
         intervals[field] = interval
         means[field] = None if interval is None else interval.mean
     error = intervals["error_rad"]
@@ -527,12 +537,13 @@ def _measure_run(scenario: Scenario) -> _RunMeasures:
     from_mean_rad = q - mean_rad
     from_pose_rad = mean_rad - compute_consensus_pose(scenario, t_s)
     in_last_second = t_s > t_s[-1] - END_WINDOW_S
+    final_distance_rad = np.abs(from_mean_rad[:, in_last_second])
 
     effort_nm, saturated = _measure_torques(scenario, records)
     return _RunMeasures(
         end=end,
         fall_rad=_predict_fall_rad(t_s, from_pose_rad),
-        apart_rad=float(np.abs(from_mean_rad[:, in_last_second]).max()),
+        apart_rad=float(final_distance_rad.max()),
         spread_rad=_rms(from_mean_rad),
         pose_rad=_rms(from_pose_rad),
         effort_nm=effort_nm,
@@ -554,13 +565,17 @@ def _predict_fall_rad(t_s: Array, from_pose_rad: Array) -> float:
     Returns:
         The distance, the largest over the joints, in rad.
     """
-    half_s = 0.5 * t_s[-1]
-    at_end = t_s > t_s[-1] - END_WINDOW_S
+    end_s = t_s[-1]
+    half_s = 0.5 * end_s
+    at_end = t_s > end_s - END_WINDOW_S
     at_half = (t_s > half_s - END_WINDOW_S) & (t_s <= half_s + 1e-9)
-    end_rad = np.abs(from_pose_rad[at_end].mean(axis=0))
-    half_rad = np.abs(from_pose_rad[at_half].mean(axis=0))
+    mean_at_end_rad = from_pose_rad[at_end].mean(axis=0)
+    mean_at_half_rad = from_pose_rad[at_half].mean(axis=0)
+    end_rad = np.abs(mean_at_end_rad)
+    half_rad = np.abs(mean_at_half_rad)
     growth_rad = np.maximum(end_rad - half_rad, 0.0)
-    return float((end_rad + 2.0 * growth_rad).max())
+    predicted_rad = end_rad + 2.0 * growth_rad
+    return float(predicted_rad.max())
 
 
 def _find_settling_time(t_s: Array, e: Array) -> float | None:
@@ -595,11 +610,15 @@ def _measure_torques(scenario: Scenario, records: Sequence[RecordBatch]) -> tupl
     mean_squares = []
     saturated_shares = []
     for record, site in zip(records, scenario.names, strict=True):
-        gravity_nm = build_arm_rows(scenario, site).gravity_torque(record.q)
-        mean_squares.append(np.mean((record.tau - gravity_nm) ** 2))
-        limit_nm = scenario.sites[site].limits.tau_limit_nm
-        saturated_shares.append(np.mean(np.abs(record.tau) >= limit_nm))
-    return float(np.sqrt(np.mean(mean_squares))), float(np.mean(saturated_shares))
+        arm = build_arm_rows(scenario, site)
+        effort_nm = record.tau - arm.gravity_torque(record.q)
+        mean_squares.append(np.mean(effort_nm**2))
+        limits = scenario.sites[site].limits
+        is_saturated = np.abs(record.tau) >= limits.tau_limit_nm
+        saturated_shares.append(np.mean(is_saturated))
+    rms_effort_nm = np.sqrt(np.mean(mean_squares))
+    saturated_share = np.mean(saturated_shares)
+    return float(rms_effort_nm), float(saturated_share)
 
 
 def _sample_at_common_times(records: Sequence[RecordBatch]) -> tuple[Array, Array, Array]:
@@ -621,7 +640,8 @@ def _sample_at_common_times(records: Sequence[RecordBatch]) -> tuple[Array, Arra
     q = []
     e = []
     for record in records:
-        latest = np.searchsorted(record.t_ns, times_ns, side="right") - 1
+        next_indices = np.searchsorted(record.t_ns, times_ns, side="right")
+        latest = next_indices - 1
         q.append(record.q[latest])
         e.append(record.e[latest])
     return times_ns / NS_PER_S, np.array(q), np.array(e)
@@ -688,7 +708,8 @@ class TuningScenario(NamedTuple):
             knowledge: What the law is told about the arm, such as its gravity parameters.
             gains: Values of the gains, by their names.
         """
-        return self.with_controls(space.controls(self.scenario, knowledge, gains))
+        controls = space.controls(self.scenario, knowledge, gains)
+        return self.with_controls(controls)
 
     @property
     def texts(self) -> tuple[str, str | None]:
@@ -698,12 +719,14 @@ class TuningScenario(NamedTuple):
         without a target pose. Its text is None if the scenario has no such parts.
         """
         twin = build_twin(self.scenario)
-        return self.scenario.text, None if twin is None else twin.text
+        twin_text = None if twin is None else twin.text
+        return self.scenario.text, twin_text
 
     @property
     def command(self) -> str:
         """The command with which a user can simulate the scenario and record a log."""
-        return format_command("sim", self.source, *set_options(self.overrides))
+        options = set_options(self.overrides)
+        return format_command("sim", self.source, *options)
 
 
 class CandidateItem(NamedTuple):
@@ -729,8 +752,10 @@ def build_candidate_item(seeds: Sequence[TuningScenario]) -> CandidateItem:
     Args:
         seeds: The scenario with the law and its gains, once for each random seed. At least one.
     """
-    name = ", ".join(seeds[0].overrides) or seeds[0].source
-    return CandidateItem(tuple(seed.texts for seed in seeds), name)
+    first = seeds[0]
+    name = ", ".join(first.overrides) or first.source
+    runs = tuple(seed.texts for seed in seeds)
+    return CandidateItem(runs, name)
 
 
 def measure_candidate_task(task: CandidateItem) -> CandidateScore:
@@ -758,4 +783,5 @@ def load_tuning_scenario(
         ScenarioError: The scenario does not exist, or is not valid with the overrides.
     """
     experiment = read_experiment(source)
-    return TuningScenario(experiment, tuple(overrides), experiment.load(overrides))
+    scenario = experiment.load(overrides)
+    return TuningScenario(experiment, tuple(overrides), scenario)
