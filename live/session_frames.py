@@ -84,7 +84,8 @@ class ArmFrames:
         self._walls = list_walls(self._spec)
         self._hand = self._spec.find_live_hand()
         limits_nm = np.asarray(self._spec.limits.tau_limit_nm, dtype=np.float64)
-        self._tau_limit = np.broadcast_to(limits_nm, (self._model.counts.joints,))
+        joint_count = self._model.counts.joints
+        self._tau_limit = np.broadcast_to(limits_nm, (joint_count,))
         self._rows = build_arm_rows(scenario, site)
 
     def describe(self) -> Json:
@@ -98,23 +99,32 @@ class ArmFrames:
         spec = self._spec
         colours = self._scenario.assign_colours(COLOURS)
         site_number = self._scenario.names.index(self._site)
+        colour = colours[site_number % len(colours)]
+        up = None
+        if model.chain is not None:
+            up_axes = upright_axes(model.chain)
+            up = _round(up_axes)
         q0 = np.array([spec.q0_rad], dtype=np.float64)
         start_m = joint_positions_m(model, q0)[0]
         link_vectors_m = np.diff(start_m, axis=0)
         link_lengths_m = np.linalg.norm(link_vectors_m, axis=1)
+        reach_m = float(link_lengths_m.sum())
         body_sizes_m = self._scenario.bodies_m(self._site).values()
+        walls: list[Json] = []
+        for wall in self._walls:
+            walls.append({"at": list(wall.a), "normal": list(wall.b)})
         return {
             "role": spec.role,
-            "colour": colours[site_number % len(colours)],
+            "colour": colour,
             "rate_hz": spec.rate_hz,
             "planar": model.chain is None,
-            "up": None if model.chain is None else _round(upright_axes(model.chain)),
+            "up": up,
             "joints": len(spec.q0_rad),
             "start": _round(start_m),
-            "reach": float(link_lengths_m.sum()),
+            "reach": reach_m,
             "tau_limit": _round(self._tau_limit),
             "bodies": [list(size) for size in body_sizes_m],
-            "walls": [{"at": list(wall.a), "normal": list(wall.b)} for wall in self._walls],
+            "walls": walls,
             "task": model.shares_pose,
             "unit": "m" if model.shares_pose else "rad",
             "hand": self._describe_hand(),
@@ -128,18 +138,21 @@ class ArmFrames:
         if hand is None:
             return None
         device = hand.device
+        axis_count = self._model.counts.axes
         centre, _, outer_m, *_ = self._model.reach
+        # JSON has no infinity.
+        longest_m = outer_m if outer_m < math.inf else None
         return {
             "mode": hand.mode,
             "limit": hand.actor.limit,
             "device": {
-                "rows": device.rows(self._model.counts.axes),
+                "rows": device.rows(axis_count),
                 "scale": device.scale,
                 "jump_m_s": device.jump_m_s,
             },
             "reach": {
                 "centre": list(centre),
-                "most": outer_m if outer_m < math.inf else None,
+                "most": longest_m,
             },
         }
 
@@ -153,8 +166,12 @@ class ArmFrames:
             The points between the links of the arm in m, and the joint positions, as plain
             values for JSON.
         """
-        points_m = joint_positions_m(self._model, q[np.newaxis])[0]
-        return {"points": _round(points_m), "q": _round(q)}
+        rows = q[np.newaxis]
+        points_m = joint_positions_m(self._model, rows)[0]
+        return {
+            "points": _round(points_m),
+            "q": _round(q),
+        }
 
     def describe_start(self) -> Json:
         """Computes where the joints of the arm are before the first tick of the session.
@@ -162,8 +179,13 @@ class ArmFrames:
         Returns:
             The pose as `describe_pose` returns it, with the tick -1 and no bodies.
         """
-        pose = self.describe_pose(np.array(self._spec.q0_rad, dtype=np.float64))
-        return {**pose, "tick": -1, "bodies": []}
+        q0 = np.array(self._spec.q0_rad, dtype=np.float64)
+        pose = self.describe_pose(q0)
+        return {
+            **pose,
+            "tick": -1,
+            "bodies": [],
+        }
 
     def describe_now(self, records: AlignedRecords) -> tuple[Json, list[float]]:
         """Describes the present state of the arm, and the peaks since the previous frame.
@@ -184,17 +206,23 @@ class ArmFrames:
         wall_force_n = self._compute_wall_force(records, split)
         error_norm = np.linalg.norm(records.e, axis=1)
         torque_size = np.abs(records.tau)
-        is_at_limit = torque_size >= self._tau_limit * (1.0 - 1e-12)
+        full_torque = self._tau_limit * (1.0 - 1e-12)
+        is_at_limit = torque_size >= full_torque
+        present_pose = self.describe_pose(records.q[-1])
+        reference_m = self._place_reference(records)
+        present_torque = records.tau[-1]
+        present_hand_force = hand_force[-1]
+        present_grip = self._describe_grip(records, present_hand_force)
         state = {
-            **self.describe_pose(records.q[-1]),
-            "ghost": _round(self._place_reference(records)),
+            **present_pose,
+            "ghost": _round(reference_m),
             "e": float(error_norm[-1]),
-            "tau": _round(records.tau[-1], 3),
+            "tau": _round(present_torque, 3),
             "clamped": bool(is_at_limit.any()),
-            "hand": _round(hand_force[-1], 3),
+            "hand": _round(present_hand_force, 3),
             "pull": self._compute_pull(records, split),
             "wall": _round(wall_force_n[-1], 3),
-            **self._describe_grip(records, hand_force[-1]),
+            **present_grip,
         }
         hand_force_size = np.linalg.norm(hand_force, axis=1)
         wall_force_size = np.linalg.norm(wall_force_n, axis=1)
@@ -214,10 +242,12 @@ class ArmFrames:
         """
         points_m: Array
         if self._model.shares_pose:
-            points_m = records.q_des[-1, :3][np.newaxis] / self._spec.task.scale
+            shared_position = records.q_des[-1, :3]
+            points_m = shared_position[np.newaxis] / self._spec.task.scale
         else:
-            last = slice(len(records.known) - 1, None)
-            points_m = joint_positions_m(self._model, records.q_des[last])[0]
+            last_index = len(records.known) - 1
+            last_reference = records.q_des[last_index:]
+            points_m = joint_positions_m(self._model, last_reference)[0]
         return points_m
 
     def _describe_grip(self, records: AlignedRecords, force: Array) -> Json:
@@ -229,18 +259,21 @@ class ArmFrames:
         """
         if not records.hand.size:
             return {}
-        grip = HandInForce.read(records.hand[-1].tolist())
+        last_values = records.hand[-1].tolist()
+        grip = HandInForce.read(last_values)
         hand = self._hand
         is_limited = False
         if hand is not None and hand.mode != "joint" and grip.source:
             force_size_n = float(np.linalg.norm(force))
-            limit_n = grip.grip * hand.force_limit_n * (1.0 - 1e-6)
-            is_limited = force_size_n >= limit_n
-        has_target = hand is not None and hand.mode == "tip" and grip.grip > 0.0
+            limit_n = grip.grip * hand.force_limit_n
+            is_limited = force_size_n >= limit_n * (1.0 - 1e-6)
+        pulls_tip = hand is not None and hand.mode == "tip"
+        has_target = pulls_tip and grip.grip > 0.0
+        target = grip.target if has_target else None
         return {
             "grip": grip.grip,
             "source": grip.source,
-            "target": grip.target if has_target else None,
+            "target": target,
             "hand_limited": is_limited,
         }
 
@@ -249,8 +282,10 @@ class ArmFrames:
         torque = split.operator
         if not self._spec.hands:
             # Without a hand in the scenario, a tiny torque is a rounding error of the split.
-            rounding_nm = 1e-9 * (1.0 + np.abs(records.tau_x).max())
-            if np.abs(torque).max() < rounding_nm:
+            largest_external_nm = np.abs(records.tau_x).max()
+            rounding_nm = 1e-9 * (1.0 + largest_external_nm)
+            largest_torque_nm = np.abs(torque).max()
+            if largest_torque_nm < rounding_nm:
                 return np.zeros_like(split.end_effector.position)
         return split.end_effector.find_force(torque, _MIN_SINGULAR_SHARE)
 
@@ -265,10 +300,17 @@ class ArmFrames:
         if not self._spec.arm.known:
             return []
         motion = split.end_effector
-        last = EndEffectorRows(motion.position[-1:], motion.speed[-1:], motion.J[-1:])
-        torque = records.tau[-1:] - self._rows.gravity_torque(records.q[-1:])
-        force = last.find_force(torque, _MIN_SINGULAR_SHARE)[0]
-        return _round(force, 3)
+        last_motion = EndEffectorRows(
+            position=motion.position[-1:],
+            speed=motion.speed[-1:],
+            J=motion.J[-1:],
+        )
+        last_q = records.q[-1:]
+        gravity_torque = self._rows.gravity_torque(last_q)
+        law_torque = records.tau[-1:] - gravity_torque
+        forces = last_motion.find_force(law_torque, _MIN_SINGULAR_SHARE)
+        last_force = forces[0]
+        return _round(last_force, 3)
 
     def _compute_wall_force(self, records: AlignedRecords, split: TorqueSplit) -> Array:
         """Returns the force of all walls at the end effector, shape (K, 2) or (K, 3), in N."""
@@ -321,7 +363,10 @@ class SessionFrames:
         scenario = view.scenario
         # Prepared before the session runs, because loading the compiled arms takes seconds.
         if scenario is not None and not self._arms:
-            self._arms = {site: ArmFrames(scenario, site) for site in scenario.names}
+            arms: dict[str, ArmFrames] = {}
+            for site in scenario.names:
+                arms[site] = ArmFrames(scenario, site)
+            self._arms = arms
             for site, arm in self._arms.items():
                 self._arm_constants[site] = arm.describe()
         if scenario is None or not view.running:
@@ -330,6 +375,12 @@ class SessionFrames:
         for site in scenario.names:
             columns += [f"{site}.{kind}" for kind in ("e", "tau", "hand", "wall")]
         columns += [f"{link}.age" for link in scenario.links]
+        link_ends: dict[str, list[str]] = {}
+        for link in scenario.links:
+            link_ends[link] = link.split("->")
+        shares: Json = {}
+        for site in scenario.names:
+            shares[site] = scenario.dominance[site]
         return {
             "running": True,
             "session": view.session,
@@ -338,8 +389,8 @@ class SessionFrames:
             "about": scenario.about,
             "duration_s": scenario.duration_s,
             "sites": self._arm_constants,
-            "links": {name: list(name.split("->")) for name in scenario.links},
-            "shares": {site: scenario.dominance[site] for site in scenario.names},
+            "links": link_ends,
+            "shares": shares,
             "columns": columns,
         }
 
@@ -347,12 +398,16 @@ class SessionFrames:
         """Returns the members of a session that has not begun."""
         members = self._view.members
         names = [] if scenario is None else scenario.names
+        missing: list[str] = []
+        for name in names:
+            if name not in members:
+                missing.append(name)
         return {
             "session": self._view.session,
             "running": False,
             "title": "",
             "here": sorted(members),
-            "missing": [name for name in names if name not in members],
+            "missing": missing,
         }
 
     def make_frame(self) -> Json | None:
@@ -380,24 +435,34 @@ class SessionFrames:
             point += extremes
         links = {name: self._describe_link(name) for name in view.links}
         point += [link["age_ms"] for link in links.values()]
-        if any(site["new"] for site in sites.values()):
+        has_new_records = any(site["new"] for site in sites.values())
+        if has_new_records:
             self._add_point(t_s, point)
         self._add_energies()
+        energy_problem = ""
+        if view.energy is not None:
+            energy_problem = view.energy.reason
+        silence_s = 0.0
+        if not view.ended:
+            silence_s = round(view.session_silence_s, 1)
         return {
             "t": t_s,
             "sites": sites,
             "links": links,
             "shares": view.dominance,
-            "energy": "" if view.energy is None else view.energy.reason,
+            "energy": energy_problem,
             "ended": view.ended,
-            "silent_s": 0.0 if view.ended else round(view.session_silence_s, 1),
+            "silent_s": silence_s,
             "dropped": sum(view.dropped.values()),
         }
 
     def _add_point(self, t_s: float, values: list[float | None]) -> None:
         """Adds a point to the plots, with values of five digits."""
-        rounded = [None if value is None else float(f"{value:.5g}") for value in values]
-        self.points.add([round(t_s, 4), *rounded])
+        point: list[float | None] = [round(t_s, 4)]
+        for value in values:
+            rounded = None if value is None else float(f"{value:.5g}")
+            point.append(rounded)
+        self.points.add(point)
 
     def _add_energies(self) -> None:
         """Adds points to the energy plot, at most one per `ENERGY_PERIOD_S`."""
@@ -406,7 +471,8 @@ class SessionFrames:
             return
         columns = [column.tolist() for column in course]
         for t_s, V, supplied in zip(*columns, strict=True):
-            if t_s >= self._energy_s + ENERGY_PERIOD_S - 1e-9:
+            next_point_s = self._energy_s + ENERGY_PERIOD_S
+            if t_s >= next_point_s - 1e-9:
                 self._energy_s = t_s
                 self.energies.add([t_s, V, supplied])
 
@@ -422,7 +488,12 @@ class SessionFrames:
         constants = self.describe()
         if not constants["running"]:
             return constants
-        hidden: Json = {"about": "", "links": {}, "shares": {}, "columns": []}
+        hidden: Json = {
+            "about": "",
+            "links": {},
+            "shares": {},
+            "columns": [],
+        }
         return {**constants, **hidden}
 
     def describe_as(self, frame: Json, site: str, *, ages: bool) -> Json:
@@ -448,7 +519,8 @@ class SessionFrames:
                 continue
             peer = self._describe_peer(site, name, ticks[name])
             if ages:
-                peer = {**peer, "age_ms": self._compute_age_ms(name, peer["tick"], local["t"])}
+                age_ms = self._compute_age_ms(name, peer["tick"], local["t"])
+                peer = {**peer, "age_ms": age_ms}
             sites[name] = peer
         return {
             "t": local["t"],
@@ -474,7 +546,8 @@ class SessionFrames:
         if tick < 0:
             return None
         rate_hz = self._view.sites[site].window.rate_hz
-        age_ms: float = t_s * 1e3 - tick * 1e3 / rate_hz
+        record_ms = tick * 1e3 / rate_hz
+        age_ms: float = t_s * 1e3 - record_ms
         return age_ms
 
     def _describe_peer(self, site: str, peer: str, tick: int) -> Json:
@@ -482,12 +555,19 @@ class SessionFrames:
 
         If the record of that tick is missing, the pose is that of the previous frame.
         """
-        pose = self._peer_poses.get((site, peer)) or self._arms[peer].describe_start()
+        arm = self._arms[peer]
+        pose = self._peer_poses.get((site, peer)) or arm.describe_start()
         view = self._view.sites[peer]
         if tick != pose["tick"] and view.window.has_record(tick):
-            q = view.window.rows(tick, tick).q[0]
-            bodies = self._turns[site, peer].align(view.bodies.get(tick, []))
-            pose = {**self._arms[peer].describe_pose(q), "tick": tick, "bodies": _round(bodies)}
+            record = view.window.rows(tick, tick)
+            joint_pose = arm.describe_pose(record.q[0])
+            body_poses = view.bodies.get(tick, [])
+            bodies = self._turns[site, peer].align(body_poses)
+            pose = {
+                **joint_pose,
+                "tick": tick,
+                "bodies": _round(bodies),
+            }
         self._peer_poses[site, peer] = pose
         return pose
 
@@ -498,10 +578,18 @@ class SessionFrames:
         assert record is not None
         state, extremes, has_new_records = self._describe_new_records(name, site)
         has_ended = self._view.ended
-        alarm = None if has_ended else site.find_alarm(self._view.session, name)
+        alarm = None
+        silence_s = 0.0
+        if not has_ended:
+            alarm = site.find_alarm(self._view.session, name)
+            silence_s = round(self._view.silence_s(site), 1)
         bodies = self._turns["", name].align(record.bodies)
         # A view that joined late does not know how many earlier records are missing.
-        missing = site.reception.accounts["state"].missing if site.first_tick == 0 else 0
+        missing = 0
+        if site.first_tick == 0:
+            state_account = site.reception.accounts["state"]
+            missing = state_account.missing
+        holder = site.holder if state.get("source") else ""
         fields = {
             **state,
             "new": has_new_records,
@@ -512,8 +600,8 @@ class SessionFrames:
             "bodies": _round(bodies),
             "alarm": None if alarm is None else _describe_alarm(alarm),
             "ended": site.ended or has_ended,
-            "silent_s": 0.0 if has_ended else round(self._view.silence_s(site), 1),
-            "holder": site.holder if state.get("source") else "",
+            "silent_s": silence_s,
+            "holder": holder,
             "late_us": stats.late_max_us if stats else 0,
             "overruns": stats.overruns if stats else 0,
             "missing": missing,
@@ -534,12 +622,14 @@ class SessionFrames:
         previous_tick = self._last_ticks.get(name, -1)
         self._last_ticks[name] = newest_tick
         # After a pause, only the last `MAX_FRAME_S` are evaluated: a frame must be fast.
-        earliest_tick = newest_tick - round(MAX_FRAME_S * window.rate_hz)
+        most_ticks = round(MAX_FRAME_S * window.rate_hz)
+        earliest_tick = newest_tick - most_ticks
         next_tick = min(previous_tick + 1, newest_tick)
         first_tick = max(next_tick, earliest_tick, window.first)
         records = window.rows(first_tick, newest_tick)
         state, extremes = self._arms[name].describe_now(records)
-        return state, extremes, newest_tick > previous_tick
+        has_new_records = newest_tick > previous_tick
+        return state, extremes, has_new_records
 
     def _describe_link(self, name: str) -> Json:
         """Returns the present state of a link: age of samples, settings and counts."""
@@ -553,23 +643,27 @@ class SessionFrames:
         if record is not None:
             used_tick = record.used.get(peer, -1)
             if used_tick >= 0:
-                age_ms = record.t_ns / 1e6 - used_tick * 1e3 / sending.window.rate_hz
-        newest_tick = sending.record.tick if sending.record else used_tick
+                used_ms = used_tick * 1e3 / sending.window.rate_hz
+                age_ms = record.t_ns / 1e6 - used_ms
+        newest_tick = used_tick
+        if sending.record:
+            newest_tick = sending.record.tick
         samples_under_way = 0
         if used_tick >= 0:
-            samples_under_way = max(0, min(newest_tick - used_tick, 100_000))
-        settings = view.links[name]
-        stated = {
-            key: value
-            for key, value in settings.items()
-            if isinstance(value, str | int | float)
-        }
+            newer_samples = min(newest_tick - used_tick, 100_000)
+            samples_under_way = max(0, newer_samples)
+        stated: Json = {}
+        for key, value in view.links[name].items():
+            if isinstance(value, str | int | float):
+                stated[key] = value
+        shares = view.dominance.get(receiver, {})
+        sample_counts = _count_samples(receiving, peer)
         return {
             "age_ms": age_ms,
             "under_way": samples_under_way,
             "stated": stated,
-            "share": view.dominance.get(receiver, {}).get(peer, 0.0),
-            **_count_samples(receiving, peer),
+            "share": shares.get(peer, 0.0),
+            **sample_counts,
         }
 
 
@@ -593,7 +687,12 @@ def _describe_alarm(alarm: LifeAlarm) -> Json:
     a shell command.
     """
     advice = alarm.before if alarm.order else alarm.advice
-    return {"word": alarm.word, "reason": alarm.reason, "advice": advice, "order": alarm.order}
+    return {
+        "word": alarm.word,
+        "reason": alarm.reason,
+        "advice": advice,
+        "order": alarm.order,
+    }
 
 
 def render_event(event: Event) -> Json:
@@ -607,4 +706,9 @@ def render_event(event: Event) -> Json:
     """
     t_s = None if event.t_ns < 0 else event.t_ns / NS_PER_S
     text = describe_event(event.kind, event.text, event.command)
-    return {"t": t_s, "member": event.member, "kind": event.kind, "text": text}
+    return {
+        "t": t_s,
+        "member": event.member,
+        "kind": event.kind,
+        "text": text,
+    }
