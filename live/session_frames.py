@@ -112,7 +112,9 @@ class ArmFrames:
         body_sizes_m = self._scenario.bodies_m(self._site).values()
         walls: list[Json] = []
         for wall in self._walls:
-            walls.append({"at": list(wall.a), "normal": list(wall.b)})
+            point_m = list(wall.a)
+            normal = list(wall.b)
+            walls.append({"at": point_m, "normal": normal})
         return {
             "role": spec.role,
             "colour": colour,
@@ -398,10 +400,7 @@ class SessionFrames:
         """Returns the members of a session that has not begun."""
         members = self._view.members
         names = [] if scenario is None else scenario.names
-        missing: list[str] = []
-        for name in names:
-            if name not in members:
-                missing.append(name)
+        missing = [name for name in names if name not in members]
         return {
             "session": self._view.session,
             "running": False,

@@ -167,10 +167,14 @@ class HandImpedance(Result):
         yield self._tabulate_matrices()
         sine_rows = [_format_response(response) for response in self.responses]
         heads = ("sine", "motion", "force", "coherence", "unexplained")
-        yield TextTable(heads, sine_rows, "r", ("Hz", "mm", "N"))
-        settings = [f"{key} = {json.dumps(value)}" for key, value in self.to_hand().items()]
-        hand = ", ".join(settings)
-        yield f"in a scenario, without its mass: hands = [{{ {hand} }}]"
+        units = ("Hz", "mm", "N")
+        yield TextTable(heads, sine_rows, "r", units)
+        settings: list[str] = []
+        for key, value in self.to_hand().items():
+            text = json.dumps(value)
+            settings.append(f"{key} = {text}")
+        table = ", ".join(settings)
+        yield f"in a scenario, without the mass of the hand: hands = [{{ {table} }}]"
 
     def _tabulate_matrices(self) -> TextTable:
         """Returns a table with a row for each of M, B and K, and a column for each entry.
@@ -185,8 +189,12 @@ class HandImpedance(Result):
         for letter, unit in UNITS.items():
             matrix = getattr(self, letter)
             half = self.halves[letter]
-            cells = [f"{matrix[entry]:.4g} +- {half[entry]:.2g}" for entry in entries]
-            rows.append((f"{letter}, {unit}", *cells))
+            cells = [f"{letter}, {unit}"]
+            for entry in entries:
+                value = matrix[entry]
+                half_width = half[entry]
+                cells.append(f"{value:.4g} +- {half_width:.2g}")
+            rows.append(tuple(cells))
         return TextTable(("", *heads), rows, align="lr")
 
 
@@ -197,7 +205,11 @@ def _format_response(response: SineResponse) -> tuple[str, ...]:
 
 def _round_diagonal(matrix: Array) -> list[float]:
     """Returns the diagonal of a matrix with four digits, where negative entries become 0."""
-    return [max(0.0, float(f"{value:.4g}")) for value in np.diag(matrix)]
+    rounded: list[float] = []
+    for value in np.diag(matrix):
+        four_digits = float(f"{value:.4g}")
+        rounded.append(max(0.0, four_digits))
+    return rounded
 
 
 def identify_hand(log: Log | str | Path, site: str = "m1") -> HandImpedance:
@@ -220,7 +232,8 @@ def identify_hand(log: Log | str | Path, site: str = "m1") -> HandImpedance:
         UsageError: The run has no such arm or no sines, the run is too short, or the motion
             along some axes is too similar to separate them.
     """
-    log = log if isinstance(log, Log) else open_log(log)
+    if not isinstance(log, Log):
+        log = open_log(log)
     scenario = log.scenario
     find_site(scenario, site)
     sines = _find_sines(scenario)
@@ -229,9 +242,11 @@ def identify_hand(log: Log | str | Path, site: str = "m1") -> HandImpedance:
 
     # A segment lasts two periods of the smallest spacing between frequencies (or of the lowest
     # frequency), so that the window separates the sines.
-    spacing_hz = np.diff(np.concatenate([[0.0], sines.hz]))
-    segment_s = float(np.round(2.0 / spacing_hz.min(), 9))
-    signals = np.hstack((force, position))[records.t_s < sines.end_s]
+    frequencies_hz = np.concatenate([[0.0], sines.hz])
+    smallest_spacing_hz = np.diff(frequencies_hz).min()
+    segment_s = float(np.round(2.0 / smallest_spacing_hz, 9))
+    is_before_end = records.t_s < sines.end_s
+    signals = np.hstack((force, position))[is_before_end]
     phasors = _compute_phasors(
         records=records,
         signals=signals,
@@ -241,7 +256,8 @@ def identify_hand(log: Log | str | Path, site: str = "m1") -> HandImpedance:
     )
     if len(phasors) < MIN_SEGMENTS:
         segments = count_nouns(len(phasors), "whole segment")
-        needed_s = sines.start_s + (0.5 * MIN_SEGMENTS + 1.0) * segment_s
+        needed_segments = 0.5 * MIN_SEGMENTS + 1.0
+        needed_s = sines.start_s + needed_segments * segment_s
         raise UsageError(
             f"{site}: the log has {segments} of {segment_s:g} s in which the sines act, but "
             f"the confidence intervals need {MIN_SEGMENTS}: record a run of at least "
@@ -250,14 +266,16 @@ def identify_hand(log: Log | str | Path, site: str = "m1") -> HandImpedance:
 
     axis_count = force.shape[1]
     F, X = np.split(np.array(phasors), [axis_count], axis=2)
-    fit = _fit_with_intervals(site, F, X, 2.0 * np.pi * sines.hz)
+    rates_rad_s = 2.0 * np.pi * sines.hz
+    fit = _fit_with_intervals(site, F, X, rates_rad_s)
     M, B, K = fit.matrices
+    halves = dict(zip(UNITS, fit.halves, strict=True))
     return HandImpedance(
         site=site,
         M=M,
         B=B,
         K=K,
-        halves=dict(zip(UNITS, fit.halves, strict=True)),
+        halves=halves,
         segments=len(phasors),
         segment_s=segment_s,
         responses=_list_responses(F, X, sines.hz, fit.unexplained),
@@ -275,9 +293,13 @@ def _list_responses(
         hz: The F frequencies, in Hz.
         unexplained: Fraction of the force that the fit does not explain, shape (F,).
     """
-    coherence = np.minimum(_compute_coherence(F), _compute_coherence(X))
-    motion_mm = 1e3 * np.linalg.norm(X.mean(axis=0), axis=1)
-    force_n = np.linalg.norm(F.mean(axis=0), axis=1)
+    force_coherence = _compute_coherence(F)
+    motion_coherence = _compute_coherence(X)
+    coherence = np.minimum(force_coherence, motion_coherence)
+    mean_motion = X.mean(axis=0)
+    motion_mm = 1e3 * np.linalg.norm(mean_motion, axis=1)
+    mean_force = F.mean(axis=0)
+    force_n = np.linalg.norm(mean_force, axis=1)
     responses: list[SineResponse] = []
     for index, frequency_hz in enumerate(hz):
         response = SineResponse(
@@ -311,16 +333,19 @@ def _find_sines(scenario: Scenario) -> _Sines:
     Raises:
         UsageError: The scenario has no sines.
     """
-    hands = [hand for spec in scenario.sites.values() for hand in spec.hands]
-    multisines = [hand for hand in hands if isinstance(hand, Multisine)]
+    multisines: list[Multisine] = []
+    for spec in scenario.sites.values():
+        multisines += [hand for hand in spec.hands if isinstance(hand, Multisine)]
     if not multisines:
         raise UsageError(
             "no operator of kind 'multisine' in the scenario moves an arm, so that the "
             "reaction of a hand cannot be distinguished from its own movements (docs/ports.md)"
         )
-    frequencies = [float(hz) for multisine in multisines for hz in multisine.frequencies_hz]
+    frequencies_hz: list[float] = []
+    for multisine in multisines:
+        frequencies_hz += map(float, multisine.frequencies_hz)
     return _Sines(
-        hz=np.unique(frequencies),
+        hz=np.unique(frequencies_hz),
         start_s=max(multisine.start_s for multisine in multisines),
         end_s=min(multisine.end_s for multisine in multisines),
     )
@@ -340,17 +365,19 @@ def _compute_hand_force(records: AlignedRecords, scenario: Scenario) -> tuple[Ar
         The force in N and the position in m, shape (K, n) each for K records.
     """
     split = split_torque(records, scenario)
+    end_effector = split.end_effector
     scripted_torque = np.zeros_like(records.q)
     for hand in scenario.sites[records.site].hands:
         source = hand.actor
         if source.kind in SCRIPTED_KINDS:
-            first_jacobian = split.end_effector.J[0]
             scripted_torque += compute_operator_script(
-                source, records.nominal_s, first_jacobian
+                source,
+                records.nominal_s,
+                end_effector.J[0],
             )
     hand_torque = split.operator - scripted_torque
-    force = split.end_effector.find_force(hand_torque)
-    return force, split.end_effector.position
+    force = end_effector.find_force(hand_torque)
+    return force, end_effector.position
 
 
 def _compute_phasors(
@@ -376,18 +403,25 @@ def _compute_phasors(
     """
     size = round(segment_s * records.rate_hz)
     half_s = 0.5 * segment_s
-    first = round((start_s + half_s) * records.rate_hz) - records.first
-    window = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(size) / size)
+    first_tick = round((start_s + half_s) * records.rate_hz)
+    first_row = max(first_tick - records.first, 0)
+    end_row = len(signals) - size + 1
+    step = size // 2
+    window_phase = 2.0 * np.pi * np.arange(size) / size
+    window = 0.5 - 0.5 * np.cos(window_phase)
     window_sum = window.sum()
     phasors: list[Complex] = []
-    for start in range(max(first, 0), len(signals) - size + 1, size // 2):
+    for start in range(first_row, end_row, step):
         rows = slice(start, start + size)
-        if records.known[rows].mean() < MIN_KNOWN_SHARE:
+        known_share = records.known[rows].mean()
+        if known_share < MIN_KNOWN_SHARE:
             continue
         segment = signals[rows]
-        carriers = np.exp(-2j * np.pi * np.outer(hz, records.t_s[rows]))
+        cycles = np.outer(hz, records.t_s[rows])
+        carriers = np.exp(-2j * np.pi * cycles)
         mean = window @ segment / window_sum
-        phasors.append(2.0 / window_sum * (carriers * window) @ (segment - mean))
+        deviation = segment - mean
+        phasors.append(2.0 / window_sum * (carriers * window) @ deviation)
     return phasors
 
 
@@ -401,8 +435,11 @@ def _compute_coherence(phasors: Complex) -> Array:
     Args:
         phasors: The phasors, shape (segments, F, n).
     """
-    power = (np.abs(phasors) ** 2).mean(axis=0).sum(axis=1)
-    power_of_mean = (np.abs(phasors.mean(axis=0)) ** 2).sum(axis=1)
+    squares = np.abs(phasors) ** 2
+    power = squares.mean(axis=0).sum(axis=1)
+    mean_phasors = phasors.mean(axis=0)
+    squares_of_mean = np.abs(mean_phasors) ** 2
+    power_of_mean = squares_of_mean.sum(axis=1)
     coherence: Array = power_of_mean / np.maximum(power, _TINY)
     return coherence
 
@@ -437,7 +474,9 @@ def _fit_with_intervals(site: str, F: Complex, X: Complex, w: Array) -> _HandFit
     """
     count, _, axes = X.shape
     s = 1j * w[:, np.newaxis]
-    motions = -np.concatenate((s**2 * X, s * X, X), axis=2)
+    acceleration = s**2 * X
+    velocity = s * X
+    motions = -np.concatenate((acceleration, velocity, X), axis=2)
     if not _can_distinguish(motions):
         raise UsageError(
             f"{site}: the end effector moved along fewer than {count_nouns(axes, 'axis')}, "
@@ -447,29 +486,46 @@ def _fit_with_intervals(site: str, F: Complex, X: Complex, w: Array) -> _HandFit
 
     all_segments = np.arange(count)
     forces = F.transpose(2, 0, 1)
-    estimate = np.array([_fit_impedance(force, motions, all_segments) for force in forces])
+    estimate = _fit_all_axes(forces, motions, all_segments)
 
     # The jackknife leaves out one segment at a time.
-    partial_estimates = []
+    partial_estimates: list[Array] = []
     for segment in range(count):
         others = all_segments[all_segments != segment]
-        partial_estimates.append([_fit_impedance(force, motions, others) for force in forces])
-    pseudo_values = count * estimate - (count - 1) * np.array(partial_estimates)
+        partial_estimates.append(_fit_all_axes(forces, motions, others))
+    freedom = count - 1
+    pseudo_values = count * estimate - freedom * np.array(partial_estimates)
     # Neighbouring segments overlap and are correlated, which widens the interval.
-    inflation = 1.0 + 2.0 * NEIGHBOUR_CORRELATION * (count - 1) / count
+    inflation = 1.0 + 2.0 * NEIGHBOUR_CORRELATION * freedom / count
     deviation = pseudo_values.std(axis=0, ddof=1)
-    student_quantile = stdtrit(count - 1, 0.975)
+    student_quantile = stdtrit(freedom, 0.975)
     halves = student_quantile * deviation * np.sqrt(inflation / count)
 
     mean_force = F.mean(axis=0)
     fitted_force = motions.mean(axis=0) @ estimate.T
-    residual = np.linalg.norm(mean_force - fitted_force, axis=1)
+    force_error = mean_force - fitted_force
+    residual = np.linalg.norm(force_error, axis=1)
     force_size = np.linalg.norm(mean_force, axis=1)
+    # The rows of M, B and K for an axis follow each other in the estimate.
+    matrix_rows = estimate.reshape(axes, 3, axes)
+    half_rows = halves.reshape(axes, 3, axes)
     return _HandFit(
-        matrices=estimate.reshape(axes, 3, axes).transpose(1, 0, 2),
-        halves=halves.reshape(axes, 3, axes).transpose(1, 0, 2),
+        matrices=matrix_rows.transpose(1, 0, 2),
+        halves=half_rows.transpose(1, 0, 2),
         unexplained=residual / np.maximum(force_size, _TINY),
     )
+
+
+def _fit_all_axes(forces: Complex, motions: Complex, segments: NDArray[np.int64]) -> Array:
+    """Returns the rows of M, B and K for each axis, shape (n, 3 n), by `_fit_impedance`.
+
+    Args:
+        forces: Phasors of the force along each axis, shape (n, segments, F).
+        motions: Phasors of -(acceleration, velocity, position), shape (segments, F, 3 n).
+        segments: Indices of the segments to average.
+    """
+    impedances = [_fit_impedance(force, motions, segments) for force in forces]
+    return np.array(impedances)
 
 
 def _can_distinguish(motions: Complex) -> bool:
@@ -481,12 +537,16 @@ def _can_distinguish(motions: Complex) -> bool:
     Args:
         motions: Phasors of -(acceleration, velocity, position), shape (segments, F, 3 n).
     """
-    design = _stack_real_and_imaginary(motions.mean(axis=0))
+    mean_motion = motions.mean(axis=0)
+    design = _stack_real_and_imaginary(mean_motion)
     column_sizes = np.linalg.norm(design, axis=0)
     normalised = design / np.maximum(column_sizes, _TINY)
     singular_values = np.linalg.svd(normalised, compute_uv=False)
-    is_singular = singular_values[-1] * MAX_CONDITION < singular_values[0]
-    return len(design) >= design.shape[1] and not is_singular
+    largest = singular_values[0]
+    smallest = singular_values[-1]
+    is_singular = smallest * MAX_CONDITION < largest
+    equation_count, unknown_count = design.shape
+    return equation_count >= unknown_count and not is_singular
 
 
 def _stack_real_and_imaginary(phasors: Complex) -> Array:
@@ -532,13 +592,16 @@ def _fit_impedance(force: Complex, motions: Complex, segments: NDArray[np.int64]
             The real parts and then the imaginary parts, shape (2 F,), for F frequencies.
         """
         residuals = force - motions @ impedance
-        deviation = np.maximum(residuals.std(axis=0), smallest_deviation)
+        measured_deviation = residuals.std(axis=0)
+        deviation = np.maximum(measured_deviation, smallest_deviation)
         mean_residual = mean_force - mean_motion @ impedance
         return _stack_real_and_imaginary(mean_residual / deviation)
 
     design = _stack_real_and_imaginary(mean_motion)
-    start = np.linalg.lstsq(design, _stack_real_and_imaginary(mean_force), rcond=None)[0]
-    impedance: Array = least_squares(compute_weighted_residuals, start, x_scale="jac").x
+    values = _stack_real_and_imaginary(mean_force)
+    first_guess = np.linalg.lstsq(design, values, rcond=None)[0]
+    fit = least_squares(compute_weighted_residuals, first_guess, x_scale="jac")
+    impedance: Array = fit.x
     return impedance
 
 
@@ -566,13 +629,16 @@ def _read_hand(file: Path) -> HandMatrices:
     try:
         values = json.loads(file.read_text(encoding="utf-8"))
         M, B, K = (np.array(values[key], dtype=np.float64) for key in KEYS)
-        if not M.shape == B.shape == K.shape or M.shape not in ((2, 2), (3, 3)):
+        have_same_shape = M.shape == B.shape == K.shape
+        if not have_same_shape or M.shape not in ((2, 2), (3, 3)):
             raise ValueError("the matrices must all have 2 rows and columns, or all have 3")
         if not np.isfinite([M, B, K]).all():
             raise ValueError("a number is not finite")
     except (OSError, ValueError, KeyError, TypeError) as error:
+        problem = str(error)
         # The text of a KeyError is only the key.
-        problem = f"the key {error} is missing" if isinstance(error, KeyError) else str(error)
+        if isinstance(error, KeyError):
+            problem = f"the key {error} is missing"
         raise UsageError(
             f"{file}: does not contain the output of `trilat identify hand --json`: {problem}"
         ) from None
