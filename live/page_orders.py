@@ -222,7 +222,8 @@ class AbortTrial(PageMessage, frozen=True, kw_only=True, tag="abort"):
 
 Order = SetLink | SetShares
 StageMessage = DoStep | AbortTrial
-_DECODER = msgspec.json.Decoder(reduce(or_, PageMessage.__subclasses__()))
+_ANY_MESSAGE = reduce(or_, PageMessage.__subclasses__())
+_DECODER = msgspec.json.Decoder(_ANY_MESSAGE)
 _RATES: dict[type[PageMessage], tuple[float, int]] = {
     PageMessage: (240.0, 480),
     MoveHand: (200.0, 400),
@@ -264,9 +265,9 @@ class MessageLimits:
     """
 
     def __init__(self) -> None:
-        self._buckets = {
-            kind: _TokenBucket(float(burst)) for kind, (_, burst) in _RATES.items()
-        }
+        self._buckets: dict[type[PageMessage], _TokenBucket] = {}
+        for kind, (_, burst) in _RATES.items():
+            self._buckets[kind] = _TokenBucket(float(burst))
 
     def allows(self, kind: type[PageMessage], now_ns: int) -> bool:
         """Checks whether a message of a page is within its rate, and counts it if it is.
@@ -284,7 +285,8 @@ class MessageLimits:
         bucket = self._buckets[kind]
         # The bucket is full before the first message.
         if bucket.filled_ns:
-            new_tokens = (now_ns - bucket.filled_ns) * 1e-9 * rate
+            elapsed_ns = now_ns - bucket.filled_ns
+            new_tokens = elapsed_ns * 1e-9 * rate
             bucket.tokens = min(bucket.tokens + new_tokens, burst)
         bucket.filled_ns = now_ns
         is_allowed = bucket.tokens >= 1.0
@@ -336,7 +338,9 @@ class Role:
         Args:
             message: The message of the person's web page.
         """
-        if isinstance(message, Seen | StopArms) or self.kind == "experimenter":
+        if self.kind == "experimenter":
+            return True
+        if isinstance(message, Seen | StopArms):
             return True
         if self.kind != "user":
             return False
@@ -360,7 +364,9 @@ class Role:
         The text "as=m1" stands for the view of the user of site m1. It is empty for an
         experimenter.
         """
-        parts = ["watch"] if self.kind == "watcher" else []
+        parts: list[str] = []
+        if self.kind == "watcher":
+            parts.append("watch")
         if self.site:
             parts.append(f"as={self.site}")
         return "&".join(parts)
@@ -387,7 +393,8 @@ class RoleLinks:
             role: The role that the link grants.
         """
         query = f"?{role.query}" if role.query else ""
-        return f"{address}{query}#token={self._make_token(role)}"
+        token = self._make_token(role)
+        return f"{address}{query}#token={token}"
 
     def find(self, query: str) -> Role | None:
         """Finds out which role a link grants to the page that was opened with it.
@@ -399,15 +406,19 @@ class RoleLinks:
             The role. None if the token is not that of any role.
         """
         fields = parse_qs(query, keep_blank_values=True)
-        token = fields.get("token", [""])[0]
-        site = fields.get("as", [""])[0]
-        if self._is_token(token, Role()):
+        tokens = fields.get("token", [""])
+        token = tokens[0]
+        sites = fields.get("as", [""])
+        site = sites[0]
+        experimenter = Role()
+        user = Role("user", site)
+        if self._is_token(token, experimenter):
             # An experimenter may use a lower role.
             if "watch" in fields:
                 return Role("watcher", site)
-            return Role("user", site) if site else Role()
-        if self._is_token(token, Role("user", site)):
-            return Role("user", site)
+            return user if site else experimenter
+        if self._is_token(token, user):
+            return user
         if self._is_token(token, Role("watcher")):
             return Role("watcher", site)
         return None
@@ -421,7 +432,11 @@ class RoleLinks:
     def _is_token(self, token: str, role: Role) -> bool:
         """Returns True if a token is that of a role."""
         role_token = self._make_token(role)
-        return hmac.compare_digest(token.encode(), role_token.encode())
+        # The time of this comparison does not reveal how many characters are right.
+        return hmac.compare_digest(
+            token.encode(),
+            role_token.encode(),
+        )
 
 
 class PageHands:
@@ -467,15 +482,19 @@ class PageHands:
         else:
             self._held_sites.discard(site)
         goal = order.to if order.grip else []
-        if pushes:
-            sender.send(HandMessage, source=self._source, grip=order.grip, force=goal)
-        else:
-            sender.send(HandMessage, source=self._source, grip=order.grip, target=goal)
+        goal_field = "force" if pushes else "target"
+        content = {
+            "source": self._source,
+            "grip": order.grip,
+            goal_field: goal,
+        }
+        sender.send(HandMessage, **content)
 
     def release(self) -> None:
         """Releases all arms that the page holds."""
         for site in list(self._held_sites):
-            self.move(MoveHand(site=site, grip=False), pushes=False)
+            message = MoveHand(site=site, grip=False)
+            self.move(message, pushes=False)
 
     def holds(self, site: str, source: int) -> bool:
         """Finds out whether this page is the one that holds the arm of a site.
@@ -486,7 +505,9 @@ class PageHands:
                 nobody holds the arm.
         """
         sender = self._senders.get(site)
-        return source != 0 and sender is not None and sender.boot == source
+        if source == 0 or sender is None:
+            return False
+        return sender.boot == source
 
 
 class _OpenQuery(NamedTuple):
@@ -530,7 +551,9 @@ class OrderDesk:
         # Requests that wait for a reply, by site and channel.
         self._open_queries: dict[tuple[str, str], _OpenQuery] = {}
         self.replies: list[tuple[str, str, bool, str]] = []
-        self.refused: Counter[str] = Counter() if refused is None else refused
+        if refused is None:
+            refused = Counter()
+        self.refused = refused
 
     def queue_change(
         self, order: Order, sites: Collection[str], links: Collection[str], source: str = ""
@@ -559,7 +582,11 @@ class OrderDesk:
                 self.refused["no such site"] += 1
                 return
             site = order.site
-            request = ChangeRequest(dominance=site, to={**order.to}, ramp_s=MIN_RAMP_S)
+            request = ChangeRequest(
+                dominance=site,
+                to={**order.to},
+                ramp_s=MIN_RAMP_S,
+            )
         self._enqueue(site, request.link, _add_source(request, source))
 
     def stop(self, sites: Iterable[str], source: str = "") -> None:
@@ -569,7 +596,8 @@ class OrderDesk:
             sites: Names of the sites.
             source: Who sends the order, for the sites' events.
         """
-        request = _add_source(ChangeRequest(order="stop"), source)
+        stop = ChangeRequest(order="stop")
+        request = _add_source(stop, source)
         for site in sites:
             # A pending release would let the arm move again right after the stop.
             self._pending.pop((site, RELEASE), None)
@@ -585,7 +613,8 @@ class OrderDesk:
             sites: Names of all sites (processes, one per arm) of the session.
             source: Name of the person or program that requests it, for the events in the log.
         """
-        request = _add_source(ChangeRequest(order=order.order), source)
+        release = ChangeRequest(order=order.order)
+        request = _add_source(release, source)
         for site in order.sites:
             if site in sites:
                 self._enqueue(site, RELEASE, request)
@@ -615,7 +644,9 @@ class OrderDesk:
             site: Name of the site.
             text: The text.
         """
-        self._enqueue(site, f"mark {text}", ChangeRequest(mark=text))
+        subject = f"mark {text}"
+        request = ChangeRequest(mark=text)
+        self._enqueue(site, subject, request)
 
     def poll(self) -> None:
         """Receives the replies of the sites to earlier requests, and sends requests that wait.
@@ -625,16 +656,20 @@ class OrderDesk:
         `replies` receives an entry that says so.
         """
         now_ns = self._clock.monotonic_ns()
-        for (site, channel), query in list(self._open_queries.items()):
+        open_queries = list(self._open_queries.items())
+        for (site, channel), query in open_queries:
             reply = query.inbox.poll()
+            waited_ns = now_ns - query.sent_ns
             if reply is not None:
                 del self._open_queries[site, channel]
                 _, payload = reply
                 self._handle_reply(site, channel, query.request, payload)
-            elif now_ns - query.sent_ns > REPLY_TIMEOUT_NS:
+            elif waited_ns > REPLY_TIMEOUT_NS:
                 del self._open_queries[site, channel]
-                self.replies.append((site, channel, False, f"{site} does not answer"))
-        for (site, subject), request in list(self._pending.items()):
+                problem = f"{site} does not answer"
+                self.replies.append((site, channel, False, problem))
+        pending = list(self._pending.items())
+        for (site, subject), request in pending:
             if (site, topics.SET) not in self._open_queries:
                 del self._pending[site, subject]
                 self._send_request(site, topics.SET, request)
@@ -653,7 +688,8 @@ class OrderDesk:
             self.refused[error.reason] += 1
             return
         is_refused_stop = channel == topics.STOP and not reply.accepted
-        if is_refused_stop and request.source is not msgspec.UNSET:
+        has_source = request.source is not msgspec.UNSET
+        if is_refused_stop and has_source:
             plain_request = msgspec.structs.replace(request, source=msgspec.UNSET)
             self._send_request(site, channel, plain_request)
         else:
@@ -662,7 +698,9 @@ class OrderDesk:
 
 def _add_source(request: ChangeRequest, source: str) -> ChangeRequest:
     """Returns a request that names its source. An empty source leaves it unchanged."""
-    return msgspec.structs.replace(request, source=source) if source else request
+    if not source:
+        return request
+    return msgspec.structs.replace(request, source=source)
 
 
 def _make_link_request(order: SetLink) -> ChangeRequest:
@@ -673,9 +711,10 @@ def _make_link_request(order: SetLink) -> ChangeRequest:
     """
     settings: dict[str, Any] = dict(order.to)
     if "preset" not in settings and "delay_ms" in settings:
-        has_delay = not _is_zero(settings["delay_ms"])
-        has_deviation = not _is_zero(settings.get("deviation_ms", 0.0))
-        if has_delay and has_deviation:
+        delay_ms = settings["delay_ms"]
+        deviation_ms = settings.get("deviation_ms", 0.0)
+        is_random = not _is_zero(delay_ms) and not _is_zero(deviation_ms)
+        if is_random:
             settings["model"] = "gamma"
         else:
             settings["model"] = "constant"
