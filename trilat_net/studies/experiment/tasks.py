@@ -155,11 +155,12 @@ class TrialGoal:
             return True
         begins_s, ramp_s = self.handover or (math.inf, 0.0)
         # In the middle of the ramp, both users have the same authority.
-        is_handed_over = t_s >= self.appears_s + begins_s + ramp_s / 2.0
-        leading_user = 1 if is_handed_over else 0
-        if user == leading_user:
-            return abs(self.lead) > 0.05
-        return abs(self.lead - 1) > 0.05
+        handed_over_s = self.appears_s + begins_s + ramp_s / 2.0
+        leading_user = 1 if t_s >= handed_over_s else 0
+        authority = self.lead
+        if user != leading_user:
+            authority = self.lead - 1
+        return abs(authority) > 0.05
 
     def find_corridor(self, t_s: float) -> tuple[Array, float] | None:  # noqa: ARG002 - there is none
         """Returns the corridor to the target, which the end effector may not leave.
@@ -303,7 +304,10 @@ class ReachTrial(TrialTask, frozen=True, tag="reach"):
         # Targets with even numbers advance around the ring. Those with odd numbers are half a
         # ring further.
         half_ring = self.targets // 2
-        index = (number // 2 + (number % 2) * half_ring) % self.targets
+        step = number // 2
+        if number % 2:
+            step += half_ring
+        index = step % self.targets
         angle = 2.0 * math.pi * index / self.targets
         direction = np.zeros(len(start_m))
         direction[0] = math.cos(angle)
@@ -330,13 +334,16 @@ class _DwellGoal(TrialGoal):
 
     def _judge(self, t_s: float, position_m: Array, force_n: float) -> Outcome | None:
         """Ends the trial if the condition was met long enough, or if the time is over."""
-        if self._is_inside(t_s - self.appears_s, position_m, force_n):
+        after_s = t_s - self.appears_s
+        if self._is_inside(after_s, position_m, force_n):
             self._inside_since_s = min(self._inside_since_s, t_s)
         else:
             self._inside_since_s = math.inf
-        if t_s - self._inside_since_s >= self._dwell_s:
+        inside_s = t_s - self._inside_since_s
+        if inside_s >= self._dwell_s:
             return Outcome(True, t_s)
-        if t_s >= self.appears_s + self._longest_s:
+        latest_end_s = self.appears_s + self._longest_s
+        if t_s >= latest_end_s:
             return Outcome(False, t_s)
         return None
 
@@ -355,8 +362,9 @@ class _ReachGoal(_DwellGoal):
         if task.handover_s is not None:
             self.lead = 1.0
             self.handover = (task.handover_s, task.ramp_s)
-        self._handover_s, ramp_s = self.handover or (-1.0, 0.0)
-        self._second_appears_s = self._handover_s + ramp_s
+        handover_s, ramp_s = self.handover or (-1.0, 0.0)
+        self._handover_s = handover_s
+        self._second_appears_s = handover_s + ramp_s
 
     def compute_measures(
         self,
@@ -373,12 +381,15 @@ class _ReachGoal(_DwellGoal):
             The measure by its name. Empty without a handover.
         """
         has_begun = after_s >= self._handover_s
-        is_handover = has_begun & (after_s < self._second_appears_s)
+        has_not_ended = after_s < self._second_appears_s
+        is_handover = has_begun & has_not_ended
         target_m = self._waypoints_m[1]
-        errors_m = np.linalg.norm(position_m - target_m, axis=1)[is_handover]
+        distances_m = np.linalg.norm(position_m - target_m, axis=1)
+        errors_m = distances_m[is_handover]
         if not len(errors_m):
             return {}
-        return {"error_handover_mm": 1e3 * float(errors_m.max())}
+        largest_error_m = float(errors_m.max())
+        return {"error_handover_mm": 1e3 * largest_error_m}
 
     def find_corridor(self, t_s: float) -> tuple[Array, float] | None:
         """Returns the corridor to the target, once the target has appeared.
@@ -389,34 +400,42 @@ class _ReachGoal(_DwellGoal):
         """
         if self._corridor_m is None or t_s < self.appears_s:
             return None
-        start_m, _ = self._find_segment(t_s - self.appears_s)
+        after_s = t_s - self.appears_s
+        start_m, _ = self._find_segment(after_s)
         return start_m, self._corridor_m
 
     def _find_segment(self, after_s: float) -> Sequence[Array]:
         """Returns the start and the end of the present movement, in m."""
         has_second_appeared = 0.0 <= self._second_appears_s <= after_s
-        return self._waypoints_m[1:] if has_second_appeared else self._waypoints_m[:2]
+        if has_second_appeared:
+            return self._waypoints_m[1:]
+        return self._waypoints_m[:2]
 
     def _find_target_m(self, after_s: float, user: int | None) -> Array:  # noqa: ARG002 - all users see the same
         """Returns the end of the present movement, which all users see alike."""
-        return self._find_segment(after_s)[1]
+        _, end_m = self._find_segment(after_s)
+        return end_m
 
     def _is_inside(self, after_s: float, position_m: Array, force_n: float) -> bool:  # noqa: ARG002 - no force
         """Returns True if the end effector is in the last target that will appear."""
         target_m = self._find_target_m(after_s, None)
         error_m = float(np.linalg.norm(position_m - target_m))
+        is_in_target = error_m <= self.width_m / 2.0
         # Before the second target appears, the trial cannot succeed.
-        return error_m <= self.width_m / 2.0 and after_s >= self._second_appears_s
+        return is_in_target and after_s >= self._second_appears_s
 
     def _judge(self, t_s: float, position_m: Array, force_n: float) -> Outcome | None:
         """Ends the trial as failed if the end effector left the corridor."""
         if self._corridor_m is not None:
-            start_m, end_m = self._find_segment(t_s - self.appears_s)
+            after_s = t_s - self.appears_s
+            start_m, end_m = self._find_segment(after_s)
             path_m = end_m - start_m
             offset_m = position_m - start_m
+            squared_length = path_m @ path_m
             # The nearest point of the straight segment is at this share of its length.
-            share = np.clip(offset_m @ path_m / (path_m @ path_m), 0.0, 1.0)
-            distance_m = float(np.linalg.norm(offset_m - share * path_m))
+            share = np.clip(offset_m @ path_m / squared_length, 0.0, 1.0)
+            nearest_m = share * path_m
+            distance_m = float(np.linalg.norm(offset_m - nearest_m))
             if distance_m > self._corridor_m / 2.0:
                 return Outcome(False, t_s)
         return super()._judge(t_s, position_m, force_n)
@@ -488,15 +507,20 @@ class _ContactGoal(_DwellGoal):
         Returns:
             The measures by their names.
         """
-        is_dwell = after_s >= after_s[-1] - self._dwell_s
+        dwell_start_s = after_s[-1] - self._dwell_s
+        is_dwell = after_s >= dwell_start_s
         held_n = force_n[is_dwell]
         errors_n = held_n - self.force_n
-        rms_error_n = float(np.sqrt(np.mean(errors_n**2)))
-        return {"wall_force_n": float(held_n.mean()), "error_force_n": rms_error_n}
+        mean_square = np.mean(errors_n**2)
+        return {
+            "wall_force_n": float(held_n.mean()),
+            "error_force_n": float(np.sqrt(mean_square)),
+        }
 
     def _is_inside(self, after_s: float, position_m: Array, force_n: float) -> bool:  # noqa: ARG002 - only the force counts
         """Returns True if the force is right within the tolerance."""
-        return abs(force_n - self.force_n) <= self._tolerance_n
+        error_n = abs(force_n - self.force_n)
+        return error_n <= self._tolerance_n
 
 
 class TrackTrial(TrialTask, frozen=True, tag="track"):
@@ -561,7 +585,8 @@ class TrackTrial(TrialTask, frozen=True, tag="track"):
             seed: Seed of the random numbers that determine the path.
         """
         random = np.random.default_rng(seed)
-        phases = random.uniform(0.0, 2.0 * math.pi, len(self.frequencies_hz))
+        sine_count = len(self.frequencies_hz)
+        phases = random.uniform(0.0, 2.0 * math.pi, sine_count)
         return _TrackGoal(self, start_m, phases)
 
 
@@ -598,28 +623,36 @@ class _TrackGoal(TrialGoal):
         task = self._task
         if not task.needs_pair:
             return {}
-        middle_m = np.array([self._find_target_m(after, None) for after in after_s.tolist()])
+        targets = [self._find_target_m(after, None) for after in after_s.tolist()]
+        middle_m = np.array(targets)
         errors_m = position_m - middle_m
-        mean_error_m = float(errors_m[:, task.axis].mean())
-        return {"first_settled": 0.5 + mean_error_m / task.apart_m}
+        axis_errors_m = errors_m[:, task.axis]
+        mean_error_m = float(axis_errors_m.mean())
+        first_settled = 0.5 + mean_error_m / task.apart_m
+        return {"first_settled": first_settled}
 
     def _find_target_m(self, after_s: float, user: int | None) -> Array:
         """Returns the point of the path, with the offset of a user's target."""
         task = self._task
         rates_rad_s = 2.0 * math.pi * np.array(task.frequencies_hz)
         # The path begins at the start: each sine is 0 when the target appears.
-        sines = np.sin(rates_rad_s * after_s + self._phases) - np.sin(self._phases)
+        angles = rates_rad_s * after_s + self._phases
+        sines = np.sin(angles) - np.sin(self._phases)
+        sum_of_sines = float(sines.sum())
         largest_sum = 2.0 * len(sines)
-        path_m = task.amplitude_m * float(sines.sum()) / largest_sum
+        path_m = task.amplitude_m * sum_of_sines / largest_sum
         # The users' targets are on opposite sides of the path.
-        offset_m = 0.0 if user is None else task.apart_m * (0.5 - user)
+        offset_m = 0.0
+        if user is not None:
+            offset_m = task.apart_m * (0.5 - user)
         target_m = self.start_m.copy()
         target_m[task.axis] += offset_m + path_m
         return target_m
 
     def _judge(self, t_s: float, position_m: Array, force_n: float) -> Outcome | None:  # noqa: ARG002 - by its time
         """Ends the trial as completed when its time is over."""
-        if t_s >= self.appears_s + self._task.duration_s:
+        ends_s = self.appears_s + self._task.duration_s
+        if t_s >= ends_s:
             return Outcome(True, t_s)
         return None
 

@@ -105,8 +105,11 @@ class TrialJudge:
         """
         if self.outcome is None:
             # The force is computed only for tasks that need it, because it takes long.
-            force_n = self._trial.find_force_n(q, tau_x) if self.goal.force_n else 0.0
-            position_m = np.array(self._trial.arm.end_effector(q))
+            force_n = 0.0
+            if self.goal.force_n:
+                force_n = self._trial.find_force_n(q, tau_x)
+            position = self._trial.arm.end_effector(q)
+            position_m = np.array(position)
             self.outcome = self.goal.judge(t_s, position_m, force_n)
         return self.outcome
 
@@ -161,7 +164,8 @@ class ExperimentTrial:
         self.planned = planned
         self.slave = scenario.slave
         self.arm = scenario.arms[scenario.slave]
-        start = self.arm.end_effector(scenario.sites[self.slave].q0_rad)
+        start_q = scenario.sites[self.slave].q0_rad
+        start = self.arm.end_effector(start_q)
         self._start_m = np.array(start, dtype=np.float64)
 
         shortest_s, longest_s = protocol.foreperiod_s
@@ -172,10 +176,12 @@ class ExperimentTrial:
         scenario = self._set_authority(scenario)
         # Synthetic participants act, and their trial is judged, once per 1 / HAND_HZ. The end
         # of a trial may be noticed that late.
-        self.longest_s = self.appears_s + protocol.task.longest_s + 1.0 / HAND_HZ
+        latest_end_s = self.appears_s + protocol.task.longest_s
+        self.longest_s = latest_end_s + 1.0 / HAND_HZ
         kind = "" if self.people else "synthetic "
+        participants = ", ".join(planned.group)
         about = (
-            f"trial {planned.number} of {protocol.name}: {kind}{', '.join(planned.group)}, "
+            f"trial {planned.number} of {protocol.name}: {kind}{participants}, "
             f"condition {planned.condition}, block {planned.block}, trial {planned.trial}; "
             f"protocol sha256 {digest}"
         )
@@ -210,9 +216,17 @@ class ExperimentTrial:
                     user has the rest.
             """
             first_share = sum_of_shares * lead
-            return {**row, first: first_share, second: sum_of_shares - first_share}
+            second_share = sum_of_shares - first_share
+            return {
+                **row,
+                first: first_share,
+                second: second_share,
+            }
 
-        dominance = {**scenario.dominance, self.slave: divide_shares(goal.lead)}
+        dominance = {
+            **scenario.dominance,
+            self.slave: divide_shares(goal.lead),
+        }
         timeline = scenario.timeline
         if goal.handover is not None:
             after_s, ramp_s = goal.handover
@@ -249,7 +263,8 @@ class ExperimentTrial:
     def make_goal(self) -> TrialGoal:
         """Creates the goal of the trial, which states its target and decides when it ends."""
         planned = self.planned
-        goal = self.protocol.task.make_goal(self._start_m, planned.target, planned.seed)
+        task = self.protocol.task
+        goal = task.make_goal(self._start_m, planned.target, planned.seed)
         goal.appears_s = self.appears_s
         # The task of a handover fixes the authority; otherwise the plan does.
         if goal.lead is None:
@@ -273,10 +288,10 @@ class ExperimentTrial:
         """
         log = open_log(path)
         if not verify(log).passed:
-            raise LogError(f"{path}: its records are not those of the run")
+            raise LogError(f"{path}: the records differ from those of a repeated run")
         outcome = self._judge_log(log)
         if outcome is None:
-            raise LogError(f"{path}: ends before its trial does")
+            raise LogError(f"{path}: the log ends before the trial does")
         return TrialEntry(
             cell=self.planned.number,
             seed=self.planned.seed,
@@ -314,35 +329,45 @@ class ExperimentTrial:
         for number, user in enumerate(users, 1):
             records = aligned[user]
             split = split_torque(records, log.scenario)
+            end_effector = split.end_effector
             is_in_trial = records.t_s <= outcome.ended_s
             # The force of the hand ON its arm, shape (K, 2) or (K, 3).
-            force = split.end_effector.find_force(split.operator)[is_in_trial]
+            hand_force = end_effector.find_force(split.operator)
+            force = hand_force[is_in_trial]
             forces.append(force)
             magnitude_n = np.linalg.norm(force, axis=1)
-            velocity = split.end_effector.speed[is_in_trial]
-            suffix = f"_user{number}" if len(users) > 1 else ""
+            velocity = end_effector.speed[is_in_trial]
+            suffix = ""
+            if len(users) > 1:
+                suffix = f"_user{number}"
             measures[f"force_mean{suffix}_n"] = float(magnitude_n.mean())
             measures[f"force_peak{suffix}_n"] = float(magnitude_n.max())
             measures[f"work{suffix}_j"] = energy_j(force, velocity, records.rate_hz)
         if len(forces) > 1:
             measures |= self._measure_pair(aligned, forces, outcome.ended_s)
         age_ms = sample_ages_ns(log, self.slave, users[0]) / 1e6
-        measures["delay_ms"] = float(age_ms.mean()) if len(age_ms) else 0.0
+        mean_age_ms = 0.0
+        if len(age_ms):
+            mean_age_ms = float(age_ms.mean())
+        measures["delay_ms"] = mean_age_ms
         return measures
 
     def _sample_motion(
         self, records: SiteLog | AlignedRecords, start_s: float, end_s: float
     ) -> _MotionSamples:
         """Returns the motion of the slave's end effector between two times."""
-        is_between = (records.t_s >= start_s) & (records.t_s <= end_s)
+        has_started = records.t_s >= start_s
+        is_between = has_started & (records.t_s <= end_s)
         indices = np.flatnonzero(is_between)[::RECORD_STEP]
-        positions_m = self._place_end_effector(records.q[indices]).position
+        end_effector = self._place_end_effector(records.q[indices])
+        positions_m = end_effector.position
         rate_hz = records.rate_hz / RECORD_STEP
+        velocities_m_s = np.gradient(positions_m, 1.0 / rate_hz, axis=0)
         return _MotionSamples(
             indices=indices,
             t_s=records.t_s[indices],
             positions_m=positions_m,
-            velocities_m_s=np.gradient(positions_m, 1.0 / rate_hz, axis=0),
+            velocities_m_s=velocities_m_s,
             rate_hz=rate_hz,
         )
 
@@ -361,7 +386,10 @@ class ExperimentTrial:
         for user, force in zip(self.protocol.users, forces, strict=True):
             # The times of the user's records differ from those of the slave's records.
             force_t_s = aligned[user].t_s[: len(force)]
-            columns = [np.interp(motion.t_s, force_t_s, component) for component in force.T]
+            columns: list[Array] = []
+            for component in force.T:
+                column = np.interp(motion.t_s, force_t_s, component)
+                columns.append(column)
             interpolated.append(np.column_stack(columns))
         first, second = interpolated
         pair = measure_pair(first, second, motion.velocities_m_s, motion.rate_hz)
@@ -374,9 +402,14 @@ class ExperimentTrial:
         records = log[self.slave]
         motion = self._sample_motion(records, goal.appears_s, ended_s)
         speed = np.linalg.norm(motion.velocities_m_s, axis=1)
-        is_moving = speed > 0.05 * speed.max()
-        targets_m = np.array([goal.find_target_m(t_s) for t_s in motion.t_s])
-        errors_m = np.linalg.norm(motion.positions_m - targets_m, axis=1)
+        onset_speed = 0.05 * speed.max()
+        is_moving = speed > onset_speed
+        targets = [goal.find_target_m(t_s) for t_s in motion.t_s]
+        targets_m = np.array(targets)
+        error_vectors_m = motion.positions_m - targets_m
+        errors_m = np.linalg.norm(error_vectors_m, axis=1)
+        rms_error_m = float(np.sqrt(np.mean(errors_m**2)))
+        first_moving = float(np.argmax(is_moving))
         force_n = 0.0 * motion.t_s
         if goal.force_n:
             q = records.q[motion.indices]
@@ -385,9 +418,9 @@ class ExperimentTrial:
         measures = {
             "completion_s": ended_s - goal.appears_s,
             "movement_s": movement_time_s(speed, motion.rate_hz) or 0.0,
-            "reaction_s": float(np.argmax(is_moving)) / motion.rate_hz,
+            "reaction_s": first_moving / motion.rate_hz,
             "error_end_mm": 1e3 * float(errors_m[-1]),
-            "error_rms_mm": 1e3 * float(np.sqrt(np.mean(errors_m**2))),
+            "error_rms_mm": 1e3 * rms_error_m,
             "path_m": path_length_m(motion.positions_m),
         }
         smoothness = sparc(speed, motion.rate_hz)
@@ -395,8 +428,11 @@ class ExperimentTrial:
             measures["sparc"] = smoothness
         after_s = motion.t_s - goal.appears_s
         measures |= goal.compute_measures(after_s, motion.positions_m, force_n)
-        end_m = motion.positions_m[-1]
-        points = {"start": goal.start_m, "target": targets_m[-1], "end": end_m}
+        points = {
+            "start": goal.start_m,
+            "target": targets_m[-1],
+            "end": motion.positions_m[-1],
+        }
         for name, point in points.items():
             # The end effector of a planar arm has no z.
             for axis, coordinate_m in zip("xyz", point, strict=False):
@@ -421,7 +457,11 @@ class SyntheticTrial(ExperimentTrial):
             # `plan_experiment` has checked that the scenario has the hands of all users.
             assert hand is not None
             hand_site = HandSite(
-                scenario=scenario, name=site, spec=hand, rate_hz=HAND_HZ, delay_s=HAND_DELAY_S
+                scenario=scenario,
+                name=site,
+                spec=hand,
+                rate_hz=HAND_HZ,
+                delay_s=HAND_DELAY_S,
             )
             participant = SyntheticParticipant(
                 facts=hand_site.describe(),
@@ -451,19 +491,25 @@ class SyntheticTrial(ExperimentTrial):
         scenario = self.scenario
         judge = TrialJudge(self)
         slave = self.slave
-        kept_ticks = scenario.sites[slave].rate_hz // HAND_HZ + 1
-        run = FusedRun(scenario, keep=kept_ticks, hands=self._make_players(scenario))
-        run.plan([scenario.ticks(name) for name in scenario.names])
+        ticks_per_period = scenario.sites[slave].rate_hz // HAND_HZ
+        players = self._make_players(scenario)
+        run = FusedRun(scenario, keep=ticks_per_period + 1, hands=players)
+        tick_counts = [scenario.ticks(name) for name in scenario.names]
+        run.plan(tick_counts)
         slave_index = scenario.names.index(slave)
         columns = scenario.layout(slave).columns()
+        q_columns = columns["q"]
+        torque_columns = columns["tau_x"]
         # The run is judged after each period of the hands.
-        for period in range(math.ceil(self.longest_s * HAND_HZ)):
+        period_count = math.ceil(self.longest_s * HAND_HZ)
+        for period in range(period_count):
             period_end_ns = (period + 1) * NS_PER_S // HAND_HZ
             run.step_to(period_end_ns)
-            t_ns, rows = run.pop_records()[slave_index]
+            records = run.pop_records()
+            t_ns, rows = records[slave_index]
             times_s = (t_ns / NS_PER_S).tolist()
-            positions = rows[:, columns["q"]].tolist()
-            torques = rows[:, columns["tau_x"]].tolist()
+            positions = rows[:, q_columns].tolist()
+            torques = rows[:, torque_columns].tolist()
             for t_s, q, tau_x in zip(times_s, positions, torques, strict=True):
                 judge.accept(t_s, q, tau_x)
             if judge.outcome is not None:
@@ -482,7 +528,13 @@ class SyntheticTrial(ExperimentTrial):
         scenario = replace(self.scenario, duration_s=duration_s)
         players = self._make_players(scenario)
         hands = {site: player.track for site, player in players.items()}
-        record_virtual(scenario, path, force=True, views_hz=0.0, hands=hands)
+        record_virtual(
+            scenario,
+            path,
+            force=True,
+            views_hz=0.0,
+            hands=hands,
+        )
         return self.settle(path)
 
 
@@ -503,5 +555,6 @@ def run_trial(task: tuple[Protocol, str, PlannedTrial, str, Path]) -> TrialEntry
         LogError: The written log does not reproduce the run.
     """
     protocol, text, planned, digest, folder = task
-    trial = SyntheticTrial(protocol, parse_scenario(text), planned, digest)
+    scenario = parse_scenario(text)
+    trial = SyntheticTrial(protocol, scenario, planned, digest)
     return trial.write(folder / planned.file)
