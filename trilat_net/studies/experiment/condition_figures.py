@@ -64,11 +64,16 @@ def draw_conditions(rows: Sequence[Row], measure: str, *, unit: str = "participa
         axes = _add_panel(figure, measure)
         for columns, values in _list_unit_lines(means):
             axes.plot(columns, values, **_USER)
-        for column, mean in enumerate(summarise_conditions(rows, measure, unit=unit)):
+        summaries = summarise_conditions(rows, measure, unit=unit)
+        for column, mean in enumerate(summaries):
             _plot_interval(axes, column, mean, interval_look)
             axes.plot([column], [mean.mean], zorder=3, **_MEAN)
         _label_conditions(axes, means)
-        style.add_legend(figure, [(f"a {unit}", _USER), ("mean, 95 % interval", _MEAN)])
+        legend = [
+            (f"a {unit}", _USER),
+            ("mean, 95 % interval", _MEAN),
+        ]
+        style.add_legend(figure, legend)
     return figure
 
 
@@ -90,15 +95,19 @@ def draw_times(rows: Sequence[Row], limit_s: float, *, unit: str = "participant"
         axes.axhline(limit_s, **_LIMIT)
         for columns, times_s in _list_unit_lines(medians):
             _plot_times(axes, columns, times_s, limit_s, _USER)
-        for column, summary in enumerate(summarise_times(rows, limit_s, unit=unit)):
+        summaries = summarise_times(rows, limit_s, unit=unit)
+        for column, summary in enumerate(summaries):
             low_s, high_s = summary.interval or (None, None)
             if low_s is not None:
                 # An interval without an upper end is drawn up to the limit.
-                ends_s = [low_s, limit_s if high_s is None else high_s]
-                axes.plot([column, column], ends_s, **interval_look)
-            median_s = limit_s if summary.median is None else summary.median
+                end_s = limit_s if high_s is None else high_s
+                axes.plot([column, column], [low_s, end_s], **interval_look)
+            median_s = summary.median
+            beyond_limit: list[float] = []
+            if median_s is None:
+                median_s = limit_s
+                beyond_limit.append(column)
             axes.plot([column], [median_s], zorder=3, **_MEAN)
-            beyond_limit = [column] if summary.median is None else []
             _mark_beyond_limit(axes, beyond_limit, limit_s, _MEAN)
         _label_conditions(axes, medians)
         legend = [
@@ -118,8 +127,8 @@ def _list_unit_lines(
     Args:
         values: A value by condition and unit. Each condition is a column of the figure.
     """
-    units = dict.fromkeys(chain.from_iterable(values.values()))
-    for unit in units:
+    all_units = chain.from_iterable(values.values())
+    for unit in dict.fromkeys(all_units):
         columns: list[int] = []
         unit_values: list[float] = []
         for column, values_by_unit in enumerate(values.values()):
@@ -133,9 +142,11 @@ def _label_conditions(axes: Axes, values: Mapping[str, Mapping[str, float]]) -> 
     """Labels the horizontal axis with the conditions and their numbers of units."""
     labels: list[str] = []
     for condition, values_by_unit in values.items():
-        labels.append(f"{condition}\nn = {len(values_by_unit)}")
-    axes.set_xticks(range(len(values)), labels)
-    axes.set_xlim(-0.4, len(values) - 0.6)
+        unit_count = len(values_by_unit)
+        labels.append(f"{condition}\nn = {unit_count}")
+    condition_count = len(values)
+    axes.set_xticks(range(condition_count), labels)
+    axes.set_xlim(-0.4, condition_count - 0.6)
 
 
 def _plot_times(
@@ -156,8 +167,11 @@ def _plot_times(
     """
     limited_s = [min(time_s, limit_s) for time_s in times_s]
     axes.plot(positions, limited_s, **look)
-    times = zip(positions, times_s, strict=True)
-    beyond_limit = [position for position, time_s in times if math.isinf(time_s)]
+    beyond_limit: list[float] = []
+    for position, time_s in zip(positions, times_s, strict=True):
+        is_beyond = math.isinf(time_s)
+        if is_beyond:
+            beyond_limit.append(position)
     _mark_beyond_limit(axes, beyond_limit, limit_s, look)
 
 
@@ -172,7 +186,8 @@ def _mark_beyond_limit(
         "markerfacecolor": "white",
         "markeredgecolor": look["color"],
     }
-    axes.plot(positions, [limit_s] * len(positions), zorder=4, **open_marker)
+    heights_s = [limit_s] * len(positions)
+    axes.plot(positions, heights_s, zorder=4, **open_marker)
 
 
 def draw_learning(
@@ -199,14 +214,17 @@ def draw_learning(
         axes = _add_panel(figure, measure)
         looks = _assign_looks(rows)
         for condition, look in looks.items():
-            means: dict[Any, ConditionMean] = {}
+            summaries: dict[Any, ConditionMean] = {}
             for trial, trial_rows in _group_by_trial(rows, condition).items():
                 # The rows of one condition have one mean, or none without data.
-                for mean in summarise_conditions(trial_rows, measure, unit=unit):
-                    means[trial] = mean
-            for trial, mean in means.items():
-                _plot_interval(axes, trial, mean, {**look, "marker": "", "alpha": 0.5})
-            axes.plot(list(means), [mean.mean for mean in means.values()], **look)
+                for summary in summarise_conditions(trial_rows, measure, unit=unit):
+                    summaries[trial] = summary
+            interval_look = {**look, "marker": "", "alpha": 0.5}
+            for trial, summary in summaries.items():
+                _plot_interval(axes, trial, summary, interval_look)
+            trials = list(summaries)
+            means = [summary.mean for summary in summaries.values()]
+            axes.plot(trials, means, **look)
         _label_trials(axes)
         style.add_legend(figure, list(looks.items()))
     return figure
@@ -233,7 +251,8 @@ def _group_by_trial(rows: Sequence[Row], condition: str) -> dict[Any, list[Row]]
     groups: dict[Any, list[Row]] = {}
     for row in rows:
         if row["condition"] == condition:
-            groups.setdefault(row["trial"], []).append(row)
+            group = groups.setdefault(row["trial"], [])
+            group.append(row)
     return dict(sorted(groups.items()))
 
 
@@ -247,9 +266,11 @@ def _draw_learning_times(rows: Sequence[Row], limit_s: float, unit: str) -> Figu
             trials: list[Any] = []
             medians_s: list[float] = []
             for trial, trial_rows in _group_by_trial(rows, condition).items():
-                unit_medians_s = find_unit_medians(trial_rows, unit)[condition]
+                medians_by_condition = find_unit_medians(trial_rows, unit)
+                unit_medians_s = list(medians_by_condition[condition].values())
+                median_s = find_median(unit_medians_s)
                 trials.append(trial)
-                medians_s.append(find_median(list(unit_medians_s.values())))
+                medians_s.append(median_s)
             _plot_times(axes, trials, medians_s, limit_s, look)
         _label_trials(axes)
         legend = [*looks.items(), ("time limit; open: not reached", _LIMIT)]
@@ -259,9 +280,11 @@ def _draw_learning_times(rows: Sequence[Row], limit_s: float, unit: str) -> Figu
 
 def _add_panel(figure: Figure, measure: str) -> Axes:
     """Adds the only panel of a figure, labelled with a measure and its unit."""
-    axes: Axes = style.add_panels(figure, 1, 1)[0, 0]
+    panels = style.add_panels(figure, 1, 1)
+    axes: Axes = panels[0, 0]
     name, unit = split_unit(measure)
-    axes.set_ylabel(f"{name}, {unit}" if unit else name)
+    label = f"{name}, {unit}" if unit else name
+    axes.set_ylabel(label)
     return axes
 
 

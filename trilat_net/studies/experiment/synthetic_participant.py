@@ -75,14 +75,16 @@ class ParticipantModel(Frozen, frozen=True):
             A model with these parameters.
         """
         random = np.random.default_rng(seed)
-        factors = np.exp(self.spread * random.standard_normal(5)).tolist()
-        reaction, fitts_a, fitts_b, noise, crossover = factors
+        logarithms = self.spread * random.standard_normal(5)
+        factors = np.exp(logarithms).tolist()
+        reaction, fitts_a, fitts_b, noise_factor, crossover = factors
+        noise = self.noise * noise_factor
         return replace(
             self,
             reaction_s=self.reaction_s * reaction,
             fitts_a_s=self.fitts_a_s * fitts_a,
             fitts_b_s=self.fitts_b_s * fitts_b,
-            noise=min(self.noise * noise, 1.0),
+            noise=min(noise, 1.0),
             crossover_rad_s=self.crossover_rad_s * crossover,
         )
 
@@ -148,16 +150,18 @@ class SyntheticParticipant:
             self._start_m = now.pose
             self._end_m = now.pose
             return now.pose
+        goal = self._goal
         seen_s = now.t_s - self._model.reaction_s
-        target_m = self._goal.find_target_m(seen_s, self._user)[: self._axes]
-        error_m = target_m - slave_m
-        if self._goal.is_moving:
+        target_m = goal.find_target_m(seen_s, self._user)
+        error_m = target_m[: self._axes] - slave_m
+        if goal.is_moving:
             return self._follow(now, error_m, slave.age_s)
-        if self._goal.force_n and now.t_s > self._goal.appears_s:
+        if goal.force_n and now.t_s > goal.appears_s:
             press_step_m = self._find_press_step(slave, now.t_s)
             if press_step_m.any():
                 return self._follow(now, press_step_m, slave.age_s)
-        is_off_target = float(np.linalg.norm(error_m)) > OFF_TARGET_SHARE * self._goal.width_m
+        distance_m = float(np.linalg.norm(error_m))
+        is_off_target = distance_m > OFF_TARGET_SHARE * goal.width_m
         if is_off_target and now.t_s >= self._find_next_start_s(slave):
             self._start_movement(now.t_s, error_m)
         return self._interpolate_movement(now.t_s)
@@ -167,12 +171,14 @@ class SyntheticParticipant:
 
         The time at which the slave last moved is remembered.
         """
-        slave_m = place_slave(self._arm, slave.q)[: self._axes]
+        position_m = place_slave(self._arm, slave.q)
+        slave_m = position_m[: self._axes]
         if self._slave_m is None:
             self._start_m = now.pose
             self._end_m = now.pose
             self._slave_m = slave_m
-        distance_m = float(np.linalg.norm(slave_m - self._slave_m))
+        step_m = slave_m - self._slave_m
+        distance_m = float(np.linalg.norm(step_m))
         self._slave_m = slave_m
         if distance_m > MOVED_SHARE * self._goal.width_m:
             self._moved_s = now.t_s
@@ -184,19 +190,27 @@ class SyntheticParticipant:
         The hand and the slave must have come to rest. Then the participant reacts. Before a
         correction, the participant also waits for the delayed view of the slave.
         """
-        rest_s = max(self._begins_s + self._duration_s, self._moved_s)
+        hand_rest_s = self._begins_s + self._duration_s
+        rest_s = max(hand_rest_s, self._moved_s)
+        view_delay_s = 0.0
         is_correction = not math.isinf(self._begins_s)
-        wait_s = self._model.reaction_s + (slave.age_s if is_correction else 0.0)
+        if is_correction:
+            view_delay_s = slave.age_s
+        wait_s = self._model.reaction_s + view_delay_s
         return max(rest_s, 0.0) + wait_s
 
     def _find_press_step(self, slave: PeerView, t_s: float) -> Array:
         """Returns the step towards the required force, in m. It is 0 away from the wall."""
+        goal = self._goal
         force_n = self._find_force_n(slave.q, slave.tau_x)
-        towards_m = (self._goal.find_target_m(t_s) - self._goal.start_m)[: self._axes]
-        step_m: Array = towards_m * (self._goal.width_m / np.linalg.norm(towards_m))
+        way_m = goal.find_target_m(t_s) - goal.start_m
+        towards_m = way_m[: self._axes]
+        distance_m = np.linalg.norm(towards_m)
+        step_m: Array = towards_m * (goal.width_m / distance_m)
         if not force_n:
             return 0.0 * step_m
-        return step_m * (1.0 - force_n / self._goal.force_n)
+        missing_share = 1.0 - force_n / goal.force_n
+        return step_m * missing_share
 
     def _start_movement(self, t_s: float, step_m: Array) -> None:
         """Starts a movement by a step, with noise in proportion to the step's length.
@@ -207,16 +221,20 @@ class SyntheticParticipant:
         """
         model = self._model
         length_m = float(np.linalg.norm(step_m))
-        scatter_m = model.noise * length_m * self._random.standard_normal(self._axes)
+        deviation_m = model.noise * length_m
+        scatter_m = deviation_m * self._random.standard_normal(self._axes)
         # Index of difficulty by Shannon's formulation of Fitts' law, in bit.
-        difficulty_bits = math.log2(length_m / self._goal.width_m + 1.0)
-        practice = 0.5 ** (self._before / model.practised)
+        relative_length = length_m / self._goal.width_m
+        difficulty_bits = math.log2(relative_length + 1.0)
+        practised_duration_s = model.fitts_a_s + model.fitts_b_s * difficulty_bits
+        halvings = self._before / model.practised
+        practice = 0.5**halvings
         slowness = 1.0 + model.learning * practice
         start_m = self._interpolate_movement(t_s)
         self._start_m = start_m
         self._end_m = start_m + step_m + scatter_m
         self._begins_s = t_s
-        self._duration_s = slowness * (model.fitts_a_s + model.fitts_b_s * difficulty_bits)
+        self._duration_s = slowness * practised_duration_s
 
     def _interpolate_movement(self, t_s: float) -> Array:
         """Returns the position of the present movement of minimum jerk, in m.
@@ -226,9 +244,11 @@ class SyntheticParticipant:
         """
         s = 1.0
         if self._duration_s:
-            s = min(max((t_s - self._begins_s) / self._duration_s, 0.0), 1.0)
+            elapsed_s = t_s - self._begins_s
+            s = min(max(elapsed_s / self._duration_s, 0.0), 1.0)
         share = 10.0 * s**3 - 15.0 * s**4 + 6.0 * s**5
-        position_m: Array = self._start_m + (self._end_m - self._start_m) * share
+        way_m = self._end_m - self._start_m
+        position_m: Array = self._start_m + way_m * share
         return position_m
 
     def _follow(self, now: HandView, distance_m: Array, age_s: float) -> Array:
@@ -245,13 +265,17 @@ class SyntheticParticipant:
             The target position of the hand, in m.
         """
         # The age is the delay of one direction; a correction is seen after both directions.
-        loop_delay_s = self._model.reaction_s + 2.0 * age_s
-        rate = min(self._model.crossover_rad_s, DELAY_MARGIN / loop_delay_s)
+        model = self._model
+        loop_delay_s = model.reaction_s + 2.0 * age_s
+        rate = min(model.crossover_rad_s, DELAY_MARGIN / loop_delay_s)
         length_m = float(np.linalg.norm(distance_m))
-        scatter_m = self._model.noise * length_m * self._random.standard_normal(self._axes)
+        deviation_m = model.noise * length_m
+        scatter_m = deviation_m * self._random.standard_normal(self._axes)
         share = 0.0
         if not math.isinf(self._begins_s):
-            share = rate * (now.t_s - max(self._begins_s, 0.0))
+            elapsed_s = now.t_s - max(self._begins_s, 0.0)
+            share = rate * elapsed_s
         self._begins_s = now.t_s
-        self._end_m = self._end_m + min(share, 1.0) * (distance_m + scatter_m)
+        correction_m = min(share, 1.0) * (distance_m + scatter_m)
+        self._end_m = self._end_m + correction_m
         return self._end_m
