@@ -16,7 +16,7 @@ Invariant:
 """
 
 from collections import Counter, deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Generic, TypeVar
 
 import msgspec
@@ -89,8 +89,10 @@ class Tail(Generic[T]):
             The entries, the oldest first. Empty if there are no new ones.
         """
         size = len(self._entries)
-        new_count = min(self.count - count, most, size)
-        return [self._entries[index] for index in range(size - new_count, size)]
+        unread_count = self.count - count
+        new_count = min(unread_count, most, size)
+        first = size - new_count
+        return [self._entries[index] for index in range(first, size)]
 
 
 class SiteView:
@@ -132,11 +134,14 @@ class SiteView:
         boot: int,
         window: RecordWindow,
     ) -> None:
-        rule = scenario.sites[name].on_stale
+        spec = scenario.sites[name]
+        rule = spec.on_stale
         self.glides = rule.action == "glide"
         self.peers = scenario.peers(name)
-        self.layout = scenario.layout(name) if rule.rule.degrades else None
-        self.hand = scenario.sites[name].find_live_hand(is_open=True)
+        self.layout = None
+        if rule.rule.degrades:
+            self.layout = scenario.layout(name)
+        self.hand = spec.find_live_hand(is_open=True)
         self.reception = SiteReception(scenario, name, boot)
         self.window = window
         self.holder = ""
@@ -173,8 +178,11 @@ class SiteView:
             shared=len(record.q_des),
             lost=lost,
         )
-        if alarm is not None and alarm.order == "enable" and self.stopped_by:
-            return alarm._replace(reason=f"ordered by {self.stopped_by}")
+        if alarm is None:
+            return None
+        if alarm.order == "enable" and self.stopped_by:
+            reason = f"ordered by {self.stopped_by}"
+            return alarm._replace(reason=reason)
         return alarm
 
     @property
@@ -238,7 +246,8 @@ class SessionView:
         self._query = MemberQuery(bus, clock, session)
         self._queue = InboundQueue(clock)
         for channel in (topics.STATE, topics.LINK, topics.EVENT):
-            bus.tap(topics.key(session, "*", channel), self._queue.receive)
+            key_of_all_sites = topics.key(session, "*", channel)
+            bus.tap(key_of_all_sites, self._queue.receive)
 
     @property
     def running(self) -> bool:
@@ -250,7 +259,9 @@ class SessionView:
         """True once every site has published its end, or `finish` was called."""
         if not self.running:
             return False
-        return self._finished or all(site.ended for site in self.sites.values())
+        if self._finished:
+            return True
+        return all(site.ended for site in self.sites.values())
 
     def finish(self) -> None:
         """Marks the session as ended.
@@ -275,13 +286,19 @@ class SessionView:
         if received_ns is None or site.ended:
             return 0.0
         silence_ns = self._clock.monotonic_ns() - received_ns
-        return silence_ns / NS_PER_S if silence_ns >= MIN_SILENCE_NS else 0.0
+        if silence_ns < MIN_SILENCE_NS:
+            return 0.0
+        return silence_ns / NS_PER_S
 
     @property
     def session_silence_s(self) -> float:
         """Time for which all running sites have been silent, in s."""
-        running = [site for site in self.sites.values() if not site.ended]
-        return min((self.silence_s(site) for site in running), default=0.0)
+        silences_s: list[float] = []
+        for site in self.sites.values():
+            if not site.ended:
+                silence_s = self.silence_s(site)
+                silences_s.append(silence_s)
+        return min(silences_s, default=0.0)
 
     def poll(self) -> None:
         """Receives the messages that have arrived, and requests those that are missing.
@@ -303,9 +320,11 @@ class SessionView:
             repaired = site.repair.poll(now_ns, alive=not site.ended)
             for channel, reply, _ in repaired:
                 self._store(name, site, channel, reply.content)
-        records = [site.record for site in self.sites.values()]
-        times_ns = [record.t_ns for record in records if record is not None]
-        self.links.advance_to(max(times_ns, default=0))
+        newest_ns = 0
+        for site in self.sites.values():
+            if site.record is not None:
+                newest_ns = max(newest_ns, site.record.t_ns)
+        self.links.advance_to(newest_ns)
 
     def advance_energy(self) -> EnergyCourse | None:
         """Computes the energy of the session at the new ticks, with which stability is checked.
@@ -341,9 +360,11 @@ class SessionView:
         assert self.scenario is not None
         if site not in self._pictures:
             self._pictures[site] = PictureDelay(self.scenario, site)
+        picture_ticks = self._pictures[site].advance_to(tick, used)
         peer_ticks: dict[str, int] = {}
-        for peer, peer_tick in self._pictures[site].advance_to(tick, used).items():
-            peer_ticks[peer] = min(peer_tick, self.sites[peer].window.newest)
+        for peer, picture_tick in picture_ticks.items():
+            newest_tick = self.sites[peer].window.newest
+            peer_ticks[peer] = min(picture_tick, newest_tick)
         return peer_ticks
 
     def _connect_to_sites(self) -> None:
@@ -357,8 +378,9 @@ class SessionView:
                     self.dropped["another scenario"] += 1
         if self.scenario is None:
             return
-        infos = [self.members[name] for name in self.scenario.names if name in self.members]
-        have_all_replied = len(infos) == len(self.scenario.names)
+        names = self.scenario.names
+        infos = [self.members[name] for name in names if name in self.members]
+        have_all_replied = len(infos) == len(names)
         if have_all_replied and all(info.running for info in infos):
             self._create_sites(self.scenario)
 
@@ -385,13 +407,16 @@ class SessionView:
             WireError: The message cannot be decoded.
         """
         parts = topics.parse_key(inbound.key)
-        site = None if parts is None else self.sites.get(parts.member)
-        if parts is None or site is None:
+        if parts is None:
+            return
+        site = self.sites.get(parts.member)
+        if site is None:
             return
         channel = parts.channel
+        payloads: Iterable[bytes] = (inbound.payload,)
         # A message on the channel of records contains a block of records.
-        is_block = channel == topics.STATE
-        payloads = split_states(inbound.payload) if is_block else (inbound.payload,)
+        if channel == topics.STATE:
+            payloads = split_states(inbound.payload)
         for payload in payloads:
             try:
                 message = site.reception.read(channel, payload)
@@ -425,8 +450,9 @@ class SessionView:
             return False
         if self.scenario is None or not self.scenario.sites_may_return:
             return False
-        site.reception = SiteReception(self.scenario, name, event.boot, site.reception)
-        site.repair = GapRepair(self.bus, self.session, site.reception, site.dropped)
+        reception = SiteReception(self.scenario, name, event.boot, site.reception)
+        site.reception = reception
+        site.repair = GapRepair(self.bus, self.session, reception, site.dropped)
         return True
 
     def _skip_records_before(self, site: SiteView, content: State | LinkStats | Event) -> None:
@@ -438,12 +464,16 @@ class SessionView:
             site: The site.
             content: The first message of the site.
         """
-        tick = content.tick if isinstance(content, State | LinkStats) else 0
-        if tick / site.window.rate_hz < LATE_S:
+        tick = 0
+        if isinstance(content, State | LinkStats):
+            tick = content.tick
+        first_s = tick / site.window.rate_hz
+        if first_s < LATE_S:
             return
         site.first_tick = tick
         for channel in (topics.STATE, topics.LINK):
-            site.reception.accounts[channel].abandon_below(tick)
+            account = site.reception.accounts[channel]
+            account.abandon_below(tick)
         site.repair.probe()
 
     def _store(
@@ -464,7 +494,8 @@ class SessionView:
         site.window.receive(record)
         if record.bodies:
             site.bodies[record.tick] = record.bodies
-            while len(site.bodies) > KEPT_S * site.window.rate_hz:
+            kept_ticks = KEPT_S * site.window.rate_hz
+            while len(site.bodies) > kept_ticks:
                 oldest_tick = next(iter(site.bodies))
                 del site.bodies[oldest_tick]
         for change in record.cmd:
@@ -493,9 +524,10 @@ class SessionView:
         """
         if self.scenario is None or self.energy is None:
             return
-        if (site, text) in self._applied_changes:
+        identity = (site, text)
+        if identity in self._applied_changes:
             return
-        self._applied_changes.add((site, text))
+        self._applied_changes.add(identity)
         try:
             change = parse_core_change(self.scenario, site, text)
         except ScenarioError:

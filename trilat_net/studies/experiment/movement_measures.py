@@ -114,10 +114,13 @@ def sparc(
         return None
     next_power = int(np.ceil(np.log2(samples.size)))
     padded_size = 1 << (next_power + padding)
-    magnitude = np.abs(np.fft.rfft(samples, padded_size))
-    frequency_hz = np.arange(magnitude.size) * (rate_hz / padded_size)
+    coefficients = np.fft.rfft(samples, padded_size)
+    magnitude = np.abs(coefficients)
+    spacing_hz = rate_hz / padded_size
+    frequency_hz = np.arange(magnitude.size) * spacing_hz
     relative_magnitude = magnitude / magnitude.max()
-    spectrum = relative_magnitude[frequency_hz <= cutoff_hz]
+    is_motion = frequency_hz <= cutoff_hz
+    spectrum = relative_magnitude[is_motion]
 
     # The spectrum is cut to the range in which it exceeds the threshold.
     above = np.flatnonzero(spectrum >= threshold)
@@ -129,7 +132,8 @@ def sparc(
 
     # Length of the curve, whose frequency axis is scaled to run from 0 to 1.
     frequency_step = 1.0 / (curve.size - 1)
-    segment_lengths = np.hypot(np.diff(curve), frequency_step)
+    magnitude_steps = np.diff(curve)
+    segment_lengths = np.hypot(magnitude_steps, frequency_step)
     return -float(segment_lengths.sum())
 
 
@@ -139,7 +143,8 @@ def path_length_m(places: ArrayLike) -> float:
     Args:
         places: Positions along the path, in m, shape (K, D).
     """
-    steps = np.diff(_read("places", places, 2), axis=0)
+    points_m = _read("places", places, 2)
+    steps = np.diff(points_m, axis=0)
     step_lengths = np.linalg.norm(steps, axis=1)
     return float(step_lengths.sum())
 
@@ -259,22 +264,25 @@ def measure_throughput(
         )
     # How far each end point is beyond its target, along the axis of the task.
     end_errors = end_points - target_points
-    overshoots = (end_errors * axes).sum(axis=1) / lengths
+    projections = (end_errors * axes).sum(axis=1)
+    overshoots = projections / lengths
     distances = lengths + overshoots
     if serial:
         distances[1:] += overshoots[:-1]
     width = 0.0
     if overshoots.size > 1:
-        width = EFFECTIVE_WIDTH * float(np.std(overshoots, ddof=1))
+        deviation = float(np.std(overshoots, ddof=1))
+        width = EFFECTIVE_WIDTH * deviation
     distance = float(distances.mean())
     # End points that coincide have a spread of rounding errors.
     smallest_width = 1e-12 * float(lengths.max())
     if width <= smallest_width or distance <= 0.0:
         return None
+    relative_distance = distance / width
     return Throughput(
         width_m=width,
         distance_m=distance,
-        difficulty_bits=float(np.log2(distance / width + 1.0)),
+        difficulty_bits=float(np.log2(relative_distance + 1.0)),
         time_s=float(times.mean()),
     )
 
@@ -301,9 +309,12 @@ def find_internal_force(first: ArrayLike, second: ArrayLike) -> Array:
     """
     first_force, second_force = _read_same_shape(first=first, second=second)
     first_sign = np.sign(first_force)
-    are_opposed = first_sign * np.sign(second_force) < 0.0
-    smaller_size = np.minimum(np.abs(first_force), np.abs(second_force))
-    internal: Array = np.where(are_opposed, first_sign * smaller_size, 0.0)
+    second_sign = np.sign(second_force)
+    are_opposed = first_sign * second_sign < 0.0
+    first_size = np.abs(first_force)
+    second_size = np.abs(second_force)
+    cancelled = first_sign * np.minimum(first_size, second_size)
+    internal: Array = np.where(are_opposed, cancelled, 0.0)
     return internal
 
 
@@ -361,17 +372,22 @@ def measure_pair(
     first_effort = float((first_force * first_force).sum())
     second_effort = float((second_force * second_force).sum())
     effort = first_effort + second_effort
+    first_effort_share = None
+    if effort:
+        first_effort_share = first_effort / effort
     first_power = (first_force * velocities).sum(axis=1)
     second_power = (second_force * velocities).sum(axis=1)
+    first_absorbed_power = np.maximum(-first_power, 0.0)
+    second_absorbed_power = np.maximum(-second_power, 0.0)
     return PairMeasures(
         internal_rms_n=_compute_rms(internal),
         useful_rms_n=_compute_rms(useful),
         internal_share=internal_share,
-        first_effort_share=first_effort / effort if effort else None,
+        first_effort_share=first_effort_share,
         first_work_j=_integrate(first_power, rate_hz),
         second_work_j=_integrate(second_power, rate_hz),
-        first_taken_j=_integrate(np.maximum(-first_power, 0.0), rate_hz),
-        second_taken_j=_integrate(np.maximum(-second_power, 0.0), rate_hz),
+        first_taken_j=_integrate(first_absorbed_power, rate_hz),
+        second_taken_j=_integrate(second_absorbed_power, rate_hz),
     )
 
 

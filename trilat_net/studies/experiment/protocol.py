@@ -190,7 +190,8 @@ class Protocol(Frozen, frozen=True):
             return phases
         training = self.training
         if training is None:
-            return [("", None)] * self.trials
+            phases += [("", None)] * self.trials
+            return phases
         first_lead, last_lead = training.lead[condition]
         phases += [("before", 0.0)] * training.before
         leads = np.linspace(first_lead, last_lead, self.trials).tolist()
@@ -222,7 +223,11 @@ class Protocol(Frozen, frozen=True):
         else:
             names = participants
         size = len(self.users)
-        return [names[first : first + size] for first in range(0, len(names), size)]
+        groups: list[tuple[str, ...]] = []
+        for first in range(0, len(names), size):
+            group = names[first : first + size]
+            groups.append(group)
+        return groups
 
 
 class PlannedTrial(NamedTuple):
@@ -396,11 +401,14 @@ class ExperimentPlan(Result):
         """
         staircase = self.protocol.staircase
         assert staircase is not None
-        pair = (planned.trial - self.protocol.practice - 1) // 2
+        index_in_block = planned.trial - self.protocol.practice - 1
+        pair = index_in_block // 2
         judgements = self.judge_choices(planned, choices)
-        difference = staircase.list_differences(judgements)[pair]
-        is_right = judgements[pair] if pair < len(judgements) else None
-        return difference, is_right
+        differences = staircase.list_differences(judgements)
+        is_right = None
+        if pair < len(judgements):
+            is_right = judgements[pair]
+        return differences[pair], is_right
 
     def find_scenario(self, planned: PlannedTrial, choices: Choices) -> Scenario:
         """Returns the scenario of a trial.
@@ -419,7 +427,8 @@ class ExperimentPlan(Result):
         difference = 0.0
         if planned.phase == COMPARISON:
             difference, _ = self.find_pair(planned, choices)
-        return load_scenario(scenario, {staircase.key: staircase.standard + difference})
+        value = staircase.standard + difference
+        return load_scenario(scenario, {staircase.key: value})
 
     def rest_before_s(self, planned: PlannedTrial) -> float:
         """Returns how long participants must at least rest before a trial, in s.
@@ -433,7 +442,9 @@ class ExperimentPlan(Result):
         if training is not None and starts_retention:
             return training.rest_s
         starts_later_block = planned.trial == 1 and planned.block > 1
-        return self.protocol.rest_s if starts_later_block else 0.0
+        if starts_later_block:
+            return self.protocol.rest_s
+        return 0.0
 
     def list_orders(self) -> dict[str, list[str]]:
         """Returns the order in which each group of participants gets the conditions.
@@ -445,7 +456,8 @@ class ExperimentPlan(Result):
         for trial in self.trials:
             if trial.catch:
                 continue
-            order = orders.setdefault("-".join(trial.group), [])
+            group = "-".join(trial.group)
+            order = orders.setdefault(group, [])
             if trial.condition not in order:
                 order.append(trial.condition)
         return orders
@@ -459,7 +471,8 @@ class ExperimentPlan(Result):
         yield f"{protocol.name}: {protocol.title or protocol.task.description}"
         yield f"{facts['groups']} {units} at {users}, {protocol.task.description}"
         conditions = count_nouns(len(protocol.conditions), "condition")
-        counted = count_nouns(self.trials[-1].trial - protocol.practice, "trial")
+        block_size = self.trials[-1].trial
+        counted = count_nouns(block_size - protocol.practice, "trial")
         total = count_nouns(len(self.trials), "trial")
         _, longest_foreperiod_s = protocol.foreperiod_s
         longest_s = longest_foreperiod_s + protocol.task.longest_s
@@ -527,7 +540,8 @@ def plan_experiment(
     if problems:
         raise UsageError(f"{protocol.name}: " + "; ".join(problems))
     texts = {name: scenario.text for name, scenario in condition_scenarios.items()}
-    content = msgspec.json.encode([msgspec.to_builtins(protocol), texts], order="sorted")
+    tables = msgspec.to_builtins(protocol)
+    content = msgspec.json.encode([tables, texts], order="sorted")
     return ExperimentPlan(
         protocol=protocol,
         scenarios=condition_scenarios,
@@ -548,8 +562,9 @@ def _list_keys(table: Mapping[str, Any], path: str = "") -> dict[str, Any]:
     keys = dict[str, Any]()
     for name, value in table.items():
         key = f"{path}.{name}" if path else name
-        is_expanded = key in ("sites", "links", "dominance") or path in ("sites", "links")
-        if is_expanded and isinstance(value, Mapping):
+        has_members = key in ("sites", "links", "dominance")
+        is_member = path in ("sites", "links")
+        if isinstance(value, Mapping) and (has_members or is_member):
             keys |= _list_keys(value, key)
         else:
             keys[key] = value
@@ -687,7 +702,8 @@ def _check_scenario(scenario: Scenario, protocol: Protocol) -> Scenario:
         limit_forces(scenario, protocol, group)
     staircase = protocol.staircase
     if staircase is not None:
-        for value in (staircase.standard, staircase.standard + staircase.start):
+        largest = staircase.standard + staircase.start
+        for value in (staircase.standard, largest):
             load_scenario(scenario, {staircase.key: value})
     return scenario
 
@@ -756,7 +772,11 @@ def list_orders(design: str, conditions: Sequence[str], seed: int) -> list[tuple
     if design == "random":
         random = np.random.default_rng(seed)
         names = np.array(conditions)
-        return [tuple(names[random.permutation(count)].tolist()) for _ in range(1000)]
+        orders: list[tuple[str, ...]] = []
+        for _ in range(1000):
+            order = names[random.permutation(count)]
+            orders.append(tuple(order.tolist()))
+        return orders
     first_row = list(range(count))
     if design == "williams":
         # The first row is 0, 1, n - 1, 2, n - 2, ...
@@ -783,14 +803,16 @@ def _list_trials(protocol: Protocol) -> Iterator[PlannedTrial]:
         phases: list[tuple[str, float | None]] = [("", None)] * protocol.practice
         phases += protocol.list_phases(condition, random)
         catches = _draw_catches(protocol, condition, index, block)
-        first_target = np.random.default_rng([protocol.seed, index, block]).integers(1000)
+        target_random = np.random.default_rng([protocol.seed, index, block])
+        first_target = int(target_random.integers(1000))
         for trial, (phase, lead) in enumerate(phases):
             number += 1
             is_catch = trial in catches
             trial_condition = condition
             if protocol.catch is not None and is_catch:
                 trial_condition = protocol.catch.condition
-            state = np.random.SeedSequence([protocol.seed, number]).generate_state(1)
+            seed_sequence = np.random.SeedSequence([protocol.seed, number])
+            state = seed_sequence.generate_state(1)
             target_step = trial
             if protocol.staircase:
                 target_step = (trial - protocol.practice) // 2
@@ -802,7 +824,7 @@ def _list_trials(protocol: Protocol) -> Iterator[PlannedTrial]:
                 trial=trial + 1,
                 practice=trial < protocol.practice,
                 before=block * len(phases) + trial,
-                target=int(first_target) + target_step,
+                target=first_target + target_step,
                 # 31 bits, so that the seed is a positive 32-bit integer.
                 seed=int(state[0]) >> 1,
                 catch=is_catch,
@@ -828,5 +850,6 @@ def _draw_catches(protocol: Protocol, condition: str, group: int, block: int) ->
         return set()
     random = np.random.default_rng([protocol.seed, group, block, 1])
     count = round(catch.share * protocol.trials)
-    indices = protocol.practice + random.permutation(protocol.trials)[:count]
+    drawn = random.permutation(protocol.trials)[:count]
+    indices = protocol.practice + drawn
     return set(indices.tolist())
