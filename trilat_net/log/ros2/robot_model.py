@@ -15,7 +15,7 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 from xml.etree import ElementTree
-from xml.etree.ElementTree import Element
+from xml.etree.ElementTree import Element, SubElement
 
 from ...scenario import Scenario
 from ...scenario.arms import read_arm
@@ -36,6 +36,8 @@ Quaternion = tuple[float, float, float, float]
 """A unit quaternion x, y, z, w."""
 Transform = tuple[Vector, Quaternion]
 """The pose of a frame in its parent: origin in m, and rotation."""
+FramePose = tuple[Sequence[float], Sequence[float]]
+"""The same pose as two sequences: origin in m, and quaternion x, y, z, w."""
 
 _X_AXIS = (1.0, 0.0, 0.0)
 _Y_AXIS = (0.0, 1.0, 0.0)
@@ -62,6 +64,27 @@ class _JointFrame(NamedTuple):
     axis: Vector
     is_prismatic: bool
     q_index: int
+
+    def compute_transform(self, position: float) -> Transform:
+        """Computes the pose of the link's frame in the parent link's frame.
+
+        Args:
+            position: Position of the joint, in rad or m.
+        """
+        if self.is_prismatic:
+            axis_x, axis_y, axis_z = rotate_vector(self.rotation, self.axis)
+            x, y, z = self.origin_m
+            origin_m = (
+                x + position * axis_x,
+                y + position * axis_y,
+                z + position * axis_z,
+            )
+            return origin_m, self.rotation
+        if not position:
+            return self.origin_m, self.rotation
+        joint_rotation = _rotate_about(self.axis, position)
+        rotation = multiply_quaternions(self.rotation, joint_rotation)
+        return self.origin_m, rotation
 
 
 def multiply_quaternions(a: Quaternion, b: Quaternion) -> Quaternion:
@@ -102,9 +125,11 @@ def rotate_vector(rotation: Quaternion, vector: Vector) -> Vector:
 
 def _rotate_about(axis: Vector, angle: float) -> Quaternion:
     """Returns the quaternion of a rotation about a unit vector by an angle in rad."""
-    sine = math.sin(angle / 2.0)
-    cosine = math.cos(angle / 2.0)
-    return axis[0] * sine, axis[1] * sine, axis[2] * sine, cosine
+    half_angle = angle / 2.0
+    sine = math.sin(half_angle)
+    cosine = math.cos(half_angle)
+    x, y, z = axis
+    return x * sine, y * sine, z * sine, cosine
 
 
 def compute_quaternion(rotation_vector: Vector) -> Quaternion:
@@ -116,8 +141,9 @@ def compute_quaternion(rotation_vector: Vector) -> Quaternion:
     angle = math.hypot(*rotation_vector)
     if not angle:
         return _rotate_about(_X_AXIS, angle)
-    x, y, z = (component / angle for component in rotation_vector)
-    return _rotate_about((x, y, z), angle)
+    x, y, z = rotation_vector
+    axis = (x / angle, y / angle, z / angle)
+    return _rotate_about(axis, angle)
 
 
 def _rotate_upright(down: Sequence[float]) -> Quaternion:
@@ -127,14 +153,19 @@ def _rotate_upright(down: Sequence[float]) -> Quaternion:
         down: The direction of gravity. It need not be a unit vector.
     """
     length = math.hypot(*down)
-    x, y, z = (component / length for component in down)
+    down_x, down_y, down_z = down
+    x = down_x / length
+    y = down_y / length
+    z = down_z / length
     # If the direction is +z, any half turn about a horizontal axis is a shortest rotation.
     if z > 1.0 - 1e-12:
         return 1.0, 0.0, 0.0, 0.0
     # For unit vectors a and b, the shortest rotation is the quaternion (a x b, 1 + a . b),
     # normalised. With b = -z, the cross product is (-y, x, 0), and the scalar part is 1 - z.
-    norm = math.sqrt(x * x + y * y + (1.0 - z) ** 2)
-    return -y / norm, x / norm, 0.0, (1.0 - z) / norm
+    scalar = 1.0 - z
+    squared_norm = x * x + y * y + scalar**2
+    norm = math.sqrt(squared_norm)
+    return -y / norm, x / norm, 0.0, scalar / norm
 
 
 def _convert_rpy(rpy: Sequence[float]) -> Quaternion:
@@ -171,32 +202,42 @@ class RobotModel:
     def __init__(self, scenario: Scenario, site: str) -> None:
         spec = scenario.sites[site].arm
         site_number = scenario.names.index(site)
-        base = "base"
-        urdf = _PLANAR.format(l1_m=spec.l1_m, l2_m=spec.l2_m)
         if spec.urdf:
-            base = read_arm(spec, scenario.urdf).base
+            arm_model = read_arm(spec, scenario.urdf)
+            base = arm_model.base
             urdf = scenario.urdf[spec.urdf]
+        else:
+            base = "base"
+            urdf = _PLANAR.format(l1_m=spec.l1_m, l2_m=spec.l2_m)
         root = ElementTree.fromstring(urdf)
-        self.frames = [(WORLD, f"{site}/{base}")]
+        base_frame = f"{site}/{base}"
+        self.frames = [(WORLD, base_frame)]
         self._joints: list[_JointFrame] = []
         joint_names = scenario.arms[site].joint_names
         for joint in _list_joints(root, base):
             parent = _get_link(joint, "parent")
             child = _get_link(joint, "child")
-            self.frames.append((f"{site}/{parent}", f"{site}/{child}"))
-            self._joints.append(_read_joint_frame(joint, joint_names))
+            parent_frame = f"{site}/{parent}"
+            child_frame = f"{site}/{child}"
+            self.frames.append((parent_frame, child_frame))
+            joint_frame = _read_joint_frame(joint, joint_names)
+            self._joints.append(joint_frame)
         self._packer = TransformPacker(self.frames)
 
         base_rotation = _convert_rpy(spec.base_rpy_rad)
         down_x, down_y, down_z = spec.down if spec.urdf else _PLANAR_DOWN
-        down = rotate_vector(base_rotation, (down_x, down_y, down_z))
+        down_of_base = (down_x, down_y, down_z)
+        down = rotate_vector(base_rotation, down_of_base)
         upright = _rotate_upright(down)
-        base_x, base_y, base_z = spec.base_xyz_m
-        x, y, z = rotate_vector(upright, (base_x, base_y, base_z))
         site_y = SPACING_M * site_number
-        self.shared = ((0.0, site_y, 0.0), upright)
+        shared_origin = (0.0, site_y, 0.0)
+        self.shared = (shared_origin, upright)
+        base_x, base_y, base_z = spec.base_xyz_m
+        base_xyz_m = (base_x, base_y, base_z)
+        x, y, z = rotate_vector(upright, base_xyz_m)
         base_origin = (x, y + site_y, z)
-        self._base = (base_origin, multiply_quaternions(upright, base_rotation))
+        world_rotation = multiply_quaternions(upright, base_rotation)
+        self._base = (base_origin, world_rotation)
         # The description is made last, because the links of `root` are renamed for it.
         self.description = _describe_robot(root, site, site_number)
 
@@ -211,19 +252,10 @@ class RobotModel:
         """
         transforms: list[Transform] = [self._base]
         for joint in self._joints:
-            origin = joint.origin_m
-            rotation = joint.rotation
-            position = q[joint.q_index] if joint.q_index >= 0 else 0.0
-            if joint.is_prismatic:
-                x, y, z = rotate_vector(rotation, joint.axis)
-                origin = (
-                    origin[0] + position * x,
-                    origin[1] + position * y,
-                    origin[2] + position * z,
-                )
-            elif position:
-                rotation = multiply_quaternions(rotation, _rotate_about(joint.axis, position))
-            transforms.append((origin, rotation))
+            can_move = joint.q_index >= 0
+            position = q[joint.q_index] if can_move else 0.0
+            transform = joint.compute_transform(position)
+            transforms.append(transform)
         return transforms
 
     def pack(self, stamp_ns: int, q: Sequence[float]) -> bytes:
@@ -233,11 +265,10 @@ class RobotModel:
             stamp_ns: Unix time of the message, in ns, 0 or more.
             q: Positions of the joints, in rad or m.
         """
-        return self.pack_transforms(stamp_ns, self.compute_transforms(q))
+        transforms = self.compute_transforms(q)
+        return self.pack_transforms(stamp_ns, transforms)
 
-    def pack_transforms(
-        self, stamp_ns: int, transforms: Iterable[tuple[Sequence[float], Sequence[float]]]
-    ) -> bytes:
+    def pack_transforms(self, stamp_ns: int, transforms: Iterable[FramePose]) -> bytes:
         """Encodes computed poses as one message of the topic `/tf`.
 
         Args:
@@ -261,14 +292,16 @@ def _list_joints(root: Element, base: str) -> list[Element]:
     joints_of_parent: dict[str, list[Element]] = {}
     for joint in root.findall("joint"):
         parent = _get_link(joint, "parent")
-        joints_of_parent.setdefault(parent, []).append(joint)
+        siblings = joints_of_parent.setdefault(parent, [])
+        siblings.append(joint)
     joints: list[Element] = []
     links = [base]
     # The list of links grows while the loop runs: breadth-first search.
     for link in links:
         for joint in joints_of_parent.get(link, ()):
+            child = _get_link(joint, "child")
             joints.append(joint)
-            links.append(_get_link(joint, "child"))
+            links.append(child)
     return joints
 
 
@@ -280,7 +313,9 @@ def _get_link(joint: Element, end: str) -> str:
         end: "parent" or "child".
     """
     element = joint.find(end)
-    return "" if element is None else element.get("link", "")
+    if element is None:
+        return ""
+    return element.get("link", "")
 
 
 def _parse_vector(element: Element | None, key: str, default: Vector) -> Vector:
@@ -295,12 +330,15 @@ def _parse_vector(element: Element | None, key: str, default: Vector) -> Vector:
         key: Name of the attribute.
         default: The default.
     """
-    text = "" if element is None else element.get(key, "")
+    if element is None:
+        return default
+    numbers_text = element.get(key, "")
     try:
-        x, y, z = map(float, text.split())
+        x, y, z = map(float, numbers_text.split())
     except ValueError:
         return default
-    return (x, y, z) if math.isfinite(x + y + z) else default
+    is_finite = math.isfinite(x + y + z)
+    return (x, y, z) if is_finite else default
 
 
 def _read_joint_frame(joint: Element, joint_names: Sequence[str]) -> _JointFrame:
@@ -312,14 +350,19 @@ def _read_joint_frame(joint: Element, joint_names: Sequence[str]) -> _JointFrame
     """
     name = joint.get("name", "")
     origin = joint.find("origin")
-    axis = _parse_vector(joint.find("axis"), "xyz", _X_AXIS)
-    length = math.hypot(*axis) or 1.0
+    rpy = _parse_vector(origin, "rpy", _NO_VECTOR)
+    axis = joint.find("axis")
+    x, y, z = _parse_vector(axis, "xyz", _X_AXIS)
+    length = math.hypot(x, y, z) or 1.0
+    q_index = -1
+    if name in joint_names:
+        q_index = joint_names.index(name)
     return _JointFrame(
         origin_m=_parse_vector(origin, "xyz", _NO_VECTOR),
-        rotation=_convert_rpy(_parse_vector(origin, "rpy", _NO_VECTOR)),
-        axis=(axis[0] / length, axis[1] / length, axis[2] / length),
+        rotation=_convert_rpy(rpy),
+        axis=(x / length, y / length, z / length),
         is_prismatic=joint.get("type") == "prismatic",
-        q_index=joint_names.index(name) if name in joint_names else -1,
+        q_index=q_index,
     )
 
 
@@ -335,18 +378,25 @@ def _describe_robot(root: Element, site: str, site_number: int) -> str:
         site_number: Index of the site, which determines the colour.
     """
     has_shapes = root.find("link/visual") is not None
-    colour = _SHAPE_COLOURS[site_number % len(_SHAPE_COLOURS)]
-    links = {link.get("name", ""): link for link in root.findall("link")}
+    colour_index = site_number % len(_SHAPE_COLOURS)
+    colour = _SHAPE_COLOURS[colour_index]
+    links: dict[str, Element] = {}
+    for link in root.findall("link"):
+        name = link.get("name", "")
+        links[name] = link
     for joint in root.findall("joint"):
-        parent = links.get(_get_link(joint, "parent"))
+        parent_name = _get_link(joint, "parent")
+        parent = links.get(parent_name)
         if parent is not None and not has_shapes:
-            joint_origin_m = _parse_vector(joint.find("origin"), "xyz", _NO_VECTOR)
+            origin = joint.find("origin")
+            joint_origin_m = _parse_vector(origin, "xyz", _NO_VECTOR)
             _add_shape(parent, joint_origin_m, colour, site)
         for end in ("parent", "child"):
             element = joint.find(end)
-            if element is not None:
-                link_name = element.get("link", "")
-                element.set("link", f"{site}/{link_name}")
+            if element is None:
+                continue
+            link_name = element.get("link", "")
+            element.set("link", f"{site}/{link_name}")
     for name, link in links.items():
         link.set("name", f"{site}/{name}")
     return ElementTree.tostring(root, encoding="unicode")
@@ -363,21 +413,24 @@ def _add_shape(link: Element, end_m: Vector, colour: str, site: str) -> None:
         colour: Red, green, blue and opacity, from 0 to 1.
         site: Name of the site, which makes the name of the material unique.
     """
-    length_m = math.hypot(*end_m)
-    centre_text = " ".join(f"{coordinate / 2.0:.9g}" for coordinate in end_m)
+    x, y, z = end_m
+    length_m = math.hypot(x, y, z)
+    centre_text = f"{x / 2.0:.9g} {y / 2.0:.9g} {z / 2.0:.9g}"
     # The axis of a cylinder is z in a URDF. It is tilted from z, and then turned about z.
-    tilt = math.atan2(math.hypot(end_m[0], end_m[1]), end_m[2])
-    azimuth = math.atan2(end_m[1], end_m[0])
+    horizontal_m = math.hypot(x, y)
+    tilt = math.atan2(horizontal_m, z)
+    azimuth = math.atan2(y, x)
     rpy_text = f"0 {tilt:.9g} {azimuth:.9g}"
-    visual = ElementTree.SubElement(link, "visual")
-    ElementTree.SubElement(visual, "origin", xyz=centre_text, rpy=rpy_text)
-    geometry = ElementTree.SubElement(visual, "geometry")
+    visual = SubElement(link, "visual")
+    SubElement(visual, "origin", xyz=centre_text, rpy=rpy_text)
+    geometry = SubElement(visual, "geometry")
     if length_m > 0.0:
         radius_text = f"{_RADIUS_M:g}"
         length_text = f"{length_m:.9g}"
-        ElementTree.SubElement(geometry, "cylinder", radius=radius_text, length=length_text)
+        SubElement(geometry, "cylinder", radius=radius_text, length=length_text)
     else:
-        radius_text = f"{1.2 * _RADIUS_M:g}"
-        ElementTree.SubElement(geometry, "sphere", radius=radius_text)
-    material = ElementTree.SubElement(visual, "material", name=f"{site}_plain")
-    ElementTree.SubElement(material, "color", rgba=colour)
+        sphere_radius_m = 1.2 * _RADIUS_M
+        radius_text = f"{sphere_radius_m:g}"
+        SubElement(geometry, "sphere", radius=radius_text)
+    material = SubElement(visual, "material", name=f"{site}_plain")
+    SubElement(material, "color", rgba=colour)
