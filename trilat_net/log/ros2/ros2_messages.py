@@ -14,7 +14,7 @@ Invariant:
 
 import math
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -45,6 +45,18 @@ ROBOT = "robot_description"
 """Channel with the URDF of an arm."""
 FRAMES = "tf"
 """Channel with the frames of an arm's links."""
+
+NamedMessages = Iterator[tuple[str, bytes]]
+"""Encoded messages, each with the name of its channel or topic."""
+_INDEX_ERRORS = (
+    McapError,
+    EOFError,
+    OSError,
+    struct.error,
+    ValueError,
+    OverflowError,
+)
+"""Errors of the library `mcap` for a file whose index cannot be read."""
 
 
 class Ros2Channel(NamedTuple):
@@ -83,18 +95,18 @@ class StandardChannels:
         if topic not in self._channel_numbers:
             channel = self._known[topic]
             schema_number = self._get_schema_number(channel.kind)
-            self._channel_numbers[topic] = self._file.register_channel(
+            channel_number = self._file.register_channel(
                 topic, cdr.ENCODING, schema_number, channel.about
             )
+            self._channel_numbers[topic] = channel_number
         return self._channel_numbers[topic]
 
     def _get_schema_number(self, kind: str) -> int:
         """Returns the number of a message type, and registers the type if necessary."""
         if kind not in self._schema_numbers:
             definition = cdr.ROS2_SCHEMAS[kind]
-            self._schema_numbers[kind] = self._file.register_schema(
-                kind, cdr.SCHEMA_ENCODING, definition
-            )
+            schema_number = self._file.register_schema(kind, cdr.SCHEMA_ENCODING, definition)
+            self._schema_numbers[kind] = schema_number
         return self._schema_numbers[kind]
 
 
@@ -102,9 +114,14 @@ SESSION_CHANNELS = {
     EVENTS: Ros2Channel(cdr.STRING, {"content": "what happened, member first"}),
     LINES: Ros2Channel(cdr.LOG, {"content": "the same as lines of a log"}),
 }
+_ROBOT_METADATA = {"content": "URDF, with links named after their site"}
+_FRAMES_METADATA = {
+    "content": "frames of the links",
+    "unit": "m",
+}
 ROBOT_CHANNELS = {
-    ROBOT: Ros2Channel(cdr.STRING, {"content": "URDF, with links named after their site"}),
-    FRAMES: Ros2Channel(cdr.TRANSFORMS, {"content": "frames of the links", "unit": "m"}),
+    ROBOT: Ros2Channel(cdr.STRING, _ROBOT_METADATA),
+    FRAMES: Ros2Channel(cdr.TRANSFORMS, _FRAMES_METADATA),
 }
 _LEVELS = {
     "diverged": cdr.RosLogLevel.ERROR,
@@ -124,7 +141,7 @@ _MODE_NUMBERS: dict[Mode | str, float] = {
 """Number of a mode, which is a `Mode` in a `TickRecord` and a word in a `State`."""
 
 
-def pack_event(event: Event, stamp_ns: int) -> Iterator[tuple[str, bytes]]:
+def pack_event(event: Event, stamp_ns: int) -> NamedMessages:
     """Encodes an event for viewers in two forms: as a text, and as a line for the ROS log.
 
     Args:
@@ -135,9 +152,11 @@ def pack_event(event: Event, stamp_ns: int) -> Iterator[tuple[str, bytes]]:
         For each form, the name of its channel (`EVENTS` or `LINES`) and the message.
     """
     text = describe_event(event.kind, event.text, event.command)
+    text_with_member = f"{event.member}: {text}"
+    yield EVENTS, cdr.pack_string(text_with_member)
     level = _LEVELS.get(event.kind, cdr.RosLogLevel.INFO)
-    yield EVENTS, cdr.pack_string(f"{event.member}: {text}")
-    yield LINES, cdr.pack_log(stamp_ns, level, event.member, text)
+    log_line = cdr.pack_log(stamp_ns, level, event.member, text)
+    yield LINES, log_line
 
 
 class ArrayChannel:
@@ -158,8 +177,12 @@ class ArrayChannel:
 
     def __init__(self, content: str, unit: str, *axes: Sequence[str]) -> None:
         names = [" ".join(axis) for axis in axes]
-        about = {"content": content, "unit": unit, "names": "; ".join(names)}
-        self.channel = Ros2Channel(cdr.FLOAT64_ARRAY, about)
+        metadata = {
+            "content": content,
+            "unit": unit,
+            "names": "; ".join(names),
+        }
+        self.channel = Ros2Channel(cdr.FLOAT64_ARRAY, metadata)
         # The first label also names the content, and the last label the unit.
         labels = [*names]
         labels[0] = f"{content}: {labels[0]}"
@@ -168,6 +191,10 @@ class ArrayChannel:
         self.size = math.prod(lengths)
         dimensions = zip(labels, lengths, strict=True)
         self.pack = cdr.make_float_array_packer(*dimensions)
+
+
+ArrayChannels = dict[str, ArrayChannel]
+"""Array channels by the last part of their topic."""
 
 
 class Ros2SiteChannels:
@@ -199,9 +226,13 @@ class Ros2SiteChannels:
         n = arm.counts.joints
         shared = arm.counts.shared
         # A row begins with q, q_des, qd and tau, n numbers each. The errors follow.
-        self.error_row = slice(4 * n, 4 * n + shared)
-        self.slow_row = slice(4 * n + shared, None)
-        self.robot = RobotModel(scenario, site) if arm.chain is not None else None
+        error_start = 4 * n
+        error_end = error_start + shared
+        self.error_row = slice(error_start, error_end)
+        self.slow_row = slice(error_end, None)
+        self.robot: RobotModel | None = None
+        if arm.chain is not None:
+            self.robot = RobotModel(scenario, site)
         self.joints = [*arm.joint_names]
         if self.robot is None:
             self.joints = [f"{site}_{name}" for name in arm.joint_names]
@@ -213,7 +244,7 @@ class Ros2SiteChannels:
             "tau_x": ArrayChannel(
                 "exogenous torque, as Eq. (8) subtracts it",
                 self._join_units("N m"),
-                self._list_joint_labels(),
+                _make_labels(self.joints),
             ),
             "theta_hat": self._make_estimate_array(),
             **sent_arrays,
@@ -221,26 +252,25 @@ class Ros2SiteChannels:
             **self._make_statistics_arrays(),
         }
 
-    def _list_joint_labels(self) -> list[str]:
-        """Returns the names of the joints without spaces, which separate them in a label."""
-        return [_replace_spaces(name) for name in self.joints]
-
     def _make_error_array(self) -> ArrayChannel:
         """Returns the array of the synchronisation error, of a pose or of the joints."""
         if self._arm.shares_pose:
-            axes = TASK_AXES[: self._arm.counts.shared]
+            shared = self._arm.counts.shared
+            axes = TASK_AXES[:shared]
             return ArrayChannel("x - x_des", "m or rad", axes)
-        return ArrayChannel("q - q_des", self._join_units("rad"), self._list_joint_labels())
+        units = self._join_units("rad")
+        labels = _make_labels(self.joints)
+        return ArrayChannel("q - q_des", units, labels)
 
     def _make_estimate_array(self) -> ArrayChannel:
         """Returns the array of the estimated parameters of the arm."""
-        parameters = [_replace_spaces(name) for name, _ in self._arm.parameters]
+        labels = _make_labels(name for name, _ in self._arm.parameters)
         if self._arm.chain is not None:
-            return ArrayChannel("estimate", "kg, kg m, kg m^2", parameters)
+            return ArrayChannel("estimate", "kg, kg m, kg m^2", labels)
         units = "kg m^2, kg m^2, kg m^2, kg m, kg m"
-        return ArrayChannel("estimate of Eq. (24)", units, parameters)
+        return ArrayChannel("estimate of Eq. (24)", units, labels)
 
-    def _make_statistics_arrays(self) -> dict[str, ArrayChannel]:
+    def _make_statistics_arrays(self) -> ArrayChannels:
         """Returns the arrays that are computed from the statistics of links."""
         peers = self._peers
         return {
@@ -263,8 +293,12 @@ class Ros2SiteChannels:
         There is a channel for each array of numbers. If the arm has a robot model, there are
         also channels for the model and for the poses of its links.
         """
-        arrays = {name: array.channel for name, array in self.arrays.items()}
-        return arrays if self.robot is None else arrays | ROBOT_CHANNELS
+        channels: dict[str, Ros2Channel] = {}
+        for name, array in self.arrays.items():
+            channels[name] = array.channel
+        if self.robot is not None:
+            channels |= ROBOT_CHANNELS
+        return channels
 
     def joint_states(self, names: Sequence[str], *, effort: bool = True) -> Ros2Channel:
         """Returns a channel of joint states.
@@ -273,11 +307,16 @@ class Ros2SiteChannels:
             names: Names of the joints.
             effort: True if the messages contain torques.
         """
-        revolute_units = ["rad", "rad/s", "N m"] if effort else ["rad", "rad/s"]
-        units = ", ".join(self._join_units(unit) for unit in revolute_units)
-        # The names are separated by spaces and cannot contain any.
-        joined_names = " ".join(_replace_spaces(name) for name in names)
-        return Ros2Channel(cdr.JOINT_STATE, {"unit": units, "names": joined_names})
+        revolute_units = ["rad", "rad/s"]
+        if effort:
+            revolute_units.append("N m")
+        units = map(self._join_units, revolute_units)
+        labels = _make_labels(names)
+        metadata = {
+            "unit": ", ".join(units),
+            "names": " ".join(labels),
+        }
+        return Ros2Channel(cdr.JOINT_STATE, metadata)
 
     def _join_units(self, revolute_unit: str) -> str:
         """Returns the units of all joints as a text, such as "rad or m".
@@ -285,10 +324,11 @@ class Ros2SiteChannels:
         Args:
             revolute_unit: Unit of the quantity for a revolute joint.
         """
-        different_units = dict.fromkeys(self._arm.joint_units(revolute_unit))
+        joint_units = self._arm.joint_units(revolute_unit)
+        different_units = dict.fromkeys(joint_units)
         return " or ".join(different_units)
 
-    def pack_slow_arrays(self, row: Sequence[float]) -> Iterator[tuple[str, bytes]]:
+    def pack_slow_arrays(self, row: Sequence[float]) -> NamedMessages:
         """Encodes the quantities of a record that viewers receive at a reduced rate.
 
         These are the exogenous torque of Eq. (8), the estimated parameters, the numbers that
@@ -305,10 +345,11 @@ class Ros2SiteChannels:
         for name in self._slow_names:
             array = self.arrays[name]
             end = start + array.size
-            yield name, array.pack(*row[start:end])
+            numbers = row[start:end]
+            yield name, array.pack(*numbers)
             start = end
 
-    def pack_statistics(self, stats: LinkStats) -> Iterator[tuple[str, bytes]]:
+    def pack_statistics(self, stats: LinkStats) -> NamedMessages:
         """Encodes the statistics about the connections of a site to other sites as arrays.
 
         The age of the received states is always included. Delays, clock offsets and the timing
@@ -324,8 +365,12 @@ class Ros2SiteChannels:
         peers = self._peers
         if not peers:
             return
-        ages_ms = [_convert_to_ms(stats.age_us.get(peer, -1)) for peer in peers]
-        yield "link_age", self.arrays["link_age"].pack(*ages_ms)
+        ages_ms: list[float] = []
+        for peer in peers:
+            age_us = stats.age_us.get(peer, -1)
+            ages_ms.append(_convert_to_ms(age_us))
+        age_array = self.arrays["link_age"]
+        yield "link_age", age_array.pack(*ages_ms)
         # Virtual time has no measured delays and no clock offsets.
         if not stats.delay_us:
             return
@@ -334,33 +379,45 @@ class Ros2SiteChannels:
         for peer in peers:
             median_us = stats.delay_us.get(peer, -1)
             maximum_us = stats.delay_max_us.get(peer, -1)
-            delays_ms += [_convert_to_ms(median_us), _convert_to_ms(maximum_us)]
+            delays_ms.append(_convert_to_ms(median_us))
+            delays_ms.append(_convert_to_ms(maximum_us))
             offset_us = stats.offset_us.get(peer, math.nan)
             bound_us = stats.bound_us.get(peer, math.nan)
             offsets_ms += [offset_us / 1e3, bound_us / 1e3]
-        yield "link_delay", self.arrays["link_delay"].pack(*delays_ms)
-        yield "link_offset", self.arrays["link_offset"].pack(*offsets_ms)
-        timing = self.arrays["timing"].pack(stats.late_max_us, stats.busy_max_us)
-        yield "timing", timing
+        delay_array = self.arrays["link_delay"]
+        yield "link_delay", delay_array.pack(*delays_ms)
+        offset_array = self.arrays["link_offset"]
+        yield "link_offset", offset_array.pack(*offsets_ms)
+        timing_array = self.arrays["timing"]
+        yield "timing", timing_array.pack(stats.late_max_us, stats.busy_max_us)
 
 
-def _replace_spaces(name: str) -> str:
-    """Returns a name with underscores in place of spaces."""
-    return "_".join(name.split())
+def _make_labels(names: Iterable[str]) -> list[str]:
+    """Returns names with underscores in place of spaces, because spaces separate labels."""
+    labels: list[str] = []
+    for name in names:
+        parts = name.split()
+        labels.append("_".join(parts))
+    return labels
 
 
-def _make_sent_arrays(scenario: Scenario, site: str) -> dict[str, ArrayChannel]:
+def _make_sent_arrays(scenario: Scenario, site: str) -> ArrayChannels:
     """Returns an array for each vector that a site's law sends, in the record's order."""
-    arrays: dict[str, ArrayChannel] = {}
-    for vector, peer, index in scenario.channel(site).entries(scenario.peers(site)):
+    arrays: ArrayChannels = {}
+    peers = scenario.peers(site)
+    channel = scenario.channel(site)
+    for vector, peer, index in channel.entries(peers):
         # A vector has an entry per number. The first entry stands for the whole vector.
         if index:
             continue
         suffix = f"_to_{peer}" if peer else ""
-        content = f"{vector.name} that the law sends to {peer or 'all'}"
-        entries = [f"{vector.name}{number}" for number in range(1, vector.length + 1)]
-        array = ArrayChannel(content, vector.unit or "-", entries)
-        arrays[f"{SENT_PREFIX}{vector.name}{suffix}"] = array
+        receiver = peer or "all"
+        content = f"{vector.name} that the law sends to {receiver}"
+        numbers = range(1, vector.length + 1)
+        entries = [f"{vector.name}{number}" for number in numbers]
+        unit = vector.unit or "-"
+        array_name = f"{SENT_PREFIX}{vector.name}{suffix}"
+        arrays[array_name] = ArrayChannel(content, unit, entries)
     return arrays
 
 
@@ -384,15 +441,18 @@ def read_ros2_channels(path: Path) -> dict[str, Ros2Channel]:
     with reading(path) as stream:
         try:
             summary = make_reader(stream).get_summary()
-        except (McapError, EOFError, OSError, struct.error, ValueError, OverflowError):
+        except _INDEX_ERRORS:
             summary = None
     if summary is None:
         return {}
     channels: dict[str, Ros2Channel] = {}
-    for _, channel in sorted(summary.channels.items()):
+    numbered_channels = sorted(summary.channels.items())
+    for _, channel in numbered_channels:
         schema = summary.schemas.get(channel.schema_id)
-        if channel.message_encoding == cdr.ENCODING and schema is not None:
-            channels[channel.topic] = Ros2Channel(schema.name, dict(channel.metadata))
+        is_ros2 = channel.message_encoding == cdr.ENCODING
+        if is_ros2 and schema is not None:
+            metadata = dict(channel.metadata)
+            channels[channel.topic] = Ros2Channel(schema.name, metadata)
     return channels
 
 
@@ -425,22 +485,33 @@ def stack_signals(records: Sequence[Record]) -> list[SignalRow]:
         joint_reference = record.q if is_task_space else record.q_des
         kinematics = (*record.q, *joint_reference, *record.qd)
         torques = (*record.tau, *record.tau_x)
-        rows.append((*kinematics, *torques, *record.theta_hat, *record.ch))
-    curves: list[SignalRow] = [*zip(*rows, strict=True)]
+        row = (*kinematics, *torques, *record.theta_hat, *record.ch)
+        rows.append(row)
+    curves = _transpose(rows)
 
     joint_count = len(first.q)
     actual = curves[:joint_count]
     if is_task_space:
-        actual = [*zip(*(record.x for record in records), strict=True)]
-    desired = [*zip(*(record.q_des for record in records), strict=True)]
+        actual = _transpose(record.x for record in records)
+    desired = _transpose(record.q_des for record in records)
     errors = _compute_errors(actual, desired)
     # The error of an orientation is not a difference of numbers.
     if is_task_space and len(errors) > POSITION:
         x = np.array(actual).T
         x_des = np.array(desired).T
-        errors = compute_task_errors(x, x_des, [1.0] * len(errors)).T.tolist()
+        all_axes = [1.0] * len(errors)
+        task_errors = compute_task_errors(x, x_des, all_axes)
+        errors = task_errors.T.tolist()
     error_start = 4 * joint_count
-    return [*curves[:error_start], *errors, *curves[error_start:], _list_modes(records)]
+    curves_before = curves[:error_start]
+    curves_after = curves[error_start:]
+    modes = _list_modes(records)
+    return [*curves_before, *errors, *curves_after, modes]
+
+
+def _transpose(rows: Iterable[SignalRow]) -> list[SignalRow]:
+    """Returns the columns of rows of equal length."""
+    return [*zip(*rows, strict=True)]
 
 
 def _compute_errors(
@@ -450,13 +521,15 @@ def _compute_errors(
     errors: list[list[float]] = []
     for actual_curve, desired_curve in zip(actual, desired, strict=True):
         pairs = zip(actual_curve, desired_curve, strict=True)
-        errors.append([value - reference for value, reference in pairs])
+        differences = [value - reference for value, reference in pairs]
+        errors.append(differences)
     return errors
 
 
 def _list_modes(records: Sequence[Record]) -> list[float]:
     """Returns the mode of each record as a number, or only one number if all are equal."""
     modes = [record.mode for record in records]
-    if modes.count(modes[0]) == len(modes):
+    first_mode = modes[0]
+    if modes.count(first_mode) == len(modes):
         del modes[1:]
     return [_MODE_NUMBERS.get(mode, 0.0) for mode in modes]
