@@ -30,7 +30,7 @@ from ...scenario import Scenario
 from ..log_layout import VIZ_ROOT
 from . import ros2_messages
 from .cdr import JointStatePacker, pack_string
-from .ros2_messages import Record, SignalRow
+from .ros2_messages import Record, Ros2Channel, SignalRow
 
 VIZ_HZ = 100.0
 """Default rate of the messages with the joints and their error, in Hz."""
@@ -55,6 +55,8 @@ ReceiveMessage = Callable[[Any, int], None]
 """Function that receives one message of the log, and its arrival time in Unix ns."""
 StampedRow = tuple[int, SignalRow]
 """Time in Unix ns, and the values of all curves at this time."""
+WriteRow = Callable[[int, SignalRow, int], None]
+"""Function that writes the values of all curves at one time: time, values, arrival time."""
 
 _get_tick = attrgetter("tick")
 
@@ -69,7 +71,7 @@ class _BucketOutput:
         write: Function that writes a row: time, values, and arrival time in Unix ns.
     """
 
-    def __init__(self, write: Callable[[int, SignalRow, int], None]) -> None:
+    def __init__(self, write: WriteRow) -> None:
         self._write = write
         self._waiting_rows: Sequence[StampedRow] = ()
 
@@ -160,17 +162,23 @@ class _SiteBuckets:
         self._not_measured = [math.nan] * joint_count
         joint_channel = site_channels.joint_states(joint_names)
         channels = {"joint_states": joint_channel, **site_channels.channels}
-        self._topics = {name: f"{VIZ_ROOT}{site}/{name}" for name in channels}
-        self.channels = {self._topics[name]: channel for name, channel in channels.items()}
+        self._topics: dict[str, str] = {}
+        self.channels: dict[str, Ros2Channel] = {}
+        for name, channel in channels.items():
+            topic = f"{VIZ_ROOT}{site}/{name}"
+            self._topics[name] = topic
+            self.channels[topic] = channel
         self._is_robot_described = site_channels.robot is None
 
-        self._half_ticks = max(1, int(rate_hz // views_hz))
+        ticks_per_message = int(rate_hz // views_hz)
+        self._half_ticks = max(1, ticks_per_message)
         self._bucket_ticks = 2 * self._half_ticks
         # Number of fast buckets in a slow bucket.
         self._slow_ratio = 1
         if views_hz != FULL_RATE_HZ:
             messages_hz = rate_hz / self._half_ticks
-            self._slow_ratio = max(1, round(messages_hz / SLOW_VIZ_HZ))
+            slow_ratio = round(messages_hz / SLOW_VIZ_HZ)
+            self._slow_ratio = max(1, slow_ratio)
         self._fast_output = _BucketOutput(self._write_fast)
         self._slow_output = _BucketOutput(self._write_slow)
         # The open bucket: its number, its first tick, and the end of the half that is being
@@ -186,27 +194,38 @@ class _SiteBuckets:
     def _write_fast(self, stamp_ns: int, row: SignalRow, log_ns: int) -> None:
         """Writes the joints, their error and, for an arm with a URDF, its frames."""
         n = len(self._not_measured)
-        velocity = [*row[2 * n : 3 * n], *self._not_measured]
-        effort = [*row[3 * n : 4 * n], *self._not_measured]
-        data = self._joint_state_packer.pack(stamp_ns, row[: 2 * n], velocity, effort)
-        self._put(self._topics["joint_states"], data, stamp_ns, log_ns)
-        error_row = row[self._site_channels.error_row]
-        error = self._site_channels.arrays["error"].pack(*error_row)
-        self._put(self._topics["error"], error, stamp_ns, log_ns)
-        robot = self._site_channels.robot
+        velocity = row[2 * n : 3 * n]
+        effort = row[3 * n : 4 * n]
+        joint_states = self._joint_state_packer.pack(
+            stamp_ns,
+            position=row[: 2 * n],
+            velocity=[*velocity, *self._not_measured],
+            effort=[*effort, *self._not_measured],
+        )
+        self._write_message("joint_states", joint_states, stamp_ns, log_ns)
+        site_channels = self._site_channels
+        errors = row[site_channels.error_row]
+        error_array = site_channels.arrays["error"]
+        self._write_message("error", error_array.pack(*errors), stamp_ns, log_ns)
+        robot = site_channels.robot
         if robot is None:
             return
         if not self._is_robot_described:
             self._is_robot_described = True
-            topic = self._topics[ros2_messages.ROBOT]
-            self._put(topic, pack_string(robot.description), stamp_ns, log_ns)
+            description = pack_string(robot.description)
+            self._write_message(ros2_messages.ROBOT, description, stamp_ns, log_ns)
         frames = robot.pack(stamp_ns, row[:n])
-        self._put(self._topics[ros2_messages.FRAMES], frames, stamp_ns, log_ns)
+        self._write_message(ros2_messages.FRAMES, frames, stamp_ns, log_ns)
 
     def _write_slow(self, stamp_ns: int, row: SignalRow, log_ns: int) -> None:
         """Writes the exogenous torque, the estimate, the law's numbers, and the mode."""
         for name, data in self._site_channels.pack_slow_arrays(row):
-            self._put(self._topics[name], data, stamp_ns, log_ns)
+            self._write_message(name, data, stamp_ns, log_ns)
+
+    def _write_message(self, name: str, data: bytes, stamp_ns: int, log_ns: int) -> None:
+        """Writes a message to the channel with a name, the last part of the topic."""
+        topic = self._topics[name]
+        self._put(topic, data, stamp_ns, log_ns)
 
     def add_record(self, record: Record, log_ns: int) -> None:
         """Adds a record of the site, and writes the messages that are complete now.
@@ -252,7 +271,7 @@ class _SiteBuckets:
         """
         stamp_ns = max(0, self._epoch_unix_ns + stats.t_ns)
         for name, data in self._site_channels.pack_statistics(stats):
-            self._put(self._topics[name], data, stamp_ns, log_ns)
+            self._write_message(name, data, stamp_ns, log_ns)
 
     def finish(self, log_ns: int) -> None:
         """Writes the messages for all records that were added but not written yet.
@@ -263,7 +282,8 @@ class _SiteBuckets:
             log_ns: Arrival time that the log states for the messages, in Unix time, in ns.
         """
         # Two slow buckets further on, both the fast and the slow bucket are closed.
-        self._close_bucket(self._bucket + 2 * self._slow_ratio, log_ns)
+        bucket_after_log = self._bucket + 2 * self._slow_ratio
+        self._close_bucket(bucket_after_log, log_ns)
         self._fast_output.flush(log_ns)
         self._slow_output.flush(log_ns)
 
@@ -282,10 +302,12 @@ class _SiteBuckets:
         next_slow_half = 2 * next_bucket // self._slow_ratio
         if next_slow_half != slow_half:
             self._slow_output.flush(log_ns)
-        if next_slow_half // 2 != slow_half // 2 and self._slow_rows:
+        is_slow_bucket_over = next_slow_half // 2 != slow_half // 2
+        if is_slow_bucket_over and self._slow_rows:
             stamps_ns, rows_of_curves = zip(*self._slow_rows, strict=True)
             curves = zip(*rows_of_curves, strict=True)
-            self._slow_output.add(_stamp_extremes(stamps_ns, curves), log_ns)
+            slow_extremes = _stamp_extremes(stamps_ns, curves)
+            self._slow_output.add(slow_extremes, log_ns)
             self._slow_rows = []
         self._bucket = next_bucket
         self._first_tick = self._bucket_ticks * next_bucket
@@ -294,8 +316,9 @@ class _SiteBuckets:
         """Writes the extremes of the records that arrived late, on all channels."""
         if self._late_records:
             rows = self._decimate(self._late_records)
+            slow_rows = self._select_slow_columns(rows)
             self._fast_output.write_all(rows, log_ns)
-            self._slow_output.write_all(self._select_slow_columns(rows), log_ns)
+            self._slow_output.write_all(slow_rows, log_ns)
             self._late_records = []
 
     def _select_slow_columns(self, rows: Iterable[StampedRow]) -> list[StampedRow]:
@@ -312,9 +335,12 @@ class _SiteBuckets:
         # Records nearly always arrive in order, so that sorting costs little.
         records.sort(key=_get_tick)
         stamps_ns: list[int] = []
-        for record in (records[0], records[len(records) // 2]):
+        middle_index = len(records) // 2
+        middle_record = records[middle_index]
+        for record in (records[0], middle_record):
             t_ns = record.tick * NS_PER_S // self._rate_hz
-            stamps_ns.append(max(0, self._epoch_unix_ns + t_ns))
+            stamp_ns = max(0, self._epoch_unix_ns + t_ns)
+            stamps_ns.append(stamp_ns)
         curves = ros2_messages.stack_signals(records)
         return _stamp_extremes(stamps_ns[: len(records)], curves)
 
@@ -356,11 +382,13 @@ def _stamp_extremes(stamps_ns: Sequence[int], curves: Iterable[SignalRow]) -> li
     Returns:
         Two rows, or one row for a single time.
     """
-    stamps = (stamps_ns[0], stamps_ns[len(stamps_ns) // 2])
+    middle_index = len(stamps_ns) // 2
+    stamps = (stamps_ns[0], stamps_ns[middle_index])
     rows = decimate_min_max(curves)
     # For a single time, the minimum and the maximum are equal, and one row is enough.
     row_count = min(2, len(stamps_ns))
-    return list(zip(stamps[:row_count], rows[:row_count], strict=True))
+    stamped_rows = zip(stamps[:row_count], rows[:row_count], strict=True)
+    return list(stamped_rows)
 
 
 class VizChannels:
@@ -393,13 +421,13 @@ class VizChannels:
     ) -> None:
         self._epoch_unix_ns = epoch_unix_ns
         self._put = put
-        self.channels = {
-            f"{VIZ_ROOT}{name}": channel
-            for name, channel in ros2_messages.SESSION_CHANNELS.items()
-        }
+        self.channels: dict[str, Ros2Channel] = {}
+        for name, channel in ros2_messages.SESSION_CHANNELS.items():
+            self.channels[f"{VIZ_ROOT}{name}"] = channel
         self.receivers: dict[str, ReceiveMessage] = {}
         for member in (*scenario.names, topics.RECORDER):
-            self.receivers[topics.key(session, member, topics.EVENT)] = self._add_event
+            event_key = topics.key(session, member, topics.EVENT)
+            self.receivers[event_key] = self._add_event
         self._buckets: list[_SiteBuckets] = []
         for site in scenario.names:
             buckets = _SiteBuckets(
@@ -411,8 +439,10 @@ class VizChannels:
             )
             self._buckets.append(buckets)
             self.channels |= buckets.channels
-            self.receivers[topics.key(session, site, topics.STATE)] = buckets.add_record
-            self.receivers[topics.key(session, site, topics.LINK)] = buckets.add_statistics
+            state_key = topics.key(session, site, topics.STATE)
+            self.receivers[state_key] = buckets.add_record
+            link_key = topics.key(session, site, topics.LINK)
+            self.receivers[link_key] = buckets.add_statistics
 
     def _add_event(self, event: Event, log_ns: int) -> None:
         """Writes an event. One from before the start of the session gets its arrival time."""
@@ -463,7 +493,9 @@ def decimate_min_max(curves: Iterable[SignalRow]) -> tuple[list[float], list[flo
         maximum = ordered[-1]
         is_minimum_first = values[0] == minimum
         if not is_minimum_first and values[0] != maximum:
-            is_minimum_first = values.index(minimum) < values.index(maximum)
+            minimum_index = values.index(minimum)
+            maximum_index = values.index(maximum)
+            is_minimum_first = minimum_index < maximum_index
         earlier.append(minimum if is_minimum_first else maximum)
         later.append(maximum if is_minimum_first else minimum)
     return earlier, later

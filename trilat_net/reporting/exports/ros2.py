@@ -13,7 +13,7 @@ Invariant:
 """
 
 import heapq
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from operator import itemgetter
 from pathlib import Path
 
@@ -38,7 +38,8 @@ from ..export import ExportFormat, Written
 
 SOURCE_METADATA = "trilat.source"
 """Name of the metadata record that describes the exported session."""
-_QOS = (cdr.DEFINITIONS / "qos.yaml").read_text(encoding="utf-8")
+_QOS_FILE = cdr.DEFINITIONS / "qos.yaml"
+_QOS = _QOS_FILE.read_text(encoding="utf-8")
 """Template of a quality of service, as rosbag2 writes it: reliable."""
 _VOLATILE = {"DEPTH": "10", "DURABILITY": "2"}
 """Values for `_QOS`: the last ten messages, for present subscribers."""
@@ -47,13 +48,19 @@ _LATCHED = {"DEPTH": "1", "DURABILITY": "1"}
 _RECORDS_PER_REPORT = 1000
 """Number of records between two reports of progress."""
 
-TimedMessages = tuple[int, int, list[tuple[str, bytes]]]
+TopicMessages = list[tuple[str, bytes]]
+"""Encoded messages, each with its topic."""
+TimedMessages = tuple[int, int, TopicMessages]
 """Log time in ns, publish time in ns, and the topic and data of each message with these times.
 """
 
 
 def export_ros2(
-    log: Log, path: Path, written: Written = lambda _: None, *, names: str = NAMINGS[0]
+    log: Log,
+    path: Path,
+    written: Written = lambda _: None,
+    *,
+    names: str = NAMINGS[0],
 ) -> None:
     """Writes a log as a file that `ros2 bag` and other players of ROS 2 bags can read.
 
@@ -75,11 +82,14 @@ def export_ros2(
         OSError: The disk refused the data.
     """
     table = read_topic_table(names)
-    session = make_session_name(log.session.get("session", "") or log.scenario.name)
+    log_session = log.session.get("session", "") or log.scenario.name
+    session = make_session_name(log_session)
     with path.open("wb") as stream:
-        version = collect_provenance()["version_trilat-net"]
+        provenance = collect_provenance()
+        version = provenance["version_trilat-net"]
         file = McapWriter(stream, f"trilat-net {version}", profile="ros2")
-        file.add_metadata(SOURCE_METADATA, {"source": log.source, **log.session})
+        source = {"source": log.source, **log.session}
+        file.add_metadata(SOURCE_METADATA, source)
         file.add_attachment(
             create_time=0,
             log_time=0,
@@ -88,22 +98,31 @@ def export_ros2(
             data=log.scenario_text.encode(),
         )
         channels = {}
-        for topic, channel in list_topics(log.scenario, session, table).items():
+        topics = list_topics(log.scenario, session, table)
+        for topic, channel in topics.items():
             channels[f"/{topic}"] = _add_quality(channel)
         channel_numbers = ros2_messages.StandardChannels(file, channels)
 
         streams: list[Iterator[TimedMessages]] = []
         for site in log.sites:
             site_bag = _SiteBag(
-                log=log, site=site, session=session, table=table, progress=written
+                log=log,
+                site=site,
+                session=session,
+                table=table,
+                progress=written,
             )
-            streams += [site_bag.iterate_records(), site_bag.iterate_statistics()]
-        streams += [_iterate_events(log, session), _iterate_diagnostics(log, session)]
+            streams.append(site_bag.iterate_records())
+            streams.append(site_bag.iterate_statistics())
+        streams.append(_iterate_events(log, session))
+        streams.append(_iterate_diagnostics(log, session))
 
         # Each stream is in the order of log times. Merging them keeps this order.
-        for log_ns, publish_ns, messages in heapq.merge(*streams, key=itemgetter(0)):
+        merged_streams = heapq.merge(*streams, key=itemgetter(0))
+        for log_ns, publish_ns, messages in merged_streams:
             for topic, data in messages:
-                file.add_message(channel_numbers[f"/{topic}"], log_ns, data, publish_ns)
+                channel_number = channel_numbers[f"/{topic}"]
+                file.add_message(channel_number, log_ns, data, publish_ns)
         file.finish()
 
 
@@ -113,7 +132,8 @@ def _add_quality(channel: ros2_messages.Ros2Channel) -> ros2_messages.Ros2Channe
     values = _LATCHED if channel.latched else _VOLATILE
     for placeholder, value in values.items():
         text = text.replace(placeholder, value)
-    return channel._replace(about={"offered_qos_profiles": text, **channel.about})
+    metadata = {"offered_qos_profiles": text, **channel.about}
+    return channel._replace(about=metadata)
 
 
 class _SiteBag:
@@ -140,15 +160,20 @@ class _SiteBag:
         self._session = session
         self._table = table
         self._progress = progress
-        self._messages = SiteMessages(log.scenario, site, _find_epoch_ns(log))
+        epoch_unix_ns = _find_epoch_ns(log)
+        self._messages = SiteMessages(log.scenario, site, epoch_unix_ns)
 
     def _find_topic(self, topic: str) -> str:
         """Returns the full name of a topic of the site."""
         return self._table.find(self._session, self._site, topic)
 
-    def _name_messages(self, messages: Iterable[tuple[str, bytes]]) -> list[tuple[str, bytes]]:
+    def _name_messages(self, messages: ros2_messages.NamedMessages) -> TopicMessages:
         """Returns messages with the full names of their topics."""
-        return [(self._find_topic(topic), data) for topic, data in messages]
+        topic_messages: TopicMessages = []
+        for name, data in messages:
+            topic = self._find_topic(name)
+            topic_messages.append((topic, data))
+        return topic_messages
 
     def iterate_records(self) -> Iterator[TimedMessages]:
         """Yields the ROS messages that describe the motion of the site.
@@ -157,21 +182,27 @@ class _SiteBag:
         description of the robot.
         """
         records = self._log[self._site]
-        shares = trace_dominance(self._log, self._site, records.t_s).alpha.tolist()
+        dominance = trace_dominance(self._log, self._site, records.t_s)
+        shares = dominance.alpha.tolist()
         log_ns = records.log_time_ns.tolist()
         publish_ns = records.publish_time_ns.tolist()
-        order = np.argsort(records.log_time_ns, kind="stable").tolist()
-        for count, row in enumerate(order, 1):
+        order = np.argsort(records.log_time_ns, kind="stable")
+        for count, row in enumerate(order.tolist(), 1):
             record = records.states[row]
-            messages = self._name_messages(self._messages.pack_record(record, shares[row]))
+            packed = self._messages.pack_record(record, shares[row])
+            messages = self._name_messages(packed)
             if count == 1:
-                description_topic = self._find_topic("robot_description")
-                messages.insert(0, (description_topic, self._messages.description))
-            messages += [(FRAMES, data) for data in self._messages.pack_frames(record)]
+                topic = self._find_topic("robot_description")
+                description = (topic, self._messages.description)
+                messages.insert(0, description)
+            for data in self._messages.pack_frames(record):
+                messages.append((FRAMES, data))
             yield log_ns[row], publish_ns[row], messages
-            if count % _RECORDS_PER_REPORT == 0 or count == len(records):
+            is_last = count == len(records)
+            if is_last or count % _RECORDS_PER_REPORT == 0:
                 # The last report can have fewer records than the others.
-                self._progress((count - 1) % _RECORDS_PER_REPORT + 1)
+                new_records = (count - 1) % _RECORDS_PER_REPORT + 1
+                self._progress(new_records)
 
     def iterate_statistics(self) -> Iterator[TimedMessages]:
         """Yields the ROS messages about the delays and losses of the links to the site.
@@ -179,23 +210,28 @@ class _SiteBag:
         The messages are in the order of their arrival.
         """
         timed = self._log.timed_link_stats(self._site)
-        rows = zip(
-            timed.log_ns.tolist(), timed.publish_ns.tolist(), timed.messages, strict=True
-        )
-        for log_ns, publish_ns, stats in sorted(rows, key=itemgetter(0)):
-            messages = self._name_messages(self._messages.pack_statistics(stats))
+        log_times_ns = timed.log_ns.tolist()
+        publish_times_ns = timed.publish_ns.tolist()
+        rows = zip(log_times_ns, publish_times_ns, timed.messages, strict=True)
+        ordered_rows = sorted(rows, key=itemgetter(0))
+        for log_ns, publish_ns, stats in ordered_rows:
+            packed = self._messages.pack_statistics(stats)
+            messages = self._name_messages(packed)
             yield log_ns, publish_ns, messages
 
 
 def _find_epoch_ns(log: Log) -> int:
     """Returns the Unix time of a session's common start, in ns. It is 0 in virtual time."""
-    return int(log.session.get("epoch_unix_ns", "0"))
+    epoch_text = log.session.get("epoch_unix_ns", "0")
+    return int(epoch_text)
 
 
 def _iterate_events(log: Log, session: str) -> Iterator[TimedMessages]:
     """Yields the messages about the events of a session."""
     timed = log.timed_events()
-    rows = zip(timed.log_ns.tolist(), timed.publish_ns.tolist(), timed.messages, strict=True)
+    log_times_ns = timed.log_ns.tolist()
+    publish_times_ns = timed.publish_ns.tolist()
+    rows = zip(log_times_ns, publish_times_ns, timed.messages, strict=True)
     for log_ns, publish_ns, event in rows:
         packed = ros2_messages.pack_event(event, publish_ns)
         messages = [(f"{session}/{topic}", data) for topic, data in packed]
@@ -209,19 +245,26 @@ def _iterate_diagnostics(log: Log, session: str) -> Iterator[TimedMessages]:
     of the previous message.
     """
     parts = [log[site] for site in log.sites if len(log[site])]
-    end_ns = max((int(part.t_ns.max()) for part in parts), default=-1)
+    end_times_ns = [int(part.t_ns.max()) for part in parts]
+    end_ns = max(end_times_ns, default=-1)
     log_ns = 0
     publish_ns = 0
     for second in range(end_ns // NS_PER_S + 1):
+        t_ns = second * NS_PER_S
         records = []
         for part in parts:
-            row = int(np.searchsorted(part.t_ns, second * NS_PER_S, side="right")) - 1
-            if row >= 0:
-                records.append(part.record(row))
-                log_ns = max(log_ns, int(part.log_time_ns[row]))
-                publish_ns = max(publish_ns, int(part.publish_time_ns[row]))
+            next_row = int(np.searchsorted(part.t_ns, t_ns, side="right"))
+            row = next_row - 1
+            if row < 0:
+                continue
+            records.append(part.record(row))
+            record_log_ns = int(part.log_time_ns[row])
+            log_ns = max(log_ns, record_log_ns)
+            record_publish_ns = int(part.publish_time_ns[row])
+            publish_ns = max(publish_ns, record_publish_ns)
         if records:
-            data = pack_session_diagnostics(session, _find_epoch_ns(log), records)
+            epoch_unix_ns = _find_epoch_ns(log)
+            data = pack_session_diagnostics(session, epoch_unix_ns, records)
             yield log_ns, publish_ns, [(DIAGNOSTICS, data)]
 
 
