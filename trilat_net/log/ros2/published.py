@@ -13,15 +13,21 @@ Invariant:
     - A message is encoded only if its topic is wanted.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 from ...core.task_space import POSE, POSITION
 from ...net.messages import LinkStats, State
 from ...scenario import Scenario
 from ..orientations import QuaternionSigns
 from . import cdr
-from .robot_model import WORLD, RobotModel, compute_quaternion
-from .ros2_messages import SESSION_CHANNELS, Ros2Channel, Ros2SiteChannels, stack_signals
+from .robot_model import WORLD, FramePose, RobotModel, Vector, compute_quaternion
+from .ros2_messages import (
+    SESSION_CHANNELS,
+    NamedMessages,
+    Ros2Channel,
+    Ros2SiteChannels,
+    stack_signals,
+)
 from .topic_names import DIAGNOSTICS, FRAMES, TopicTable
 
 Topics = dict[str, Ros2Channel]
@@ -40,14 +46,15 @@ _QUATERNION_TEXT = "unit quaternion, each nearest to the one before"
 _NO_ROTATION = (0.0, 0.0, 0.0)
 """Angular part of a velocity or wrench, if the sites share only positions."""
 
+_FRAMES_METADATA = {
+    "content": "frames of the links",
+    "unit": "m",
+    "rotation": _QUATERNION_TEXT,
+}
+_DIAGNOSTICS_METADATA = {"content": "modes and loops of the sites, once a second"}
 COMMON_TOPICS = {
-    FRAMES: Ros2Channel(
-        cdr.TRANSFORMS,
-        {"content": "frames of the links", "unit": "m", "rotation": _QUATERNION_TEXT},
-    ),
-    DIAGNOSTICS: Ros2Channel(
-        cdr.DIAGNOSTICS, {"content": "modes and loops of the sites, once a second"}
-    ),
+    FRAMES: Ros2Channel(cdr.TRANSFORMS, _FRAMES_METADATA),
+    DIAGNOSTICS: Ros2Channel(cdr.DIAGNOSTICS, _DIAGNOSTICS_METADATA),
 }
 """Topics that all sessions have in common, by their full names."""
 
@@ -67,9 +74,10 @@ def list_topics(scenario: Scenario, session: str, table: TopicTable) -> Topics:
     for name, channel in SESSION_CHANNELS.items():
         topics[f"{session}/{name}"] = channel
     for site in scenario.names:
-        site_topics = SiteMessages(scenario, site, epoch_unix_ns=0).topics
-        for name, channel in site_topics.items():
-            topics[table.find(session, site, name)] = channel
+        site_messages = SiteMessages(scenario, site, epoch_unix_ns=0)
+        for name, channel in site_messages.topics.items():
+            topic = table.find(session, site, name)
+            topics[topic] = channel
     return topics
 
 
@@ -98,7 +106,10 @@ class SiteMessages:
         channels = Ros2SiteChannels(scenario, site)
         self._channels = channels
         self._robot = RobotModel(scenario, site)
-        self._signs = {"tip_pose": QuaternionSigns(), "reference_pose": QuaternionSigns()}
+        self._signs = {
+            "tip_pose": QuaternionSigns(),
+            "reference_pose": QuaternionSigns(),
+        }
         self._link_signs = [QuaternionSigns() for _ in self._robot.frames]
         # The mode and the dominance factors are published when they change.
         self._mode = ""
@@ -108,19 +119,24 @@ class SiteMessages:
         _, self.frame = self._robot.frames[0]
         self._pack_shared_frame: Callable[..., bytes] | None = None
         # With a displaced base, the poses are in the frame that the sites share.
-        if any((*spec.arm.base_xyz_m, *spec.arm.base_rpy_rad)):
+        if any(spec.arm.base_xyz_m) or any(spec.arm.base_rpy_rad):
             self.frame = f"{site}/shared"
-            self._pack_shared_frame = cdr.TransformPacker([(WORLD, self.frame)]).pack
-        self._pack_joint_states = cdr.JointStatePacker(channels.joints).pack
-        self._pack_reference = cdr.JointStatePacker(channels.joints, effort=False).pack
+            frame_packer = cdr.TransformPacker([(WORLD, self.frame)])
+            self._pack_shared_frame = frame_packer.pack
+        state_packer = cdr.JointStatePacker(channels.joints)
+        self._pack_joint_states = state_packer.pack
+        reference_packer = cdr.JointStatePacker(channels.joints, effort=False)
+        self._pack_reference = reference_packer.pack
         peers = scenario.peers(site)
-        self._pack_shares = cdr.make_float_array_packer((" ".join(peers), len(peers)))
+        peer_dimension = (" ".join(peers), len(peers))
+        self._pack_shares = cdr.make_float_array_packer(peer_dimension)
         self.topics = self._list_topics(peers)
 
     def _list_topics(self, peers: Sequence[str]) -> Topics:
         """Lists the topics of the site, by their names in trilat-net."""
         channels = self._channels
-        topics: Topics = {"joint_states": channels.joint_states(channels.joints)}
+        topics: Topics = {}
+        topics["joint_states"] = channels.joint_states(channels.joints)
         if self._arm.shares_pose:
             topics["tip_pose"] = self._describe_pose("the end effector")
             topics["tip_twist"] = self._describe_twist("the end effector")
@@ -135,8 +151,12 @@ class SiteMessages:
         else:
             topics["reference"] = channels.joint_states(channels.joints, effort=False)
             topics["tip_pose"] = self._describe_pose("the end effector")
-        topics["mode"] = Ros2Channel(cdr.STRING, {"content": "mode of the site"}, latched=True)
-        shares = {"content": "shares of its peers in its reference", "names": " ".join(peers)}
+        mode = {"content": "mode of the site"}
+        topics["mode"] = Ros2Channel(cdr.STRING, mode, latched=True)
+        shares = {
+            "content": "shares of its peers in its reference",
+            "names": " ".join(peers),
+        }
         topics["dominance"] = Ros2Channel(cdr.FLOAT64_ARRAY, shares, latched=True)
         robot = {"content": "URDF, with links named after their site"}
         topics["robot_description"] = Ros2Channel(cdr.STRING, robot, latched=True)
@@ -165,8 +185,10 @@ class SiteMessages:
         """Lists the topics that contain arrays of numbers, such as the error."""
         topics: Topics = {}
         for name, array in self._channels.arrays.items():
-            topics[_name_array_topic(name)] = array.channel
-        if self._arm.counts.shared == POSE and self._arm.shares_pose:
+            topic = _name_array_topic(name)
+            topics[topic] = array.channel
+        is_full_pose = self._arm.counts.shared == POSE
+        if is_full_pose and self._arm.shares_pose:
             error = topics["error"]
             rotation_text = "rotation vector of the law's error, at most half a turn long"
             about = {**error.about, "orientation": rotation_text}
@@ -189,7 +211,7 @@ class SiteMessages:
         record: State,
         shares: Sequence[float],
         is_wanted: IsWanted = lambda _topic: True,
-    ) -> Iterator[tuple[str, bytes]]:
+    ) -> NamedMessages:
         """Converts a record of a site to ROS 2 messages.
 
         A record contains the state of the site in one period of its control loop: motion,
@@ -224,7 +246,7 @@ class SiteMessages:
 
     def _pack_joint_reference(
         self, record: State, stamp_ns: int, is_wanted: IsWanted
-    ) -> Iterator[tuple[str, bytes]]:
+    ) -> NamedMessages:
         """Encodes the reference of the joints, and the pose of the end effector.
 
         This applies if the sites share joint angles. The pose is computed from them.
@@ -237,31 +259,49 @@ class SiteMessages:
 
     def _pack_shared_motion(
         self, record: State, stamp_ns: int, is_wanted: IsWanted
-    ) -> Iterator[tuple[str, bytes]]:
+    ) -> NamedMessages:
         """Encodes the pose of the end effector, its reference, and the wrench.
 
         This applies if the sites share the position or pose of the end effector.
         """
-        motions = [("tip", record.x, record.xd), ("reference", record.q_des, record.qd_des)]
+        motions = [
+            ("tip", record.x, record.xd),
+            ("reference", record.q_des, record.qd_des),
+        ]
         for subject, pose, rate in motions:
             pose_topic = f"{subject}_pose"
             if is_wanted(pose_topic):
-                yield pose_topic, self._pack_pose(pose_topic, record, pose, stamp_ns)
+                pose_data = self._pack_pose(pose_topic, record, pose, stamp_ns)
+                yield pose_topic, pose_data
             twist_topic = f"{subject}_twist"
             if is_wanted(twist_topic):
-                linear = [speed / self._scale for speed in rate[:POSITION]]
+                linear_rate = rate[:POSITION]
+                linear = [speed / self._scale for speed in linear_rate]
                 angular = _fill_rotation(rate)
-                data = cdr.pack_frame_vectors(stamp_ns, self.frame, *linear, *angular)
-                yield twist_topic, data
+                yield twist_topic, self._pack_vectors(stamp_ns, linear, angular)
         if is_wanted("tip_wrench"):
             # A record contains the wrench that Eq. (8) subtracts, the negative of this wrench.
-            force = [-self._scale * component for component in record.wrench[:POSITION]]
-            torque = [-component for component in _fill_rotation(record.wrench)]
-            data = cdr.pack_frame_vectors(stamp_ns, self.frame, *force, *torque)
-            yield "tip_wrench", data
+            subtracted_force = record.wrench[:POSITION]
+            subtracted_torque = _fill_rotation(record.wrench)
+            force = [-self._scale * component for component in subtracted_force]
+            torque = [-component for component in subtracted_torque]
+            yield "tip_wrench", self._pack_vectors(stamp_ns, force, torque)
+
+    def _pack_vectors(
+        self,
+        stamp_ns: int,
+        linear: Sequence[float],
+        angular: Sequence[float],
+    ) -> bytes:
+        """Encodes the linear and the angular part of a quantity in the frame of the site."""
+        return cdr.pack_frame_vectors(stamp_ns, self.frame, *linear, *angular)
 
     def _pack_pose(
-        self, topic: str, record: State, pose: Sequence[float], stamp_ns: int
+        self,
+        topic: str,
+        record: State,
+        pose: Sequence[float],
+        stamp_ns: int,
     ) -> bytes:
         """Encodes a pose of the end effector.
 
@@ -272,10 +312,11 @@ class SiteMessages:
             stamp_ns: Time of the message, in Unix time, in ns.
         """
         rotation_vector = self._compute_rotation_vector(record, pose)
+        quaternion = compute_quaternion(rotation_vector)
         # Only packed quaternions are aligned: the sign is continuous from message to message.
-        quaternion = self._signs[topic].align(compute_quaternion(rotation_vector))
+        aligned_quaternion = self._signs[topic].align(quaternion)
         position = self._compute_position(record, pose)
-        return cdr.pack_frame_vectors(stamp_ns, self.frame, *position, *quaternion)
+        return self._pack_vectors(stamp_ns, position, aligned_quaternion)
 
     def _compute_position(self, record: State, pose: Sequence[float]) -> Sequence[float]:
         """Returns the position of a pose, in m.
@@ -283,33 +324,37 @@ class SiteMessages:
         If the sites share joint angles, it is computed from the angles.
         """
         if pose:
-            return [coordinate / self._scale for coordinate in pose[:POSITION]]
+            coordinates = pose[:POSITION]
+            return [coordinate / self._scale for coordinate in coordinates]
+        end_effector = self._arm.end_effector(record.q)
         # The end effector of a planar arm has two coordinates; the third is 0.
-        end_effector = [*self._arm.end_effector(record.q), 0.0]
-        return end_effector[:POSITION]
+        coordinates = [*end_effector, 0.0]
+        return coordinates[:POSITION]
 
-    def _compute_rotation_vector(
-        self, record: State, pose: Sequence[float]
-    ) -> tuple[float, float, float]:
+    def _compute_rotation_vector(self, record: State, pose: Sequence[float]) -> Vector:
         """Returns the rotation vector of a pose, in rad.
 
         If the pose contains no orientation, it is computed from the joint angles.
         """
         if len(pose) == POSE:
-            return pose[POSITION], pose[POSITION + 1], pose[POSITION + 2]
+            x, y, z = pose[POSITION:]
+            return x, y, z
         return self._arm.end_effector_orientation(record.q)
 
-    def _pack_arrays(self, record: State, is_wanted: IsWanted) -> Iterator[tuple[str, bytes]]:
+    def _pack_arrays(self, record: State, is_wanted: IsWanted) -> NamedMessages:
         """Encodes the wanted arrays of a record."""
         channels = self._channels
         topics = [_name_array_topic(name) for name in channels.record_arrays]
         if not any(is_wanted(topic) for topic in topics):
             return
-        row = [curve[0] for curve in stack_signals([record])]
+        curves = stack_signals([record])
+        row = [curve[0] for curve in curves]
         if is_wanted("error"):
-            error_row = row[channels.error_row]
-            yield "error", channels.arrays["error"].pack(*error_row)
-        for name, data in channels.pack_slow_arrays(row[channels.slow_row]):
+            errors = row[channels.error_row]
+            error_array = channels.arrays["error"]
+            yield "error", error_array.pack(*errors)
+        slow_values = row[channels.slow_row]
+        for name, data in channels.pack_slow_arrays(slow_values):
             topic = _name_array_topic(name)
             if is_wanted(topic):
                 yield topic, data
@@ -325,15 +370,18 @@ class SiteMessages:
         """
         stamp_ns = self.stamp_ns(record)
         transforms = self._robot.compute_transforms(record.q)
-        aligned: list[tuple[Sequence[float], Sequence[float]]] = []
-        for signs, (origin, rotation) in zip(self._link_signs, transforms, strict=True):
-            aligned.append((origin, signs.align(rotation)))
-        yield self._robot.pack_transforms(stamp_ns, aligned)
+        aligned_transforms: list[FramePose] = []
+        pairs = zip(self._link_signs, transforms, strict=True)
+        for signs, (origin, rotation) in pairs:
+            aligned_rotation = signs.align(rotation)
+            aligned_transforms.append((origin, aligned_rotation))
+        yield self._robot.pack_transforms(stamp_ns, aligned_transforms)
         if self._pack_shared_frame is not None:
             origin, rotation = self._robot.shared
-            yield self._pack_shared_frame(stamp_ns, [*origin, *rotation])
+            numbers = [*origin, *rotation]
+            yield self._pack_shared_frame(stamp_ns, numbers)
 
-    def pack_statistics(self, stats: LinkStats) -> Iterator[tuple[str, bytes]]:
+    def pack_statistics(self, stats: LinkStats) -> NamedMessages:
         """Encodes the statistics of a site's links.
 
         Args:
@@ -370,7 +418,8 @@ def pack_session_diagnostics(
     Returns:
         The message, with one status per site.
     """
-    newest_ns = max((record.t_ns for record in records), default=0)
+    times_ns = [record.t_ns for record in records]
+    newest_ns = max(times_ns, default=0)
     diagnoses: list[cdr.Diagnosis] = []
     for record in records:
         values = {
@@ -380,6 +429,7 @@ def pack_session_diagnostics(
         }
         level = _LEVELS.get(record.mode, _WARNING)
         name = f"{session}/{record.site}"
-        diagnoses.append(cdr.Diagnosis(level, name, record.mode, values))
+        diagnosis = cdr.Diagnosis(level, name, record.mode, values)
+        diagnoses.append(diagnosis)
     stamp_ns = max(0, epoch_unix_ns + newest_ns)
     return cdr.pack_diagnostics(stamp_ns, diagnoses)
