@@ -21,7 +21,11 @@ from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnected
 
 import trilat_net as tn
 
-_HAND_COMMANDS = {"tip": ("move", "pos"), "joint": ("turn", "pos"), "force": ("push", "force")}
+_HAND_COMMANDS = {
+    "tip": ("move", "pos"),
+    "joint": ("turn", "pos"),
+    "force": ("push", "force"),
+}
 """How a hand (operator) of each mode is commanded.
 
 The values are the method of `tn.hand`, and the suffix of the keys of a command.
@@ -100,7 +104,8 @@ class TrilatRobot(Robot):
         operator has a position in m, and feels a force in N. In mode `joint` these are angles
         in rad and torques in N m.
         """
-        return dict.fromkeys([*self._joint_keys, *self._position_keys, *self._felt_keys], float)
+        keys = [*self._joint_keys, *self._position_keys, *self._felt_keys]
+        return dict.fromkeys(keys, float)
 
     @property
     def action_features(self) -> dict[str, type]:
@@ -140,7 +145,10 @@ class TrilatRobot(Robot):
         if self._hand is not None:
             raise DeviceAlreadyConnectedError(f"{self} is already connected.")
         config = self.config
-        connection = {"connect": config.connect or None, "keys": config.keys or None}
+        connection = {
+            "connect": config.connect or None,
+            "keys": config.keys or None,
+        }
         with ExitStack() as stack:
             hand_context = tn.hand(
                 config.session,
@@ -151,7 +159,8 @@ class TrilatRobot(Robot):
             )
             hand = stack.enter_context(hand_context)
             session = tn.session(config.session, **connection)
-            self._receive_records = stack.enter_context(session.records(*self._sites))
+            records_context = session.records(*self._sites)
+            self._receive_records = stack.enter_context(records_context)
             self._await_records(config.timeout_s)
             self._hand = hand
             self._stack = stack.pop_all()
@@ -261,5 +270,7 @@ def _list_hand_axes(scenario: Any, site: str, mode: str) -> list[str]:
     arm = scenario.arms[site]
     if mode == "joint":
         return list(arm.joint_names)
-    end_effector = arm.end_effector(scenario.sites[site].q0_rad)
-    return ["x", "y", "z"][: len(end_effector)]
+    initial_q = scenario.sites[site].q0_rad
+    end_effector = arm.end_effector(initial_q)
+    axis_count = len(end_effector)
+    return ["x", "y", "z"][:axis_count]

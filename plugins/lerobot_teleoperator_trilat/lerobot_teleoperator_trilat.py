@@ -25,7 +25,11 @@ from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnected
 
 import trilat_net as tn
 
-_HAND_COMMANDS = {"tip": ("move", "pos"), "joint": ("turn", "pos"), "force": ("push", "force")}
+_HAND_COMMANDS = {
+    "tip": ("move", "pos"),
+    "joint": ("turn", "pos"),
+    "force": ("push", "force"),
+}
 """How a hand (operator) of each mode is commanded.
 
 The values are the method of `tn.hand`, and the suffix of the keys of a command.
@@ -137,7 +141,10 @@ class TrilatTeleoperator(Teleoperator):
         if self._hand is not None:
             raise DeviceAlreadyConnectedError(f"{self} is already connected.")
         config = self.config
-        connection = {"connect": config.connect or None, "keys": config.keys or None}
+        connection = {
+            "connect": config.connect or None,
+            "keys": config.keys or None,
+        }
         with ExitStack() as stack:
             hand_context = tn.hand(
                 config.session,
@@ -148,7 +155,8 @@ class TrilatTeleoperator(Teleoperator):
             )
             hand = stack.enter_context(hand_context)
             session = tn.session(config.session, **connection)
-            self._get_shares = stack.enter_context(session.shares(config.slave))
+            shares_context = session.shares(config.slave)
+            self._get_shares = stack.enter_context(shares_context)
             self._hand = hand
             self._stack = stack.pop_all()
 
@@ -205,7 +213,9 @@ class TrilatTeleoperator(Teleoperator):
         """
         hand = self._require_hand()
         shares = self._get_shares()
-        person_leads = shares[self.config.site] > shares[self.config.program]
+        person_share = shares[self.config.site]
+        policy_share = shares[self.config.program]
+        person_leads = person_share > policy_share
         return {
             TeleopEvents.IS_INTERVENTION: person_leads,
             TeleopEvents.TERMINATE_EPISODE: bool(hand.over),
@@ -264,5 +274,7 @@ def _list_hand_axes(scenario: Any, site: str, mode: str) -> list[str]:
     arm = scenario.arms[site]
     if mode == "joint":
         return list(arm.joint_names)
-    end_effector = arm.end_effector(scenario.sites[site].q0_rad)
-    return ["x", "y", "z"][: len(end_effector)]
+    initial_q = scenario.sites[site].q0_rad
+    end_effector = arm.end_effector(initial_q)
+    axis_count = len(end_effector)
+    return ["x", "y", "z"][:axis_count]

@@ -69,9 +69,12 @@ _INDEX = {
     "pandas_type": "unicode",
     "numpy_type": "object",
 }
-_PANDAS = {
-    "pandas": json.dumps({"index_columns": ["task"], "column_indexes": [], "columns": [_INDEX]})
+_INDEX_TABLE = {
+    "index_columns": ["task"],
+    "column_indexes": [],
+    "columns": [_INDEX],
 }
+_PANDAS = {"pandas": json.dumps(_INDEX_TABLE)}
 """Metadata with which pandas, which LeRobot uses, reads the texts of tasks as an index."""
 _QUANTILES = (0.01, 0.1, 0.5, 0.9, 0.99)
 """Quantiles that LeRobot expects among the statistics of a feature."""
@@ -85,6 +88,20 @@ Names = dict[str, list[str]]
 """Names of the numbers of each feature."""
 Columns = dict[str, NDArray[Any]]
 """Columns of frames by the names of their features, shape (F, n) or (F,)."""
+
+
+class _Feature(NamedTuple):
+    """A vector of n numbers in each of F frames, such as the state of the slave.
+
+    Attributes:
+        key: Name of the feature in the dataset.
+        values: The numbers, shape (F, n).
+        names: Names of the n numbers.
+    """
+
+    key: str
+    values: Array
+    names: list[str]
 
 
 class _Frames(NamedTuple):
@@ -145,25 +162,39 @@ def _write(
             raise LogError(
                 f"{log.source}: the users or joints are not the same as in {first_source}"
             )
-        first_episode = parts[-1]["episode_index"][-1] + 1 if parts else 0
+        first_episode = 0
+        if parts:
+            last_episode = parts[-1]["episode_index"][-1]
+            first_episode = last_episode + 1
         columns["episode_index"] = frames.episode + first_episode
-        task = tasks.setdefault(log.scenario.title or log.scenario.name, len(tasks))
+        task_text = log.scenario.title or log.scenario.name
+        task = tasks.setdefault(task_text, len(tasks))
         columns["task_index"] = np.full_like(frames.episode, task)
         parts.append(columns)
         sessions.append(_describe_session(log, frames))
         left_out += frames.left_out
-        written(sum(len(log[site]) for site in log.sites))
+        record_count = sum(len(log[site]) for site in log.sites)
+        written(record_count)
 
-    dataset = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+    dataset: Columns = {}
+    for key in parts[0]:
+        column_parts = [part[key] for part in parts]
+        dataset[key] = np.concatenate(column_parts)
     starts = _number_frames(dataset, fps)
     files = _write_tables(folder, dataset, starts, list(tasks))
     frame_count = len(dataset["index"])
     episode_count = len(starts)
     files["meta/info.json"] = _describe_dataset(
-        fps=fps, names=names, columns=dataset, episodes=episode_count, tasks=len(tasks)
+        fps=fps,
+        names=names,
+        columns=dataset,
+        episodes=episode_count,
+        tasks=len(tasks),
     )
+    provenance = collect_provenance()
+    version = provenance["version_trilat-net"]
     files[EXPORT_MANIFEST] = {
-        "exported_by": f"trilat-net {collect_provenance()['version_trilat-net']}",
+        "exported_by": f"trilat-net {version}",
         "meanings": _MEANINGS,
         "actions": actions or "what sites share",
         "program": program or "the last user",
@@ -202,7 +233,8 @@ def _write_json(folder: Path, files: dict[str, Any]) -> None:
     """
     for file_name, content in files.items():
         text = json.dumps(content, indent=4) + "\n"
-        (folder / file_name).write_text(text, encoding="utf-8", newline="\n")
+        path = folder / file_name
+        path.write_text(text, encoding="utf-8", newline="\n")
 
 
 def _describe_session(log: Log, frames: _Frames) -> dict[str, Any]:
@@ -226,9 +258,11 @@ def _number_frames(dataset: Columns, fps: int) -> list[int]:
     """
     episode = dataset["episode_index"]
     index = np.arange(len(episode))
-    starts = np.flatnonzero(np.diff(episode, prepend=-1))
+    episode_steps = np.diff(episode, prepend=-1)
+    starts = np.flatnonzero(episode_steps)
     frame_index = index - starts[episode]
-    dataset["timestamp"] = (frame_index / fps).astype(np.float32)
+    times_s = frame_index / fps
+    dataset["timestamp"] = times_s.astype(np.float32)
     dataset["frame_index"] = frame_index
     dataset["index"] = index
     return [int(start) for start in starts]
@@ -243,7 +277,10 @@ def _choose_frames(log: Log, fps: int) -> _Frames:
     Raises:
         LogError: A site has no records, or there is no time for which every site has a record.
     """
-    rows = {site: np.flatnonzero(log[site].mode != "diverged") for site in log.sites}
+    rows = {}
+    for site in log.sites:
+        has_not_diverged = log[site].mode != "diverged"
+        rows[site] = np.flatnonzero(has_not_diverged)
     empty_sites = [site for site, site_rows in rows.items() if not len(site_rows)]
     if empty_sites:
         sites_text = ", ".join(empty_sites)
@@ -253,11 +290,15 @@ def _choose_frames(log: Log, fps: int) -> _Frames:
         )
     stamps_ns = {}
     for site, site_rows in rows.items():
-        stamps_ns[site] = log[site].tick[site_rows] * NS_PER_S // log[site].rate_hz
+        records = log[site]
+        ticks = records.tick[site_rows]
+        stamps_ns[site] = ticks * NS_PER_S // records.rate_hz
 
     # Frames are at equal steps over the time for which all sites have records.
-    begin_ns = max(t_ns[0] for t_ns in stamps_ns.values())
-    end_ns = min(t_ns[-1] for t_ns in stamps_ns.values())
+    first_times_ns = [t_ns[0] for t_ns in stamps_ns.values()]
+    last_times_ns = [t_ns[-1] for t_ns in stamps_ns.values()]
+    begin_ns = max(first_times_ns)
+    end_ns = min(last_times_ns)
     count = (end_ns - begin_ns) * fps // NS_PER_S + 1
     frame_ns = begin_ns + np.arange(count) * NS_PER_S // fps
 
@@ -265,22 +306,29 @@ def _choose_frames(log: Log, fps: int) -> _Frames:
     for site, t_ns in stamps_ns.items():
         newest = np.searchsorted(t_ns, frame_ns, side="right") - 1
         age_ns = frame_ns - t_ns[newest]
-        is_fresh &= age_ns <= NS_PER_S // min(fps, log[site].rate_hz)
+        lower_rate_hz = min(fps, log[site].rate_hz)
+        longer_period_ns = NS_PER_S // lower_rate_hz
+        is_fresh &= age_ns <= longer_period_ns
         rows[site] = rows[site][newest]
 
     fresh_frames = np.flatnonzero(is_fresh)
     if not len(fresh_frames):
         raise LogError(f"{log.source}: there is no time for which every site has a record")
-    is_after_gap = np.diff(fresh_frames, prepend=fresh_frames[0]) > 1
+    frame_steps = np.diff(fresh_frames, prepend=fresh_frames[0])
+    is_after_gap = frame_steps > 1
+    fresh_rows = {site: site_rows[fresh_frames] for site, site_rows in rows.items()}
     return _Frames(
-        rows={site: site_rows[fresh_frames] for site, site_rows in rows.items()},
+        rows=fresh_rows,
         episode=np.cumsum(is_after_gap, dtype=np.int64),
         left_out=len(frame_ns) - len(fresh_frames),
     )
 
 
 def _read_columns(
-    log: Log, rows: dict[str, Ints], program: str, actions: str
+    log: Log,
+    rows: dict[str, Ints],
+    program: str,
+    actions: str,
 ) -> tuple[Columns, Names]:
     """Returns the features of all frames of a log that follow from its records.
 
@@ -303,38 +351,56 @@ def _read_columns(
     if not slave or not users:
         raise LogError(f"{log.source}: the session must have a slave and at least one master")
 
-    # The action of a frame is the command of the user with the largest dominance factor.
-    alpha = trace_dominance(log, slave, log[slave].t_s[rows[slave]]).alpha
-    shared = find_user_shares(log.scenario, alpha, program)
-    commands, command_names = _read_commands(log, users, rows, actions)
-    leading_commands = np.stack(commands)[shared.leader, np.arange(len(alpha))]
-
     slave_records = log[slave]
     slave_rows = rows[slave]
-    state = np.hstack([slave_records.q[slave_rows], slave_records.qd[slave_rows]])
-    joints = {site: list(log.scenario.arms[site].joint_names) for site in (slave, *users)}
+    frame_times_s = slave_records.t_s[slave_rows]
+    dominance = trace_dominance(log, slave, frame_times_s)
+    shared = find_user_shares(log.scenario, dominance.alpha, program)
+    commands, command_names = _read_commands(log, users, rows, actions)
+    # The action of a frame is the command of the user with the largest dominance factor.
+    all_commands = np.stack(commands)
+    frame_indices = np.arange(len(dominance.alpha))
+    leading_commands = all_commands[shared.leader, frame_indices]
+
+    q = slave_records.q[slave_rows]
+    qd = slave_records.qd[slave_rows]
+    state = np.hstack([q, qd])
+    joints: Names = {}
+    for site in (slave, *users):
+        arm = log.scenario.arms[site]
+        joints[site] = list(arm.joint_names)
     state_names = [f"{slave}.{joint}.pos" for joint in joints[slave]]
     state_names += [f"{slave}.{joint}.vel" for joint in joints[slave]]
 
     features = [
-        ("observation.state", state, state_names),
-        ("action", leading_commands, command_names),
+        _Feature("observation.state", state, state_names),
+        _Feature("action", leading_commands, command_names),
     ]
-    features += [
-        (f"action.{user}", command, command_names)
-        for user, command in zip(users, commands, strict=True)
-    ]
-    features.append(("dominance", shared.shares, users))
-    features.append(("tau_x", slave_records.tau_x[slave_rows], joints[slave]))
-    features += [(f"tau_x.{user}", log[user].tau_x[rows[user]], joints[user]) for user in users]
+    for user, command in zip(users, commands, strict=True):
+        user_action = _Feature(f"action.{user}", command, command_names)
+        features.append(user_action)
+    slave_torques = slave_records.tau_x[slave_rows]
+    features.append(_Feature("dominance", shared.shares, users))
+    features.append(_Feature("tau_x", slave_torques, joints[slave]))
+    for user in users:
+        user_rows = rows[user]
+        user_torques = log[user].tau_x[user_rows]
+        features.append(_Feature(f"tau_x.{user}", user_torques, joints[user]))
 
-    columns: Columns = {key: values.astype(np.float32) for key, values, _ in features}
+    columns: Columns = {}
+    names: Names = {}
+    for feature in features:
+        columns[feature.key] = feature.values.astype(np.float32)
+        names[feature.key] = feature.names
     columns["intervention"] = shared.leader != shared.program
-    return columns, {key: names for key, _, names in features}
+    return columns, names
 
 
 def _read_commands(
-    log: Log, users: Sequence[str], rows: dict[str, Ints], actions: str
+    log: Log,
+    users: Sequence[str],
+    rows: dict[str, Ints],
+    actions: str,
 ) -> tuple[list[Array], list[str]]:
     """Returns the commands of every user.
 
@@ -354,19 +420,27 @@ def _read_commands(
         positions = []
         for user in users:
             records = log[user]
+            user_rows = rows[user]
             arm_rows = build_arm_rows(log.scenario, user)
-            q = records.q[rows[user]]
-            qd = records.qd[rows[user]]
-            positions.append(arm_rows.place_end_effector(q, qd).position)
-        axes = TASK_AXES[: positions[0].shape[1]]
+            q = records.q[user_rows]
+            qd = records.qd[user_rows]
+            end_effector = arm_rows.place_end_effector(q, qd)
+            positions.append(end_effector.position)
+        axis_count = positions[0].shape[1]
+        axes = TASK_AXES[:axis_count]
         return positions, [f"{axis}.pos" for axis in axes]
 
     first_user = users[0]
     if not actions and log[first_user].layout.task:
-        poses = [expand_poses(log[user].x[rows[user]]) for user in users]
+        poses = []
+        for user in users:
+            user_rows = rows[user]
+            exchanged_poses = log[user].x[user_rows]
+            poses.append(expand_poses(exchanged_poses))
         names = [f"{axis}.pos" for axis in TASK_AXES[:POSITION]]
         names += [f"{entry}.rot" for entry in MATRIX_ENTRIES]
-        return poses, names[: poses[0].shape[1]]
+        entry_count = poses[0].shape[1]
+        return poses, names[:entry_count]
 
     joints = {user: log.scenario.arms[user].joint_names for user in users}
     for user in users:
@@ -375,7 +449,10 @@ def _read_commands(
                 f"{log.source}: {user} and {first_user} have different joints, so that the two "
                 "users have no common action: use --actions tip"
             )
-    angles = [log[user].q[rows[user]] for user in users]
+    angles = []
+    for user in users:
+        user_rows = rows[user]
+        angles.append(log[user].q[user_rows])
     return angles, [f"{joint}.pos" for joint in joints[first_user]]
 
 
@@ -402,9 +479,13 @@ def _write_tables(
         if size > 1:
             numbers = pa.FixedSizeListArray.from_arrays(numbers, size)
         frames[key] = numbers
-    episode_edges = pairwise([*starts, len(dataset["index"])])
-    episodes = [_describe_episode(dataset, first, end, tasks) for first, end in episode_edges]
-    task_table = pa.table({"task_index": np.arange(len(tasks)), "task": tasks})
+    frame_count = len(dataset["index"])
+    episodes = []
+    for first, end in pairwise([*starts, frame_count]):
+        episode = _describe_episode(dataset, first, end, tasks)
+        episodes.append(episode)
+    task_columns = {"task_index": np.arange(len(tasks)), "task": tasks}
+    task_table = pa.table(task_columns)
     tables = {
         f"data/{_FILE}": pa.table(frames),
         f"meta/episodes/{_FILE}": pa.Table.from_pylist(episodes),
@@ -467,9 +548,10 @@ def _describe_episode(
         end: Index after its last frame.
         tasks: Texts of the tasks.
     """
+    task_index = dataset["task_index"][first]
     row: dict[str, Any] = {
         "episode_index": int(dataset["episode_index"][first]),
-        "tasks": [tasks[dataset["task_index"][first]]],
+        "tasks": [tasks[task_index]],
         "length": end - first,
         "dataset_from_index": first,
         "dataset_to_index": end,
@@ -479,7 +561,8 @@ def _describe_episode(
         "meta/episodes/file_index": 0,
     }
     for key, column in dataset.items():
-        for name, numbers in _compute_statistics(column[first:end]).items():
+        statistics = _compute_statistics(column[first:end])
+        for name, numbers in statistics.items():
             row[f"stats/{key}/{name}"] = numbers
     return row
 
@@ -501,7 +584,9 @@ def _compute_statistics(column: NDArray[Any]) -> dict[str, list[float]]:
         "std": np.std(rows, axis=0).tolist(),
     }
     for share in _QUANTILES:
-        statistics[f"q{100 * share:02.0f}"] = np.quantile(rows, share, axis=0).tolist()
+        quantiles = np.quantile(rows, share, axis=0)
+        percent = 100 * share
+        statistics[f"q{percent:02.0f}"] = quantiles.tolist()
     statistics["count"] = [len(rows)]
     return statistics
 
