@@ -65,6 +65,11 @@ REQUEST_PERIOD_S = 0.05
 """Time between two checks for new weights, in s."""
 TRIGGER = "std_srvs/srv/Trigger"
 """Type of the services, whose requests have no content."""
+INBOX_MESSAGES = 4096
+"""Capacity of each queue of messages from the session."""
+
+JointNames = Sequence[Sequence[str]]
+"""For each joint of an arm, the names that it may have in ROS messages."""
 
 
 class SingleSender:
@@ -207,7 +212,10 @@ class DominanceTopic:
     """
 
     def __init__(
-        self, peers: Sequence[str], change: Callable[[dict[str, float]], object], clock: Clock
+        self,
+        peers: Sequence[str],
+        change: Callable[[dict[str, float]], object],
+        clock: Clock,
     ) -> None:
         self._peers = peers
         self._change = change
@@ -238,7 +246,8 @@ class DominanceTopic:
         silent_ns = self._sender.admit(attachment.gid)
         if silent_ns > SENDER_TIMEOUT_NS:
             self._sent_request = None
-        self._requested = dict(zip(self._peers, shares, strict=True))
+        peer_shares = zip(self._peers, shares, strict=True)
+        self._requested = dict(peer_shares)
 
     def send_request(self) -> None:
         """Asks the site to use the newest weights with which its arm follows the other arms.
@@ -280,7 +289,7 @@ class RobotArm:
     def __init__(
         self,
         make_client: Callable[[], ArmClient],
-        joints: Sequence[Sequence[str]],
+        joints: JointNames,
         robot: RobotTable,
         commands: TopicPublisher,
         clock: Clock,
@@ -293,7 +302,8 @@ class RobotArm:
         controller = robot.controller or [names[0] for names in joints]
         self._safe_command = robot.safe or [0.0] * len(joints)
         self._joint_order = _order_joints(joints, controller, self._safe_command)
-        self._pack = cdr.make_float_array_packer((" ".join(controller), len(controller)))
+        controller_dimension = (" ".join(controller), len(controller))
+        self._pack = cdr.make_float_array_packer(controller_dimension)
 
         self._commands = commands
         self._clock = clock
@@ -370,7 +380,9 @@ class RobotArm:
 
 
 def _order_joints(
-    joints: Sequence[Sequence[str]], controller: Sequence[str], safe_command: Sequence[float]
+    joints: JointNames,
+    controller: Sequence[str],
+    safe_command: Sequence[float],
 ) -> list[int]:
     """Finds the joint of the scenario to which each joint of the controller corresponds.
 
@@ -392,9 +404,12 @@ def _order_joints(
             if controller_name in names:
                 joint_order.append(index)
     # Each joint occurs exactly once if the sorted indices are 0, 1, ... count - 1.
-    is_complete = sorted(joint_order) == list(range(count)) and len(controller) == count
-    is_safe_valid = len(safe_command) == count and all(map(math.isfinite, safe_command))
-    if not is_complete or not is_safe_valid:
+    all_indices = list(range(count))
+    has_each_joint = sorted(joint_order) == all_indices
+    is_controller_valid = has_each_joint and len(controller) == count
+    is_safe_complete = len(safe_command) == count
+    is_safe_valid = is_safe_complete and all(map(math.isfinite, safe_command))
+    if not is_controller_valid or not is_safe_valid:
         known = ", ".join(names[0] for names in joints)
         raise UsageError(
             "--names: `controller` and `safe` must each have one entry for every joint "
@@ -403,7 +418,7 @@ def _order_joints(
     return joint_order
 
 
-def find_joint_indices(joints: Sequence[Sequence[str]], state: cdr.RosJoints) -> list[int]:
+def find_joint_indices(joints: JointNames, state: cdr.RosJoints) -> list[int]:
     """Finds the index of each joint of an arm in a message with joint states.
 
     The message may contain further joints, and the joints may have any order.
@@ -423,7 +438,8 @@ def find_joint_indices(joints: Sequence[Sequence[str]], state: cdr.RosJoints) ->
         position_count = count_nouns(len(state.position), "position")
         raise ValueError(f"has {name_count} and {position_count}")
 
-    missing = [names[0] for names in joints if set(names).isdisjoint(state.names)]
+    message_names = set(state.names)
+    missing = [names[0] for names in joints if message_names.isdisjoint(names)]
     if missing:
         present = ", ".join(state.names[:9]) or "no names"
         missing_text = ", ".join(missing)
@@ -440,7 +456,7 @@ def find_joint_indices(joints: Sequence[Sequence[str]], state: cdr.RosJoints) ->
     return indices
 
 
-def read_joint_target(joints: Sequence[Sequence[str]], data: bytes) -> list[float]:
+def read_joint_target(joints: JointNames, data: bytes) -> list[float]:
     """Reads target angles from a `JointState` message.
 
     Args:
@@ -525,10 +541,14 @@ class Bridge:
         self._epoch_unix_ns = epoch_unix_ns
 
         # Messages from the session.
-        self._records = bus.inbox(topics.key(session, "*", topics.STATE), 4096)
-        self._events = bus.inbox(topics.key(session, "*", topics.EVENT), 4096)
-        self._links = bus.inbox(topics.key(session, "*", topics.LINK), 4096)
-        self._presence = bus.presence(topics.presence_key(session, "*"))
+        records_key = topics.key(session, "*", topics.STATE)
+        events_key = topics.key(session, "*", topics.EVENT)
+        links_key = topics.key(session, "*", topics.LINK)
+        presence_key = topics.presence_key(session, "*")
+        self._records = bus.inbox(records_key, INBOX_MESSAGES)
+        self._events = bus.inbox(events_key, INBOX_MESSAGES)
+        self._links = bus.inbox(links_key, INBOX_MESSAGES)
+        self._presence = bus.presence(presence_key)
         self._present = set[topics.KeyParts]()
         self._has_seen_site = False
 
@@ -539,7 +559,8 @@ class Bridge:
         )
         self._lines: dict[str, TopicPublisher] = {}
         for name, channel in SESSION_CHANNELS.items():
-            self._lines[name] = graph.publisher(f"{session}/{name}", channel.kind, RELIABLE)
+            topic = f"{session}/{name}"
+            self._lines[name] = graph.publisher(topic, channel.kind, RELIABLE)
         self._sites: dict[str, SiteTopics] = {}
         for site in scenario.names:
             self._sites[site] = SiteTopics(
@@ -564,11 +585,13 @@ class Bridge:
         """Subscribes to the topic that sets the weights of a site."""
         ends = self._ends
         # The changes before the bridge was started determine the site's present shares.
+        shares = self._sites[site].shares
         for event in list_past_events(ends.bus, ends.clock, ends.session, site):
-            self._sites[site].shares.add_change(event.command)
+            shares.add_change(event.command)
         topic = ends.topic(site, "set_dominance")
         change = partial(running.set_dominance, site)
-        dominance = DominanceTopic(self._scenario.peers(site), change, ends.clock)
+        peers = self._scenario.peers(site)
+        dominance = DominanceTopic(peers, change, ends.clock)
         self.dominance[topic] = dominance
         ends.graph.subscribe(topic, cdr.FLOAT64_ARRAY, dominance.receive)
 
@@ -611,7 +634,8 @@ class Bridge:
         wake_ns = now_ns
         checked_ns = now_ns
         diagnosed_ns = now_ns
-        poll_ns = max(POLL_NS, int(NS_PER_S / (POLLS_PER_RECORD * rate_hz)))
+        polls_hz = POLLS_PER_RECORD * rate_hz
+        poll_ns = max(POLL_NS, int(NS_PER_S / polls_hz))
         while not stopped() and not self._have_sites_left():
             if self._publish_messages(rate_hz):
                 return True
@@ -653,7 +677,8 @@ class Bridge:
             if event.kind == "epoch" and event.epoch_unix_ns != self._epoch_unix_ns:
                 has_new_epoch = True
             if event.member in self._sites:
-                self._sites[event.member].shares.add_change(event.command)
+                member_topics = self._sites[event.member]
+                member_topics.shares.add_change(event.command)
             stamp_ns = self._ends.clock.unix_ns()
             for name, data in pack_event(event, stamp_ns):
                 self._lines[name].put(data)
@@ -703,7 +728,8 @@ def describe_target(
     """
     live = scenario.sites[site].find_live_hand(is_open=True)
     assert live is not None
-    end_effector = scenario.arms[site].end_effector(scenario.sites[site].q0_rad)
+    initial_q = scenario.sites[site].q0_rad
+    end_effector = scenario.arms[site].end_effector(initial_q)
     axes = len(end_effector)  # 2 for an arm in a plane, 3 in space
     if live.mode == "joint":
         read = partial(read_joint_target, list_joint_names(scenario, site))
@@ -727,7 +753,8 @@ def list_joint_names(scenario: Scenario, site: str) -> list[tuple[str, ...]]:
         scenario.
     """
     topic_names = Ros2SiteChannels(scenario, site).joints
-    pairs = zip(topic_names, scenario.arms[site].joint_names, strict=True)
+    scenario_names = scenario.arms[site].joint_names
+    pairs = zip(topic_names, scenario_names, strict=True)
     return [tuple(dict.fromkeys(pair)) for pair in pairs]
 
 
@@ -751,7 +778,8 @@ def serve_orders(graph: Ros2Graph, running: RunningSession, sites: Sequence[str]
             *site: Name of the site, the process that controls one arm. All sites if it is
                 missing.
         """
-        name = "/".join([running.name, *site, order.__name__])
+        name_parts = [running.name, *site, order.__name__]
+        name = "/".join(name_parts)
         graph.serve(name, TRIGGER, lambda _request: _send_order(order, *site))
 
     for order in (running.stop, running.enable, running.reset):
@@ -775,7 +803,8 @@ def _send_order(order: Callable[..., list[str]], *sites: str) -> bytes:
         replies = order(*sites)
     except TrilatError as error:
         return cdr.pack_trigger_response(success=False, text=str(error))
-    return cdr.pack_trigger_response(success=True, text="; ".join(replies))
+    replies_text = "; ".join(replies)
+    return cdr.pack_trigger_response(success=True, text=replies_text)
 
 
 @contextmanager
@@ -846,7 +875,11 @@ def serve_ros2(
                 continue
             with graph:
                 ends = BridgeEnds(
-                    graph=graph, bus=bus, clock=clock, session=running.name, table=table
+                    graph=graph,
+                    bus=bus,
+                    clock=clock,
+                    session=running.name,
+                    table=table,
                 )
                 has_new_epoch = publish_session(ends, rate_hz, stopped, say)
 
@@ -879,7 +912,8 @@ def publish_session(
             # A robot whose joints are named needs no scenario, and can start before any site
             # replies.
             if robot.joints:
-                robots[site] = stack.enter_context(open_robot(ends, site, robot))
+                robot_context = open_robot(ends, site, robot)
+                robots[site] = stack.enter_context(robot_context)
 
         say(f"waiting for session {ends.session!r} to begin")
         info = await_site(ends, stopped, running=False)
@@ -907,7 +941,8 @@ def publish_session(
             send_request = ends.graph.refusals.guard(topic, dominance.send_request)
             stack.enter_context(_repeat_in_thread(REQUEST_PERIOD_S, send_request))
         session_text = f"session {ends.session} is in the graph of ROS 2: /{ends.session}/..."
-        say("; ".join([session_text, *_describe_inputs(ends, bridge, robots)]))
+        input_clauses = _describe_inputs(ends, bridge, robots)
+        say("; ".join([session_text, *input_clauses]))
         return bridge.run(rate_hz, stopped, say)
 
 
@@ -937,7 +972,7 @@ def open_robot(
     ends: BridgeEnds,
     site: str,
     robot: RobotTable,
-    joints: Sequence[Sequence[str]] = (),
+    joints: JointNames = (),
 ) -> Iterator[RobotArm]:
     """Connects the ROS robot of a site, as a context manager.
 

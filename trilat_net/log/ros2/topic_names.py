@@ -102,7 +102,8 @@ class TopicTable(NamedTuple):
             topic: Name of the topic in trilat-net.
         """
         common_name = self.names.get(topic, topic)
-        name = self.of_site.get(site, {}).get(topic, common_name)
+        site_names = self.of_site.get(site, {})
+        name = site_names.get(topic, common_name)
         if name.startswith("/"):
             return name[1:]
         return f"{session}/{site}/{name}"
@@ -164,8 +165,10 @@ def _read_names_file(source: str) -> TopicTable:
     """
     try:
         with open_regular(Path(source)) as stream:
-            names = tomllib.loads(stream.read().decode())
-        site_names = msgspec.convert(names.pop("sites", {}), dict[str, dict[str, Any]])
+            text = stream.read().decode()
+        names = tomllib.loads(text)
+        site_tables = names.pop("sites", {})
+        site_names = msgspec.convert(site_tables, dict[str, dict[str, Any]])
         robot_fields: dict[str, dict[str, Any]] = {}
         # A table of a site holds names of topics as well as the fields of the site's robot.
         for site, table in site_names.items():
@@ -194,7 +197,8 @@ def _check_names(source: str, names: Mapping[str, object]) -> None:
     """
     for topic, name in names.items():
         if topic not in TOPICS:
-            suggestion = suggest_nearest(topic, list(TOPICS))
+            known_topics = list(TOPICS)
+            suggestion = suggest_nearest(topic, known_topics)
             raise UsageError(f"{source}: there is no topic {topic!r}{suggestion}")
         if not isinstance(name, str):
             raise UsageError(f"{source}: {topic} must be a text in quotes, not {name!r}")
@@ -218,7 +222,8 @@ def _check_unique_names(source: str, table: TopicTable) -> None:
     full_names: list[str] = []
     for site in (*table.of_site, "*", "**"):
         full_names += [table.find("", site, topic) for topic in topics]
-    if len(set(full_names)) < len(full_names):
+    different_names = set(full_names)
+    if len(different_names) < len(full_names):
         raise UsageError(
             f"{source}: two topics have the same name; a name that begins with / can be used "
             "for one site only"
