@@ -277,10 +277,13 @@ WRONG: dict[str, tuple[Callable[[Path], object], str]] = {
     "log": (lambda _: tn.open_log("nothing.mcap"), "^nothing.mcap: cannot be read"),
     "log is none": (
         lambda _: tn.verify(None),
-        "a log is a path, or a file opened for reading, not None",
+        "a log must be given as a path or as a file opened for reading, not None",
     ),
-    "site": (lambda file: tn.open_log(file)["x"], "^no site 'x' in .*; it has m, s$"),
-    "table": (lambda file: tn.open_log(file).table("m", "x"), "^no table 'x' of m"),
+    "site": (
+        lambda file: tn.open_log(file)["x"],
+        "^there is no site 'x' in .*; the sites are m, s$",
+    ),
+    "table": (lambda file: tn.open_log(file).table("m", "x"), "^m has no table 'x'"),
     "save": (
         lambda file: tn.simulate("two_sites", duration_s=0.1).save(file),
         "replace it with force=True$",

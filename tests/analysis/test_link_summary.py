@@ -156,7 +156,7 @@ def test_record_of_tick_that_is_never_made_costs_no_memory():
         )
 
     with pytest.raises(
-        LogError, match="m2 has a record of tick 549755813888; the scenario has 400"
+        LogError, match="m2 has a record of tick 549755813888, but the scenario has only 400"
     ):
         uses(logs.rewritten(logs.simulated("paper"), change=far))
 

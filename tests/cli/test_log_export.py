@@ -82,7 +82,7 @@ def test_a_folder_of_logs_becomes_a_set_of_episodes(folder: Path) -> None:
     )
     (folder / "none").mkdir()
     trilat("log", "export", "none", "--to", "lerobot", cwd=folder).refuses(
-        "no log is in this directory"
+        "this directory contains no log"
     )
 
 

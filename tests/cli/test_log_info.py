@@ -114,7 +114,7 @@ def test_no_mcap_file_is_bad_input_or_a_finding(tmp_path: Path) -> None:
     for command in ("info", "check"):
         trilat("log", command, "none.mcap", cwd=tmp_path).refuses("none.mcap", "cannot be read")
     path = written(tmp_path, b"text")
-    trilat("log", "info", path, cwd=tmp_path).refuses("is no MCAP file")
+    trilat("log", "info", path, cwd=tmp_path).refuses("is not an MCAP file")
     assert trilat("log", "check", path, cwd=tmp_path).code == 1
 
 

@@ -12,7 +12,7 @@ from .running import trilat
     [
         (["--rate", "-1"], ["--rate is how much faster", "from 0.001 to 1000, or max", "'-1'"]),
         (["--start", "7"], ["--start 7 s: is beyond the end", "from 0.000 s to 0.499 s"]),
-        (["--include", "m1*"], ["--include is a key expression like", "'m1*'"]),
+        (["--include", "m1*"], ["--include must be a key expression such as", "'m1*'"]),
         (["--exclude", "**"], ["no message for this selection"]),
         (
             ["--time", "arrival"],

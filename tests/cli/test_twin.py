@@ -93,7 +93,7 @@ def test_bad_input_is_refused_in_one_line(
 
 def test_two_logs_are_refused(folder: Path, tmp_path: Path) -> None:
     other = tmp_path / simulated(tmp_path, "two_sites", "seed=2", seconds="1")
-    trilat("twin", "run.mcap", other, cwd=folder).refuses("no part of the session")
+    trilat("twin", "run.mcap", other, cwd=folder).refuses("not a part of the session")
 
 
 def test_a_law_that_may_not_run_has_no_twin(folder: Path) -> None:

@@ -196,7 +196,7 @@ def test_two_runs_over_a_gap_are_refused_without_a_chain() -> None:
     taken.messages += [m for m in other if "state" in topics[m.channel] and m.sequence >= 62]
     found = judge_integrity(opened(taken.bytes()))
     assert found.state is DigestState.CHANGED
-    assert "taken out or put in" in found.text
+    assert "were removed or added" in found.text
 
 
 def test_sparse_logs_fail_and_say_how_much_was_judged() -> None:

@@ -128,7 +128,7 @@ def test_a_session_of_another_log_is_not_believed(tmp_path: Path) -> None:
     live[:PAGE_BYTES] = other[:PAGE_BYTES]
     result, _ = recovered(bytes(live), tmp_path)
     assert any("commands of trilat-net do not" in text for text in result.lost)
-    with pytest.raises(LogError, match="no log of trilat-net"):
+    with pytest.raises(LogError, match="not a log of trilat-net"):
         open_log(tmp_path / "zz.mcap")
 
 
@@ -155,7 +155,9 @@ def test_a_chunk_of_another_virtual_run_is_refused(tmp_path: Path) -> None:
     first, length = chunk_offsets(other)[0]
     torn = data[:begin] + other[first:length] + data[last_begin:last_end]
     result, saved = recovered(torn, tmp_path)
-    assert [text.partition(": ")[2] for text in result.lost] == ["a chunk of another run"]
+    assert [text.partition(": ")[2] for text in result.lost] == [
+        "a chunk belongs to another run"
+    ]
     assert not Counter(messages(saved)) - Counter(messages(data))
     assert verify(open_log(tmp_path / "zz.mcap")).agreed
     result, _ = recovered(data[:begin] + data[begin:end] + data[last_begin:last_end], tmp_path)
@@ -206,7 +208,7 @@ def test_a_log_that_no_command_opens_is_stated(scenario: str, tmp_path: Path) ->
     with pytest.raises(LogError):
         open_log(tmp_path / "zz.mcap")
     assert len(result.lost) == 1
-    assert "its scenario cannot be read" in result.lost[0]
+    assert "the scenario in this log cannot be read" in result.lost[0]
     assert "commands of trilat-net do not" in result.lost[0]
 
 

@@ -196,7 +196,9 @@ def test_what_there_is_not_is_answered_with_what_there_is() -> None:
 
 def test_arrival_of_peer_that_there_is_not_is_refused() -> None:
     log = opened(edited(recorded("paper"), record=lambda r: {**r, "rx": [[5, 0, 0]]}))
-    with pytest.raises(LogError, match="record of m1 lists an arrival of a peer"):
+    with pytest.raises(
+        LogError, match="record of m1 lists a sample from a site that is not a peer"
+    ):
         log.table("m1", "arrivals")
 
 

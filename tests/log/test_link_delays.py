@@ -146,7 +146,7 @@ def test_delays_within_missing_records_are_left_out(data: bytes, path: Path) -> 
 
 @pytest.mark.parametrize(
     ("link", "words"),
-    [("m1->ss", "did you mean 'm1->s'"), ("x", "Its links are m2->m1"), ("m1->m1", "no link")],
+    [("m1->ss", "did you mean 'm1->s'"), ("x", "The links are m2->m1"), ("m1->m1", "no link")],
 )
 def test_link_that_log_does_not_have_is_named_with_nearest(
     path: Path, link: str, words: str

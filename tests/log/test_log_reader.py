@@ -223,7 +223,7 @@ def test_what_is_no_mcap_file_is_refused(data: bytes, tmp_path: Path) -> None:
 
 
 def test_an_mcap_file_of_others_is_refused() -> None:
-    with pytest.raises(LogError, match=r"no log of trilat-net"):
+    with pytest.raises(LogError, match=r"not a log of trilat-net"):
         opened(foreign())
 
 

@@ -98,7 +98,7 @@ def test_only_what_agrees_with_its_chain_is_signed(tmp_path: Path) -> None:
     with pytest.raises(LogError, match=r"is not signed: .*trilat log recover"):
         sign_log(path, private)
     made = recover(path).output
-    assert problem(made, key) == f"there is no signature {made}.sig"
+    assert problem(made, key) == f"there is no signature file {made}.sig"
     sign_log(made, private)
     assert problem(made, key) == ""
 
@@ -118,9 +118,9 @@ def test_keys_that_are_none_or_open_to_others_are_refused(
     )
     for content in (b"", locked, foreign, public.read_bytes()):
         (tmp_path / "odd.key").write_bytes(content)
-        with pytest.raises(UsageError, match="no private Ed25519 key"):
+        with pytest.raises(UsageError, match="not a private Ed25519 key"):
             sign_log(path, tmp_path / "odd.key", force=True)
-    with pytest.raises(UsageError, match="no public Ed25519 key"):
+    with pytest.raises(UsageError, match="not a public Ed25519 key"):
         check_signatures([path], private)
     private.chmod(0o644)
     with pytest.raises(UsageError, match="chmod 600"):

@@ -198,12 +198,12 @@ def test_any_name_will_do(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("number", [0.5, float("nan"), 0.0, 1e7])
 def test_a_part_that_cannot_be_meant_is_refused(number: float) -> None:
-    with pytest.raises(UsageError, match="split_size is a number of MiB"):
+    with pytest.raises(UsageError, match="split_size must be a number of MiB"):
         parse_split("--split-size", "MiB", number, 1 << 20)
 
 
 def test_to_continue_and_to_replace_at_once_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="give one of them"):
+    with pytest.raises(UsageError, match="give only one of these options"):
         LogStorage(tmp_path / "run.mcap", force=True, carry_on=True).find_first_part()
 
 

@@ -66,7 +66,7 @@ def test_a_torn_file_gives_every_chunk_that_is_whole(size: int) -> None:
     """Wherever it is cut, what lies in whole chunks before is read, and the cut is told."""
     whole = [frame for frame in CHUNKS if frame.end <= size]
     if size < 8:
-        with pytest.raises(LogError, match="no MCAP file"):
+        with pytest.raises(LogError, match="not an MCAP file"):
             walked(DATA[:size])
         return
     walk, items = walked(DATA[:size])
@@ -165,7 +165,8 @@ def test_file_that_holds_absurdly_much_is_refused_with_place(
     )
     data = DATA[: CHUNKS[1].offset] + bombs + DATA[CHUNKS[1].offset :]
     with pytest.raises(
-        LogError, match=r"file: holds absurdly much for a file of \d+ bytes: up to byte \d+"
+        LogError,
+        match=r"file: needs too much memory for a file of \d+ bytes: the data up to byte \d+",
     ):
         walked(data)
     streaming = McapReader(io.BytesIO(data), "file", kept=False)

@@ -101,10 +101,10 @@ def test_parts_that_tell_same_differently_are_refused_by_their_names(
 @pytest.mark.parametrize(
     ("session", "scenario", "named"),
     [
-        ({"session": "lab"}, None, "session lab, not paper"),
-        ({"epoch_unix_ns": "7"}, None, "epoch_unix_ns 7, not 0"),
-        ({"driver": "live"}, None, "driver live, not virtual"),
-        ({}, load_scenario("free").text, "scenario [0-9a-f]{16}, not "),
+        ({"session": "lab"}, None, "session is lab, not paper"),
+        ({"epoch_unix_ns": "7"}, None, "epoch_unix_ns is 7, not 0"),
+        ({"driver": "live"}, None, "driver is live, not virtual"),
+        ({}, load_scenario("free").text, "scenario is [0-9a-f]{16}, not "),
     ],
 )
 def test_files_of_different_sessions_are_refused_with_what_differs(
@@ -114,7 +114,7 @@ def test_files_of_different_sessions_are_refused_with_what_differs(
     one.write_bytes(whole())
     two.write_bytes(a_file(whole(), [], session=session, scenario=scenario))
     with pytest.raises(
-        LogError, match=rf"two\.mcap: is no part of the session in .*one\.mcap: {named}"
+        LogError, match=rf"two\.mcap: is not a part of the session in .*one\.mcap: {named}"
     ):
         open_log(one, two)
 

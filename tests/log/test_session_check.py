@@ -146,7 +146,7 @@ SAID: dict[str, tuple[Callable[[], bytes], set[str], str]] = {
     "a number twice": (
         lambda: edited(DATA, record=lambda r: {**r, "tick": 5} if r["tick"] == 6 else r),
         {"sequence", "accounts"},
-        "number 5 occurs twice",
+        "message 5 occurs twice",
     ),
     "a message of another site": (
         lambda: edited(DATA, record=lambda r: {**r, "site": "m2"} if r["site"] == "m1" else r),
@@ -161,14 +161,18 @@ SAID: dict[str, tuple[Callable[[], bytes], set[str], str]] = {
     "sent at another time": (
         lambda: edited(DATA, record=lambda r: {**r, "sent_ns": 5} if r["tick"] == 3 else r),
         {"times"},
-        "was sent at 5 ns, not 3000000",
+        "was sent at 5 ns, but is stored with 3000000",
     ),
     "another scenario": (
         lambda: edited(DATA, scenario=lambda text: text + "# and more\n"),
         {"scenario"},
         "SHA-256",
     ),
-    "another seed": (lambda: edited(DATA, session={"seed": "7"}), {"scenario"}, "has seed 1"),
+    "another seed": (
+        lambda: edited(DATA, session={"seed": "7"}),
+        {"scenario"},
+        "has the seed 1",
+    ),
     "another version": (
         lambda: edited(DATA, session={"schema_version": "2"}),
         {"schema"},

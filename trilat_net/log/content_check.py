@@ -245,10 +245,13 @@ class ContentCheck:
         """
         first_ns, last_ns = span_ns
         if not max(first_ns, self._log_ns) <= log_ns <= last_ns:
-            raise UnreadableRecord(f"a message of {topic} was logged outside of its chunk")
+            raise UnreadableRecord(
+                f"the log time of a message of {topic} lies outside the time range of its "
+                "chunk, or is earlier than that of a previous message"
+            )
         if topic.startswith(VIZ_ROOT):
             if payload[:2] != CDR_HEAD:
-                raise UnreadableRecord(f"a message of {topic} is not CDR")
+                raise UnreadableRecord(f"a message of {topic} is not encoded in CDR")
         elif self.owns_channel(topic):
             self._check_session_message(topic, sequence, publish_ns, payload)
         else:
@@ -302,12 +305,13 @@ class ContentCheck:
             )
         boot = self._find_boot(member)
         if boot is not None and message.boot != boot:
-            raise UnreadableRecord(f"a message of {topic} is of another boot of {member}")
+            raise UnreadableRecord(f"a message of {topic} comes from another start of {member}")
 
         # A file stores the sequence number in 32 bits.
         if identity.sequence >= 0 and sequence != identity.sequence & 0xFFFFFFFF:
             raise UnreadableRecord(
-                f"number {identity.sequence} of {topic} is stored as {sequence}"
+                f"message {identity.sequence} of {topic} is stored with the sequence number "
+                f"{sequence}"
             )
         number = sequence if identity.number < 0 else identity.number
         self._check_number(topic, message, number)
@@ -316,7 +320,10 @@ class ContentCheck:
         if identity.sent_ns is not None:
             sent_ns = min(max(0, self._epoch_ns + identity.sent_ns), MAX_TIME_NS)
             if publish_ns != sent_ns:
-                raise UnreadableRecord(f"number {number} of {topic} was sent at another time")
+                raise UnreadableRecord(
+                    f"the sending time that is stored with message {number} of {topic} differs "
+                    "from the time that the message states"
+                )
 
     def check_origin(self, data: bytes) -> None:
         """Checks that a block of messages (chunk) does not come from another simulated run.
@@ -336,7 +343,7 @@ class ContentCheck:
             return
         origins = find_origins(data, _CHECKED_MESSAGES)
         if has_foreign_boots(self._about, origins.boots):
-            raise UnreadableRecord("a chunk of another run")
+            raise UnreadableRecord("a chunk belongs to another run")
 
     def _find_boot(self, member: str) -> int | None:
         """Returns the number that identifies the present start of a member.
@@ -382,7 +389,9 @@ class ContentCheck:
             # The changes in a record state how many ticks the site skipped before it.
             expected += count_skipped_ticks(message.cmd)
         if number != expected:
-            raise UnreadableRecord(f"number {number} of {topic} follows number {expected - 1}")
+            raise UnreadableRecord(
+                f"message {number} of {topic} stands where message {expected} was expected"
+            )
 
     def _check_tick(self, topic: str, record: messages.State) -> None:
         """Checks that the content of a record is possible in a run of the scenario.
@@ -398,10 +407,17 @@ class ContentCheck:
             UnreadableRecord: The content is not possible.
         """
         site = record.site
-        if not 0 <= record.tick < self._scenario.ticks(site):
-            raise UnreadableRecord(f"the scenario has no tick {record.tick} of {site}")
+        ticks = self._scenario.ticks(site)
+        if not 0 <= record.tick < ticks:
+            raise UnreadableRecord(
+                f"a record states tick {record.tick} of {site}, but the ticks of the scenario "
+                f"are 0 to {ticks - 1}"
+            )
         if record.t_ns != tick_ns(record.tick, self._scenario.sites[site].rate_hz):
-            raise UnreadableRecord(f"tick {record.tick} of {topic} has another nominal time")
+            raise UnreadableRecord(
+                f"the nominal time of tick {record.tick} of {topic} differs from that in the "
+                "scenario"
+            )
         peers = self._scenario.peers(site)
         uses_known_peers = record.used.keys() <= set(peers)
         receives_from_known_peers = all(0 <= peer < len(peers) for peer, *_ in record.rx)

@@ -166,7 +166,7 @@ class Table:
         """
         columns = {column.name: column for column in self.columns}
         if name not in columns:
-            raise KeyError(f"no column {name!r}; there are {', '.join(columns)}")
+            raise KeyError(f"there is no column {name!r}; the columns are {', '.join(columns)}")
         return columns[name]
 
     @property
@@ -605,8 +605,8 @@ def build_arrivals_table(site: SiteLog, source: str, *, live: bool) -> Table:
     index = entries[:, 0]
     if ((index < 0) | (index >= len(site.peers))).any():
         raise LogError(
-            f"{source}: a record of {site.name} lists an arrival of a peer "
-            "that it does not have"
+            f"{source}: a record of {site.name} lists a sample from a site that is not a peer "
+            f"of {site.name}"
         )
     # Index of the record that contains each arrival.
     row = np.repeat(np.arange(len(site)), counts)

@@ -166,8 +166,9 @@ def parse_channel_filter(include: Collection[str], exclude: Collection[str]) -> 
         for text in texts:
             if not all(map(_CHUNK.fullmatch, text.strip("/").split("/"))):
                 raise UsageError(
-                    f"{option} is a key expression like 'trilat/*/m1/**' or '**/link': names, "
-                    f"* for one of them, ** for any number, $* for a part of one; not {text!r}"
+                    f"{option} must be a key expression such as 'trilat/*/m1/**' or '**/link', "
+                    f"not {text!r}: * stands for one name, ** for any number of names, and $* "
+                    "for part of a name"
                 )
     return ChannelFilter(
         include=tuple(text.strip("/") for text in include),

@@ -125,7 +125,9 @@ class Log(Result, Mapping[str, SiteLog]):
                 self.scenario_text, f"{self.source}: scenario"
             )
         except (ScenarioError, UnicodeDecodeError) as error:
-            raise LogError(f"{self.source}: its scenario cannot be read: {error}") from None
+            raise LogError(
+                f"{self.source}: the scenario in this log cannot be read: {error}"
+            ) from None
         self.sites = self.scenario.names
         self._contents = contents
         self._sites: dict[str, SiteLog] = {}
@@ -560,7 +562,8 @@ class Log(Result, Mapping[str, SiteLog]):
     def __getitem__(self, site: str) -> SiteLog:
         if site not in self.scenario.sites:
             raise UnknownName(
-                f"no site {site!r} in {self.source}; it has {', '.join(self.sites)}"
+                f"there is no site {site!r} in {self.source}; the sites are "
+                f"{', '.join(self.sites)}"
             )
         if site not in self._sites:
             self._sites[site] = self._read_site(site)
@@ -590,7 +593,8 @@ class Log(Result, Mapping[str, SiteLog]):
         # memory.
         if last >= ticks:
             raise LogError(
-                f"{self.source}: {site} has a record of tick {last}; the scenario has {ticks}"
+                f"{self.source}: {site} has a record of tick {last}, but the scenario has only "
+                f"{count_nouns(ticks, 'tick')}"
             )
         return part
 
@@ -738,7 +742,8 @@ class Log(Result, Mapping[str, SiteLog]):
             case "arrivals":
                 return build_arrivals_table(site, self.source, live=self.driver == "live")
         raise UnknownName(
-            f"no table {kind!r} of {name}; there are {', '.join(SITE_TABLE_KINDS)}"
+            f"{name} has no table {kind!r}; the tables of a site are "
+            f"{', '.join(SITE_TABLE_KINDS)}"
         )
 
     def tables(self) -> Iterator[Table]:
@@ -822,7 +827,7 @@ def open_logs(*sources: str | Path, progress: Progress | None = None) -> list[Lo
             continue
         logs = sorted(path.glob("*.mcap"))
         if not logs:
-            raise LogError(f"{path}: no log is in this directory")
+            raise LogError(f"{path}: this directory contains no log")
         files += logs
     sessions: dict[str, list[LogContents]] = {}
     for part in _read_parts(files, progress):
@@ -850,7 +855,8 @@ def _read_parts(
                 files.append((source, "log"))
             else:
                 raise LogError(
-                    f"a log is a path, or a file opened for reading, not {source!r:.80}"
+                    "a log must be given as a path or as a file opened for reading, not "
+                    f"{source!r:.80}"
                 )
         sizes = [_measure_size(stream) for stream, _ in files]
         start = 0
@@ -905,7 +911,7 @@ def read_link_delays(path: Path, link: str) -> list[TracePoint]:
     links = _read_links(path, status.st_mtime_ns, status.st_size)
     if link not in links:
         hint = suggest_nearest(link, list(links)) or "."
-        raise ValueError(f"has no link {link!r}{hint} Its links are {', '.join(links)}")
+        raise ValueError(f"has no link {link!r}{hint} The links are {', '.join(links)}")
     if not links[link]:
         raise ValueError(f"no sample arrived over {link}")
     return links[link]

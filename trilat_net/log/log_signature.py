@@ -85,7 +85,9 @@ def create_signing_keys(path: str | Path) -> tuple[Path, Path]:
     """
     path = Path(path)
     if not path.name:
-        raise UsageError(f"{path}: is no name; keys are named as in: trilat keys pair lab")
+        raise UsageError(
+            f"{path}: is not the name of a key; name the key as in: trilat keys pair lab"
+        )
     private = path.with_name(f"{path.name}.key")
     public = path.with_name(f"{path.name}.pub")
     for file in (private, public):
@@ -135,14 +137,17 @@ def sign_log(
         "private Ed25519 key; make a pair with: trilat keys pair NAME",
     )
     if read_foreign_permissions(key_file):
-        raise UsageError(f"{key_file}: can be read by others: chmod 600 {key_file}")
+        raise UsageError(
+            f"{key_file}: other users can read this key; protect the key with: "
+            f"chmod 600 {key_file}"
+        )
     signature_file = path.with_name((path.name or "log") + SUFFIX)
     refuse_existing(signature_file, force=force)
     integrity, chain = _read_chain(path, progress)
     if integrity.state is not DigestState.INTACT:
         advice = {
             DigestState.OPEN: f"; make it whole first with: trilat log recover {path}",
-            DigestState.ABSENT: f"; trilat log recover {path} makes a copy with one",
+            DigestState.ABSENT: f"; trilat log recover {path} makes a copy with a digest chain",
         }
         raise LogError(
             f"{path}: is not signed: {integrity.text}{advice.get(integrity.state, '')}"
@@ -210,13 +215,13 @@ def _find_problem(path: Path, key: Ed25519PublicKey, progress: Progress | None) 
             stated = msgspec.json.decode(stream.read(_MAX_BYTES), type=LogSignature)
         signature = base64.b64decode(stated.signature, validate=True)
     except FileNotFoundError:
-        return f"there is no signature {file}"
+        return f"there is no signature file {file}"
     except OSError as error:
         return f"{file} cannot be read: {error.strerror}"
     except ValueError as error:  # msgspec and base64 raise it
-        return f"{file} is no signature of this program: {error}"
+        return f"{file} is not a signature of this program: {error}"
     if stated.format != _FORMAT:
-        return f"{file} is of another version: {stated.format[:40]!r}"
+        return f"{file} has the format {stated.format[:40]!r}, not {_FORMAT!r}"
     try:
         key.verify(signature, _signed_bytes(stated.chain))
     except InvalidSignature:
@@ -224,7 +229,7 @@ def _find_problem(path: Path, key: Ed25519PublicKey, progress: Progress | None) 
     integrity, chain = _read_chain(path, progress)
     if chain != stated.chain:
         return (
-            "what was signed is another content "
+            "the signature belongs to other content "
             f"({count_nouns(stated.chain.get('messages', '?'), 'message')})"
         )
     return "" if integrity.state is DigestState.INTACT else integrity.text
@@ -283,5 +288,5 @@ def _load_key(path: Path, kind: Any, expected: str) -> Any:
         else:
             key = serialization.load_pem_public_key(data)
     if not isinstance(key, kind):
-        raise UsageError(f"{path}: is no {expected}")
+        raise UsageError(f"{path}: is not a {expected}")
     return key

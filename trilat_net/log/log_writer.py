@@ -354,7 +354,8 @@ class LogStorage:
         """
         if self.carry_on and self.force:
             raise UsageError(
-                "--continue keeps what exists, --force replaces it; give one of them"
+                "--continue keeps the existing files and --force replaces them; give only one "
+                "of these options"
             )
         parts = log_layout.find_parts(self.path)
         if self.carry_on and parts:
@@ -366,8 +367,8 @@ class LogStorage:
         )
         if self.splits and parts and not self.force:
             raise UsageError(
-                f"{parts[max(parts)]}: exists; choose another name, continue the log with "
-                "--continue, or replace it with --force"
+                f"{parts[max(parts)]}: already exists; choose another name, continue the log "
+                "with --continue, or replace it with --force"
             )
         return int(self.splits), ""
 
@@ -390,7 +391,7 @@ def parse_split(option: str, unit: str, number: float | None, scale: int) -> int
     if number is None:
         return None
     if not 1.0 <= number <= 1e6:
-        raise UsageError(f"{option} is a number of {unit} from 1 to 1e6, not {number:g}")
+        raise UsageError(f"{option} must be a number of {unit} from 1 to 1e6, not {number:g}")
     return int(number * scale)
 
 

@@ -140,7 +140,9 @@ class FileCheck:
                 )
             case Opcode.ATTACHMENT:
                 if not mcap_records.has_right_crc(content):
-                    raise mcap_records.UnreadableRecord("an attachment's CRC differs")
+                    raise mcap_records.UnreadableRecord(
+                        "the CRC of an attachment does not match its content"
+                    )
                 self.counts["crcs"] += content[-4:] != bytes(4)
                 self._expected_index[Opcode.ATTACHMENT_INDEX, frame.offset] = (
                     frame.size,
@@ -174,11 +176,13 @@ class FileCheck:
         name = "schema" if opcode == Opcode.SCHEMA else "channel"
         if self._defined.setdefault((opcode, record.id), record) != record:
             self._add(
-                "records", frame.offset, f"{name} {record.id} is defined again, differently"
+                "records",
+                frame.offset,
+                f"{name} {record.id} is defined again with other values",
             )
         schema = record.schema_id if opcode == Opcode.CHANNEL else 0
         if schema and (Opcode.SCHEMA, schema) not in self._defined and not self._has_unreadable:
-            text = f"channel {record.id} names schema {schema}, which is not defined before"
+            text = f"channel {record.id} names schema {schema}, which no earlier record defines"
             self._add("records", frame.offset, text)
 
     def _check_message(
@@ -201,13 +205,15 @@ class FileCheck:
             UnreadableRecord: The message is too short.
         """
         if end - begin < mcap_records.MESSAGE_HEAD.size:
-            raise mcap_records.UnreadableRecord("a message is shorter than its head")
+            raise mcap_records.UnreadableRecord("a message is shorter than its header")
         channel, _, log_ns, _ = mcap_records.MESSAGE_HEAD.unpack_from(data, begin)
         is_defined = (Opcode.CHANNEL, channel) in self._defined
         if not is_defined and channel not in self._undefined_channels:
             self._undefined_channels.add(channel)
             if not self._has_unreadable:
-                text = f"messages of channel {channel}, which is not defined before"
+                text = (
+                    f"a message belongs to channel {channel}, which no earlier record defines"
+                )
                 self._add("records", frame.offset, text)
         self.counts["messages"] += 1
         return channel, log_ns
@@ -240,9 +246,8 @@ class FileCheck:
             elif opcode in mcap_records.DEFINITIONS:
                 self._define(frame, opcode, data[begin:end])
             else:
-                self._add(
-                    "records", frame.offset, f"a chunk contains a record of kind {opcode}"
-                )
+                text = f"a chunk contains a record of kind {opcode}, which is not allowed there"
+                self._add("records", frame.offset, text)
 
         self._message_indexes = {}
         # The offsets of the message indexes are added to the dictionary when those records
@@ -264,7 +269,8 @@ class FileCheck:
         # An entry is a log time and an offset of 8 bytes each.
         if length != len(content) - _INDEX_HEAD_BYTES or length % 16:
             raise mcap_records.UnreadableRecord(
-                f"a message index of {count_nouns(len(body), 'byte')} says that it has {length}"
+                f"a message index has {count_nouns(len(body), 'byte')} and states a length of "
+                f"{length}; both must be the same multiple of 16"
             )
         self._message_indexes[channel] = frame.offset
         stated = _sort_by_offset(body)
@@ -281,7 +287,7 @@ class FileCheck:
         """
         scanner = self._scanner
         if not scanner.begins:
-            problem = "does not begin as an MCAP file does" if scanner.size else "is empty"
+            problem = "does not begin with the mark of MCAP" if scanner.size else "is empty"
             self._add("whole", 0, problem)
             return
 
@@ -329,10 +335,13 @@ class FileCheck:
                 continue
             if self._stated_index.pop((opcode, offset), None) != entry:
                 name = _INDEXED_NAMES[opcode]
-                text = f"the {name} that begins here is not in the index, or with other values"
+                text = (
+                    f"the {name} record that begins here is missing in the index, or has other "
+                    "values there"
+                )
                 self._add("index", offset, text)
         for opcode, offset in sorted(self._stated_index):
-            text = f"the index names {_INDEXED_NAMES[opcode]} that does not exist"
+            text = f"the index lists a record ({_INDEXED_NAMES[opcode]}) that does not exist"
             self._add("index", offset, text)
 
     def _compare_statistics(self) -> None:

@@ -219,8 +219,8 @@ class McapReader:
         """
         scanner = self.scanner
         if not scanner.begins and self.watch is None:
-            empty = "is empty" if not self.size else "does not begin as one does"
-            raise LogError(f"{self._source}: is no MCAP file: it {empty}")
+            reason = "is empty" if not self.size else "does not begin with the mark of MCAP"
+            raise LogError(f"{self._source}: is not an MCAP file: the file {reason}")
         for frame in scanner.frames():
             self.offset = frame.offset
             if frame.opcode in _READ or self.watch is not None:
@@ -284,7 +284,8 @@ class McapReader:
                 attachment = mcap_records.parse_record(frame.opcode, content)
                 if not mcap_records.has_right_crc(content):
                     raise mcap_records.UnreadableRecord(
-                        f"the attachment {attachment.name[:80]!r}: its CRC differs"
+                        f"the CRC of the attachment {attachment.name[:80]!r} does not match "
+                        "its content"
                     )
                 self.attachments[attachment.name] = attachment.data
             case Opcode.HEADER:
@@ -324,7 +325,7 @@ class McapReader:
                 length = end - begin
                 messages += 1
                 if length < head_bytes:
-                    raise mcap_records.UnreadableRecord("a message is shorter than its head")
+                    raise mcap_records.UnreadableRecord("a message is shorter than its header")
                 channel, sequence, log_time_ns, publish_time_ns = parse_head(data, begin)
 
                 # Messages of the session will be decoded, the others will not.
@@ -419,7 +420,8 @@ class McapReader:
             self._channel_memory_left[channel] = -math.inf
             topic = self._topics.get(channel, f"channel {channel}")
             text = (
-                f"{topic[:80]} takes absurdly much for such a file; from here on it is not read"
+                f"{topic[:80]} needs too much memory for a file of this size; the rest of this "
+                "channel is not read"
             )
             self._more_damage.append(mcap_records.Damage(frame.offset, frame.size, text))
 
@@ -438,9 +440,9 @@ class McapReader:
         self._memory_left -= amount
         if self._memory_left < 0:
             raise LogError(
-                f"{self._source}: holds absurdly much for a file of "
-                f"{count_nouns(self.size, 'byte')}: up to byte {frame.end} alone it would take "
-                f"more than {KEPT_RATIO} times that in memory, and more than "
+                f"{self._source}: needs too much memory for a file of "
+                f"{count_nouns(self.size, 'byte')}: the data up to byte {frame.end} alone "
+                f"would need more than {KEPT_RATIO} times the size of the file, and more than "
                 f"{KEPT_BYTES >> 20} MiB"
             )
 
@@ -590,7 +592,7 @@ def check_log(stream: BinaryIO, name: str) -> None:
     try:
         parse_embedded(reader.attachments[SCENARIO].decode(), f"{name}: scenario")
     except (ScenarioError, UnicodeDecodeError) as error:
-        raise LogError(f"{name}: its scenario cannot be read: {error}") from None
+        raise LogError(f"{name}: the scenario in this log cannot be read: {error}") from None
 
 
 def _check_head(reader: McapReader, name: str) -> None:
@@ -609,5 +611,7 @@ def _check_head(reader: McapReader, name: str) -> None:
         missing.append(SCENARIO)
     if missing:
         reason = f"damaged: {reader.damaged[0]}" if reader.damaged else reader.torn
-        problem = f"{name}: is an MCAP file, but no log of trilat-net: no {missing[0]}"
+        problem = (
+            f"{name}: is an MCAP file, but not a log of trilat-net: {missing[0]} is missing"
+        )
         raise LogError(f"{problem}; {reason}" if reason else problem)

@@ -115,12 +115,13 @@ def parse_chunk_head(content: bytes, length: int) -> ChunkHead:
         (packed_bytes,) = _SIZE.unpack_from(content, _FIXED_HEAD.size + name_bytes)
         compression = content[_FIXED_HEAD.size : _FIXED_HEAD.size + name_bytes].decode()
     except (struct.error, UnicodeDecodeError):
-        raise UnreadableRecord("a chunk has no head") from None
+        raise UnreadableRecord("a chunk has no valid header") from None
     data_offset = _FIXED_HEAD.size + name_bytes + _SIZE.size
     stated_length = data_offset + packed_bytes
     if stated_length != length:
         raise UnreadableRecord(
-            f"a chunk of {count_nouns(length, 'byte')} says that it has {stated_length}"
+            f"a chunk of {count_nouns(length, 'byte')} states a length of "
+            f"{count_nouns(stated_length, 'byte')}"
         )
     return ChunkHead(
         start_ns=start_ns,
@@ -148,16 +149,19 @@ def unpack_chunk(content: bytes) -> bytes:
     limit = max(MAX_UNPACKED_BYTES, MAX_UNPACKED_RATIO * len(content))
     if head.size > limit:
         raise UnreadableRecord(
-            f"a chunk says that it unpacks to {count_nouns(head.size, 'byte')}, "
-            f"at most {limit} are taken"
+            f"a chunk states an unpacked size of {count_nouns(head.size, 'byte')}, but at most "
+            f"{limit} are allowed"
         )
     data = _unpack(head, memoryview(content)[head.data_offset :])
     if len(data) != head.size:
+        # The unpacking of longer data may end early, so that their length is not known.
+        actual_size = "more" if len(data) > head.size else str(len(data))
         raise UnreadableRecord(
-            f"a chunk of {count_nouns(head.size, 'byte')} unpacks to {len(data)}"
+            f"a chunk states an unpacked size of {count_nouns(head.size, 'byte')}, but unpacks "
+            f"to {actual_size}"
         )
     if head.crc and zlib.crc32(data) != head.crc:
-        raise UnreadableRecord("a chunk's CRC differs")
+        raise UnreadableRecord("the CRC of a chunk does not match its data")
     return data
 
 
@@ -176,7 +180,8 @@ def _unpack(head: ChunkHead, data: memoryview) -> bytes:
             # The library would allocate the size that the frame declares, however large.
             if declared not in (head.size, zstandard.CONTENTSIZE_UNKNOWN):
                 raise UnreadableRecord(
-                    f"a chunk of {count_nouns(head.size, 'byte')} unpacks to {declared}"
+                    f"a chunk states an unpacked size of {count_nouns(head.size, 'byte')}, but "
+                    f"its zstd data state {declared}"
                 )
             unpacker = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW_BYTES)
             return unpacker.decompress(data, head.size)
@@ -191,7 +196,7 @@ def _unpack(head: ChunkHead, data: memoryview) -> bytes:
 
     if head.compression:
         raise UnreadableRecord(
-            f"a chunk is packed by {head.compression!r}, which is not supported"
+            f"a chunk is compressed with {head.compression!r}, which is not supported"
         )
     return bytes(data)
 
@@ -217,7 +222,7 @@ def iterate_records(data: bytes | bytearray) -> Iterator[tuple[int, int, int]]:
         begin = end + RECORD_HEAD_BYTES
         end = begin + length
         if end > size:
-            raise UnreadableRecord("a record reaches beyond its chunk")
+            raise UnreadableRecord("a record reaches beyond the end of its chunk")
         yield opcode, begin, end
     if end < size:
         raise UnreadableRecord("a record in a chunk is cut off")
@@ -325,7 +330,8 @@ class RecordScanner:
                     self.head(frame)
                 elif frame.opcode == Opcode.FOOTER and frame.size + len(MAGIC) != FOOTER_BYTES:
                     raise UnreadableRecord(
-                        f"a record (footer) of {count_nouns(frame.length, 'byte')} is none"
+                        f"a footer record has {count_nouns(frame.length, 'byte')}, which is "
+                        "not the length of a footer"
                     )
             except UnreadableRecord as error:
                 # The length of the previous record may be wrong, so that the search includes
@@ -345,7 +351,9 @@ class RecordScanner:
             search_start = frame.end if frame.opcode == Opcode.CHUNK else frame.offset + 1
             offset = frame.end
         self.torn = Damage(
-            offset, self.size - offset, f"it is damaged in {MAX_DAMAGED_PARTS} places before"
+            offset,
+            self.size - offset,
+            f"the file is damaged in {MAX_DAMAGED_PARTS} places before",
         )
 
     def _end_at(self, footer_end: int) -> None:

@@ -84,13 +84,13 @@ def _check_same_session(first: LogContents, other: LogContents) -> None:
     expected = identify_session(first)
     actual = identify_session(other)
     differences = [
-        f"{name} {actual[name]}, not {expected[name]}"
+        f"{name} is {actual[name]}, not {expected[name]}"
         for name in expected
         if expected[name] != actual[name]
     ]
     if differences:
         session = f"the session in {first.source}: {'; '.join(differences)}"
-        raise LogError(f"{other.source}: is no part of {session}")
+        raise LogError(f"{other.source}: is not a part of {session}")
 
 
 def _check_digests(parts: Sequence[LogContents]) -> None:
@@ -110,7 +110,8 @@ def _check_digests(parts: Sequence[LogContents]) -> None:
             continue
         if before.metadata[DIGESTS].get("records") != stated:
             raise LogError(
-                f"{part.source}: does not follow {before.source}: it followed another file"
+                f"{part.source}: is not the continuation of {before.source}: it was recorded "
+                "after another file"
             )
 
 
@@ -218,7 +219,8 @@ def _merge_channel(topic: str, parts: Sequence[LogContents]) -> ChannelMessages:
                 other = topic_parts[bisect_right(part_ends, index)]
                 message = _describe_message(topic, key)
                 raise LogError(
-                    f"{other.source} and {part.source} differ: {message} is not the same"
+                    f"{other.source} and {part.source} differ: {message} is not the same in "
+                    "both"
                 )
         merged_indices |= new_indices
         part_ends.append(len(merged.payloads))

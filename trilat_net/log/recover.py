@@ -467,7 +467,7 @@ class _FileCopy:
         elif opcode == Opcode.ATTACHMENT:
             self._copy_attachment(content)
         else:
-            raise UnreadableRecord(f"the kind {opcode} of this record is unknown")
+            raise UnreadableRecord(f"this record has the unknown kind {opcode}")
 
     def _copy_metadata(self, content: bytes) -> None:
         """Copies a metadata record, unless the recovery writes this record itself.
@@ -480,7 +480,7 @@ class _FileCopy:
         if entry.name == RECOVERED or is_regenerated:
             return
         if entry.name == SESSION and entry.metadata != self._survey.metadata.get(SESSION):
-            raise UnreadableRecord("metadata of another session")
+            raise UnreadableRecord("the metadata belong to another session")
         self._out.add_metadata(entry.name, entry.metadata)
         self._is_empty = False
 
@@ -494,7 +494,9 @@ class _FileCopy:
         """
         entry = mcap_records.parse_record(Opcode.ATTACHMENT, content)
         name = entry.name
-        problem = "" if mcap_records.has_right_crc(content) else "its CRC differs"
+        problem = (
+            "" if mcap_records.has_right_crc(content) else "its CRC does not match its content"
+        )
         if name == SCENARIO and entry.data != self._survey.attachments.get(SCENARIO):
             problem = problem or "it belongs to another session"
         if problem:
@@ -530,7 +532,7 @@ class _FileCopy:
                 raise UnreadableRecord("a message index has the wrong length")
         elif frame.offset < self._data_end:
             raise UnreadableRecord(
-                f"an index record of kind {frame.opcode} lies among the data"
+                f"an index record of kind {frame.opcode} appears in the data section"
             )
 
     def _copy_chunk(self, frame: mcap_records.RecordFrame, data: bytes) -> None:
@@ -647,13 +649,17 @@ class _FileCopy:
             self._check_unproven_definition(opcode, content)
             return
         if opcode != mcap_records.OP_MESSAGE:
-            raise UnreadableRecord(f"a chunk holds a record of kind {opcode}")
+            raise UnreadableRecord(
+                f"a chunk contains a record of kind {opcode}, which is not allowed there"
+            )
 
         number, sequence, log_ns, publish_ns = _parse_message_head(content)
         payload = content[mcap_records.MESSAGE_HEAD.size :]
         channel = self._find_channel(number, payload)
         if channel is None:
-            raise UnreadableRecord(f"a message is of channel {number}, which no record defines")
+            raise UnreadableRecord(
+                f"a message belongs to channel {number}, which no record defines"
+            )
         if self._content is not None:
             self._content.check(
                 topic=channel[1],
@@ -664,7 +670,9 @@ class _FileCopy:
                 span_ns=span_ns,
             )
         elif not span_ns[0] <= log_ns <= span_ns[1]:
-            raise UnreadableRecord("a message was logged outside of its chunk")
+            raise UnreadableRecord(
+                "the log time of a message lies outside the time range of its chunk"
+            )
 
     def _check_unproven_definition(self, opcode: int, content: bytes) -> None:
         """Checks a schema or channel that no checksum covers, and notes it.
@@ -969,7 +977,7 @@ def _parse_message_head(content: bytes) -> tuple[int, int, int, int]:
         UnreadableRecord: The message is too short.
     """
     if len(content) < mcap_records.MESSAGE_HEAD.size:
-        raise UnreadableRecord("a message is too short")
+        raise UnreadableRecord("a message is shorter than its header")
     number, sequence, log_ns, publish_ns = mcap_records.MESSAGE_HEAD.unpack_from(content)
     return number, sequence, log_ns, publish_ns
 

@@ -160,8 +160,10 @@ class RecoverySurvey:
     def _explain_empty(self) -> str:
         """Returns the reason why the file contains nothing to recover."""
         if self._scanner.begins:
-            return "it holds no messages"
-        return "it does not begin as an MCAP file does" if self._scanner.size else "it is empty"
+            return "it contains no messages"
+        if not self._scanner.size:
+            return "it is empty"
+        return "it does not begin with the mark of MCAP"
 
     def _read_description(self, frame: RecordFrame, content: bytes) -> None:
         """Reads a record that describes the file.
@@ -311,7 +313,7 @@ class RecoverySurvey:
             if unmatched[measures] > 0:
                 unmatched[measures] -= 1
             else:
-                misplaced[frame.offset] = "a chunk that the index of the file does not name"
+                misplaced[frame.offset] = "the index of the file does not name this chunk"
         return misplaced
 
 

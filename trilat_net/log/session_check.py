@@ -227,17 +227,17 @@ class ChannelCheck:
             return "has no schema"
         encodings = (channel.encoding, channel.schema_encoding)
         if encodings != ("msgpack", "jsonschema"):
-            return f"is {encodings[0]} with {encodings[1]}, not msgpack with jsonschema"
+            return f"must be msgpack with jsonschema, not {encodings[0]} with {encodings[1]}"
         name = f"trilat.{kind.__name__}.v{self._version}"
         if channel.schema != name:
             return f"has the schema {channel.schema}, not {name}"
         if self._version == messages.VERSION:
             released = json.dumps(messages.json_schema(kind)).encode()
             if channel.schema_data != released:
-                return f"the schema {channel.schema} is not what it was released as"
+                return f"the schema {channel.schema} differs from its released version"
         rate = channel.metadata.get("rate_hz", str(self.rate_hz))
         if self.kind == topics.STATE and rate != str(self.rate_hz):
-            return f"says {rate} Hz, the scenario {self.rate_hz}"
+            return f"states {rate} Hz, but the scenario states {self.rate_hz}"
         return ""
 
     def check_message(self, stored: McapMessage, offset: int) -> None:
@@ -264,7 +264,7 @@ class ChannelCheck:
             number = self._in_file[message.boot].expected
             sequence = number
         if message.v != self._version:
-            text = f"a message of version {message.v} in a log of version {self._version}"
+            text = f"a message has version {message.v}, but the log has version {self._version}"
             self._add("schema", offset, text)
         if identity.sender != self.member:
             self._add("schema", offset, f"a message states the sender {identity.sender[:40]!r}")
@@ -272,9 +272,10 @@ class ChannelCheck:
         if number >= 0:
             # A file stores the sequence number in 32 bits.
             if stored.sequence != sequence & 0xFFFFFFFF:
-                self._add(
-                    "sequence", offset, f"number {sequence} is stored as {stored.sequence}"
+                text = (
+                    f"message {sequence} is stored with the sequence number {stored.sequence}"
                 )
+                self._add("sequence", offset, text)
             self._count(message, number, stored.publish_time_ns, offset)
         elif isinstance(message, messages.Event):
             # Events have no number before version 3 of the schema.
@@ -295,13 +296,13 @@ class ChannelCheck:
             offset: Offset of the message in the file.
         """
         if message.boot not in self.boots and len(self.boots) >= MAX_BOOTS:
-            self._add("sequence", offset, f"more than {MAX_BOOTS} starts")
+            self._add("sequence", offset, f"there were more than {MAX_BOOTS} starts")
             return
         self.boots.add(message.boot)
 
         # Two parts of a log may contain the same message, but one file may not.
         if not self._in_file[message.boot].receive(number):
-            self._add("sequence", offset, f"number {number} occurs twice")
+            self._add("sequence", offset, f"message {number} occurs twice")
         if isinstance(message, messages.Event):
             is_new = self._accounts.receive_event(self._topic, number, message)
         elif self.kind == topics.STATS:
@@ -339,21 +340,21 @@ class ChannelCheck:
         log_ns = stored.log_time_ns
         publish_ns = stored.publish_time_ns
         if log_ns < self._log_ns:
-            text = f"log_time goes back by {self._log_ns - log_ns} ns at number {number}"
+            text = f"log_time goes back by {self._log_ns - log_ns} ns at message {number}"
             self._add("times", offset, text)
         self._log_ns = log_ns
         sent_ns = publish_ns
         if stated_ns is not None:
             sent_ns = min(max(0, self._epoch_ns + stated_ns), MAX_TIME_NS)
         if publish_ns != sent_ns:
-            self._add(
-                "times", offset, f"number {number} was sent at {sent_ns} ns, not {publish_ns}"
+            text = (
+                f"message {number} was sent at {sent_ns} ns, but is stored with {publish_ns} ns"
             )
+            self._add("times", offset, text)
         elif publish_ns > log_ns + MAX_AHEAD_NS:
             ahead_s = (publish_ns - log_ns) / NS_PER_S
-            self._add(
-                "times", offset, f"number {number} came {ahead_s:.1f} s before it was sent"
-            )
+            text = f"message {number} arrived {ahead_s:.1f} s before it was sent"
+            self._add("times", offset, text)
 
 
 def _parse_number(about: Mapping[str, str], key: str) -> int:
@@ -452,7 +453,7 @@ class SessionCheck:
                 self._views += 1
                 if message.payload[:2] != _CDR_HEAD:
                     self._findings["schema"].add(
-                        file, reader.offset, f"{topic[:80]}: a message is not in CDR"
+                        file, reader.offset, f"{topic[:80]}: a message is not encoded in CDR"
                     )
         if not has_begun:
             self._begin_file(reader)
@@ -474,11 +475,17 @@ class SessionCheck:
         about = reader.metadata.get(SESSION, {})
         if not {"session", "driver"} <= about.keys() or SCENARIO not in reader.attachments:
             if self.ours:
-                raise LogError(f"{self._file}: is no part of that log; look at it alone")
+                raise LogError(
+                    f"{self._file}: is not a part of the same log as the previous files; check "
+                    "this file separately"
+                )
             return
         same = ("session", "epoch_unix_ns", "scenario_sha256")
         if self.ours and any(about.get(key) != self._about.get(key) for key in same):
-            raise LogError(f"{self._file}: is of another session; look at it alone")
+            raise LogError(
+                f"{self._file}: belongs to another session than the previous files; check this "
+                "file separately"
+            )
 
         is_first_file = not self.ours
         self.ours = True
@@ -514,7 +521,7 @@ class SessionCheck:
             finding.add(
                 self._file,
                 None,
-                f"its SHA-256 is {digest[:16]}, the session names {stated[:16]}",
+                f"its SHA-256 is {digest[:16]}, but the session names {stated[:16]}",
             )
         try:
             self._scenario = scenario = parse_embedded(text.decode(), "scenario")
@@ -530,7 +537,9 @@ class SessionCheck:
             if about.get(key) != value:
                 stated_value = about.get(key, "")[:40]
                 finding.add(
-                    self._file, None, f"has {key} {value}, the session {stated_value!r}"
+                    self._file,
+                    None,
+                    f"has the {key} {value}, but the session states {stated_value!r}",
                 )
 
     def _begin_channel(self, channel: ChannelInfo) -> ChannelCheck | None:
@@ -560,7 +569,9 @@ class SessionCheck:
 
         if topic not in self.channels:
             if self._scenario and key.member not in (*self._scenario.sites, topics.RECORDER):
-                finding.add(self._file, None, f"{topic[:80]}: the scenario has no such member")
+                finding.add(
+                    self._file, None, f"{topic[:80]}: the scenario has no member of this name"
+                )
             self._counted.open_channel(topic)
             self.channels[topic] = ChannelCheck(
                 key=key,
@@ -691,8 +702,8 @@ class SessionCheck:
                 counted = {"received": check.received, "missing": missing}
                 for name, count in stated.items():
                     if count != counted[name]:
-                        account = f"{check.name}: {count} {name} by the account"
-                        finding.add("", None, f"{account}, {counted[name]} by the file")
+                        account = f"{check.name}: the account states {count} {name}"
+                        finding.add("", None, f"{account}, but the file has {counted[name]}")
             if not stated and self._version >= _ACCOUNTS_SINCE:
                 finding.add("", None, f"{check.name}: has no account")
         return finding.conclude("agree with the messages")
@@ -716,7 +727,7 @@ class SessionCheck:
             texts.append(f"{check.member} {rate_hz:.1f} Hz")
             if abs(rate_hz / check.rate_hz - 1) > _RATE_TOLERANCE:
                 sent = f"{check.member} sent {rate_hz:.1f} records a second"
-                finding.add("", None, f"{sent}, the scenario says {check.rate_hz}")
+                finding.add("", None, f"{sent}, but the scenario says {check.rate_hz}")
         return finding.conclude(", ".join(texts) or "the log is too short to measure them")
 
 
@@ -765,8 +776,8 @@ def _describe_unexplained_gap(log: Log, site: str) -> str:
         stated_text = " and ".join(f"{stated.get(name, 0)} {name}" for name in counted)
         counted_text = " and ".join(f"{count} {name}" for name, count in counted.items())
         return (
-            f"records of {site} were taken out or put in: its account says {stated_text}, "
-            f"the file has {counted_text}"
+            f"records of {site} were removed or added: the account of {site} states "
+            f"{stated_text}, but the file has {counted_text}"
         )
 
     gaps = int(ticks[-1] - ticks[0]) + 1 - len(ticks) if len(ticks) else 0

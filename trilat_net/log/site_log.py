@@ -181,7 +181,10 @@ class LazyRecords(Sequence[State]):
             return [self[n] for n in range(*index.indices(len(self)))]
         row = index + len(self) if index < 0 else index
         if not 0 <= row < len(self):
-            raise IndexError(f"record {index} of {len(self)}")
+            raise IndexError(
+                f"there is no record {index}: the log of this site has "
+                f"{count_nouns(len(self), 'record')}"
+            )
         block = self._get_block(row // self._size)
         return block[row % self._size]
 

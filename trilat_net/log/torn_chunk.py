@@ -85,7 +85,7 @@ class TornChunk(NamedTuple):
         content = scanner.read(begin, MAX_SALVAGE_BYTES)
         head = parse_chunk_head(content, length)
         if head.end_ns < head.start_ns:
-            raise UnreadableRecord("a chunk ends before it begins")
+            raise UnreadableRecord("the end time of a chunk is before its start time")
 
         trusted_bytes = find_doubtful_page(scanner, begin, begin + len(content)) - begin
         packed = content[head.data_offset : max(head.data_offset, trusted_bytes)]
