@@ -100,8 +100,11 @@ def test_search_says_its_time_and_its_procedure_and_writes_folder(logs: Path) ->
         (["a.mcap"], ["name at least two logs"]),
         (["a.mcap", "no.mcap"], ["no.mcap"]),
         (["a.mcap", "none.mcap"], ["none.mcap", "cannot be read"]),
-        (["a.mcap", "b.mcap", "--budget", "3"], ["--budget belongs to --tune SCENARIO"]),
-        (["a.mcap", "b.mcap", "--force"], ["--force belongs to --tune SCENARIO"]),
+        (
+            ["a.mcap", "b.mcap", "--budget", "3"],
+            ["--budget can be used only with --tune SCENARIO"],
+        ),
+        (["a.mcap", "b.mcap", "--force"], ["--force can be used only with --tune SCENARIO"]),
         (["a.mcap", "--tune", "free"], ["--tune makes its own runs"]),
         (["--tune", "fre"], ["no scenario of that name", "free"]),
         (

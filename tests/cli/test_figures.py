@@ -57,7 +57,7 @@ def test_the_list_says_what_a_log_has_nothing_for(folder: Path) -> None:
     ("words", "facts"),
     [
         (["contact"], ["no site has a wall"]),
-        (["phase", "--format", ","], ["--format names no format"]),
+        (["phase", "--format", ","], ["--format is empty"]),
         (["phase", "--out", "run.mcap"], ["run.mcap"]),
     ],
 )

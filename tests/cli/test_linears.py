@@ -59,7 +59,7 @@ def test_a_figure_is_the_same_file_every_time(tmp_path: Path) -> None:
 
 
 REFUSED = {
-    "a pose with letters": (["free", "--pose", "up"], ["--pose is angles in rad", "'up'"]),
+    "a pose with letters": (["free", "--pose", "up"], ["--pose must be angles in rad", "'up'"]),
     "a range without a colon": (
         ["free", "--over", "control.Kd=5"],
         ["--over must have the form KEY=LOW:HIGH"],
@@ -67,7 +67,7 @@ REFUSED = {
     "a figure of no kind": (["free", "--figure", "map.jpg"], ["map.jpg", ".pdf, .png, .svg"]),
     "a figure in no folder": (
         ["free", "--figure", "no/map.png"],
-        ["no/map.png", "there is no folder"],
+        ["no/map.png", "does not exist"],
     ),
     "a measured link": (
         ["free", "--set", "link.model=measured"],

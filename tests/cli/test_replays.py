@@ -18,12 +18,15 @@ from .running import trilat
             ["--time", "arrival"],
             ["--time is publish (as it was sent) or log (as it arrived), not 'arrival'"],
         ),
-        (["--preload", "-1"], ["--preload is a number of MiB, not -1"]),
+        (["--preload", "-1"], ["--preload must be a number of MiB, at least 0, not -1"]),
         (
             ["--prefix", "a/b"],
-            ["a session's name is at most 80 letters, digits, _", "not 'a/b-paper'"],
+            [
+                "a session's name must have 1 to 80 characters (letters, digits, _",
+                "not 'a/b-paper'",
+            ],
         ),
-        (["--session", "a b"], ["a session's name is at most 80 letters", "'a b'"]),
+        (["--session", "a b"], ["a session's name must have 1 to 80 characters", "'a b'"]),
         (["--connect", "tcp/127.0.0.1:1", "--router", "tcp/127.0.0.1:2"], ["--router"]),
     ],
 )

@@ -100,7 +100,10 @@ def test_log_that_is_not_what_it_says_is_failure(log_file: Path, short_log: byte
         ((), ("--replace", "--closed-loop")),
         (("--replace", "x"), ("no site 'x'", "m1, m2, s")),
         (("--replace", "s", "--set", "rate_hz=500"), ("rate_hz", "--closed-loop")),
-        (("--replace", "s", "-o", "run.mcap", "--force"), ("run.mcap", "the log itself")),
+        (
+            ("--replace", "s", "-o", "run.mcap", "--force"),
+            ("run.mcap", "the log that is being read"),
+        ),
         (("--replace", "s", "-o", "no/such/a.mcap"), ("a.mcap",)),
     ],
     ids=" ".join,

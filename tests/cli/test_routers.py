@@ -54,5 +54,5 @@ def test_a_router_on_a_busy_port_says_so(tmp_path: Path) -> None:
 @pytest.mark.parametrize("seconds", ["-1", "nan", "inf"])
 def test_a_time_that_is_none_is_refused_by_its_name(seconds: str, tmp_path: Path) -> None:
     trilat("router", "--until-idle", seconds, cwd=tmp_path).refuses(
-        "--until-idle is a number of seconds"
+        "--until-idle must be a number of seconds"
     )

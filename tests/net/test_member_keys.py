@@ -430,7 +430,7 @@ def test_names_that_look_alike_are_refused(name: str, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="a member's name has at most 64 letters") as raised:
         create_keys(tmp_path / "keys", [name])
     assert str(raised.value).isascii()
-    with pytest.raises(UsageError, match="a session's name is at most 80 letters"):
+    with pytest.raises(UsageError, match="a session's name must have 1 to 80 characters"):
         check_session_name(name)
     text = load_scenario("two_sites").text
     for before, after in (

@@ -90,7 +90,7 @@ def test_command_says_what_it_lacks(tmp_path: Path) -> None:
     for words, problem in (
         (("--session", "play"), "needs --scenario"),
         (("--session", "play", "--device", "spacemouse", "--set", "seed=2"), "leave out --set"),
-        (("--device", "spacemouse"), "a session's name is"),
+        (("--device", "spacemouse"), "a session's name must"),
     ):
         trilat("hand", "m1", *words, cwd=tmp_path).refuses(problem)
 

@@ -143,14 +143,14 @@ def hand_command(
         extra = scenario_options & set(options.list_used_options(context))
         if extra:
             raise UsageError(
-                f"--device leads an arm of a session that runs: leave out {min(extra)}"
+                f"--device leads an arm of a running session: leave out {min(extra)}"
             )
         return _lead_by_device(
             device=device, name=name, session=session, reach=reach, timeout_s=join_timeout
         )
     if not scenario:
         raise UsageError(
-            "a class of your own needs --scenario, a device that you hold --device"
+            "a class of your own needs --scenario; a device that you hold needs --device"
         )
     from sites.hand_process import run_hand
 
@@ -232,7 +232,8 @@ def _check_without(scenario: "Scenario", name: str, without: list[str]) -> tuple
         find_site(scenario, late_site)
         if name != first_site or late_site == name:
             raise UsageError(
-                f"--without is an option of {first_site}, the first site, and names other sites"
+                f"--without can be given only at {first_site}, the first site, and must name "
+                "other sites"
             )
         if not scenario.sites_may_return:
             raise UsageError('--without needs on_stale.action = "glide" at every site')
@@ -374,7 +375,10 @@ def _conclude(parts: list[Path], *, png: bool) -> None:
     """
     log, conclusion = terminal.conclude_files(parts, parts[0].parent, png=png)
     if conclusion.exit_code == CodeWithheld.exit_code:
-        raise CodeWithheld(f"{parts[0]}: not all was judged: it needs trilat verify --law FILE")
+        raise CodeWithheld(
+            f"{parts[0]}: parts of this log were not checked, because code that the log names "
+            "may not run; check them with: trilat verify --law FILE"
+        )
 
     if not conclusion.passed:
         raise RunFailed(f"{parts[0]}: failed a check")
@@ -441,7 +445,7 @@ def replay_command(
     from ..net.connection import default_endpoint
 
     if preload < 0:
-        raise UsageError(f"--preload is a number of MiB, not {preload}")
+        raise UsageError(f"--preload must be a number of MiB, at least 0, not {preload}")
     selection = parse_selection(
         include=include or (),
         exclude=exclude or (),
@@ -638,7 +642,7 @@ def _warn_torn(torn: dict[Path, str]) -> None:
     for path, text in torn.items():
         terminal.print_note(
             f"{path}: {text}; the intact part is played; "
-            f"make the file whole with: trilat log recover {path}"
+            f"repair the file with: trilat log recover {path}"
         )
 
 
@@ -655,7 +659,7 @@ def _warn_about_playback(outcome: "PlaybackSummary", reported: set[Path]) -> Non
     if outcome.cut:
         terminal.print_error(
             "a subscriber received nothing for 5 s and was cut off, "
-            f"{count_nouns(outcome.cut, 'time')}: it lacks the messages "
+            f"{count_nouns(outcome.cut, 'time')}: the subscriber lacks the messages "
             "that were played then"
         )
     if outcome.strays:
@@ -763,7 +767,7 @@ def ros2_command(
     domain: options.RosDomainOption = 0,
     distro: Annotated[str, value("--ros-distro", "humble|jazzy|kilted|lyrical")] = "jazzy",
     rate: Annotated[
-        float, value("--rate", "HZ", callback=options.check_range(1.0, 20000.0, "a rate, Hz,"))
+        float, value("--rate", "HZ", callback=options.check_range(1.0, 20000.0, "a rate in Hz"))
     ] = 100.0,
     names: Annotated[str, value("--names", "crisp|crtk|FILE")] = "crisp",
     timeout: options.AnswerOption = 10.0,
@@ -792,7 +796,7 @@ def ros2_command(
     from ..net.zenoh_config import BRIDGE
 
     if distro not in DISTROS:
-        raise UsageError(f"--ros-distro is one of {', '.join(DISTROS)}, not {distro!r}")
+        raise UsageError(f"--ros-distro must be one of {', '.join(DISTROS)}, not {distro!r}")
     name = check_ros_name(options.check_session_name(session), "session")
     table = read_topic_table(names)
     # Checked now, because the bridge would wait for a router at a wrong address forever.

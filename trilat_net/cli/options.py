@@ -54,7 +54,7 @@ def check_range(
         """
         if value is not None and not low <= value <= high:
             raise UsageError(
-                f"{param.opts[0]} is {noun} from {low:.7g} to {high:.7g}, not {value:g}"
+                f"{param.opts[0]} must be {noun} from {low:.7g} to {high:.7g}, not {value:g}"
             )
         return value
 
@@ -266,10 +266,10 @@ def check_session_name(name: str) -> str:
     """
     if len(name) > MOST_LETTERS or not re.fullmatch("[A-Za-z0-9_.-]+", name):
         # Letters of other alphabets may look like those of ASCII.
-        letters = "" if name.isascii() else "; its letters are a to z and A to Z"
+        letters = "" if name.isascii() else "; only the letters a to z and A to Z are allowed"
         raise UsageError(
-            f"a session's name is at most {MOST_LETTERS} letters, digits, _, - and ., "
-            f"not {ascii(name)[:80]}{letters}"
+            f"a session's name must have 1 to {MOST_LETTERS} characters (letters, digits, _, - "
+            f"and .), not {ascii(name)[:80]}{letters}"
         )
     return name
 
@@ -371,10 +371,12 @@ def check_picture(path: Path | None, *, force: bool) -> None:
     from ..reporting.style import FIGURE_FORMATS
 
     if path.suffix.lstrip(".").lower() not in FIGURE_FORMATS:
-        raise UsageError(f"{path}: a figure's name ends in .{', .'.join(FIGURE_FORMATS)}")
+        raise UsageError(
+            f"{path}: the name of a figure must end in one of .{', .'.join(FIGURE_FORMATS)}"
+        )
     refuse_existing(path, force=force)
     if not path.parent.is_dir():
-        raise UsageError(f"{path}: there is no folder {path.parent}")
+        raise UsageError(f"{path}: the folder {path.parent} does not exist")
 
 
 def print_and_draw(

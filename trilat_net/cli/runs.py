@@ -302,19 +302,21 @@ def figure_command(
         refuse_link(out)
     format_names = [name.strip().lower() for name in formats.split(",") if name.strip()]
     if not format_names:
-        raise UsageError("--format names no format, as in --format pdf,png")
+        raise UsageError("--format is empty: name one or more formats, as in --format pdf,png")
 
     settings: dict[str, Any] = {"width_in": width_in, "formats": format_names, "force": force}
     if others:
         if names:
             raise UsageError(
-                "--with draws the figure overlay, and no other: leave the names out"
+                "--with can draw only the figure overlay: leave out the names of other figures"
             )
         logs = {file.stem: log}
         logs |= {path.stem: terminal.open_with_progress(path) for path in others}
         if len(logs) <= len(others):
             # Logs of the same file name share a key, so there are too few entries.
-            raise UsageError("logs that are drawn over one another need different file names")
+            raise UsageError(
+                "logs that are drawn over one another must have different file names"
+            )
         paths = write_overlay(logs, out, **settings)
     else:
         with terminal.progress_bar("drawing") as progress:
@@ -424,7 +426,10 @@ def rerun_command(
             output.exists() and file.exists() and output.samefile(file) for file in files
         )
         if is_input:
-            raise UsageError(f"{output}: is the log itself; choose another name")
+            raise UsageError(
+                f"{output}: this file is the log that is being read; choose another name for "
+                "the output"
+            )
         refuse_existing(output, force=force, unfinished=active_path(output))
     log = laws.open(*files)
     with terminal.progress_bar("executing") as progress:
@@ -540,5 +545,5 @@ def _parse_pose(text: str | None) -> tuple[float, ...] | None:
         return tuple(float(part) for part in text.split(","))
     except ValueError:
         raise UsageError(
-            f"--pose is angles in rad, as in --pose 0.1,0.3, not {text!r}"
+            f"--pose must be angles in rad, as in --pose 0.1,0.3, not {text!r}"
         ) from None

@@ -138,7 +138,7 @@ def live_command(
         extra = _START_OPTIONS & set(options.list_used_options(context))
         if extra:
             raise UsageError(
-                "--session shows a session that runs already: "
+                "--session shows a session that is already running: "
                 f"leave out {', '.join(sorted(extra))}"
             )
         connection = reach.resolve()
@@ -156,7 +156,9 @@ def live_command(
         )
 
     if any(reach):
-        raise UsageError("--connect, --router, --zenoh-config and --keys go with --session")
+        raise UsageError(
+            "--connect, --router, --zenoh-config and --keys can be used only with --session"
+        )
     with PageAttendant(page, clock) as attendant:
         run_and_report(run.load(scenario, MAX_DURATION_S), run, attendant)
 
@@ -320,10 +322,10 @@ def _refuse_options_of_other_modes(context: typer.Context, mode: str) -> None:
     used = set(options.list_used_options(context))
     if mode:
         refused = sorted(used - _MODE_OPTIONS[mode])
-        reason = f"not with {mode}"
+        reason = f"cannot be used with {mode}"
     else:
         refused = sorted(used & _OPTIONS_WITH_MODE)
-        reason = "only with --benchmark, --answer or --ros2"
+        reason = "can be used only with --benchmark, --answer or --ros2"
     if refused:
         raise UsageError(f"{refused[0]}: {reason}")
 
@@ -507,7 +509,7 @@ def stop_command(
     port of the first site and asks for the other sites.
     """
     if end and sites:
-        raise UsageError("--end ends the whole session: name no site")
+        raise UsageError("--end ends the whole session: do not name a site")
     running = _connect(session, reach, stops=not end)
     replies = running.end() if end else running.stop(*(sites or ()))
     terminal.print_texts(replies)
@@ -557,7 +559,7 @@ def parse_milliseconds(text: str) -> float:
             return float(match[1]) * _UNITS[match[2]]
     except ValueError:
         pass
-    raise UsageError(f"a time is a number and its unit, as in 350ms or 0.35s, not {text!r}")
+    raise UsageError(f"a time must be a number with a unit, as in 350ms or 0.35s, not {text!r}")
 
 
 def parse_share(text: str) -> float:
@@ -575,7 +577,7 @@ def parse_share(text: str) -> float:
         return float(number) / (100.0 if is_percentage else 1.0)
     except ValueError:
         raise UsageError(
-            f"a share is a number or a percentage, as in 0.05 or 5%, not {text!r}"
+            f"a share must be a number or a percentage, as in 0.05 or 5%, not {text!r}"
         ) from None
 
 
@@ -598,7 +600,9 @@ def parse_pairs(texts: list[str], example: str) -> dict[str, Any]:
     for text in texts:
         pair = split_assignment(text)
         if pair is None:
-            raise UsageError(f"a change reads KEY=VALUE, as in {example}, not {text!r}")
+            raise UsageError(
+                f"a change must have the form KEY=VALUE, as in {example}, not {text!r}"
+            )
         pairs.append(pair)
     return dict(pairs)
 
@@ -656,7 +660,9 @@ def set_link_command(
         raise UsageError("nothing to change: give --delay, --loss, --preset or --to KEY=VALUE")
     _, arrow, receiver = name.partition("->")
     if not arrow:
-        raise UsageError(f"a link is FROM->TO in quotes, as in 'm1->s', not {name!r}")
+        raise UsageError(
+            f"a link must be written as FROM->TO in quotes, as in 'm1->s', not {name!r}"
+        )
     _send_change(context, receiver, {"link": name, "to": table})
 
 
@@ -702,7 +708,7 @@ def _send_change(context: typer.Context, site: str, change: dict[str, Any]) -> N
     session, connection = context.obj
     check_finite(change, "")  # messages cannot hold infinite numbers
     if session is None:
-        raise UsageError("the session is missing: trilat set --session ID ...")
+        raise UsageError("the session is not named: use trilat set --session ID ...")
     reply = RunningSession(session, connection).change(site, ChangeRequest(**change))
     if not reply.accepted:
         raise UsageError(f"refused: {reply.text}")

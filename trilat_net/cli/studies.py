@@ -87,7 +87,10 @@ def test_command(
     from ..studies.trials import encode_junit_xml
 
     if live and on is not None:
-        raise UsageError("--on runs in virtual time: leave it out, or --live")
+        raise UsageError(
+            "--on distributes runs in virtual time and cannot be combined with --live: leave "
+            "out one of the two"
+        )
     check_workers(jobs, on)
     if junit is not None and (junit.is_dir() or not os.access(junit.parent, os.W_OK)):
         raise UsageError(f"{junit}: cannot be written")
@@ -116,17 +119,21 @@ def parse_seeds(text: str | None) -> list[int]:
     """
     if text is None:
         return []
+    wrong_form = f"--seeds must be a range or a list, as in 1..20 or 1,5,9, not {text!r}"
     seeds: list[int] = []
     for part in text.split(","):
         match = re.fullmatch(r"\s*([0-9]{1,18})(?:\.\.([0-9]{1,18}))?\s*", part)
         if match is None:
-            raise UsageError(f"--seeds reads 1..20 or 1,5,9, not {text!r}")
+            raise UsageError(wrong_form)
         first = int(match[1])
         last = int(match[2] or match[1])
         if last < first:
-            raise UsageError(f"--seeds reads 1..20 or 1,5,9, not {text!r}")
+            raise UsageError(wrong_form)
         if len(seeds) + last - first >= MAX_SEEDS:
-            raise UsageError(f"--seeds {text} are more than {MAX_SEEDS}")
+            raise UsageError(
+                f"--seeds {text} names more than {MAX_SEEDS} seeds; at most {MAX_SEEDS} are "
+                "allowed"
+            )
         seeds += range(first, last + 1)
     return seeds
 
@@ -368,7 +375,8 @@ def compare_command(
         for name in options.list_used_options(context):
             if name not in ("files", "--json"):
                 raise UsageError(
-                    f"{name} belongs to --tune SCENARIO; logs are compared as they are"
+                    f"{name} can be used only with --tune SCENARIO; logs are compared as they "
+                    "were recorded"
                 )
         from ..studies.log_comparison import compare
 
@@ -376,7 +384,7 @@ def compare_command(
         terminal.print_result(compare(*logs), as_json=as_json)
         return
     if files:
-        raise UsageError("--tune makes its own runs: leave out the logs, or --tune")
+        raise UsageError("--tune makes its own runs: leave out either the logs or --tune")
     from ..studies.tuning import plan_tuning
 
     plan = plan_tuning(
@@ -525,7 +533,7 @@ def _tune_bench(laws: list[str], study: str, jobs: int | None, on: str | None) -
     all_laws = {law for form_laws in laws_by_form.values() for law in form_laws}
     unknown = [law for law in laws if law not in all_laws]
     if unknown:
-        raise UsageError(f"--law: {unknown[0]} is no law of the study {study}")
+        raise UsageError(f"--law: {unknown[0]} is not a law of the study {study}")
 
     selected_by_form = {}
     for form, form_laws in laws_by_form.items():

@@ -50,14 +50,18 @@ def _check_modes(used_options: Sequence[str]) -> None:
         name for name in ("--map", "--margin", "--confirm", "--cell") if name in used_options
     ]
     if len(modes) > 1:
-        raise UsageError(f"{' and '.join(modes)} exclude each other: give one at a time")
+        raise UsageError(f"{' and '.join(modes)} cannot be combined: give only one of them")
     if "--width" in used_options and "--map" not in used_options:
-        raise UsageError("--width belongs to a map: use it with --map")
+        raise UsageError("--width sets the width of a map: use --width with --map")
     if "--tolerance" in used_options and "--margin" not in used_options:
-        raise UsageError("--tolerance belongs to an edge: use it with --margin")
+        raise UsageError(
+            "--tolerance sets the tolerance of a stability limit: use --tolerance with --margin"
+        )
     for name in ("--judge", "--metric"):
         if name in used_options and "--margin" in used_options:
-            raise UsageError(f"{name} belongs to a sweep and its map: leave --margin out")
+            raise UsageError(
+                f"{name} applies only to a sweep and the map of a sweep: leave out --margin"
+            )
 
 
 def _draw_map(
@@ -378,22 +382,29 @@ def sweep_command(
     if uses_finished_sweep:
         _refuse_plan_options(used_options)
     elif confirm is not None:
-        raise UsageError("--confirm belongs to results: trilat sweep FOLDER --confirm 5")
+        raise UsageError(
+            "--confirm needs the results of a sweep: use trilat sweep FOLDER --confirm 5"
+        )
 
     if resume is not None:
         if scenario is not None or cell is not None:
-            raise UsageError("--resume continues the sweep of its folder: leave the rest out")
+            raise UsageError(
+                "--resume continues the sweep that is stored in the folder: leave out the "
+                "scenario and --cell"
+            )
         with terminal.lines_aside(as_json):
             finished = _run_sweep(None, resume, jobs, on, yes=yes)
     elif cell is not None:
         if scenario is None:
-            raise UsageError("--cell belongs to results: trilat sweep FOLDER --cell N")
+            raise UsageError(
+                "--cell needs the results of a sweep: use trilat sweep FOLDER --cell N"
+            )
         return _print_cell_commands(Path(scenario), cell, as_json=as_json)
     elif results is not None:
         return _show_results(results, confirm, draw if mapped else None, as_json=as_json)
     elif scenario is None or not (over or law or seeds or margin):
         raise UsageError(
-            "name a scenario and what to sweep, as in: --over link.delay_ms=0:1600:50"
+            "name a scenario and the keys to sweep, as in: --over link.delay_ms=0:1600:50"
         )
     else:
         axes = list(over or [])
@@ -481,7 +492,7 @@ def _refuse_plan_options(used_options: Sequence[str]) -> None:
     """
     for name in _PLAN_OPTIONS:
         if name in used_options:
-            raise UsageError(f"{name} belongs to the sweep already: leave it out")
+            raise UsageError(f"{name} is already set by the sweep: leave out {name}")
     if "--margin" in used_options:
         raise UsageError("--margin starts a new search in a scenario: name the scenario")
 

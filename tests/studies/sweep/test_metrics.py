@@ -93,4 +93,4 @@ def test_a_metric_that_is_none_is_refused_with_the_nearest(tmp_path: Path) -> No
         "settle_s",
         cwd=tmp_path,
     )
-    done.refuses("--metric belongs to a sweep")
+    done.refuses("--metric applies only to a sweep")
