@@ -227,7 +227,9 @@ class GapRepair:
         self._reception.check_sender(past)
         if past.channel != request.channel or past.first > max(past.made, request.first):
             raise WireError(
-                "out of range", f"{past.channel} from {past.first} on, of {past.made}"
+                "out of range",
+                f"the reply has {past.channel} from number {past.first} on, of {past.made}, "
+                f"but {request.channel} from number {request.first} on was requested",
             )
         return past
 
@@ -257,7 +259,9 @@ class GapRepair:
                 message = self._reception.read(channel, payload)
                 if message.number != number:
                     raise WireError(
-                        "out of range", f"{channel} {message.number} in the place of {number}"
+                        "out of range",
+                        f"number {message.number} of {channel} arrived where number {number} "
+                        "was expected",
                     )
             except WireError as error:
                 self._dropped[error.reason] += 1

@@ -117,10 +117,10 @@ class Recorder:
                 return epoch
             now_ns = self._clock.monotonic_ns()
             if timeout_s is not None and now_ns - begun_ns > timeout_s * 1e9:
-                members = ", ".join(self._joining.membership.others) or "nobody"
+                members = ", ".join(self._joining.membership.others) or "none"
                 raise SessionError(
                     f"the recorder waited {timeout_s:g} s for session {self._session!r} "
-                    f"to begin; it met {members}"
+                    f"to begin; members present: {members}"
                 )
             self._clock.sleep_until(now_ns + self._joining.pinger.pause_ns(POLL_NS))
         return None

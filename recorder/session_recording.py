@@ -350,7 +350,7 @@ class Recording:
         """
         since_ns = mono_ns - self.epoch.mono_ns
         if key not in self._channels:
-            raise WireError("stranger", key)
+            raise WireError("stranger", f"a message arrived under the unknown key {key}")
         self._channels[key][0].since_ns = since_ns
         site, message = self._read(key, payload)
         channel = self._channels[key][1]
@@ -405,11 +405,11 @@ class Recording:
         else:
             content = decode(payload, Event)
             if content.member != topics.RECORDER:
-                raise WireError("stranger", key)
+                raise WireError("stranger", f"{content.member} published under {key}")
             boot = content.boot
             number = content.n
         if boot != self.publisher.info.boot:
-            raise WireError("another recorder", key)
+            raise WireError("another recorder", f"another process published under {key}")
         if number >= 0 and account.receive(number, mono_ns):
             log_time_ns = self.epoch.unix_ns + since_ns
             self._writer.add(key, payload, since_ns, log_time_ns, number, content)

@@ -281,7 +281,8 @@ class SiteReception:
         if event.kind == "end" and not 0 <= event.ticks <= self._ticks:
             raise WireError(
                 "out of range",
-                f"{self.name} says it made {count_nouns(event.ticks, 'tick')}",
+                f"{self.name} reports {count_nouns(event.ticks, 'tick')}, but must report 0 to "
+                f"{self._ticks}",
             )
         self._check(
             channel=topics.EVENT,
@@ -308,11 +309,18 @@ class SiteReception:
                 the future.
         """
         if sender != self.name or boot != self._boot:
-            raise WireError("stranger", f"{sender}, start {boot}, on a key of {self.name}")
+            raise WireError(
+                "stranger", f"{sender} (start {boot}) sent a message under a key of {self.name}"
+            )
         if number >= self._largest_counts[channel]:
-            raise WireError("out of range", f"{self.name}/{channel} number {number}")
+            raise WireError(
+                "out of range", f"number {number} of {self.name}/{channel} is too large"
+            )
         if ticks > self._possible_ticks:
-            raise WireError(f"{self.name} is ahead of the clock", f"{channel} number {number}")
+            raise WireError(
+                f"{self.name} is ahead of the clock",
+                f"message {number} of {channel} is from the future",
+            )
 
     def accept_records(
         self, payloads: Iterable[bytes], received_ns: int
@@ -377,7 +385,8 @@ class SiteReception:
         is_exempt = is_first_end and size <= EVENT_BYTES_PER_S
         if size > self._event_bytes_left and not is_exempt:
             raise WireError(
-                "flood of events", f"{self.name} sent more than a log takes of one site"
+                "flood of events",
+                f"{self.name} sent more events than a log accepts from one site",
             )
         self._event_bytes_left -= size
 
@@ -424,7 +433,8 @@ class SiteReception:
         """
         if reply.member != self.name or reply.boot != self._boot:
             raise WireError(
-                "stranger", f"{reply.member}, start {reply.boot}, answers for {self.name}"
+                "stranger",
+                f"{reply.member} (start {reply.boot}) answered in place of {self.name}",
             )
 
     def add_expected(self, channel: str, count: int) -> None:

@@ -313,7 +313,7 @@ WRONG: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda file: tn.rerun(file),
         r"replace=NAME \(of m, s\), or closed_loop=True for all",
     ),
-    "figure": (lambda file: tn.figure(file, "positions", "x"), "3.5 or 7 in wide, not x"),
+    "figure": (lambda file: tn.figure(file, "positions", "x"), "3.5 or 7 inches, not x"),
     "linear": (
         lambda _: tn.linear("two_sites", pose=["x"]),
         "a pose consists of angles in rad",

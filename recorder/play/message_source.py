@@ -174,7 +174,8 @@ class MessageSource:
             # The exit code is None while the process is ending. The player has no time to wait.
             if self._process.exitcode:
                 raise RuntimeFault(
-                    f"the process that reads the log ended with {self._process.exitcode}"
+                    "the process that reads the log ended with exit code "
+                    f"{self._process.exitcode}"
                 )
             return False
         self._received += data

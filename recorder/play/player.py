@@ -97,8 +97,8 @@ def parse_rate(text: str) -> float:
         return math.inf
     if not SLOWEST <= rate <= FASTEST:
         raise UsageError(
-            f"--rate is how much faster than it was, from {SLOWEST:g} to {FASTEST:g}, "
-            f"or max; not {text!r}"
+            f"--rate, the speed relative to the recorded run, must be from {SLOWEST:g} to "
+            f"{FASTEST:g}, or max, not {text!r}"
         )
     return rate
 

@@ -113,19 +113,20 @@ def parse_selection(
     """
     if time not in get_args(PlayTime):
         raise UsageError(
-            f"--time is publish (as it was sent) or log (as it arrived), not {time!r}"
+            "--time must be publish (the time at which a message was sent) or log (the time at "
+            f"which it arrived), not {time!r}"
         )
     for name, seconds in (("--start", start_s), ("--stop", stop_s), ("--duration", duration_s)):
         if seconds is not None and not (math.isfinite(seconds) and abs(seconds) <= 1e9):
-            raise UsageError(f"{name} is a number of seconds, not {seconds:g}")
+            raise UsageError(f"{name} must be a number of seconds, not {seconds:g}")
     if duration_s is not None:
         if duration_s <= 0:
-            raise UsageError(f"--duration is more than 0 s, not {duration_s:g}")
+            raise UsageError(f"--duration must be more than 0 s, not {duration_s:g}")
         if stop_s is not None:
-            raise UsageError("--stop and --duration say the same in two ways; give one of them")
+            raise UsageError("--stop and --duration set the same limit; give only one of them")
         stop_s = (start_s or 0.0) + duration_s
     if start_s is not None and stop_s is not None and stop_s <= start_s:
-        raise UsageError(f"--stop is after --start ({start_s:g} s), not {stop_s:g} s")
+        raise UsageError(f"--stop must be after --start ({start_s:g} s), not {stop_s:g} s")
     return PlaySelection(
         channels=parse_channel_filter(include, exclude),
         start_ns=None if start_s is None else round(start_s * NS_PER_S),
@@ -363,7 +364,7 @@ class SessionReader:
         """
         metadata = reader.metadata.get(SESSION, {})
         if "session" not in metadata or SCENARIO not in reader.attachments:
-            raise LogError(f"{path}: is an MCAP file, but no log of trilat-net")
+            raise LogError(f"{path}: is an MCAP file, but not a trilat-net log")
         try:
             text = reader.attachments[SCENARIO].decode()
             epoch_ns = int(metadata.get("epoch_unix_ns", "0"))
@@ -377,11 +378,11 @@ class SessionReader:
                     version=version,
                 )
         except (ScenarioError, ValueError) as error:
-            raise LogError(f"{path}: its session cannot be read: {error}") from None
+            raise LogError(f"{path}: the session of the log cannot be read: {error}") from None
         if (self.header.session, self.header.scenario_text) != (metadata["session"], text):
             raise LogError(
-                f"{path}: is of another session than {self._paths[0]}; the files of one replay "
-                "are the parts of one log"
+                f"{path}: belongs to a different session from {self._paths[0]}; the files of "
+                "one replay must be parts of the same log"
             )
         return epoch_ns, self.header
 
@@ -424,7 +425,7 @@ def preload_messages(
                 break
         else:
             if reader.header is None:
-                raise LogError(f"{paths[0]}: holds nothing")
+                raise LogError(f"{paths[0]}: contains nothing")
             if not waiting.memory:
                 raise UsageError(_describe_empty_selection(paths[0], selection, reader.header))
             return reader.header, waiting.ordered()
@@ -440,15 +441,15 @@ def _describe_empty_selection(
 ) -> str:
     """Explains to the user why no message is selected."""
     if header.last_ns < header.first_ns:
-        return f"{path}: holds no message"
+        return f"{path}: contains no message"
     span = f"from {header.first_ns / NS_PER_S:.3f} s to {header.last_ns / NS_PER_S:.3f} s"
     if selection.start_ns is not None and selection.start_ns > header.last_ns:
         option = f"--start {selection.start_ns / NS_PER_S:g} s"
-        return f"{option}: is beyond the end; the log goes {span}"
+        return f"{option}: is after the end; the log lasts {span}"
     if selection.stop_ns is not None and selection.stop_ns < header.first_ns:
         option = f"--stop {selection.stop_ns / NS_PER_S:g} s"
-        return f"{option}: is before the beginning; the log goes {span}"
+        return f"{option}: is before the beginning; the log lasts {span}"
     return (
-        f"{path}: has no message for this selection; its topics are like "
-        f"trilat/{header.session}/{header.scenario.names[0]}/state, and it goes {span}"
+        f"{path}: has no message for this selection; the topics of the log have the form "
+        f"trilat/{header.session}/{header.scenario.names[0]}/state, and the log lasts {span}"
     )

@@ -10,13 +10,16 @@ from .running import trilat
 @pytest.mark.parametrize(
     ("options", "facts"),
     [
-        (["--rate", "-1"], ["--rate is how much faster", "from 0.001 to 1000, or max", "'-1'"]),
-        (["--start", "7"], ["--start 7 s: is beyond the end", "from 0.000 s to 0.499 s"]),
+        (
+            ["--rate", "-1"],
+            ["--rate, the speed relative to", "from 0.001 to 1000, or max", "'-1'"],
+        ),
+        (["--start", "7"], ["--start 7 s: is after the end", "from 0.000 s to 0.499 s"]),
         (["--include", "m1*"], ["--include must be a key expression such as", "'m1*'"]),
         (["--exclude", "**"], ["no message for this selection"]),
         (
             ["--time", "arrival"],
-            ["--time is publish (as it was sent) or log (as it arrived), not 'arrival'"],
+            ["--time must be publish (the time at which", "or log (the", "not 'arrival'"],
         ),
         (["--preload", "-1"], ["--preload must be a number of MiB, at least 0, not -1"]),
         (

@@ -176,7 +176,10 @@ def test_margins_are_printed_and_kept(folder: Path) -> None:
         (("done", "--map", "--confirm", "1"), "--map and --confirm cannot be combined"),
         (("done", "--map", "--cell", "1"), "--map and --cell cannot be combined"),
         (("done", "--width", "7"), "--width sets the width of a map"),
-        (("done", "--map", "--width", "5"), "a figure is 3.5 or 7 in wide, not 5"),
+        (
+            ("done", "--map", "--width", "5"),
+            "the width of a figure must be 3.5 or 7 inches, not 5",
+        ),
         (("done", "--margin", "control.Kd=1:4"), "--margin starts a new search in a scenario"),
         (
             ("trio.toml", *OVER, "--tolerance", "0.1"),

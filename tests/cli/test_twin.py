@@ -106,12 +106,14 @@ def test_what_cannot_be_executed_again_has_no_twin() -> None:
     lost, log = without_records({"m1": [7]}), tn.simulate("two_sites", duration_s=0.2)
     with pytest.raises(NotRepeatable, match="records of m1 are missing"):
         tn.twin(lost)
-    with pytest.raises(NotRepeatable, match="sites that a rerun took over did not react"):
+    with pytest.raises(
+        NotRepeatable, match="the sites whose records were copied did not react"
+    ):
         tn.twin(tn.rerun(log, ["s"], {"control.Kd": 5}).after)
     external = SimpleNamespace(
         scenario=tn.load_scenario("free", {"sites.m1.plant": "external"})
     )
-    assert "arm of m1, outside of the program" in explain_not_repeatable(external)
+    assert "the external arm of m1" in explain_not_repeatable(external)
 
 
 @pytest.mark.parametrize("command", ["certify", "twin"])

@@ -121,7 +121,7 @@ def test_rerun_can_be_rerun_and_says_what_it_cannot_be(file: Path, tmp_path: Pat
     other = rerun(made, ["m1"])  # met the s that was, and meets the one that is in the file
     assert not other.identical
     assert not other.broken
-    assert any("is a rerun itself" in note and "m1" in note for note in other.notes)
+    assert any("is itself a rerun" in note and "m1" in note for note in other.notes)
     back = rerun(made, ["s"], {"control.Kd": 3})
     assert list(back.after["s"].q[-1]) == list(open_log(file)["s"].q[-1])
 

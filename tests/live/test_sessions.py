@@ -209,5 +209,5 @@ def test_waiting_in_vain_names_the_missing_and_leaves_no_file(stage: Stage) -> N
     (error,) = (line for line in site.text().splitlines() if line.startswith("error: "))
     assert "m1, s never came" in error
     assert BEGUN not in site.text()
-    assert "it met nobody" in recorder.text()
+    assert "members present: none" in recorder.text()
     assert not apart.log.exists()

@@ -411,7 +411,7 @@ def measure_twins(
     try:
         twins = run_twins(log, choose_pushes(log.scenario, count), own_laws=own_laws)
     except NotRepeatable as error:
-        return TwinGrowth(str(error).removeprefix("no twins: "))
+        return TwinGrowth(str(error).removeprefix("twins cannot be run: "))
     return judge_twins(log.scenario, twins, end.counts_from_s, end.quiet_from_s)
 
 

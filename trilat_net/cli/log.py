@@ -61,7 +61,9 @@ def log_check_command(
     terminal.print_result(check, as_json=as_json)
     if not as_json:
         if not check.ours:
-            terminal.print_note("this is no log of trilat-net: only its structure was checked")
+            terminal.print_note(
+                "this is not a trilat-net log: only the structure of the file was checked"
+            )
         for path in files:
             terminal.warn_if_unfinished(path)
     raise typer.Exit(check.exit_code)

@@ -141,7 +141,8 @@ def check_fusable(scenario: Scenario, plants: Collection[str] = ()) -> None:
     if ratio > MAX_ARRIVALS:
         raise ScenarioError(
             f"the fastest site makes {count_nouns(ratio, 'tick')} within one tick of the "
-            f"slowest; at most {MAX_ARRIVALS} samples arrive in a tick",
+            f"slowest, but at most {MAX_ARRIVALS} samples can arrive in a tick; choose tick "
+            "rates that differ less",
             path="rate_hz",
             source=scenario.name,
         )
@@ -880,11 +881,11 @@ def explain_not_repeatable(log: Log, *, own_laws: bool = False) -> str:
     scenario = log.scenario
     if scenario.external:
         arms = ", ".join(sorted(scenario.external))
-        return f"the reaction of the arm of {arms}, outside of the program, is not known"
+        return f"the reaction of the external arm of {arms} is not known"
     if find_user_laws(scenario) and not own_laws:
-        return "laws from outside may not run (--law FILE)"
+        return "the imported control laws may not run (permit them with --law FILE)"
     if set(log.executed_sites) != set(log.sites):
-        return "sites that a rerun took over did not react"
+        return "in a rerun, the sites whose records were copied did not react"
     for name in log.sites:
         part = log[name]
         if not len(part) or not np.array_equal(part.tick, np.arange(len(part))):

@@ -523,7 +523,7 @@ def _parse_epoch(log: Log) -> int:
     """
     text = log.session.get("epoch_unix_ns", "0")
     if not text.isdecimal() or int(text) > MAX_TIME_NS:
-        raise LogError(f"{log.source}: its epoch_unix_ns is no time: {text[:40]!r}")
+        raise LogError(f"{log.source}: epoch_unix_ns is not a valid time: {text[:40]!r}")
     return int(text)
 
 
@@ -606,8 +606,8 @@ def _describe_limits(result: Rerun) -> Iterator[str]:
     foreign_sites = [name for name in request.replaced if name not in log.executed_sites]
     if foreign_sites:
         yield (
-            f"this file is a rerun itself: its {', '.join(foreign_sites)} received samples "
-            "that are not in it"
+            f"this file is itself a rerun: {', '.join(foreign_sites)} received samples that "
+            "the file does not contain"
         )
 
     other_platform = log.session.get("fingerprint") != compute_fingerprint()

@@ -132,11 +132,11 @@ def resolve_rerun_request(
     names = original.names
     if closed_loop and replace:
         raise UsageError(
-            "--closed-loop executes every site: leave out --replace, or --closed-loop"
+            "--closed-loop executes every site: leave out either --replace or --closed-loop"
         )
     if not closed_loop and not replace:
-        hint = f"--replace NAME (of {', '.join(names)}), or --closed-loop for all of them"
-        raise UsageError(f"which sites shall be executed? Give {hint}")
+        hint = f"--replace NAME (one of {', '.join(names)}), or --closed-loop for all sites"
+        raise UsageError(f"name the sites to execute: give {hint}")
 
     for name in replace:
         find_site(original, name)
@@ -174,7 +174,7 @@ def _refuse_external_sites(original: Scenario, replaced: Sequence[str]) -> None:
         if name not in replaced:
             continue
         problem = (
-            "is external: how that arm would have moved otherwise is not known; execute other "
+            "is external: how this arm would have moved otherwise is not known; execute other "
             "sites"
         )
         others = [other for other in original.names if other not in original.external]
@@ -196,7 +196,7 @@ def _check_key(key: str, replaced: Sequence[str], recorded: Sequence[str]) -> No
     group, _, rest = key.partition(".")
     if group in _TEXT_KEYS:
         raise ScenarioError(
-            "only describes the scenario: it has no effect in a rerun", path=key
+            "only describes the scenario and has no effect in a rerun", path=key
         )
     if group == "rate_hz" or rest.endswith(".rate_hz"):
         return  # `_check_frame` checks the rates of the resolved scenario
@@ -211,7 +211,7 @@ def _check_key(key: str, replaced: Sequence[str], recorded: Sequence[str]) -> No
         reason = f"{concerned} stays as recorded"
         if group == "links":
             reason += ", and a link belongs to its receiver"
-        executed = f"only {', '.join(replaced)} is executed"
+        executed = f"the rerun executes only {', '.join(replaced)}"
         raise ScenarioError(
             f"has no effect: {reason}; {executed}: add --replace {concerned}", path=key
         )
@@ -230,12 +230,13 @@ def _check_frame(original: Scenario, requested: Scenario, recorded: Sequence[str
     """
     if requested.names != original.names:
         raise ScenarioError(
-            f"a rerun has the sites of the log, {', '.join(original.names)}", path="sites"
+            f"a rerun must have the same sites as the log: {', '.join(original.names)}",
+            path="sites",
         )
     if requested.duration_s > original.duration_s:
         raise ScenarioError(
-            f"the experiment of the log lasts {original.duration_s:g} s: what the network "
-            f"would have done until {requested.duration_s:g} s is not known",
+            f"the experiment in the log lasts {original.duration_s:g} s: how the network would "
+            f"behave from then until {requested.duration_s:g} s is not known",
             path="duration_s",
         )
     if not recorded:
@@ -243,8 +244,8 @@ def _check_frame(original: Scenario, requested: Scenario, recorded: Sequence[str
     for name in original.names:
         if requested.sites[name].rate_hz != original.sites[name].rate_hz:
             raise ScenarioError(
-                "cannot change in an open loop: samples come at the ticks of the log; "
-                "use --closed-loop",
+                "cannot change in an open-loop rerun, because samples arrive at the ticks that "
+                "the log contains; use --closed-loop",
                 path=f"sites.{name}.rate_hz",
             )
 
@@ -681,7 +682,8 @@ class RerunExecution:
         if deliveries.first > 0:
             raise LogError(
                 f"{self._log.source}: the records of {name} begin at tick {deliveries.first}: "
-                "a site that begins in the middle keeps its rate, and so do its peers"
+                "if the records of a site begin after the start of the run, the rates of the "
+                "site and of its peers cannot be changed"
             )
         return retime_deliveries(
             deliveries=deliveries,

@@ -217,8 +217,8 @@ def parse_push(
         raise UsageError(_describe_targets(scenario, target))
     if not LEAST_PUSH <= abs(size) <= MOST_PUSH:
         raise UsageError(
-            f"--push {target}={size:g}: the size of a push is from {LEAST_PUSH:g} to "
-            f"{MOST_PUSH:g}"
+            f"--push {target}={size:g}: the size of a push must be from {LEAST_PUSH:g} "
+            f"to {MOST_PUSH:g}"
         )
 
     generator = np.random.Generator(np.random.Philox(0))
@@ -275,7 +275,10 @@ def _describe_targets(scenario: Scenario, target: str) -> str:
     first = scenario.names[0]
     examples = ", ".join(f"{first}.{number}" for number in ("q1", "qd1", "theta1", "q"))
     sites_text = ", ".join(sites)
-    return f"--push {target}: no such number; as in {examples}, or q, of {sites_text}"
+    return (
+        f"--push {target}: there is no such number; name a number as in {examples}, or q; "
+        f"the sites are {sites_text}"
+    )
 
 
 def run_twins(log: Log, pushes: Sequence[Push], *, own_laws: bool = False) -> Twins:
@@ -295,7 +298,7 @@ def run_twins(log: Log, pushes: Sequence[Push], *, own_laws: bool = False) -> Tw
     """
     reason = explain_not_repeatable(log, own_laws=own_laws)
     if reason:
-        raise NotRepeatable(f"no twins: {reason}")
+        raise NotRepeatable(f"twins cannot be run: {reason}")
     runs = _TwinRuns(
         scenario=log.scenario,
         pushes=pushes,
@@ -459,9 +462,9 @@ class _TwinRuns:
                 self._same &= bool(difference == 0.0)
                 if not difference <= SAME_RUN:
                     raise NotRepeatable(
-                        f"no twins: in the repeated run, {signal} of {name} differs by "
-                        f"{difference:.2g} from the records, so it is another run (see trilat "
-                        "verify)"
+                        f"twins cannot be run: in the repeated run, {signal} of {name} differs "
+                        f"by {difference:.2g} from the recorded values, so the run could not "
+                        "be repeated (see trilat verify)"
                     )
 
     def _split_buckets(
@@ -571,7 +574,8 @@ def _plan_windows(end_s: float, pushes: Sequence[Push]) -> Array:
     """
     if any(not 0.0 <= push.at_s < end_s for push in pushes):
         raise NotRepeatable(
-            f"no twins: a push lies within the run, from 0 s until before {end_s:g} s"
+            f"twins cannot be run: a push must start within the run, at or after 0 s and "
+            f"before {end_s:g} s"
         )
     equal_windows_s = np.linspace(0.0, end_s, WINDOWS + 1)[1:]
     window_ends_s = np.ceil(equal_windows_s * BUCKETS_PER_S) / BUCKETS_PER_S

@@ -245,8 +245,8 @@ def complete_deliveries(
         return recorded
     if 2 * len(recorded.entries) < ticks:
         raise LogError(
-            f"{part.name} has records of {len(recorded.entries)} of "
-            f"{count_nouns(ticks, 'tick')}: too few to execute what lies between"
+            f"{part.name} has records of only {len(recorded.entries)} of "
+            f"{count_nouns(ticks, 'tick')}: too few to execute the ticks between them"
         )
 
     unrecorded = [

@@ -78,5 +78,7 @@ def make_print_size(width_in: float) -> FigureSize:
         UsageError: The width is neither of them.
     """
     if width_in not in (COLUMN_IN, PAGE_IN):
-        raise UsageError(f"a figure is {COLUMN_IN:g} or {PAGE_IN:g} in wide, not {width_in}")
+        raise UsageError(
+            f"the width of a figure must be {COLUMN_IN:g} or {PAGE_IN:g} inches, not {width_in}"
+        )
     return FigureSize(width_in=width_in, tick_pt=8.0, small_pt=8.0, dpi=600)

@@ -165,7 +165,7 @@ def conclude(
                 findings.extend(check.result())
             except BrokenProcessPool:
                 raise RunFailed(
-                    "the process that executes the log again was ended; try again"
+                    "the process that reruns the log ended unexpectedly; try again"
                 ) from None
             yield from findings
 

@@ -92,7 +92,7 @@ class Exporter:
     ) -> None:
         names = exports.list_export_formats()
         if form not in names:
-            raise UsageError(f"--to is one of {', '.join(names)}, not {form!r}")
+            raise UsageError(f"--to must be one of {', '.join(names)}, not {form!r}")
         module = import_module(f"{exports.__name__}.{form}")
         self._format: ExportFormat = module.FORMAT
         self._settings = _parse_settings(form, self._format.write, dict(settings))
@@ -164,9 +164,10 @@ def _parse_settings(
             types[parameter.name] = type(parameter.default)
     unknown = [name for name in settings if name not in types]
     if unknown:
-        raise UsageError(
-            f"{form} has no setting {unknown[0]!r}; it has {', '.join(types) or 'none'}"
-        )
+        valid = f"the settings of {form} are {', '.join(types)}"
+        if not types:
+            valid = f"{form} has no settings"
+        raise UsageError(f"{form} has no setting {unknown[0]!r}; {valid}")
     try:
         return {name: types[name](str(value)) for name, value in settings.items()}
     except ValueError as error:

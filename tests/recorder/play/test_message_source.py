@@ -122,7 +122,7 @@ def _killed(source: MessageSource, _path: Path) -> None:
     ("happens", "error", "says"),
     [
         (lambda _, path: path.unlink(), LogError, r"run\.mcap: cannot be read"),
-        (_killed, RuntimeFault, "the process that reads the log ended with -9"),
+        (_killed, RuntimeFault, "the process that reads the log ended with exit code -9"),
     ],
 )
 def test_what_the_process_cannot_read_is_an_error_here(

@@ -83,7 +83,8 @@ def test_rates(text: str, rate: float) -> None:
 @pytest.mark.parametrize("text", ["-1", "nan", "inf", "", "fast", "1e-4", "1001", "1e-300"])
 def test_what_is_no_rate_is_refused_with_what_would_be(text: str) -> None:
     with pytest.raises(
-        UsageError, match=r"rate is how much faster than it was, from 0\.001 to 1000, or"
+        UsageError,
+        match=r"rate, the speed relative to the recorded run, must be from 0\.001 to 1000, or",
     ):
         parse_rate(text)
 

@@ -82,7 +82,9 @@ def test_parts_of_one_session_are_one_log(tmp_path: Path) -> None:
     ]
     assert facts.boots == {"m1": BOOT}
     other = write(tmp_path / "3.mcap", [("m1", 0, 0, 0)], "other")
-    with pytest.raises(LogError, match=r"3\.mcap: is of another session than .*1\.mcap"):
+    with pytest.raises(
+        LogError, match=r"3\.mcap: belongs to a different session from .*1\.mcap"
+    ):
         preload_messages([one, other], PlaySelection(), LARGE)
 
 
@@ -107,7 +109,7 @@ def test_beyond_the_limit_a_log_is_read_while_it_plays(log_file: Path) -> None:
     [
         (
             PlaySelection(start_ns=5 * 10**9),
-            r"start=5 s: is beyond the end; .* from 0\.000 s to 0\.299 s",
+            r"start=5 s: is after the end; .* from 0\.000 s to 0\.299 s",
         ),
         (PlaySelection(stop_ns=-(10**9)), r"stop -1 s: is before the beginning"),
         (

@@ -50,12 +50,12 @@ def test_a_duration_counts_from_the_start_or_from_tick_0() -> None:
 @pytest.mark.parametrize(
     ("start_s", "stop_s", "duration_s", "problem"),
     [
-        (None, 1.0, 1.0, "stop and duration_s say the same"),
-        (2.0, 2.0, None, r"stop is after start \(2 s\), not 2 s"),
+        (None, 1.0, 1.0, "stop and duration_s set the same limit"),
+        (2.0, 2.0, None, r"stop must be after start \(2 s\), not 2 s"),
         (None, None, 0.0, "duration_s is more than 0 s"),
-        (float("nan"), None, None, "start is a number of seconds"),
-        (None, float("inf"), None, "stop is a number of seconds"),
-        (1e300, None, None, "start is a number of seconds"),
+        (float("nan"), None, None, "start must be a number of seconds"),
+        (None, float("inf"), None, "stop must be a number of seconds"),
+        (1e300, None, None, "start must be a number of seconds"),
     ],
 )
 def test_windows_that_cannot_be_meant(

@@ -105,7 +105,7 @@ def test_every_shipped_scenario_expects_something_and_it_holds(
 
 
 RECIPE = textwrap.dedent(
-    str(trilat_net.studies.trials.__doc__).split("per seed:\n")[1].split("\nOr all")[0]
+    str(trilat_net.studies.trials.__doc__).split("per seed:\n")[1].split("\nAll seeds")[0]
 )
 
 

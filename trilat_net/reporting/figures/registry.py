@@ -219,7 +219,7 @@ def _write(
     for kind in kinds:
         if kind not in FIGURE_FORMATS:
             known = ", ".join(FIGURE_FORMATS)
-            raise UsageError(f"a figure is written as {known}, not as {kind!r}")
+            raise UsageError(f"a figure can be written as {known}, not as {kind!r}")
     for name in drawings:
         for kind in kinds:
             refuse_existing(folder / f"{name}.{kind}", force=force)
@@ -246,8 +246,8 @@ def _find_figure(log: Log, name: str) -> FigureEntry:
     if name not in FIGURES:
         hint = suggest_nearest(name, list(FIGURES))
         if not hint:
-            hint = f"; there are {', '.join(FIGURES)}"
-        raise UsageError(f"no figure {name!r}{hint}")
+            hint = f"; the figures are {', '.join(FIGURES)}"
+        raise UsageError(f"there is no figure {name!r}{hint}")
     entry = FIGURES[name]
     reason = entry.absent(log)
     if reason:
