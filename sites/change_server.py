@@ -174,7 +174,10 @@ class ChangeServer:
         start_ns = tick_ns(k, self._rate_hz) + AHEAD_MS * 1_000_000
         first = first_tick_at(start_ns, self._rate_hz)
         change = self._make_change(request, first)
-        text = f"{self._site} takes it in at tick {k}; it holds from tick {first} on"
+        text = (
+            f"{self._site} accepts the change at tick {k}; "
+            f"the change takes effect at tick {first}"
+        )
         return text, first, change
 
     def _poll(self) -> Query | None:
@@ -200,7 +203,7 @@ class ChangeServer:
                 without_source = msgspec.structs.replace(request, source=UNSET)
                 if without_source == ChangeRequest(order="stop"):
                     return query
-            text = f"{self._site} can be asked to stop under this key, and nothing else"
+            text = f"{self._site} accepts only requests to stop under this key"
             query.reply(encode(ChangeReply(member=self._site, accepted=False, text=text)))
         return None
 
@@ -216,7 +219,7 @@ class ChangeServer:
         """
         if len(self.marks) >= MARKS_WAITING:
             raise ScenarioError(
-                f"at most {MARKS_WAITING} marks wait to be published; mark again in 100 ms"
+                f"at most {MARKS_WAITING} marks can be pending at once; try again in 100 ms"
             )
         self.marks.append((k, text))
         return f"{self._site} marks tick {k}"
@@ -236,12 +239,13 @@ class ChangeServer:
         needed = _NEEDED_MODES.get(order)  # None for the order to stop
         if needed is not None and mode is not needed:
             raise ScenarioError(
-                f"{self._site} is in {MODE_WORDS[mode]}; "
-                f"{order} is for a site in {MODE_WORDS[needed]}"
+                f"{self._site} is in mode {MODE_WORDS[mode]}; "
+                f"{order} is possible only in mode {MODE_WORDS[needed]}"
             )
         if needed is not None and not self._is_held():
             raise ScenarioError(
-                f"the dead-man switch of {self._site} is not held; {order} it while it is"
+                f"the dead-man switch of {self._site} is not held; {order} the site while the "
+                "switch is held"
             )
         change = make_site_order(self._scenario, self._site, order, tick_ns(k, self._rate_hz))
         return to_core_change(self._scenario, change)
@@ -284,9 +288,11 @@ class ChangeServer:
         from_ns = tick_ns(first, self._rate_hz)
         self._links.advance_to(from_ns)  # applies the changes of the scenario's own timeline
         if first >= self._ticks:
-            raise ScenarioError(f"the run ends at tick {self._ticks}, before it could hold")
+            raise ScenarioError(
+                f"the run ends at tick {self._ticks}, before the change could take effect"
+            )
         if self._accepted_counts[request.link] >= MAX_CHANGES:
-            raise ScenarioError(f"a run takes at most {MAX_CHANGES} changes of a link")
+            raise ScenarioError(f"a run can have at most {MAX_CHANGES} changes of each link")
 
         # The kernel stores a limited number of weight changes that have not begun yet.
         pending_ns = self._pending_ramps_ns
@@ -294,8 +300,8 @@ class ChangeServer:
             pending_ns.popleft()
         if request.dominance and len(pending_ns) >= MAX_RAMPS:
             raise ScenarioError(
-                f"at most {MAX_RAMPS} changes of shares wait to begin; "
-                f"ask again in {AHEAD_MS} ms"
+                f"at most {MAX_RAMPS} changes of shares can be pending at once; "
+                f"try again in {AHEAD_MS} ms"
             )
 
         # The settings of a change in a scenario's timeline. Absent ones are left out.
@@ -310,7 +316,9 @@ class ChangeServer:
             self._scenario, self._links, {**settings, "to": request.to}, from_ns
         )
         if find_owner(change) != self._site:
-            raise ScenarioError(f"{self._site} cannot do that; ask {find_owner(change)}")
+            raise ScenarioError(
+                f"{self._site} cannot make this change; send the change to {find_owner(change)}"
+            )
 
         if change.link:
             self._accepted_counts[change.link] += 1

@@ -162,8 +162,9 @@ class WatchedCode:
             mean_ms = self._total_ns / self._calls * 1e-6
             period_ms = self._period_ns * 1e-6
             problem = (
-                f"it is too slow: {mean_ms:.3g} ms a call, of {period_ms:.3g} ms between two "
-                f"of them it may take {SHARE:.0%}; make it faster, or lower rate_hz"
+                f"the code is too slow: a call takes {mean_ms:.3g} ms on average, but may take "
+                f"only {SHARE:.0%} of the {period_ms:.3g} ms between two calls; make the code "
+                "faster, or lower rate_hz"
             )
             raise self._fail(k, problem)
 
@@ -176,8 +177,8 @@ class WatchedCode:
         if not self.hiccups:
             return ""
         return (
-            f"{self._name} took longer than from one tick to the next at "
-            f"{count_nouns(self.hiccups, 'tick')}, at most "
+            f"{self._name} took longer than the time between two calls in "
+            f"{count_nouns(self.hiccups, 'call')}; the longest call took "
             f"{self.longest_ns * 1e-6:.3g} ms, at tick {self.longest_tick}"
         )
 
@@ -201,7 +202,7 @@ class WatchedCode:
         checks = FIRST_CHECKS if tick == self._first_tick else CHECKS
         limit = checks - 1
         if self._same_call_checks >= limit:
-            raise self._fail(tick, f"it did not come back within {limit * CHECK_S:g} s")
+            raise self._fail(tick, f"the code did not return within {limit * CHECK_S:g} s")
 
 
 class CodeWatchdog:

@@ -147,9 +147,7 @@ class ExternalArm:
 
     def _describe_silence(self) -> SessionError:
         """Returns the error for a site that has waited in vain for its arm."""
-        text = (
-            f"{self._site} waited in vain for its arm: no measurement came on {self._address}"
-        )
+        text = f"{self._site} received no measurement from its arm on {self._address}"
         if self._dropped:
             counts = [f"{count} {reason}" for reason, count in self._dropped.items()]
             text += f"; dropped: {', '.join(counts)}"

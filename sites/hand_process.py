@@ -129,7 +129,7 @@ class HandProcess(SiteClient):
             class_name = self._code.split()[0]
             raise RunFailed(
                 f"the hand {class_name} of {message.site} failed at tick {message.k}: "
-                f"{type(error).__name__}: {error}; it has let go"
+                f"{type(error).__name__}: {error}; the hand has released the arm"
             ) from error
         self._send(message.k, numbers)
 
@@ -209,7 +209,8 @@ def run_hand(
     if hand_site is None or not hand_site.has_separate_process:
         problem = "has no hand of kind 'own' with process = true"
         raise UsageError(
-            f"{name} {problem}: its site runs such a hand itself, or there is none"
+            f"{name} {problem}: either the site runs its hand itself, or the scenario has no "
+            "such hand"
         )
 
     program = make_hand_program(hand_site)
@@ -230,7 +231,8 @@ def run_hand(
             hand.serve()
             if not hand.answered and clock.monotonic_ns() > give_up_ns:
                 raise SessionError(
-                    f"{name} did not ask its hand {hand_site.program} within {timeout_s:g} s"
+                    f"{name} did not send its state to the hand {hand_site.program} within "
+                    f"{timeout_s:g} s"
                 )
             clock.sleep_until(clock.monotonic_ns() + POLL_NS)
         say(

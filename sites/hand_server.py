@@ -277,7 +277,9 @@ class RemoteHand(HandPlayer):
             if any(self._read_decisions()):
                 return True
             if self._clock.monotonic_ns() > give_up_ns:
-                raise SessionError(f"{self._site} waited in vain for its hand {self._code}")
+                raise SessionError(
+                    f"{self._site} received no message from its hand {self._code}"
+                )
             self._clock.sleep_until(self._clock.monotonic_ns() + POLL_NS)
         return False
 

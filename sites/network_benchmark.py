@@ -225,11 +225,13 @@ def _open(
     is_encrypted = endpoint.startswith(ENCRYPTED)
     if is_encrypted and keys is None:
         raise UsageError(
-            f"{endpoint}: an encrypted endpoint takes keys: give --keys DIR of a site"
+            f"{endpoint}: an encrypted endpoint needs keys: give --keys DIR with the keys of a "
+            "site"
         )
     if is_encrypted and keys is not None and keys.member in (*ROLES, ROUTER):
         raise UsageError(
-            f"--keys: a benchmark goes as samples go, so it takes a site's, not {keys.member}'s"
+            "--keys: a benchmark sends messages as sites send samples, and so needs the keys "
+            f"of a site, not those of {keys.member}"
         )
 
     used_keys = keys if is_encrypted else None
@@ -591,9 +593,9 @@ def _measure_endpoint(
         if not near.wait_for_far_end():
             port = endpoint.rpartition(":")[2]
             raise RunFailed(
-                f"nobody answers at {endpoint} within {CONNECT_NS // 10**9} s: start there "
-                f"trilat ping --answer {protocol}/0.0.0.0:{port}, "
-                "over tls or quic with --keys of another site"
+                f"no program answered at {endpoint} within {CONNECT_NS // 10**9} s: on that "
+                f"machine, start trilat ping --answer {protocol}/0.0.0.0:{port}; over tls or "
+                "quic, also give --keys of another site"
             )
         for size_factor, rate_share in product(SIZE_FACTORS, RATE_SHARES):
             size_bytes = size_factor * needs.sample_bytes

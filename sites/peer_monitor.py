@@ -159,7 +159,7 @@ class PeerMonitor:
         elif not alive and (is_member or is_recorder):
             publisher.publish("lost", f"{member} is gone", about=member, t_ns=t_ns)
             if self._admits and is_site:
-                sentence = f"{member} is gone since t = {t_ns * 1e-9:.1f} s"
+                sentence = f"{member} has been gone since t = {t_ns * 1e-9:.1f} s"
                 self.departed[member] = (t_ns, sentence)
 
     def mark_present(self, member: str, t_ns: int) -> None:

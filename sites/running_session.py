@@ -374,13 +374,14 @@ class RunningSession:
             missing = [name for name in present if name not in infos]
             if missing:
                 raise SessionError(
-                    f"session {self.name!r}: {', '.join(missing)} of its sites did not answer"
+                    f"session {self.name!r}: these sites did not answer: {', '.join(missing)}"
                 )
             waiting = [name for name in present if not infos[name].running]
             if waiting:
                 names = ", ".join(waiting)
                 raise SessionError(
-                    f"session {self.name!r} has not begun: {names} waits for the others"
+                    f"session {self.name!r} has not begun: these sites wait for the others: "
+                    f"{names}"
                 )
             times_s = [infos[name].ticks / scenario.sites[name].rate_hz for name in present]
             request = ChangeRequest(stop_s=max(times_s) + AHEAD_S)
@@ -419,7 +420,7 @@ class RunningSession:
         if scenario is None:
             raise SessionError(
                 f"no site of session {self.name!r} answers; "
-                "other endpoints are named with --connect"
+                "to try other endpoints, name them with --connect"
             )
         return scenario, infos
 
@@ -460,7 +461,7 @@ class RunningSession:
                 raise SessionError(f"session {self.name!r} has no site {site!r}; {known}")
         raise SessionError(
             f"site {site!r} of session {self.name!r} does not answer; "
-            "other endpoints are named with --connect"
+            "to try other endpoints, name them with --connect"
         )
 
     def set_link(self, link: str, **to: Any) -> str:
@@ -855,10 +856,10 @@ def open_hand(
     live = scenario.sites[site].find_live_hand(is_open=True)
     if live is None:
         open_sites = ", ".join(scenario.open_hands)
-        remedy = f"; they can at {open_sites}" if open_sites else ""
+        remedy = f"; the sites with such an operator are {open_sites}" if open_sites else ""
         raise UsageError(
-            f"nobody can take hold of {site}: "
-            f"the scenario has no operator of kind 'live' there{remedy}"
+            f"nobody can move the arm of {site}: "
+            f"the scenario has no operator of kind 'live' at this site{remedy}"
         )
 
     compute_pose = tuple if live.mode == "joint" else scenario.arms[site].end_effector

@@ -261,8 +261,8 @@ def ping_session(
         endpoints = connection.connect or [default_endpoint(session, 0)]
         raise RunFailed(
             f"no member of session {session!r} answered at {', '.join(map(str, endpoints))} "
-            f"within {timeout_s:g} s; is that its name, and has it not ended? "
-            "name other endpoints with --connect"
+            f"within {timeout_s:g} s; check the name of the session and whether the session "
+            "has ended, or name other endpoints with --connect"
         )
     return ping.report()
 
@@ -335,8 +335,8 @@ def ping_topic(
     lasted_s = (clock.monotonic_ns() - begun_ns) / NS_PER_S
     if not samples:
         raise RunFailed(
-            f"nobody published on /{topic} in {lasted_s:.3g} s: "
-            "see ros2 topic list, and --domain"
+            f"no publisher sent a message on /{topic} in {lasted_s:.3g} s: check the topic "
+            "with ros2 topic list, and the domain with --domain"
         )
 
     publishers = []

@@ -248,11 +248,11 @@ def _describe_failed_join(parts: SiteParts, joining: SessionJoin) -> SessionErro
     missing = joining.membership.list_missing()
     reason = joining.reason
     if not reason and missing:
-        reason = f"{', '.join(missing)} never came"
+        reason = f"{', '.join(missing)} did not join"
     elif not reason:
-        reason = "the others came, but no epoch"
+        reason = "the other members joined, but no common start time (epoch) was agreed on"
     for member, problem in joining.membership.unreadable.items():
-        reason += f"; the answer of {member} cannot be read: {problem}"
+        reason += f"; the reply of {member} cannot be read: {problem}"
     waited_s = f"{options.join_timeout_s:g} s"
     return SessionError(
         f"{parts.name} waited {waited_s} in session {options.session!r}: {reason}"
@@ -838,8 +838,10 @@ class RunningSite:
         if monitor.ended_by:
             raise RunFailed(f"{parts.name} ended because {monitor.ended_by}")
         if not code and self._departures:
+            names = " and ".join(monitor.departed)
             raise PeerLeft(
-                f"{parts.name} made {ticks}; {self._departures}, and did not come back"
+                f"{parts.name} executed {ticks}; {self._departures}; {names} did not rejoin "
+                "the session"
             )
         return code
 

@@ -115,12 +115,12 @@ ENDPOINTS = [
     ("--listen", "tcp/192.0.2.1:7447", "with --keys an endpoint is encrypted"),
     ("--connect", "tcp/localhost:7447", "with --keys an endpoint is encrypted"),
     ("--connect", "unixsock-stream//tmp/x", "with --keys an endpoint is encrypted"),
-    ("--connect", "udp/127.0.0.1:7447", "UDP loses, repeats and trusts everything"),
+    ("--connect", "udp/127.0.0.1:7447", "UDP is not supported"),
     ("--router", "tcp/127.0.0.1:7447", "with --keys an endpoint is encrypted"),
     (
         "--connect",
         "tls/127.0.0.1:7447#verify_name_on_connect=false",
-        "how it is encrypted comes from --keys",
+        "--keys sets the encryption",
     ),
 ]
 
@@ -139,13 +139,13 @@ ZENOH_FILES = [
     ),
     (
         "{ transport: { link: { protocols: ['tcp', 'tls'] } } }",
-        "transport/link/protocols: comes from --keys",
+        "transport/link/protocols is also set by --keys",
     ),
     (
         "{ transport: { link: { tls: { enable_mtls: false } } } }",
-        "transport/link/tls: comes from --keys",
+        "transport/link/tls is also set by --keys",
     ),
-    ("{ access_control: { enabled: false } }", "access_control: comes from --keys"),
+    ("{ access_control: { enabled: false } }", "access_control is also set by --keys"),
 ]
 
 
@@ -185,26 +185,29 @@ def whole(source: str) -> Change:
 
 
 SPOILT: list[tuple[Change, str]] = [
-    (mode("", 0o777), "others can write it and decide who takes part: chmod go-w"),
-    (mode("", 0o770), "others can write it"),
-    (mode(MEMBERS, 0o666), "members.json: others can write it"),
-    (mode(MEMBERS, 0o620), "members.json: others can write it"),
-    (mode(AUTHORITY, 0o664), "authority.pem: others can write it"),
-    (mode(CERTIFICATE, 0o646), "certificate.pem: others can write it"),
-    (mode(PRIVATE_KEY, 0o640), "can be read by others: chmod 600"),
+    (mode("", 0o777), "and so decide who takes part; protect the keys with: chmod go-w"),
+    (mode("", 0o770), "other users can write to this path"),
+    (mode(MEMBERS, 0o666), "members.json: other users can write to this path"),
+    (mode(MEMBERS, 0o620), "members.json: other users can write to this path"),
+    (mode(AUTHORITY, 0o664), "authority.pem: other users can write to this path"),
+    (mode(CERTIFICATE, 0o646), "certificate.pem: other users can write to this path"),
+    (
+        mode(PRIVATE_KEY, 0o640),
+        "other users can read private.key; protect the key with: chmod 600",
+    ),
     (lambda keys: (keys / "m1" / MEMBERS).unlink(), "members.json: No such file"),
     (lambda keys: (keys / "m1" / PRIVATE_KEY).unlink(), "private.key: No such file"),
     (
         lambda keys: (keys / "m1" / MEMBERS).write_text("secret"),
-        "damaged, no keys of `trilat keys new`",
+        "the keys are damaged, or were not made by `trilat keys new`",
     ),
     (
         lambda keys: (keys / "m1" / MEMBERS).write_text("[" * 9999),
-        "damaged, no keys of `trilat keys new`",
+        "the keys are damaged, or were not made by `trilat keys new`",
     ),
     (
         lambda keys: (keys / "m1" / CERTIFICATE).write_text("secret"),
-        "damaged, no keys of `trilat keys new`",
+        "the keys are damaged, or were not made by `trilat keys new`",
     ),
     (say(member="m2"), "the certificate is for m1, but members.json names m2"),
     (say(members=["m2", "s"]), "members.json does not list m1"),
@@ -212,11 +215,11 @@ SPOILT: list[tuple[Change, str]] = [
     (say(members=["m1", "m1"]), "each member once"),
     (say(members=["m1", 7]), "a member's name has at most 64 letters"),
     (take(CERTIFICATE, "k/m2"), "the certificate is for m2, but members.json names m1"),
-    (take(PRIVATE_KEY, "k/m2"), "private key and certificate do not belong together"),
+    (take(PRIVATE_KEY, "k/m2"), "the private key and the certificate do not match"),
     (take(AUTHORITY, "others/m1"), "the authority has not signed this certificate"),
     (take(CERTIFICATE, "others/m1"), "the authority has not signed this certificate"),
-    (whole("old"), "the certificate ended on"),
-    (whole("early"), "the certificate begins on"),
+    (whole("old"), "the keys expired on"),
+    (whole("early"), "the certificate is not valid before"),
 ]
 
 
@@ -248,20 +251,20 @@ def test_files_of_another_user_are_refused(made: Path, monkeypatch: pytest.Monke
     own = (made / "k" / "m1" / MEMBERS).stat()
     theirs = os.stat_result((own.st_mode, *own[1:4], 65533, *own[5:10]))
     monkeypatch.setattr(os, "geteuid", lambda: 65534)
-    with pytest.raises(UsageError, match="belongs to another user, who can change it"):
+    with pytest.raises(UsageError, match="belongs to another user, who can change the keys"):
         member_keys._check_permissions(made / MEMBERS, theirs)
 
 
 NEW = [
-    (["m1", "--host", "*"], "one host name or address, without a port, not '*'"),
-    (["m1", "--host", "*.example"], "one host name or address"),
-    (["m1", "--host", "0.0.0.0"], "one host name or address"),
-    (["m1", "--host", "::"], "one host name or address"),
-    (["m1", "--host", "10.0.0.0/8"], "one host name or address"),
-    (["m1", "--host", "robot:7447"], "one host name or address"),
-    (["m1", "--host", ""], "one host name or address"),
-    (["m1", "--host", "robot.example\n"], "one host name or address"),
-    (["*"], "a member's name has at most 64 letters, digits, _ and -"),
+    (["m1", "--host", "*"], "single host name or address, without a port, not '*'"),
+    (["m1", "--host", "*.example"], "single host name or address"),
+    (["m1", "--host", "0.0.0.0"], "single host name or address"),
+    (["m1", "--host", "::"], "single host name or address"),
+    (["m1", "--host", "10.0.0.0/8"], "single host name or address"),
+    (["m1", "--host", "robot:7447"], "single host name or address"),
+    (["m1", "--host", ""], "single host name or address"),
+    (["m1", "--host", "robot.example\n"], "single host name or address"),
+    (["*"], "a member's name must have 1 to 64 characters"),
     (["m" * 65], "a member's name has at most 64 letters"),
     (["authority"], "and is not authority"),
     (["../m1"], "a member's name has at most 64 letters"),
@@ -280,7 +283,7 @@ def test_no_keys_are_made_for_many_and_nothing_is_left(
 def test_keys_are_never_replaced(keys: Path) -> None:
     before = sorted(keys.rglob("*"))
     trilat("keys", "new", keys, "m1", cwd=keys).refuses(
-        "keys are never replaced, name a new folder"
+        "keys are never replaced: name a new folder"
     )
     assert sorted(keys.rglob("*")) == before
 
@@ -346,7 +349,7 @@ def test_the_right_keys_are_taken(made: Path, tmp_path: Path) -> None:
         text=True,
     )
     assert "m1: others connect to tls/127.0.0.1:" in done.stdout
-    assert "never came" in done.stderr
+    assert "did not join" in done.stderr
     assert done.returncode == 2
 
 

@@ -60,8 +60,8 @@ def test_changes_of_a_running_session_are_answered_recorded_and_reproduced(
     shares = trilat(
         *to, "dominance", "s", "m1=0.9", "m2=0.1", "--ramp", "0.5s", cwd=stage.folder
     ).succeeds()
-    assert "it holds from tick" in link
-    assert "it holds from tick" in shares
+    assert "takes effect at tick" in link
+    assert "takes effect at tick" in shares
     trilat(*to, "dominance", "s", "m1=0.9", "m2=0.2", cwd=stage.folder).refuses("sum to 1")
     log = session.is_reproduced()
     taken = {tick: text for tick, texts in log.changes("s").items() for text in texts}
@@ -78,13 +78,13 @@ def test_python_changes_stops_measures_and_ends_session_as_commands_do(stage: St
     running.begun()
     running.recording()
     session = tn.session("t", connect=running.endpoints)
-    assert "it holds from tick" in session.set_link("m1->s", delay_ms=250.0, loss=0.05)
-    assert "it holds from tick" in session.set_dominance(
+    assert "takes effect at tick" in session.set_link("m1->s", delay_ms=250.0, loss=0.05)
+    assert "takes effect at tick" in session.set_dominance(
         "s", {"m1": 0.9, "m2": 0.1}, ramp_s=0.5
     )
     with pytest.raises(RunFailed, match="sum to 1"):
         session.set_dominance("s", {"m1": 0.9, "m2": 0.2})
-    with pytest.raises(RunFailed, match="reset is for a site in fault"):
+    with pytest.raises(RunFailed, match="reset is possible only in mode fault"):
         session.reset("s")
     assert "s: stop at tick" in session.stop("s")[0]
     assert "s: enable at tick" in session.enable("s")[0]

@@ -53,7 +53,7 @@ def test_law_that_is_too_slow_ends_session_in_order(
         if line.startswith("error: ")
     )
     assert "the law slow_law:Law of s failed at tick 4" in told
-    assert "it is too slow" in told
+    assert "the code is too slow" in told
     assert told.removeprefix("error: ") in session.processes["m"].text()
     log = open_log(session.log)
     assert log.complete

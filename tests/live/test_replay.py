@@ -91,7 +91,7 @@ def test_a_latecomer_to_a_replay_gets_all_of_it(stage: Stage) -> None:
     assert ping.code() == 0
     assert "session again runs" in ping.text()
     assert other.code() == 2
-    assert "session 'again' is there already and runs" in other.text()
+    assert "session 'again' already exists and is running" in other.text()
     assert recorder.code() == 0
     assert numbered(second) == numbered(path)
     replay.signal(signal.SIGINT)

@@ -82,7 +82,7 @@ def test_a_site_that_hangs_up_is_named_by_the_others(stage: Stage) -> None:
     session.recording()
     session.processes["s"].signal(signal.SIGHUP)
     assert session.codes() == {"recorder": 0, "m": 3, "s": 128 + signal.SIGHUP}
-    assert "ended by SIGHUP, and did not come back" in session.processes["m"].text()
+    assert "ended by SIGHUP; s did not rejoin the session" in session.processes["m"].text()
     log = open_log(session.log)
     assert len(log["m"]) == 6000
     assert verify(log).passed

@@ -169,7 +169,10 @@ def test_a_stranger_leads_and_stops_an_arm_and_verifies(stage: Stage) -> None:
         assert led.x - start.x == pytest.approx(-0.15, abs=0.05)
         ros.publish("t/s/set_dominance", "std_msgs/msg/Float64MultiArray", shares(0.9, 0.1))
         assert ros.call("t/s/stop")[0]
-        assert ros.call("t/s/reset") == (False, "s is in stopped; reset is for a site in fault")
+        assert ros.call("t/s/reset") == (
+            False,
+            "s is in mode stopped; reset is possible only in mode fault",
+        )
         until(lambda: ros.newest("t/s/mode", "std_msgs/msg/String").data == "stopped", 20.0)
         assert ros.call("t/s/enable")[0]
         kinds = {"joint_states": "MP", "target_pose": "MS", "stop": "SS"}

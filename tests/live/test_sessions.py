@@ -207,7 +207,7 @@ def test_waiting_in_vain_names_the_missing_and_leaves_no_file(stage: Stage) -> N
     recorder = apart.recorder("--join-timeout", "1")
     assert (site.code(), recorder.code()) == (2, 2)
     (error,) = (line for line in site.text().splitlines() if line.startswith("error: "))
-    assert "m1, s never came" in error
+    assert "m1, s did not join" in error
     assert BEGUN not in site.text()
     assert "members present: none" in recorder.text()
     assert not apart.log.exists()

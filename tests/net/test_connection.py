@@ -79,29 +79,32 @@ def test_client_of_router_listens_nowhere_and_connects_to_nothing_else() -> None
     [
         (
             {"listen": [A], "own": file(listen={"endpoints": [B]})},
-            "listen/endpoints: given by listen too",
+            "listen/endpoints are also given by listen",
         ),
-        ({"routers": [A], "listen": [B]}, "router: a client of a router listens nowhere"),
-        ({"routers": [A], "connect": [B]}, "router: a client connects to a router only"),
+        ({"routers": [A], "listen": [B]}, "router: a client of a router does not listen"),
+        ({"routers": [A], "connect": [B]}, "router: a client connects only to a router"),
         (
             {"routers": [A], "own": file(listen={"endpoints": [B]})},
-            "router: a client .* listens nowhere",
+            "router: a client .* does not listen",
         ),
         (
             {"routers": [A], "own": file(mode="peer")},
-            "mine.json5: mode: peer contradicts router",
+            'mine.json5: mode "peer" contradicts router',
         ),
         (
             {"own": file(mode="client")},
-            "mine.json5: mode: client: there is no router to connect to",
+            'mine.json5: mode "client": there is no router to connect to',
         ),
         (
             {"own": file(mode="client"), "listen": [A]},
-            "mine.json5: mode: client: a client .* listens nowhere",
+            'mine.json5: mode "client": a client .* does not listen',
         ),
-        ({"own": file(mode="router")}, "mine.json5: mode: router is for `trilat router`"),
+        (
+            {"own": file(mode="router")},
+            'mine.json5: mode "router" can be used only with `trilat router`',
+        ),
         *(
-            ({"routers": [endpoint]}, "router: an endpoint is like tcp/192.0.2.1:7447, not")
+            ({"routers": [endpoint]}, "router: an endpoint must have a form such as tcp")
             for endpoint in (
                 "",
                 "nonsense",
@@ -145,7 +148,9 @@ def test_a_router_listens_and_connects_as_told() -> None:
     places = {"router": [C], "peer": [B]}
     assert router(None, None, file(listen={"endpoints": places})).listen == [C]
     for mode in ("peer", "client"):
-        with pytest.raises(UsageError, match=f"mine.json5: mode: {mode} must be router here"):
+        with pytest.raises(
+            UsageError, match=f"mine.json5: the mode must be router here, not {mode}"
+        ):
             router(None, None, file(mode=mode))
 
 

@@ -325,7 +325,7 @@ def test_keys_are_whole_or_refused(folder: Path, tmp_path: Path) -> None:
     ("take", "from_", "words"),
     [
         (CERTIFICATE, "s", "is for s, but"),
-        (PRIVATE_KEY, "m2", "private key and certificate do not belong together"),
+        (PRIVATE_KEY, "m2", "the private key and the certificate do not match"),
         ("authority.pem", "", "has not signed"),
     ],
 )
@@ -500,7 +500,7 @@ def test_ended_keys_stop_arms_and_nothing_else(
 ) -> None:
     folder = make_ending_keys(timedelta(days=1))
     with pytest.raises(
-        UsageError, match=r"the certificate ended on .*: renew it with trilat keys renew"
+        UsageError, match=r"the keys expired on .*: renew the keys with trilat keys renew"
     ):
         read_member_keys(folder / "m1")
     with two_members(folder, stops=True) as (site, peer):
@@ -537,14 +537,18 @@ def test_renewed_keys_meet_those_that_are_not_renewed(tmp_path: Path) -> None:
 def test_keys_that_cannot_be_renewed_are_refused(tmp_path: Path) -> None:
     for name in ("keys", "others"):
         create_keys(tmp_path / name, SITES)
-    with pytest.raises(UsageError, match="has no keys of m9; there are keys of m1, m2, s"):
+    with pytest.raises(
+        UsageError, match="has no keys for m9; the folder has keys for m1, m2, s"
+    ):
         renew_keys(tmp_path / "keys", ["m9"])
     shutil.rmtree(tmp_path / "keys" / "s")
     shutil.copytree(tmp_path / "others" / "s", tmp_path / "keys" / "s")
     content = {
         path: path.read_bytes() for path in (tmp_path / "keys").rglob("*") if path.is_file()
     }
-    with pytest.raises(UsageError, match="s: damaged, or not of this authority"):
+    with pytest.raises(
+        UsageError, match="s: the keys are damaged, or were not issued by this authority"
+    ):
         renew_keys(tmp_path / "keys")
     assert {path: path.read_bytes() for path in content} == content
     shutil.rmtree(tmp_path / "keys" / "authority")
@@ -564,11 +568,11 @@ def test_keys_that_end_before_session_are_refused(tmp_path: Path) -> None:
         keys = str(tmp_path / "keys" / member)
         done = trilat("site", member, "--scenario", words, "--keys", keys, *long, cwd=tmp_path)
         assert done.code == 2, done
-        assert f"--keys: the keys of {member} end on " in done.err
+        assert f"--keys: the keys of {member} expire on " in done.err
         assert "renew them with trilat keys renew" in done.err
     connection = secure_connection(Connection(), tmp_path / "keys" / "m", insecure=False)
     connection.require_keys_until(86_000.0)
-    assert "the keys of m end on" in connection.describe_end()
+    assert "the keys of m expire on" in connection.describe_end()
     with pytest.raises(UsageError, match="the session is planned until"):
         connection.require_keys_until(86_500.0)
     create_keys(tmp_path / "later", ["m"], days=8)

@@ -184,7 +184,7 @@ def test_keys_that_cannot_be_used_are_found_before_anything_begins(tmp_path: Pat
     create_keys(tmp_path / "keys", ["operator"])
     with pytest.raises(UsageError, match="name the folder of one member"):
         PageOptions(tls=tmp_path / "keys").check()
-    with pytest.raises(UsageError, match="no keys of `trilat keys new`"):
+    with pytest.raises(UsageError, match="no keys made by `trilat keys new`"):
         PageOptions(tls=tmp_path).check()
 
 

@@ -126,7 +126,7 @@ def test_a_law_that_does_not_come_back_is_stopped() -> None:
     )
     with CodeWatchdog(watched):
         with pytest.raises(
-            LawFailed, match=r"laws:Hanging of s failed at tick 0: it did not come back"
+            LawFailed, match=r"laws:Hanging of s failed at tick 0: the code did not return"
         ):
             watched.run(0, lambda: site.step(TickInput(0)))
         signal.raise_signal(signal.SIGALRM)  # between two ticks: nobody hangs
@@ -141,5 +141,5 @@ def test_every_call_of_a_first_tick_may_compile() -> None:
     )
     for _ in ("poses", "step"):
         watched.run(0, lambda: [watched.check() for _ in range(FIRST_CHECKS - 1)])
-    with pytest.raises(LawFailed, match="failed at tick 1: it did not come back within 2 s"):
+    with pytest.raises(LawFailed, match="failed at tick 1: the code did not return within 2 s"):
         watched.run(1, lambda: [watched.check() for _ in range(CHECKS)])

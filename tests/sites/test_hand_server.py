@@ -112,7 +112,7 @@ def test_a_hand_does_what_its_mode_says() -> None:
             hand.push(1.0, 2.0)
         with pytest.raises(UsageError, match="finite"):
             hand.move(math.nan, 0.0)
-    with pytest.raises(UsageError, match="they can at m1, m2"):
+    with pytest.raises(UsageError, match="such an operator are m1, m2"):
         open_hand(bus, clock, "t", "s", SCENARIO)
 
 

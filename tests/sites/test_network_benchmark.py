@@ -121,7 +121,7 @@ def test_a_play_out_is_what_a_measured_link_adds() -> None:
         (["--figure", "a.png"], "--figure: can be used only with --benchmark"),
         (["--benchmark", "free", "--count", "9"], "--count: cannot be used with --benchmark"),
         (["--answer", "tcp/127.0.0.1:1", "--json"], "--json: cannot be used with --answer"),
-        (["--answer", "tls/127.0.0.1:1"], "takes keys"),
+        (["--answer", "tls/127.0.0.1:1"], "needs keys"),
         (["--answer", "tcp/0.0.0.0:1"], "--insecure"),
         (["--benchmark", "nothing"], "nothing"),
         (["--benchmark", "free", "--figure", "a.gif"], "a.gif"),

@@ -143,7 +143,7 @@ def test_a_program_that_fails_lets_go_and_ends(tmp_path: Path) -> None:
     session.relay.add("hand", serve)
     log = session.run()
     assert ended == [
-        "the hand tests.own_code:Failing of m2 failed at tick 400: RuntimeError: no idea; it has let go"
+        "the hand tests.own_code:Failing of m2 failed at tick 400: RuntimeError: no idea; the hand has released the arm"
     ]
     assert log["m2"].hand[430, 2] == 0.0
     assert verify(log).passed

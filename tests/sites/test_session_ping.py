@@ -119,5 +119,5 @@ def test_a_topic_of_which_nothing_comes_is_said() -> None:
         def tap(self, topic: str, take: object) -> None:
             del topic, take
 
-    with pytest.raises(RunFailed, match="nobody published on /chatter in 1 s"):
+    with pytest.raises(RunFailed, match="no publisher sent a message on /chatter in 1 s"):
         ping_topic(Silent(), ManualClock(), "chatter", 1.0, lambda: False)  # type: ignore[arg-type]

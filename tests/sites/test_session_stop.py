@@ -125,7 +125,7 @@ def test_one_arm_stops_and_goes_on_while_the_session_does(tmp_path: Path) -> Non
     at_site = stop._replace(reason="it was ordered to stop")  # a site knows no names of people
     assert any(f"s: *** {at_site}" in line for line in session.said)
     assert [accepted for accepted, _ in said] == [True, False, False, True]
-    assert said[1][1] == "s is in stopped; reset is for a site in fault"
+    assert said[1][1] == "s is in mode stopped; reset is possible only in mode fault"
     assert said[2][1].startswith("m is in ")
     tick = int(said[0][1].rpartition(" ")[2])
     back = int(said[3][1].rpartition(" ")[2])
@@ -202,7 +202,7 @@ def test_watching_sees_a_site_return_and_stop_reaches_all(tmp_path: Path) -> Non
     assert max(seen.values()) - seen["m1"] < 10
     ended = {name: str(end) for name, end in session.ends.items()} if session.ends else {}
     assert ended["s"] == "killed"
-    assert "s is gone since" in ended["m1"]
+    assert "s has been gone since" in ended["m1"]
     assert verify(log).differing == 0
 
 

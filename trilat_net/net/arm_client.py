@@ -667,7 +667,7 @@ class Hand(SiteClient):
         """
         while (record := self.record) is None:
             if self.over:
-                raise UsageError(f"the run of {self._site} has ended: there is no record")
+                raise UsageError(f"the run of {self._site} ended before a record arrived")
             self._clock.sleep_until(self._clock.monotonic_ns() + 1_000_000)
         return record
 
@@ -685,11 +685,11 @@ class Hand(SiteClient):
         if action != allowed:
             raise UsageError(
                 f"the hand of {self._site} can {allowed}, not {action}: "
-                "see its mode in the scenario"
+                "see the mode of the hand in the scenario"
             )
         goal = [float(number) for number in numbers]
         if not all(map(math.isfinite, goal)):
-            raise UsageError(f"a hand can {allowed} to finite numbers, not to {goal}")
+            raise UsageError(f"the numbers of {action} must be finite, not {goal}")
         key = "force" if allowed == "push" else "target"
         with self._lock:
             self._message = self._sender.send(HandMessage, source=self._source, **{key: goal})

@@ -235,8 +235,8 @@ class Connection:
         planned_end = datetime.now(UTC) + timedelta(seconds=left_s)
         if self.keys_end <= planned_end:
             raise UsageError(
-                f"--keys: the keys of {self.keys_of} end on {self.keys_end:{DATE}}, and the "
-                f"session is planned until {planned_end:{DATE}}: renew them with "
+                f"--keys: the keys of {self.keys_of} expire on {self.keys_end:{DATE}}, but "
+                f"the session is planned until {planned_end:{DATE}}: renew the keys with "
                 "trilat keys renew (docs/network.md)"
             )
 
@@ -251,8 +251,8 @@ class Connection:
         """
         if self.keys_end is None or self.keys_end - datetime.now(UTC) > ENDS_SOON:
             return ""
-        remedy = "renew them with trilat keys renew (docs/network.md)"
-        return f"the keys of {self.keys_of} end on {self.keys_end:{DATE}}: {remedy}"
+        remedy = "renew the keys with trilat keys renew (docs/network.md)"
+        return f"the keys of {self.keys_of} expire on {self.keys_end:{DATE}}: {remedy}"
 
     def require(self, member: str) -> "Connection":
         """Checks that this connection has no keys, or the keys of the named member.
@@ -303,7 +303,8 @@ def secure_connection(
     for address in addresses:
         if address.startswith("udp/"):
             raise UsageError(
-                f"{address}: UDP loses, repeats and trusts everything: use tcp, tls or quic"
+                f"{address}: UDP is not supported, because it can lose or repeat messages and "
+                "does not authenticate their senders: use tcp, tls or quic"
             )
     if keys is None:
         _check_open_endpoints(connection, insecure=insecure)
@@ -330,11 +331,13 @@ def _check_encrypted_endpoint(address: str) -> None:
     """
     if not address.startswith(ENCRYPTED):
         raise UsageError(
-            f"{address}: with --keys an endpoint is encrypted: tls/HOST:PORT or quic/HOST:PORT"
+            f"{address}: with --keys an endpoint must be encrypted: use tls/HOST:PORT or "
+            "quic/HOST:PORT"
         )
     if re.search(r"[#;](?!(iface|bind|dscp)=|so_)", address):
         raise UsageError(
-            f"{address}: how it is encrypted comes from --keys; leave out what follows the #"
+            f"{address}: --keys sets the encryption of an endpoint; leave out the part from # "
+            "on"
         )
 
 
@@ -356,7 +359,7 @@ def _refuse_settings_of_keys(settings: Mapping[str, Any]) -> None:
     ]
     if conflicts:
         raise UsageError(
-            f"--zenoh-config: {conflicts[0]}: comes from --keys; give it in one place"
+            f"--zenoh-config: {conflicts[0]} is also set by --keys; leave out {conflicts[0]}"
         )
 
 
@@ -380,8 +383,8 @@ def _check_open_endpoints(connection: Connection, *, insecure: bool) -> None:
         if not is_safe:
             raise UsageError(
                 f"--listen {address}: anybody on that network could take part: give "
-                "--keys DIR (make them with trilat keys new), or --insecure where you trust "
-                "everybody on it"
+                "--keys DIR (make the keys with trilat keys new), or --insecure if you trust "
+                "everybody on that network"
             )
 
 
@@ -463,7 +466,7 @@ def resolve_member_connection(
     file = file or ZenohFile("")
     if routes:
         if file.mode not in ("", "router"):
-            raise UsageError(f"{file.source}: mode: {file.mode} must be router here")
+            raise UsageError(f"{file.source}: the mode must be router here, not {file.mode}")
         return _join_options(
             listen=listen,
             connect=connect,
@@ -475,7 +478,8 @@ def resolve_member_connection(
 
     if file.mode == "router":
         raise UsageError(
-            f"{file.source}: mode: router is for `trilat router`; here it is peer or client"
+            f'{file.source}: mode "router" can be used only with `trilat router`; here the '
+            "mode must be peer or client"
         )
 
     # Without a router, the process connects to the other members.
@@ -490,31 +494,32 @@ def resolve_member_connection(
         )
 
     # The process is a client of a router.
-    client_source = "--router" if routers else f"{file.source}: mode: client"
+    client_source = "--router" if routers else f'{file.source}: mode "client"'
     if routers and file.mode == "peer":
         raise UsageError(
-            f"{file.source}: mode: peer contradicts --router, which makes a client"
+            f'{file.source}: mode "peer" contradicts --router, which requires mode "client"'
         )
     if listen is not None or file.endpoints("listen", "client"):
         raise UsageError(
-            f"{client_source}: a client of a router listens nowhere; "
+            f"{client_source}: a client of a router does not listen on any endpoint; "
             "leave out the endpoints to listen at"
         )
     if routers and connect is not None:
-        raise UsageError("--router: a client connects to a router only; leave out --connect")
+        raise UsageError("--router: a client connects only to a router; leave out --connect")
 
     for endpoint in routers or ():
         if not re.fullmatch(
             r"(tcp|tls|quic|udp|ws)/[^/]+:\d+([?#].*)?|unixsock-stream/.+", endpoint
         ):
             raise UsageError(
-                f"--router: an endpoint is like tcp/192.0.2.1:7447, not {endpoint!r}"
+                "--router: an endpoint must have a form such as tcp/192.0.2.1:7447, not "
+                f"{endpoint!r}"
             )
 
     endpoints = _merge_endpoints(routers or connect, file, "client", ())
     if not endpoints:
         raise UsageError(
-            f"{client_source}: there is no router to connect to; name it with --router"
+            f"{client_source}: there is no router to connect to; name a router with --router"
         )
     return Connection((), endpoints, "client", file.settings)
 
@@ -537,7 +542,8 @@ def _join_options(
     file_listen = file.endpoints("listen", mode)
     if listen is not None and file_listen is not None:
         raise UsageError(
-            f"{file.source}: listen/endpoints: given by --listen too; give them in one place"
+            f"{file.source}: listen/endpoints are also given by --listen; give the "
+            "endpoints in only one place"
         )
 
     listening: Sequence[Endpoint] = listen_else

@@ -202,7 +202,8 @@ def _query_sites(
         return None
     raise SessionError(
         f"no site of session {session!r} answered at {default_endpoint(session, 0)} "
-        f"within {timeout_s:g} s; is that its name? name other endpoints with --connect"
+        f"within {timeout_s:g} s; check the name of the session, or name other endpoints with "
+        "--connect"
     )
 
 
@@ -234,9 +235,9 @@ def send_change(
     channel = topics.STOP if request.order == "stop" else topics.SET
     payload = _query_once(bus, clock, topics.key(session, site, channel), request)
     if payload is None:
-        hint = "; with keys, only the operator's may ask for it"
+        hint = "; in a session with keys, only the operator may request changes"
         raise SessionError(
-            f"{site} gave no answer; its records show whether it made the change"
+            f"{site} did not answer; the records of {site} show whether the change was made"
             f"{'' if channel == topics.STOP else hint}"
         )
 
@@ -384,10 +385,10 @@ def refuse_running_session(
     for info in find_members(bus, clock, session, stopped=stopped, timeout_s=NAME_CHECK_S):
         if info.member == topics.RECORDER:
             continue
-        state = "waits to begin"
+        state = "is waiting to begin"
         if info.running:
-            state = f"runs; {info.member} is at tick {info.ticks}"
+            state = f"is running ({info.member} is at tick {info.ticks})"
         raise SessionError(
-            f"session {session!r} is there already and {state}; play under another name with "
-            "--prefix or --session"
+            f"session {session!r} already exists and {state}; replay the log under another "
+            "name with --prefix or --session"
         )

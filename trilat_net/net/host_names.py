@@ -67,7 +67,7 @@ def _resolve(host: str, endpoint: str) -> None:
         socket.getaddrinfo(host, None)
     except (OSError, UnicodeError) as error:
         # UnicodeError: a part of the name is empty or too long.
-        reason = getattr(error, "strerror", None) or "it is no host name"
+        reason = getattr(error, "strerror", None) or "this is not a valid host name"
         raise UnknownHost(
             f"{endpoint}: the host name {host!r} does not resolve ({reason}): "
             "correct it, or give an address"

@@ -60,7 +60,10 @@ _CLOCK_TOLERANCE = datetime.timedelta(hours=1)
 """Difference between the clocks of two machines that is tolerated."""
 MOST_KEY_BYTES = 65_536
 """Largest number of bytes that are read from a key file."""
-_RENEWAL = "renew it with trilat keys renew, or make new keys for all with trilat keys new"
+_RENEWAL = (
+    "renew the keys with trilat keys renew, or make new keys for all members with trilat keys "
+    "new"
+)
 """Advice to the user for keys that have ended."""
 _DATE = "%Y-%m-%d %H:%M UTC"
 """Format of dates in messages to the user."""
@@ -118,7 +121,7 @@ def create_keys(
     folder = Path(folder)
     faults = [_find_name_fault(members), *map(_find_host_fault, hosts)]
     if not 0 <= days <= MOST_DAYS:
-        faults.append(f"keys are valid for 0 to {MOST_DAYS} days, not {days}")
+        faults.append(f"the validity of keys must be 0 to {MOST_DAYS} days, not {days}")
     for fault in faults:
         if fault:
             raise UsageError(fault)
@@ -126,7 +129,7 @@ def create_keys(
     is_occupied = folder.exists() and not is_empty_folder
     if not folder.name or is_occupied:
         raise UsageError(
-            f"{folder}: exists already; keys are never replaced, name a new folder"
+            f"{folder}: already exists; keys are never replaced: name a new folder"
         )
 
     make_folder(folder.parent)
@@ -148,10 +151,15 @@ def _find_name_fault(members: Sequence[Any]) -> str:
     for name in members:
         has_valid_letters = isinstance(name, str) and re.fullmatch("[A-Za-z0-9_-]+", name)
         if not has_valid_letters or len(name) > MOST_LETTERS or name == _AUTHORITY_FOLDER:
-            hint = "" if str(name).isascii() else "; letters are a to z and A to Z"
+            hint = (
+                ""
+                if str(name).isascii()
+                else "; only the letters a to z and A to Z are allowed"
+            )
             return (
-                f"a member's name has at most {MOST_LETTERS} letters, digits, _ and -, and is "
-                f"not {_AUTHORITY_FOLDER}; this name is refused: {ascii(name)[:80]}{hint}"
+                f"a member's name must have 1 to {MOST_LETTERS} characters (letters, digits, _ "
+                f"and -) and must not be {_AUTHORITY_FOLDER}; this name is refused: "
+                f"{ascii(name)[:80]}{hint}"
             )
     if not members or len(members) > len(set(members)):
         return "name at least one member, and each member once"
@@ -179,9 +187,7 @@ def _find_host_fault(host: str) -> str:
         is_valid = is_host_name and len(host) <= 253
     if is_valid:
         return ""
-    return (
-        f"--host: a certificate is for one host name or address, without a port, not {host!r}"
-    )
+    return f"--host must be a single host name or address, without a port, not {host!r}"
 
 
 def renew_keys(folder: str | Path, members: Sequence[str] = (), days: int = 30) -> list[Path]:
@@ -208,7 +214,7 @@ def renew_keys(folder: str | Path, members: Sequence[str] = (), days: int = 30) 
     """
     folder = Path(folder)
     if not 0 <= days <= MOST_DAYS:
-        raise UsageError(f"keys are valid for 0 to {MOST_DAYS} days, not {days}")
+        raise UsageError(f"the validity of keys must be 0 to {MOST_DAYS} days, not {days}")
     authority_folder = folder / _AUTHORITY_FOLDER
     try:
         old_authority = x509.load_pem_x509_certificate(
@@ -219,12 +225,12 @@ def renew_keys(folder: str | Path, members: Sequence[str] = (), days: int = 30) 
         )
     except (OSError, ValueError, TypeError) as error:
         raise UsageError(
-            f"{authority_folder}: no authority ({error}); without it, make new keys for all "
-            "members with trilat keys new"
+            f"{authority_folder}: the certificate authority cannot be read ({error}); without "
+            "the authority, make new keys for all members with trilat keys new"
         ) from None
     if authority_key.public_key() != old_authority.public_key():
         raise UsageError(
-            f"{authority_folder}: private key and certificate do not belong together"
+            f"{authority_folder}: the private key and the certificate do not match"
         )
 
     present = [path.name for path in sorted(folder.iterdir()) if (path / MEMBERS).is_file()]
@@ -232,7 +238,7 @@ def renew_keys(folder: str | Path, members: Sequence[str] = (), days: int = 30) 
     missing = [name for name in names if name not in present]
     if missing:
         raise UsageError(
-            f"{folder}: has no keys of {', '.join(missing)}; there are keys of "
+            f"{folder}: has no keys for {', '.join(missing)}; the folder has keys for "
             f"{', '.join(present)}"
         )
 
@@ -290,7 +296,9 @@ def _renew_member(
     except UsageError:
         raise
     except Exception as error:  # the errors of cryptography have no common base class
-        raise UsageError(f"{folder}: damaged, or not of this authority ({error!r})") from None
+        raise UsageError(
+            f"{folder}: the keys are damaged, or were not issued by this authority ({error!r})"
+        ) from None
 
 
 def _write_all_keys(
@@ -494,14 +502,15 @@ def _check_permissions(path: Path, status: os.stat_result) -> None:
     user = os.geteuid()
     if user != 0 and status.st_uid not in (0, user):
         raise UsageError(
-            f"{path}: belongs to another user, who can change it: use keys of your own"
+            f"{path}: belongs to another user, who can change the keys: use keys of your own"
         )
 
     is_sticky_folder = stat.S_ISDIR(status.st_mode) and status.st_mode & stat.S_ISVTX
     others_may_write = status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
     if others_may_write and not is_sticky_folder:
         raise UsageError(
-            f"{path}: others can write it and decide who takes part: chmod go-w {path}"
+            f"{path}: other users can write to this path and so decide who takes part; "
+            f"protect the keys with: chmod go-w {path}"
         )
 
 
@@ -538,7 +547,8 @@ def read_member_keys(folder: str | Path, *, stops: bool = False) -> MemberKeys:
         private_pem = _read_trusted(folder / PRIVATE_KEY)
     except OSError as error:
         raise UsageError(
-            f"{error.filename}: {error.strerror}: no keys of `trilat keys new`"
+            f"{error.filename}: {error.strerror}: the folder has no keys made by "
+            "`trilat keys new`"
         ) from None
     try:
         member_list = json.loads(members_text)
@@ -553,7 +563,9 @@ def read_member_keys(folder: str | Path, *, stops: bool = False) -> MemberKeys:
             ends = min(ends, datetime.datetime.fromisoformat(member_list["ends"]))
         certificate.verify_directly_issued_by(authority)
     except (ValueError, TypeError, KeyError, RecursionError) as error:
-        raise UsageError(f"{folder}: damaged, no keys of `trilat keys new` ({error})") from None
+        raise UsageError(
+            f"{folder}: the keys are damaged, or were not made by `trilat keys new` ({error})"
+        ) from None
     except Exception as error:  # the errors of cryptography have no common base class
         raise UsageError(
             f"{folder}: the authority has not signed this certificate ({error!r})"
@@ -601,7 +613,7 @@ def _find_key_fault(
     faults = (
         (
             read_foreign_permissions(private),
-            f"{PRIVATE_KEY} can be read by others: chmod 600 {private}",
+            f"other users can read {PRIVATE_KEY}; protect the key with: chmod 600 {private}",
         ),
         (
             common_name != member,
@@ -610,15 +622,16 @@ def _find_key_fault(
         (member not in members, f"{MEMBERS} does not list {member}"),
         (
             key.public_key() != certificate.public_key(),
-            "private key and certificate do not belong together",
+            "the private key and the certificate do not match",
         ),
         (
             begins > now,
-            f"the certificate begins on {begins:{_DATE}}: is the clock of this machine right?",
+            f"the certificate is not valid before {begins:{_DATE}}: check the clock of this "
+            "machine",
         ),
         (
             ends <= now,
-            f"the certificate ended on {ends:{_DATE}}: {_RENEWAL}",
+            f"the keys expired on {ends:{_DATE}}: {_RENEWAL}",
         ),
     )
 

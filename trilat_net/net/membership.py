@@ -492,7 +492,7 @@ class Membership:
             # If a member was started twice, the start with the lower boot stays.
             if info.boot < local.boot:
                 raise SessionError(
-                    f"there is already a {local.member} in session {self._session!r}"
+                    f"session {self._session!r} already has a member named {local.member}"
                 )
             return
 
@@ -539,11 +539,11 @@ class Membership:
         """
         local = self.local_info
         text = (
-            f"another scenario: {info.member} has {info.scenario_sha256[:16]}, "
-            f"{local.member} has {local.scenario_sha256[:16]}"
+            f"the scenarios differ: {info.member} has scenario {info.scenario_sha256[:16]}, "
+            f"{local.member} has scenario {local.scenario_sha256[:16]}"
         )
         if not self.is_leader and info.member == self._sites[0]:
-            raise SessionError(f"{text}; that of the leader {info.member} counts")
+            raise SessionError(f"{text}; the scenario of the leader {info.member} applies")
         if self.is_leader and info.boot not in self._refused_boots:
             self._refused_boots.add(info.boot)
             self._publisher.publish("refused", text, about=info.member)

@@ -180,7 +180,7 @@ class ArmMeasurement(Request, frozen=True, kw_only=True):
             return
         if len(self.tau_x) != len(self.q) or not all(map(math.isfinite, self.tau_x)):
             raise ValueError(
-                f"tau_x must be {count_nouns(len(self.q), 'finite number')}, as q is"
+                f"tau_x must have {count_nouns(len(self.q), 'finite number')}, as many as q"
             )
 
 

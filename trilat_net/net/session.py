@@ -132,7 +132,7 @@ class SessionJoin:
         missing = sorted(running - self._admitted_by)
         if self.refusal or self._coming is None or not missing:
             return self.refusal
-        return f"{', '.join(missing)} did not admit it to the running session"
+        return f"{', '.join(missing)} did not admit {self._info.member} to the running session"
 
     @property
     def announced_first_tick(self) -> int:
@@ -422,7 +422,9 @@ class SessionJoin:
                 self._reply_ready()
         # A proposal with another recorder is no error: of two recorders, one joins late.
         elif local.member in event.boots and self._sites:
-            raise SessionError(f"session {self._session!r} goes on with another {local.member}")
+            raise SessionError(
+                f"session {self._session!r} continues with another process of {local.member}"
+            )
 
     def _must_wait_for_other_leader(self, event: Event) -> bool:
         """Returns True if this member has agreed to a proposal that may still be confirmed.

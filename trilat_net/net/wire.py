@@ -155,7 +155,7 @@ def encode_state(
     if not _isfinite(sum(map(sum, vectors))):
         numbers = chain.from_iterable(vectors)
         if not all(map(_isfinite, numbers)):
-            raise WireError("not finite", f"{site} at tick {tick}")
+            raise WireError("not finite", f"a value of {site} at tick {tick} is not finite")
 
     fields = {
         "v": VERSION,
@@ -224,7 +224,7 @@ def encode_sample(
     total = sum(q) + sum(qd) + sum(tau_x) + sum(ch)
     # As in `encode_state`, the terms are checked only if their sum is not finite.
     if not _isfinite(total) and not all(map(_isfinite, [*q, *qd, *tau_x, *ch])):
-        raise WireError("not finite", f"{site} at tick {output.tick}")
+        raise WireError("not finite", f"a value of {site} at tick {output.tick} is not finite")
 
     fields = {
         "v": VERSION,
@@ -280,7 +280,8 @@ def split_states(block: bytes) -> Iterator[bytes]:
         WireError: The block is too large, or ends in the middle of a record.
     """
     if len(block) > MAX_BYTES:
-        raise WireError("oversized", f"{count_nouns(len(block), 'byte')}, at most {MAX_BYTES}")
+        size = count_nouns(len(block), "byte")
+        raise WireError("oversized", f"the block has {size}; at most {MAX_BYTES} are allowed")
 
     unpacker = msgpack.Unpacker(max_buffer_size=MAX_BYTES)
     unpacker.feed(block)
@@ -290,7 +291,9 @@ def split_states(block: bytes) -> Iterator[bytes]:
         try:
             unpacker.skip()
         except (msgpack.UnpackException, ValueError) as error:
-            raise WireError("malformed", f"a block of records: {error}") from None
+            raise WireError(
+                "malformed", f"a block of records cannot be read: {error}"
+            ) from None
         end = unpacker.tell()
         yield block[start:end]
         start = end
@@ -375,16 +378,19 @@ def make_decoder(
     def decode_payload(payload: bytes) -> Any:
         """Decodes and checks one payload. Raises WireError if the payload is not valid."""
         if len(payload) > limit:
-            raise WireError(
-                "oversized", f"{count_nouns(len(payload), 'byte')}, at most {limit}"
-            )
+            size = count_nouns(len(payload), "byte")
+            raise WireError("oversized", f"the message has {size}; at most {limit} are allowed")
         try:
             message: Any = parse(payload)
         except (ValueError, RecursionError) as error:
             raise WireError("malformed", str(error)) from None
 
         if message.v not in versions:
-            raise WireError("version", f"schema version {message.v}, this is {VERSION}")
+            raise WireError(
+                "version",
+                f"the message has schema version {message.v}, but this program uses version "
+                f"{VERSION}",
+            )
 
         if get_vectors is not None:
             vectors = get_vectors(message)
@@ -460,5 +466,7 @@ def _check_finite(
     for name, vector in zip(names, vectors, strict=True):
         if not all(map(_isfinite, vector)):
             is_request = isinstance(message, ArmMeasurement | HandMessage)
-            number = message.n if is_request else message.tick
-            raise WireError("not finite", f"{name} of {message.site} at {number}")
+            position = f"message {message.n}" if is_request else f"tick {message.tick}"
+            raise WireError(
+                "not finite", f"{name} of {message.site} in {position} is not finite"
+            )

@@ -26,7 +26,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import zenoh
 from zenoh import CongestionControl, Locality, Priority, handlers
 
-from ..errors import SessionError, UsageError
+from ..errors import SessionError, UsageError, count_nouns
 from ..files import reading
 from .bus import (
     RING_CAPACITY,
@@ -231,7 +231,7 @@ class ZenohBus:
         mode: ZenohMode = "peer",
         settings: Mapping[str, Any] | None = None,
     ) -> None:
-        or_refused = ", or none lets this member in" if settings else ""
+        or_refused = ", or no router accepts this member" if settings else ""
         self._session = open_zenoh(
             listen=listen,
             connect=connect,
@@ -436,7 +436,7 @@ def read_zenoh_file(path: Path) -> ZenohFile:
         with reading(path, UsageError) as stream:
             text = stream.read().decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise UsageError(f"{path}: is no text in UTF-8") from None
+        raise UsageError(f"{path}: is not UTF-8 text") from None
     return check_zenoh_file(str(path), _parse_json5(str(path), text), _find_refusal)
 
 
@@ -460,7 +460,7 @@ def _parse_json5(source: str, text: str) -> object:
     changes = {"[": 1, "{": 1, "]": -1, "}": -1}
     nesting = accumulate(changes.get(character, 0) for character in text)
     if max(nesting, default=0) > MAX_DEPTH:
-        raise UsageError(f"{source}: no JSON5: nested deeper than {MAX_DEPTH}")
+        raise UsageError(f"{source}: not valid JSON5: nested more than {MAX_DEPTH} levels deep")
 
     try:
         config = zenoh.Config.from_json5(f"{{metadata: [\n{text}\n]}}")
@@ -470,12 +470,13 @@ def _parse_json5(source: str, text: str) -> object:
         # The text begins in the second line of what Zenoh parses.
         position = f"line {int(match[1]) - 1}, column {match[2]}: " if match else ""
         reason = expected[1] if expected else _first_line(error)
-        raise UsageError(f"{source}: {position}no JSON5: {reason}") from None
+        raise UsageError(f"{source}: {position}not valid JSON5: {reason}") from None
 
     objects: list[object] = json.loads(config.get_json("metadata"))
     if len(objects) != 1:
         raise UsageError(
-            f"{source}: a Zenoh configuration is one object in braces; here are {len(objects)}"
+            f"{source}: a Zenoh configuration must be a single object in braces, but this file "
+            f"has {count_nouns(len(objects), 'object')}"
         )
     return objects[0]
 

@@ -359,7 +359,7 @@ def check_zenoh_file(
             session. The message lists all keys that do so.
     """
     if not isinstance(stated, dict):
-        raise UsageError(f"{source}: a Zenoh configuration is one object in braces")
+        raise UsageError(f"{source}: a Zenoh configuration must be a single object in braces")
     settings = _remove_nulls(stated)
 
     reason = refusal(settings)
@@ -421,7 +421,7 @@ def _find_problems(settings: Mapping[str, Any]) -> Iterator[str]:
             except OSError as error:
                 yield f"{key}: {value} cannot be read: {error.strerror}"
     if settings.get("access_control") and "enabled" not in settings["access_control"]:
-        yield "access_control: has no `enabled: true`, without which Zenoh admits everybody"
+        yield "access_control: must have `enabled: true`, without which Zenoh admits everybody"
 
 
 _SET_BY_MODE = (
@@ -533,7 +533,7 @@ def _suggest_key(path: Sequence[str], reason: str) -> str:
     similar = difflib.get_close_matches(unknown_key, valid_keys, 1)
     if similar:
         return f"Zenoh has no such key; did you mean {similar[0]}?"
-    return f"Zenoh has no such key; there are {valid_text.replace('`', '')}"
+    return f"Zenoh has no such key; the possible keys are {valid_text.replace('`', '')}"
 
 
 RECORDER = topics.RECORDER

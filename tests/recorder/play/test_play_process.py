@@ -304,7 +304,7 @@ def test_a_session_that_is_there_already_is_refused() -> None:
         topics.key(SESSION, "m1", topics.INFO), lambda _: encode(told("m1", RECORDER_BOOT))
     )
     with pytest.raises(
-        SessionError, match="session 'replay-paper' is there already and waits to begin"
+        SessionError, match="session 'replay-paper' already exists and is waiting to begin"
     ):
         refuse_running_session(visitor, clock, SESSION, lambda: False)
 
