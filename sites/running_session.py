@@ -266,7 +266,8 @@ class RunningSession:
             live = scenario.sites[site].find_live_hand(is_open=True)
             if live is None or live.mode != "tip":
                 raise UsageError(
-                    f"a device leads an end effector: the hand of {site} is not of mode 'tip'"
+                    f"a device can lead only an end effector: the hand of {site} must be of mode "
+                    "'tip'"
                 )
             device_hand = DeviceHand(
                 hand=hand,

@@ -107,13 +107,13 @@ def test_triangle_dragged_for_minute_is_obeyed_to_its_end() -> None:
 @pytest.mark.parametrize(
     ("order", "says"),
     [
-        ({"link": "s->m1", "to": {"delay_ms": 1.0}}, "ask m1"),
+        ({"link": "s->m1", "to": {"delay_ms": 1.0}}, "send the change to m1"),
         ({"link": "m1->s", "to": {"delay_ms": float("nan")}}, "delay_ms"),
         ({"link": "m1->s", "to": {"preset": "5gg"}}, "5g"),
         ({"link": "m1->s", "to": {"model": "trace", "file": "/etc/passwd"}}, "file"),
         ({"dominance": "s", "to": {"m1": 0.9, "m2": 0.2}}, "sum"),
         ({"dominance": "x", "to": {"m1": 1.0}}, "sites are"),
-        ({"dominance": "m1", "to": {"m2": 0.5, "s": 0.5}}, "ask m1"),
+        ({"dominance": "m1", "to": {"m2": 0.5, "s": 0.5}}, "send the change to m1"),
         ({"to": {}}, "either a link or"),
     ],
 )

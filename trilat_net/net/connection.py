@@ -446,7 +446,7 @@ def resolve_member_connection(
     """Derives the connection of a process from the command line and a user's Zenoh file.
 
     If there is a router (named by `--router`, or if the file has the mode "client"), the
-    process connects only to the router, and listens nowhere.
+    process connects only to the router, and does not listen.
 
     Args:
         listen: Endpoints of the option --listen. None if the option is absent.
