@@ -266,8 +266,8 @@ class RunningSession:
             live = scenario.sites[site].find_live_hand(is_open=True)
             if live is None or live.mode != "tip":
                 raise UsageError(
-                    f"a device can lead only an end effector: the hand of {site} must be of mode "
-                    "'tip'"
+                    "a device can lead only an end effector: "
+                    f"the hand of {site} must have the mode 'tip'"
                 )
             device_hand = DeviceHand(
                 hand=hand,

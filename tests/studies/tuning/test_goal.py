@@ -106,7 +106,8 @@ def test_twin_has_no_torque_without_target_and_no_wall() -> None:
 
 def test_two_hands_that_disagree_are_refused_with_the_site() -> None:
     with pytest.raises(
-        ScenarioError, match=r"training: sites\.m1\.hands: at 0 s .* keep only one of the operators"
+        ScenarioError,
+        match=r"training: sites\.m1\.hands: at 0 s .* keep only one of the operators",
     ):
         check_comparable(load_scenario("training"))
 
