@@ -307,7 +307,7 @@ WRONG: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "sweep over": (lambda _: tn.sweep("free", 5), "^over must have the form KEY=VALUES"),
     "sweep law": (lambda _: tn.sweep("free", laws="pd"), "^laws: there is no law 'pd'"),
-    "margin": (lambda _: tn.margin("free", "x"), "^along reads KEY=FROM:TO"),
+    "margin": (lambda _: tn.margin("free", "x"), "^along must have the form KEY=FROM:TO"),
     "tune": (lambda _: tn.tune("free", gravity_percent=5), "^gravity_percent must be from 50"),
     "rerun": (
         lambda file: tn.rerun(file),

@@ -170,7 +170,7 @@ def test_long_cells_are_passed_over_for_the_next_ones() -> None:
 
 
 def test_none_is_no_number_of_cells() -> None:
-    with pytest.raises(UsageError, match="from 1 on, not 0"):
+    with pytest.raises(UsageError, match="at least 1, not 0"):
         choose_cells_near_edges(list(rows()), KEYS, 0)
 
 

@@ -103,8 +103,8 @@ def test_a_folder_that_holds_something_else_is_left_alone(tmp_path: Path) -> Non
     [
         (None, "this folder contains no sweep"),
         ("{", "is not JSON"),
-        ("[]", "is no plan"),
-        ("{}", "is no plan"),
+        ("[]", "is not the plan"),
+        ("{}", "is not the plan"),
     ],
 )
 def test_a_folder_without_a_plan_is_refused(

@@ -146,7 +146,7 @@ def test_the_facts_are_json_and_name_the_command() -> None:
     "text", ["control.d", "control.d=1:1", "=1:2", "control.d=a:b", "d=0:inf"]
 )
 def test_what_is_no_range_is_refused(text: str) -> None:
-    with pytest.raises(UsageError, match=r"along reads KEY=FROM:TO"):
+    with pytest.raises(UsageError, match=r"along must have the form KEY=FROM:TO"):
         parse_search_range(text)
 
 
