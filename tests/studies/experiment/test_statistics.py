@@ -133,7 +133,7 @@ def test_rows_that_are_not_tidy_say_what_is_missing() -> None:
     with pytest.raises(UsageError, match="a row lacks condition"):
         average_trials([{"participant": 1, "time_s": 2.0}], "time_s")
     with pytest.raises(
-        UsageError, match="no trial has a number for error_m; the rows have time_s, trial"
+        UsageError, match="no trial has a number for error_m; the rows contain time_s, trial"
     ):
         average_trials(tidy(SLEEP), "error_m")
     with pytest.raises(
