@@ -263,12 +263,15 @@ def test_a_run_that_diverged_says_so() -> None:
 
 
 WRONG: dict[str, tuple[Callable[[Path], object], str]] = {
-    "scenario": (lambda _: tn.simulate(42), "42: no scenario of that name"),
+    "scenario": (lambda _: tn.simulate(42), "42: there is no scenario of that name"),
     "set": (
         lambda _: tn.simulate("two_sites", 5),
-        "an override reads KEY=VALUE, as in control.Kd=5, not 5",
+        "an override must have the form KEY=VALUE, as in control.Kd=5, not 5",
     ),
-    "set[]": (lambda _: tn.simulate("two_sites", [5]), "an override reads KEY=VALUE"),
+    "set[]": (
+        lambda _: tn.simulate("two_sites", [5]),
+        "an override must have the form KEY=VALUE",
+    ),
     "set key": (lambda _: tn.simulate("two_sites", {5: 5}), "5: unknown key"),
     "set value": (
         lambda _: tn.simulate("two_sites", {"control.Kd": None}),
@@ -363,7 +366,7 @@ def test_a_law_is_given_as_its_class() -> None:
     class Local(Adaptive):
         """Of no file's own."""
 
-    with pytest.raises(ScenarioError, match="is not a class in a file"):
+    with pytest.raises(ScenarioError, match="is not defined in a file"):
         tn.simulate("two_sites", {"control.law": Local})
 
 

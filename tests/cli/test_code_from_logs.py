@@ -304,14 +304,14 @@ def test_what_is_cached_beside_a_law_is_not_run(place: Path) -> None:
             f"{LAW}# a word\n",
             "other.py",
             UsageError,
-            "is no law that the log names: these are mylaws:Spring",
+            "does not contain code that the log names; the log names mylaws:Spring",
         ),
         (f"{WITNESS}Spring = 1", "mylaws.py", ScenarioError, "defines no class Spring"),
         (
             f"{WITNESS}class Spring: pass",
             "mylaws.py",
             ScenarioError,
-            "is no law: it has no torque",
+            "is not a law: the class has no torque",
         ),
         (f"{WITNESS}class Spring(", "mylaws.py", ScenarioError, "is not valid Python"),
         (None, "mylaws.py", ScenarioError, "cannot be read"),
@@ -336,7 +336,7 @@ def test_file_that_changes_after_it_was_allowed_does_not_run(place: Path) -> Non
     log = tn.open_log("run.mcap", law=file)
     file.write_text(f"{LAW}# a word\n")
     assert tn.verify(log).result.withheld == ["s"]
-    with pytest.raises(ScenarioError, match="is not the one that the scenario names"):
+    with pytest.raises(ScenarioError, match="its hash is not the permitted one"):
         tn.rerun(log, ["s"])
     assert not imports(place)
 

@@ -26,7 +26,7 @@ def test_the_skeleton_is_a_law_and_replaces_nothing(
     trilat("new", "law", "soft_law.py", cwd=tmp_path).refuses("soft_law.py", "exists")
     (tmp_path / "soft_law.py").unlink()
     trilat("new", "law", "soft_law.py", cwd=tmp_path).refuses("test_soft_law.py", "exists")
-    trilat("new", "law", "numpy.py", cwd=tmp_path).refuses("Python has a module numpy already")
+    trilat("new", "law", "numpy.py", cwd=tmp_path).refuses("Python already has a module numpy")
     trilat("new", "law", "my-law.py", cwd=tmp_path).refuses("as in mylaw.py or my_law.py")
 
 

@@ -76,7 +76,7 @@ def test_junit_is_written_whether_all_held_or_not(folder: Path) -> None:
     [
         ("./missing.toml", "missing.toml"),
         ("./quick.toml", "--set", "expect.stabel=true", "did you mean 'stable'"),
-        ("./quick.toml", "--set", "expect.end_pose_rad.x=[0.0, 0.0]", "its sites are m, s"),
+        ("./quick.toml", "--set", "expect.end_pose_rad.x=[0.0, 0.0]", "the sites are m, s"),
         ("./quick.toml", "--set", "expect.peak_error_min_rad=3.0", "peak_error_max_rad"),
         ("./quick.toml", "--seeds", "5..1", "1..20 or 1,5,9"),
         ("./quick.toml", "--junit", "no/folder.xml", "no/folder.xml"),

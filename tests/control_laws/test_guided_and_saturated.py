@@ -169,7 +169,7 @@ def test_a_prediction_that_lacks_the_contact_is_unstable_there() -> None:
 
 
 def test_a_law_that_compares_joints_is_refused_in_task_space() -> None:
-    with pytest.raises(ScenarioError, match="saturated_pd compares joint by joint"):
+    with pytest.raises(ScenarioError, match="saturated_pd compares arms joint by joint"):
         load_scenario("unlike_arms", {"control": SATURATED})
 
 

@@ -76,6 +76,6 @@ def test_without_gravity_all_agree(starts: tuple[float, ...], pose: float) -> No
 @pytest.mark.parametrize("law", ["sync", "adaptive_kinematics"])
 def test_a_law_of_the_planar_arm_refuses_a_chain(law: str) -> None:
     with pytest.raises(
-        ScenarioError, match=f"control.law: {law} has the regressor of the planar arm"
+        ScenarioError, match=f"control.law: {law} uses the regressor of the planar two-link arm"
     ):
         load_scenario("six_joints", [f"control={{law = '{law}'}}"])

@@ -171,7 +171,8 @@ def test_limit_has_same_words_wherever_scenario_comes_from() -> None:
     problems = []
     for read in (parse_scenario, parse_embedded):
         with pytest.raises(
-            ScenarioError, match=r"its links would take \d+ MiB, at most 64 MiB are allowed"
+            ScenarioError,
+            match=r"the links of this site would need \d+ MiB, but at most 64 MiB are allowed",
         ) as caught:
             read(text)
         problems.append((caught.value.path, caught.value.problem))
@@ -184,7 +185,7 @@ def test_change_that_would_need_more_than_limit_is_refused() -> None:
     present = LinkTables(scenario.links, ())
     change = {"link": "a1->a0", "to": {"delay_ms": 40.0}}
     assert resolve_change(scenario, present, change, 10**9).link == "a1->a0"
-    with pytest.raises(ScenarioError, match="its links would take"):
+    with pytest.raises(ScenarioError, match="the links of this site would need"):
         resolve_change(scenario, present, {**change, "to": {"delay_ms": 9000.0}}, 10**9)
 
 

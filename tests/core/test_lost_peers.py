@@ -115,7 +115,7 @@ def test_nobody_is_dropped_without_whom_the_others_are_no_group() -> None:
 @pytest.mark.parametrize(
     ("name", "overrides", "words"),
     [
-        ("two_sites", RULE, "no master can be lost"),
+        ("two_sites", RULE, "no site can go on without a master"),
         ("paper", {"on_stale.on_lost": "degrade"}, "needs on_stale.action = 'glide'"),
         ("paper", {**RULE, "on_stale.on_lost": "drop"}, "'hold' or 'degrade'"),
     ],

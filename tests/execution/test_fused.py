@@ -243,7 +243,7 @@ def test_without_the_compiler_it_has_the_same_bits() -> None:
 
 def test_what_the_compiled_loop_cannot_run_is_refused() -> None:
     with pytest.raises(
-        ScenarioError, match=r"sites\.m1\.plant: is external: .* runs live only"
+        ScenarioError, match=r"sites\.m1\.plant: is external: .* can only run live"
     ):
         FusedRun(load_scenario("free", {"sites.m1.plant": "external"}))
     with pytest.raises(ScenarioError, match="makes 10000 ticks within one tick of the slowest"):

@@ -117,10 +117,13 @@ def test_a_changed_hand_is_found(held: Log) -> None:
 @pytest.mark.parametrize(
     ("changes", "problem"),
     [
-        ({"sites.m1.hands": [{"kind": "live"}, {"kind": "live"}]}, "an arm has one"),
+        (
+            {"sites.m1.hands": [{"kind": "live"}, {"kind": "live"}]},
+            "an arm can have only one live hand",
+        ),
         (
             {"sites.m1.hands": [{"kind": "live"}], "sites.m1.plant": "external"},
-            "outside of the program",
+            "the arm is external",
         ),
         (
             {"sites.m1.hands": [{"kind": "live", "mode": "tip", "torque_limit_nm": 2.0}]},

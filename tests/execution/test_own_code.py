@@ -121,11 +121,19 @@ def test_letting_go_is_no_failure() -> None:
     ("keys", "path", "problem"),
     [
         ({"class": "tests.own_code:Missing"}, "class", "defines no class Missing"),
-        ({"class": "tests.own_code:NoHand"}, "class", "NoHand is no hand: it has no act"),
-        ({"class": "nowhere:Hand"}, "class", "there is no module nowhere"),
+        (
+            {"class": "tests.own_code:NoHand"},
+            "class",
+            "NoHand is not a hand: the class has no act",
+        ),
+        (
+            {"class": "nowhere:Hand"},
+            "class",
+            "the module nowhere, which nowhere:Hand names, was not found",
+        ),
         ({"class": "tests.own_code"}, "class", "must be a class, as in 'my_policy:Reach'"),
         ({"class": 3}, "class", "must be a class"),
-        ({"rate_hz": 333}, "rate_hz", "must divide the site's tick rate, 1000 Hz, is 333"),
+        ({"rate_hz": 333}, "rate_hz", "must divide the site's tick rate, 1000 Hz, but is 333"),
         ({"rate_hz": 5}, "rate_hz", "a whole number from 10 to 1000, Hz"),
         ({"delay_ms": -1}, "delay_ms", "a time from 0 to 1000 ms"),
         ({"turn_s": 2}, "turn_s", "unknown key"),
@@ -133,7 +141,7 @@ def test_letting_go_is_no_failure() -> None:
         (
             {"mode": "force", "speed_limit_m_s": 1},
             "speed_limit_m_s",
-            "belongs to a live hand of mode 'tip'",
+            "applies only to a live hand with mode 'tip'",
         ),
     ],
 )
@@ -214,7 +222,11 @@ def test_bodies_of_a_plant_are_in_every_record() -> None:
 
 @pytest.mark.parametrize(
     ("how", "problem"),
-    [("few", "not seven numbers for each of 2"), ("nan", "not finite"), ("short", "not seven")],
+    [
+        ("few", "instead of seven numbers for each of 2"),
+        ("nan", "not finite"),
+        ("short", "instead of seven"),
+    ],
 )
 def test_bodies_that_are_nowhere_end_the_run(how: str, problem: str) -> None:
     with pytest.raises(
@@ -226,14 +238,18 @@ def test_bodies_that_are_nowhere_end_the_run(how: str, problem: str) -> None:
 @pytest.mark.parametrize(
     ("bodies", "kind", "problem"),
     [
-        (BODIES, "Arm", r"Arm has no poses\(\)"),
+        (BODIES, "Arm", r"Arm has no method poses\(\)"),
         (
             {"box": [0.2, 0.2]},
             "Carousel",
-            r"three sizes, m, above 0 and up to 100, is \[0.2, 0.2\]",
+            r"three sizes in m, each above 0 and at most 100, but is \[0.2, 0.2\]",
         ),
-        ({"box": [0.2, 0.2, -1.0]}, "Carousel", "three sizes, m"),
-        ({"The Box": [1.0, 1.0, 1.0]}, "Carousel", "a body is named by a to z"),
+        ({"box": [0.2, 0.2, -1.0]}, "Carousel", "three sizes in m"),
+        (
+            {"The Box": [1.0, 1.0, 1.0]},
+            "Carousel",
+            "the name of a body may contain only a to z",
+        ),
         (3, "Carousel", r"the sizes of at most 32 bodies, as in \{ box"),
     ],
 )

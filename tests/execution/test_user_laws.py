@@ -159,9 +159,7 @@ def test_a_file_that_is_not_there_says_what_to_do(file: Path) -> None:
     log = open_log(log_of(file))
     file.unlink()
     (law,) = find_user_laws(log.scenario)
-    assert str(law).endswith(
-        "code from outside, which may not run; if you trust it: --law FILE"
-    )
+    assert str(law).endswith("external code, which may not run; if you trust it: --law FILE")
     assert verify(log).withheld == ["m", "s"]
 
 
@@ -247,7 +245,7 @@ def test_another_measurement_in_the_record_is_another_torque() -> None:
 
 def test_virtual_time_has_no_arm_outside() -> None:
     scenario = load_scenario("two_sites", {"sites.s.plant": "external"})
-    with pytest.raises(ScenarioError, match="runs live only"):
+    with pytest.raises(ScenarioError, match="can only run live"):
         virtual.write_virtual_log(scenario, io.BytesIO())
-    with pytest.raises(ScenarioError, match="runs live only"):
+    with pytest.raises(ScenarioError, match="can only run live"):
         next(virtual.execute_virtual(scenario))

@@ -219,7 +219,8 @@ def test_links_that_would_fill_the_memory_are_refused() -> None:
     assert parse_embedded(text.replace("20000", "1000")).names == tuple(names)
     assert parse_embedded(text.replace("9e3", "1.0")).names == tuple(names)
     with pytest.raises(
-        ScenarioError, match=r"its links would take \d+ MiB, at most 64 MiB are allowed"
+        ScenarioError,
+        match=r"the links of this site would need \d+ MiB, but at most 64 MiB are allowed",
     ):
         parse_embedded(text)
 

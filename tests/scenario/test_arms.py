@@ -105,7 +105,7 @@ def test_shipped_arms_weigh_and_reach_what_their_makers_say() -> None:
             "arm.armature_kg_m2",
             "2 numbers, and the arm has 6 joints",
         ),
-        ({"arm.down": [0.0, 0.0, 0.0]}, "arm.down", "point somewhere"),
+        ({"arm.down": [0.0, 0.0, 0.0]}, "arm.down", "other than zero"),
         ({"arm.down": [0.0, 0.0]}, "arm.down", "length >= 3"),
         ({"arm.l1_m": 2.0}, "arm.l1_m", "planar"),
         ({"arm.urdf": ""}, "q0_rad", "2 joints"),
@@ -157,7 +157,11 @@ def test_shipped_arms_weigh_and_reach_what_their_makers_say() -> None:
             "hands[0].points[0]",
             "each joint",
         ),
-        ({"sites.m1.arm.known": False}, "arm.known", "moves by its masses"),
+        (
+            {"sites.m1.arm.known": False},
+            "arm.known",
+            "the masses of a simulated arm are always known",
+        ),
     ],
 )
 def test_a_mistake_is_refused_at_its_own_key(changes: Overrides, path: str, words: str) -> None:
@@ -203,7 +207,7 @@ def test_arms_of_unlike_joints_are_refused_in_joint_space() -> None:
         }
     )
     assert error.path == "sites.s.arm"
-    assert "has 7 joints, and that of m1 has 6" in error.problem
+    assert "has 7 joints, but the arm of m1 has 6" in error.problem
 
 
 def test_a_link_of_meshes_alone_is_refused_with_its_name() -> None:

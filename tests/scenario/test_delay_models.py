@@ -197,7 +197,7 @@ def test_a_value_that_cannot_be_is_refused_with_its_key(keys: dict[str, Any], ke
 
 def test_choices_are_named_where_one_is_wrong() -> None:
     assert refused({"delay_ms": 5, "order": "in order"}).problem == (
-        "is 'in order', must be 'newest' or 'in_order'"
+        "is 'in order', but must be 'newest' or 'in_order'"
     )
     assert (
         "'hold' or 'loop'" in refused({"model": "trace", "trace": "0 5", "at_end": "x"}).problem

@@ -70,16 +70,16 @@ def test_a_trace_keeps_its_points_to_the_microsecond(rows: list[tuple[int, int]]
     [
         ("", "has no points"),
         ("t_s,delay_ms\n# nothing\n", "has no points"),
-        ("0,5\n1,nan\n", "point 2: its delay must be from 0 to 10000 ms or 'lost', is nan"),
+        ("0,5\n1,nan\n", "point 2: the delay must be from 0 to 10000 ms or 'lost', but is nan"),
         ("0,10000.1\n", "point 1: its delay"),
-        ("0,5\ninf,5\n", "point 2: its time must be finite"),
-        ("-1,5\n", "point 1: its time must be finite and not negative"),
-        ("0,5\n2,5\n1,5\n", "point 3: its time, 1 s, must be later"),
+        ("0,5\ninf,5\n", "point 2: the time must be finite"),
+        ("-1,5\n", "point 1: the time must be finite and not negative"),
+        ("0,5\n2,5\n1,5\n", "point 3: the time, 1 s, must be later"),
         ("0,5\n1e-7,5\n", "point 2"),
-        ("0,5\n1,many\n", "line 2: a line is t_s,delay_ms or t_s,lost"),
-        ("0,5\nt_s,delay_ms\n1,6\n", "line 2: a line is"),
-        ("0,5\n1,6,7\n", "line 2: a line is"),
-        ("O.0,41\n1,5\n", "line 1: a line is"),  # a broken first line is no head
+        ("0,5\n1,many\n", "line 2: must have the form t_s,delay_ms or t_s,lost"),
+        ("0,5\nt_s,delay_ms\n1,6\n", "line 2: must have the form"),
+        ("0,5\n1,6,7\n", "line 2: must have the form"),
+        ("O.0,41\n1,5\n", "line 1: must have the form"),  # a broken first line is no head
     ],
 )
 def test_what_is_no_trace_is_refused_where_it_is_wrong(
@@ -110,7 +110,7 @@ def test_a_file_that_cannot_be_read_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_trace_that_is_too_long_is_refused() -> None:
-    with pytest.raises(ValueError, match="has 200001 points, at most 200000"):
+    with pytest.raises(ValueError, match="has 200001 points, but at most 200000"):
         format_trace([(n / 1000, 5.0) for n in range(MAX_TRACE_POINTS + 1)])
 
 
@@ -192,7 +192,7 @@ def test_trace_written_out_replaces_file_and_file_trace(tmp_path: Path) -> None:
         (
             '[link]\nmodel = "trace"\ntrace = "0 7"\nof = "m1->s"',
             "links.m2->m1.of",
-            "the log that file names",
+            "the key file, which must name the log",
         ),
         ('[link]\nmodel = "trace"\nfile = 5', "link.file", "No such file"),
     ],

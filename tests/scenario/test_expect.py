@@ -47,7 +47,7 @@ def test_every_other_key_asks_something_whatever_its_value(keys: dict[str, Any])
         (
             "end_pose_rad",
             {"m1": [0.0, 0.0], "s": [0.0]},
-            ["expect.end_pose_rad.s: expected list of length"],
+            ["expect.end_pose_rad.s: must be a list of length"],
         ),
         ("end_error_min_rad", 1.0, ["expect.end_error_min_rad", "end_error_max_rad"]),
     ],
@@ -98,7 +98,7 @@ def test_a_window_is_part_of_the_scenarios_text() -> None:
         ),
         ({"to_s": 1.0}, ["expect.windows[0].to_s", "from_s = 1"]),
         ({"site": "m3"}, ["expect.windows[0].site", "m1, m2, s"]),
-        ({"site": ""}, ["expect.windows[0].site", "wall_mean_n is of one site"]),
+        ({"site": ""}, ["expect.windows[0].site", "wall_mean_n belongs to a single site"]),
         ({"wall_mean_n": [9, 7]}, ["expect.windows[0].wall_mean_n", "[9, 7]"]),
         ({"wall_mean_n": 8}, ["expect.windows[0].wall_mean_n"]),
     ],
@@ -115,7 +115,8 @@ def test_window_that_cannot_be_right_is_refused_with_its_key(
 
 def test_a_window_that_asks_nothing_is_refused() -> None:
     with pytest.raises(
-        ScenarioError, match=r"expect.windows\[0\]: expects nothing; it may have error_peak_rad"
+        ScenarioError,
+        match=r"expect.windows\[0\]: expects nothing; the possible keys are error_peak_rad",
     ):
         with_expect(windows=[{"from_s": 1.0, "to_s": 2.0}])
 

@@ -54,11 +54,11 @@ def test_a_named_law_is_imported_only_where_defined(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("law", "fact"),
     [
-        ("nowhere_at_all:Law", "there is no module nowhere_at_all"),
-        ("tests.laws.deeper:Law", "there is no module tests.laws.deeper"),
-        ("sys:Law", "there is no module sys"),
+        ("nowhere_at_all:Law", "the module nowhere_at_all, which"),
+        ("tests.laws.deeper:Law", "the module tests.laws.deeper, which"),
+        ("sys:Law", "the module sys, which"),
         ("tests.laws", "must be one of"),
-        (".laws:Law", "must be as in package.module:Law"),
+        (".laws:Law", "must have the form package.module:Law"),
     ],
 )
 def test_name_that_is_none_is_refused_as_scenario_is_read(law: str, fact: str) -> None:
@@ -72,7 +72,7 @@ def test_name_that_is_none_is_refused_as_scenario_is_read(law: str, fact: str) -
     ("overrides", "fact"),
     [
         ({"control.law": "tests.laws:Missing"}, "defines no class Missing"),
-        ({"control.law": "tests.laws:NoLaw"}, "NoLaw is no law: it has no torque"),
+        ({"control.law": "tests.laws:NoLaw"}, "NoLaw is not a law: the class has no torque"),
         ({"control.law": LAW, "control.Kdd": 2}, "cannot be created with Kdd = 2: TypeError"),
         ({"control.law": "tests.laws:Pair"}, "is for 2 sites, but the scenario has 3"),
         (
@@ -158,7 +158,7 @@ def test_overrides_of_resolved_scenario_reach_what_law_is_made_with(
 
 
 def test_settings_stand_beside_the_name_of_the_law() -> None:
-    with pytest.raises(ScenarioError, match=r"next to its name, as in control.gain = 5"):
+    with pytest.raises(ScenarioError, match=r"next to the key law, as in control.gain = 5"):
         load_scenario("paper", {"control.law": LAW, "control.settings.Kd": 2})
 
 
@@ -167,9 +167,7 @@ def test_resolved_scenario_begins_with_no_other_file_than_it_names() -> None:
         RESOLVED.text.replace(RESOLVED.sites["s"].control.source_sha256, "0" * 64)
     )
     Site(RESOLVED.setup("s"))
-    with pytest.raises(
-        ScenarioError, match=r"is not the one that the scenario names"
-    ) as caught:
+    with pytest.raises(ScenarioError, match=r"its hash is not the permitted one") as caught:
         Site(other.setup("s"))
     assert caught.value.path == "sites.s.control.law"
 
@@ -252,7 +250,7 @@ def test_what_cannot_be_sent_is_refused_as_scenario_is_read(
 @pytest.mark.parametrize(
     ("sends", "overrides", "fact"),
     [
-        ("{}", {}, "sends other vectors than the scenario names"),
+        ("{}", {}, "sends different vectors from those in the scenario"),
         (
             "{'u': {}}; schemes = ('digital',)",
             {},

@@ -33,7 +33,12 @@ OUTSIDE = {"sites.s.plant": "external", "sites.s.arm.known": False}
             "sites.s.control.gravity",
             "p_f takes",
         ),
-        ("two_sites", {"sites.m.plant": "external"}, "sites.m.hands", "is pushed there"),
+        (
+            "two_sites",
+            {"sites.m.plant": "external"},
+            "sites.m.hands",
+            "applies only to a simulated arm",
+        ),
     ],
 )
 def test_a_law_that_cannot_do_its_work_is_refused(

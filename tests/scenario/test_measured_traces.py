@@ -105,19 +105,19 @@ def test_column_says_its_unit_and_whether_it_is_round_trip(tmp_path: Path) -> No
         math.inf,
     ]
     path.write_text("timestamp,rtt\n0,20\n")
-    with pytest.raises(ScenarioError, match="'timestamp' names no unit"):
+    with pytest.raises(ScenarioError, match="'timestamp' must name a unit"):
         import_trace(path, "csv")
 
 
 @pytest.mark.parametrize(
     ("form", "text", "said"),
     [
-        ("irtt", "{}", "is not of the form irtt"),
-        ("irtt", "[1", "is not of the form irtt"),
-        ("ping", "nothing", "no line tells of an answer"),
+        ("irtt", "{}", "is not in the format irtt"),
+        ("irtt", "[1", "is not in the format irtt"),
+        ("ping", "nothing", "no line reports an answer"),
         ("csv", "a,b\n1,2\n", "has no column like t_ms"),
-        ("csv", "t_s,delay_ms\n0,x\n", "line 2 is not as its head says"),
-        ("csv", "t_s,delay_ms\n", "it has no samples"),
+        ("csv", "t_s,delay_ms\n0,x\n", "line 2 has no time or delay in the columns"),
+        ("csv", "t_s,delay_ms\n", "the file has no samples"),
     ],
 )
 def test_what_is_not_of_a_form_is_refused(

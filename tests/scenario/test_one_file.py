@@ -101,7 +101,7 @@ def test_a_file_beside_the_others_acts_in_every_driver(tmp_path: Path, scenario:
     assert any("two_paths 8.5 +- 3.5 ms" in line for line in found["check"])
     assert found["moved"] > 0.0
     assert found["roots"]
-    assert "hands[0].turn_rad_s: must be a frequency, rad/s, is -1.0" in found["refused"]
+    assert "hands[0].turn_rad_s: must be a frequency, rad/s, but is -1.0" in found["refused"]
 
 
 numbers = st.floats(-2.0, 2.0)

@@ -59,8 +59,8 @@ def test_every_kind_has_an_example_here_that_is_valid() -> None:
 )
 def test_what_is_missing_is_named_with_what_it_wants(group: str, entry: Any, key: str) -> None:
     said = refused(group, entry)
-    assert said.startswith(f".{key}: is missing: ")
-    assert len(said) > len(f".{key}: is missing: ") + 10
+    assert said.startswith(f".{key}: is missing; the value must be ")
+    assert len(said) > len(f".{key}: is missing; the value must be ") + 10
 
 
 @pytest.mark.parametrize(
@@ -89,33 +89,37 @@ def test_value_of_wrong_kind_is_told_what_its_key_wants(
             {"kind": "pluse"},
             ".kind: is 'pluse', but must be one of 'pulse', .*; did you mean 'pulse'",
         ),
-        ("hands", WALL, ".kind: is 'wall', which belongs in environment"),
-        ("environment", PULSE, ".kind: is 'pulse', which belongs in hands"),
+        ("hands", WALL, ".kind: is 'wall', which belongs to environment"),
+        ("environment", PULSE, ".kind: is 'pulse', which belongs to hands"),
         ("hands", {**PULSE, "peak": 1.0}, ".peak: unknown key; did you mean 'peak_nm'"),
         ("hands", {**SPRING, "stiffness_n_m": 1.0}, ".*; did you mean 'stiffness_nm_rad'"),
-        ("hands", {**PULSE, "end_s": 0.5}, ".end_s: must be later than start_s = 1, is 0.5"),
+        (
+            "hands",
+            {**PULSE, "end_s": 0.5},
+            ".end_s: must be later than start_s = 1, but is 0.5",
+        ),
         (
             "hands",
             {**SPRING, "move_start_s": 4.0},
-            ".move_end_s: must not be before move_start_s = 4, is 0",
+            ".move_end_s: must not be before move_start_s = 4, but is 0",
         ),
         (
             "hands",
             {**CHIRP, "to_hz": 0.0},
-            ".to_hz: must be a frequency above 0 and up to 1000 Hz, is 0.0",
+            ".to_hz: must be a frequency above 0 and up to 1000 Hz, but is 0.0",
         ),
         (
             "hands",
             {**MULTISINE, "phases_rad": [1.0]},
-            ".phases_rad: must be 2 angles, as many as frequencies",
+            ".phases_rad: must be 2 angles, one for each frequency",
         ),
         (
             "hands",
             {**PULSE, "peak_nm": [1.0]},
             ".peak_nm: must be one torque for both joints or two, ON",
         ),
-        ("hands", {**SPRING, "stiffness_nm_rad": -5.0}, ".*at least 0, N m/rad, is -5.0"),
-        ("hands", {**SPRING, "sampled": 1}, ".sampled: must be true or false, is 1"),
+        ("hands", {**SPRING, "stiffness_nm_rad": -5.0}, ".*at least 0, N m/rad, but is -5.0"),
+        ("hands", {**SPRING, "sampled": 1}, ".sampled: must be true or false, but is 1"),
         (
             "hands",
             {**RECORDED, "points": [[0.0, 1.0]]},
@@ -129,12 +133,12 @@ def test_value_of_wrong_kind_is_told_what_its_key_wants(
         (
             "environment",
             {**WALL, "normal": [0.0, 0.0]},
-            ".normal: must point somewhere, is zero",
+            ".normal: must be a vector other than zero",
         ),
         (
             "environment",
             {**WALL, "normal": "left"},
-            ".normal: .*to which side the wall is free, is 'left'",
+            ".normal: .*to which side the wall is free, but is 'left'",
         ),
         (
             "environment",
@@ -144,7 +148,7 @@ def test_value_of_wrong_kind_is_told_what_its_key_wants(
         (
             "environment",
             {**WALL, "end_s": -1.0},
-            ".end_s: must be a time of at least 0 s, is -1.0",
+            ".end_s: must be a time of at least 0 s, but is -1.0",
         ),
         ("environment", [WALL], ": must be a table"),
     ],

@@ -211,9 +211,9 @@ def test_unfinished_output_says_that_its_end_is_unknown(
     [
         (
             IPUTILS + answers(1, 9) + summary(3, 2),
-            "counts 3 packets, but its lines reach number 9",
+            "counts 3 packets, but the lines contain sequence numbers up to 9",
         ),
-        (IPUTILS + summary(9, 9), "counts 9 answers, but its lines have 0"),
+        (IPUTILS + summary(9, 9), "counts 9 answers, but the lines contain 0"),
         (IPUTILS + answers(1) + IPUTILS + answers(1), "several runs of ping"),
         ("a : [0], 64 bytes, 1.0 ms\nb : [0], 64 bytes, 1.0 ms", "it has 2 hosts, a, b"),
         (IPUTILS + summary(10**9, 0), "at most 16777216 are read"),

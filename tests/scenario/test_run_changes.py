@@ -112,11 +112,15 @@ def test_a_trace_may_be_left_but_no_other_begun() -> None:
             "there is no site 'ss'; did you mean 's'",
         ),
         ({**ROW, "dominance": {}}, "timeline[0].dominance", "must be a name"),
-        ({**LINK, "dominance": "s"}, "timeline[0]", "either a link or, as dominance, a site"),
+        (
+            {**LINK, "dominance": "s"},
+            "timeline[0]",
+            "either a link (link = ...) or a site (dominance = ...)",
+        ),
         ({**LINK, "att_s": 1}, "timeline[0].att_s", "did you mean 'at_s'"),
         ({**LINK, "at_s": "soon"}, "timeline[0].at_s", "must be a time in s"),
         ({"link": "m1->s", "to": {}}, "timeline[0].at_s", "must be a time in s"),
-        ({**LINK, "at_s": -1}, "timeline[0].at_s", "must not be before"),
+        ({**LINK, "at_s": -1}, "timeline[0].at_s", "must not be earlier"),
         ({**LINK, "at_s": 2e6}, "timeline[0].at_s", "<= 1000000"),
         ({**LINK, "at_s": float("nan")}, "timeline[0].at_s", "finite"),
         ({**LINK, "ramp_s": 2.0}, "timeline[0].ramp_s", "only shares have a ramp"),
@@ -154,7 +158,7 @@ def test_changes_stand_in_the_order_of_their_times() -> None:
     assert scripted(LINK, {**LINK, "to": {"delay_ms": 1}}).timeline[1].at_s == 8.0
     error = refused(ROW, LINK)
     assert error.path == "timeline[1].at_s"
-    assert "must not be before the change above it, 10 s" in error.problem
+    assert "must not be earlier than the previous change, at 10 s" in error.problem
     with pytest.raises(ScenarioError, match="list of tables"):
         load_scenario("paper", {"timeline": 5})
 
@@ -229,7 +233,7 @@ def test_a_command_does_what_the_script_would_have_done(change: dict[str, Any]) 
     ("written", "words"),
     [
         ({"link": "m1->x", "to": {}}, "no link 'm1->x'"),
-        ({"link": "m1->s", "dominance": "s"}, "either a link or"),
+        ({"link": "m1->s", "dominance": "s"}, "either a link (link) or"),
         ({"link": "m1->s", "to": {"model": "trace", "trace": "0 5"}}, "trace"),
         ({"link": "m1->s", "to": {"delay_ms": 5}, "ramp_s": 1.0}, "only shares have a ramp"),
         ({"dominance": "s", "to": {"m1": 1}, "ramp_s": -1.0}, "ramp_s"),
@@ -242,7 +246,7 @@ def test_an_order_that_cannot_be_is_refused(written: dict[str, Any], words: str)
 
 def test_a_link_with_a_trace_takes_no_unrecordable_orders() -> None:
     scenario = load_scenario("paper", {"link": {"model": "trace", "trace": "0 7000"}})
-    with pytest.raises(ScenarioError, match="can only be given another model"):
+    with pytest.raises(ScenarioError, match="can be changed only by setting another model"):
         ordered(scenario, {"link": "m1->s", "to": {"loss": 0.5}})
     assert (
         to_core_change(

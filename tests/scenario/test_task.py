@@ -19,7 +19,7 @@ TEXT = planar_task()
         (
             {"sites.s.q0_rad": [0.1, 0.0]},
             "sites.s.q0_rad",
-            "singular pose: its end effector cannot move along",
+            "singular pose: the end effector cannot move along",
         ),
         (
             {"task.axes": ["x", "y", "z"]},

@@ -286,7 +286,9 @@ def test_an_arm_moves_only_while_its_switch_is_held(tmp_path: Path) -> None:
 
 
 def test_a_switch_is_for_an_arm_outside_alone() -> None:
-    with pytest.raises(ScenarioError, match=r"sites\.s\.arm\.dead_man: is for an arm outside"):
+    with pytest.raises(
+        ScenarioError, match=r"sites\.s\.arm\.dead_man: applies only to an external arm"
+    ):
         load_scenario("two_sites", {"sites.s.arm.dead_man": True})
 
 

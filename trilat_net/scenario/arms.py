@@ -216,7 +216,7 @@ class Task(fields.Frozen, frozen=True, omit_defaults=True):
             if axis not in TASK_AXES[: self.shared]:
                 return fields.KeyProblem(
                     "axes",
-                    f"has {axis}, which belongs to a pose, and task.space is 'position'",
+                    f"has {axis}, which belongs to a pose, but task.space is 'position'",
                 )
         if self.posture_rad and not self.posture_rate_1_s:
             return fields.KeyProblem("posture_rad", "has no effect while posture_rate_1_s is 0")
@@ -571,7 +571,7 @@ def read_arm(arm: Arm, urdf_texts: Mapping[str, str]) -> UrdfChain:
             of a key below that of the arm.
     """
     if arm.urdf not in urdf_texts:
-        raise ScenarioError(f"names no file of the scenario: {arm.urdf!r}", path="urdf")
+        raise ScenarioError(f"{arm.urdf!r} is not a file of the scenario", path="urdf")
     for key in ("payload_com_m", "payload_inertia_kg_m2"):
         if any(getattr(arm, key)) and not arm.payload_kg:
             raise ScenarioError("needs the mass of the payload: set payload_kg", path=key)

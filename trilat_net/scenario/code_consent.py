@@ -248,8 +248,10 @@ def _allow_file(
         # The last part of "package.module:Law" before the class is the name of the file.
         keys = [key for key in logged if re.split(r"[.:]", key.code)[-2] == module]
     if not keys:
-        names = ", ".join(sorted({key.code for key in logged})) or "none from outside"
-        raise UsageError(f"--law {file}: is no law that the log names: these are {names}")
+        names = ", ".join(sorted({key.code for key in logged})) or "no external code"
+        raise UsageError(
+            f"--law {file}: does not contain code that the log names; the log names {names}"
+        )
     for key in keys:
         if key.sha256 != sha256 and not other_version:
             versions = _compare_hashes(key, sha256)
@@ -262,7 +264,7 @@ def _allow_file(
 
 def _compare_hashes(key: CodeKey, sha256: str) -> str:
     """Returns the beginning of a file's hash, and of the hash that the log states."""
-    return f"its sha256 is {sha256[:16]}, and was {key.sha256[:16]}"
+    return f"its sha256 is {sha256[:16]}, but was {key.sha256[:16]}"
 
 
 class LoggedUserLaw(NamedTuple):
@@ -301,7 +303,7 @@ class LoggedUserLaw(NamedTuple):
             version = " --other-version" if self.changed else ""
             option = f"{self.file}{version} (it {state})"
         difference = f" ({self.other_settings})" if self.other_settings else ""
-        problem = f"{law} is code from outside, which may not run{settings}{difference}"
+        problem = f"{law} is external code, which may not run{settings}{difference}"
         return f"{problem}; if you trust it: --law {option}"
 
 

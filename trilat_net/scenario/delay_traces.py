@@ -85,7 +85,9 @@ def _read_csv(path: Path) -> list[TracePoint]:
             delay_ms = math.inf if delay_text == _LOST else float(delay_text)
             points.append((float(time_text), delay_ms))
         except ValueError:
-            raise ValueError(f"line {number}: a line is t_s,delay_ms or t_s,{_LOST}") from None
+            raise ValueError(
+                f"line {number}: must have the form t_s,delay_ms or t_s,{_LOST}"
+            ) from None
     return points
 
 
@@ -142,8 +144,8 @@ def format_trace(points: Sequence[TracePoint]) -> str:
         raise ValueError("has no points")
     if len(points) > MAX_TRACE_POINTS:
         raise ValueError(
-            f"has {count_nouns(len(points), 'point')}, at most {MAX_TRACE_POINTS} are allowed: "
-            "cut or thin it out"
+            f"has {count_nouns(len(points), 'point')}, but at most {MAX_TRACE_POINTS} are "
+            "allowed: shorten the trace or keep fewer points"
         )
     first_s = points[0][0]
     previous_us = -1
@@ -151,20 +153,20 @@ def format_trace(points: Sequence[TracePoint]) -> str:
     for number, (t_s, delay_ms) in enumerate(points, start=1):
         if not math.isfinite(t_s) or t_s < 0.0:
             raise ValueError(
-                f"point {number}: its time must be finite and not negative, is {t_s:g} s"
+                f"point {number}: the time must be finite and not negative, but is {t_s:g} s"
             )
         # an infinite delay means that the message was lost
         is_too_long = LONGEST_MS < delay_ms < math.inf
         if math.isnan(delay_ms) or delay_ms < 0.0 or is_too_long:
             raise ValueError(
-                f"point {number}: its delay must be from 0 to {LONGEST_MS:g} ms or {_LOST!r}, "
-                f"is {delay_ms:g}"
+                f"point {number}: the delay must be from 0 to {LONGEST_MS:g} ms or {_LOST!r}, "
+                f"but is {delay_ms:g}"
             )
         t_us = round((t_s - first_s) * 1e6)
         if t_us <= previous_us:
             raise ValueError(
-                f"point {number}: its time, {t_s:g} s, must be later than that of the point "
-                "before it"
+                f"point {number}: the time, {t_s:g} s, must be later than that of the previous "
+                "point"
             )
         previous_us = t_us
         delay_text = _LOST if math.isinf(delay_ms) else str(round(delay_ms * 1e3))
@@ -196,15 +198,20 @@ def parse_trace(text: str) -> Points:
             delay_us = LOST if delay_text == _LOST else int(delay_text)
             pairs.append((int(time_text), delay_us))
         except ValueError:
-            raise ValueError(f"reads {part[:40]!r} where a point is 't_us delay_us'") from None
+            raise ValueError(
+                f"contains {part[:40]!r}, where a point must have the form 't_us delay_us'"
+            ) from None
 
     points: Points = np.array(pairs, dtype=np.int64).reshape(-1, 2)
     times_us, delays_us = points.T
     has_valid_length = 0 < len(points) <= MAX_TRACE_POINTS
     if not has_valid_length or times_us[0] != 0 or np.any(np.diff(times_us) <= 0):
-        raise ValueError(f"must be 1 to {MAX_TRACE_POINTS} points in order, the first at 0")
+        raise ValueError(
+            f"must be 1 to {MAX_TRACE_POINTS} points in the order of their times, and the time "
+            "of the first point must be 0"
+        )
     if np.any(delays_us < LOST) or np.any(delays_us > MAX_DELAY_US):
-        raise ValueError(f"its delays must be from 0 to {MAX_DELAY_US} us, or {_LOST!r}")
+        raise ValueError(f"the delays must be from 0 to {MAX_DELAY_US} us, or {_LOST!r}")
     points.flags.writeable = False
     return points
 
@@ -383,10 +390,12 @@ def import_trace(
         ScenarioError: The file cannot be read, or does not have this format.
     """
     if form not in _READERS:
-        raise UsageError(f"a trace is imported from {', '.join(_READERS)}, not from {form!r}")
+        raise UsageError(
+            f"a trace can be imported from {', '.join(_READERS)}, not from {form!r}"
+        )
     ways = WAYS if form == "irtt" else ("half", "whole")
     if way and way not in ways:
-        raise UsageError(f"the way of {form} is {', '.join(ways)}, not {way!r}")
+        raise UsageError(f"--way must be {' or '.join(ways)} for {form}, not {way!r}")
     try:
         with open_regular(Path(path)) as stream:
             raw = stream.read(_MAX_BYTES)
@@ -405,7 +414,7 @@ def import_trace(
         return _build_trace(measurement)
     # A JSON text of another form lacks keys, or has values of other types.
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ScenarioError(f"{path}: is not of the form {form}: {error}") from None
+        raise ScenarioError(f"{path}: is not in the format {form}: {error}") from None
 
 
 class _Measurement(NamedTuple):
@@ -432,7 +441,7 @@ def _build_trace(measurement: _Measurement) -> MeasuredTrace:
         ValueError: There are no messages, or a delay is negative.
     """
     if not measurement.samples:
-        raise ValueError("it has no samples")
+        raise ValueError("the file has no samples")
     samples = sorted(measurement.samples, key=lambda sample: sample[0])
     first_s = samples[0][0]
     points = []
@@ -447,8 +456,8 @@ def _build_trace(measurement: _Measurement) -> MeasuredTrace:
         # NaN is refused as well
         if not delay_ms >= 0.0:
             raise ValueError(
-                f"a delay of {delay_ms:g} ms: the clocks do not agree, half of the round trip "
-                "is known"
+                f"a delay of {delay_ms:g} ms is impossible: if the two clocks do not agree, "
+                "use half of the round trip"
             )
         previous_us = t_us
         too_long += LONGEST_MS < delay_ms < math.inf
@@ -553,7 +562,9 @@ def _read_table(text: str, way: str, column: str, _: float) -> _Measurement:
                 delay_ms = unit_ms * float(delay_text)
             samples.append((float(cells[time_index]) * time_unit_s, delay_ms))
         except (IndexError, ValueError):
-            raise ValueError(f"line {number} is not as its head says") from None
+            raise ValueError(
+                f"line {number} has no time or delay in the columns that the header names"
+            ) from None
     return _Measurement(samples)
 
 
@@ -584,9 +595,10 @@ def _find_column(cells: list[str], names: tuple[str, ...], wanted: str) -> tuple
         if is_wanted:
             unit = match["suffix"] or match["unit"]
             if unit is None:
-                raise ValueError(f"its column {cell!r} names no unit, as {cell}_ms would")
+                raise ValueError(f"the column {cell!r} must name a unit, as in {cell}_ms")
             return index, _UNIT_S[unit]
-    raise ValueError(f"its head has no {wanted or f'column like {names[0]}_ms'}")
+    column = f"column {wanted!r}" if wanted else f"column such as {names[0]}_ms"
+    raise ValueError(f"the header has no {column}")
 
 
 _READERS: dict[str, Callable[[str, str, str, float], _Measurement]] = {

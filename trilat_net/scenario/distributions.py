@@ -202,5 +202,5 @@ def _read_distribution(table: TomlTable, path: str) -> Distribution:
     is_reversed = uniform is not None and uniform[1] < uniform[0]
     if origin is None or len(table) != 1 or is_reversed:
         problem = "must be { normal = [mean, deviation] } or { uniform = [low, high] }"
-        raise ScenarioError(f"{problem}, is {table}", path=path)
+        raise ScenarioError(f"{problem}, but is {table}", path=path)
     return origin

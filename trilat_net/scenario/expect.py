@@ -21,7 +21,7 @@ import msgspec
 from msgspec import Meta
 
 from ..core.chain import MAX_JOINTS
-from ..errors import ScenarioError
+from ..errors import ScenarioError, count_nouns
 from ..fields import (
     Joints,
     KeyProblem,
@@ -213,28 +213,30 @@ def find_window_problem(
     Returns:
         The key and the reason. None if the window is possible.
     """
-    sites = f"its sites are {', '.join(joint_counts)}"
+    sites = f"the sites are {', '.join(joint_counts)}"
     if window.to_s <= window.from_s:
         return KeyProblem(
-            "to_s", f"must be later than from_s = {window.from_s:g}, is {window.to_s:g}"
+            "to_s", f"must be later than from_s = {window.from_s:g}, but is {window.to_s:g}"
         )
     if window.site and window.site not in joint_counts:
         hint = suggest_nearest(window.site, list(joint_counts))
-        return KeyProblem("site", f"no site {window.site!r}{hint}; {sites}")
+        return KeyProblem("site", f"there is no site {window.site!r}{hint}; {sites}")
 
     limits = dict(window.limits)
     if not limits:
         valid = window_quantities(max(joint_counts.values()))
-        return KeyProblem("", f"expects nothing; it may have {', '.join(valid)}")
+        return KeyProblem("", f"expects nothing; the possible keys are {', '.join(valid)}")
     for key, (least, most) in limits.items():
         if not window.site and key not in ALL_SITES_QUANTITIES:
-            return KeyProblem("site", f"is missing: {key} is of one site; {sites}")
+            return KeyProblem("site", f"is missing: {key} belongs to a single site; {sites}")
         if window.site:
             joints = joint_counts[window.site]
             if key not in window_quantities(joints):
-                return KeyProblem(key, f"there is no such joint: that arm has {joints}")
+                return KeyProblem(
+                    key, f"there is no such joint: the arm has {count_nouns(joints, 'joint')}"
+                )
         if least > most:
-            return KeyProblem(key, f"must be [least, most], is [{least:g}, {most:g}]")
+            return KeyProblem(key, f"must be [least, most], but is [{least:g}, {most:g}]")
     return None
 
 
@@ -330,12 +332,14 @@ def find_expect_problem(expect: Expect, joint_counts: Mapping[str, int]) -> KeyP
     for name, pose in expect.end_pose_rad.items():
         key = f"end_pose_rad.{name}"
         if name not in joint_counts:
-            return KeyProblem(key, f"no such site; its sites are {', '.join(joint_counts)}")
+            return KeyProblem(
+                key, f"there is no such site; the sites are {', '.join(joint_counts)}"
+            )
         joints = joint_counts[name]
         if len(pose) != joints:
             return KeyProblem(
                 key,
-                f"expected list of length {joints}, one angle per joint, and it has "
+                f"must be a list of length {joints}, one angle per joint, but has length "
                 f"{len(pose)}",
             )
 
@@ -347,7 +351,7 @@ def find_expect_problem(expect: Expect, joint_counts: Mapping[str, int]) -> KeyP
     for metric, (low, high) in expect.metrics.items():
         if low > high:
             return KeyProblem(
-                f"metrics.{metric}", f"must be [least, most], is [{low:g}, {high:g}]"
+                f"metrics.{metric}", f"must be [least, most], but is [{low:g}, {high:g}]"
             )
 
     for min_key, max_key in (
@@ -358,5 +362,7 @@ def find_expect_problem(expect: Expect, joint_counts: Mapping[str, int]) -> KeyP
         least = getattr(expect, min_key)
         most = getattr(expect, max_key)
         if least is not None and most is not None and least > most:
-            return KeyProblem(min_key, f"must be at most {max_key} = {most:g}, is {least:g}")
+            return KeyProblem(
+                min_key, f"must be at most {max_key} = {most:g}, but is {least:g}"
+            )
     return None

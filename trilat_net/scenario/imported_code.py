@@ -211,7 +211,7 @@ def describe_new_settings(key: CodeKey) -> str:
     smallest_difference = min(differences, key=len, default=[])
     if not smallest_difference:
         return ""
-    return f"it was allowed with other settings, and here {', '.join(smallest_difference)}"
+    return f"it was allowed with other settings, but here {', '.join(smallest_difference)}"
 
 
 def _list_differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
@@ -292,9 +292,9 @@ class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
             # The order is compared too, because it is the order of the vectors in a message.
             if list(declared.items()) != list(self.sends.items()):
                 raise ScenarioError(
-                    f"{self.code} sends other vectors than the scenario names: write sends out "
-                    f"in the body of that class, and set law = {self.code!r} again to read "
-                    "them",
+                    f"{self.code} sends different vectors from those in the scenario: define "
+                    "`sends` explicitly in the body of the class, and set law = "
+                    f"{self.code!r} again so that the scenario is updated",
                     path=f"{path}.sends",
                 )
             law: UserLaw = make_instance(kind, self.code, context, self.settings)
@@ -352,8 +352,8 @@ def _find_file(code: str, path: str) -> Path:
         spec = _find_spec(module)
     if spec is None or spec.origin is None or not Path(spec.origin).is_file():
         raise ScenarioError(
-            f"there is no module {module}, where {code} is; install it, or run the command in "
-            "its folder (PYTHONPATH counts, too)",
+            f"the module {module}, which {code} names, was not found; install the module, or "
+            "run the command in its folder (folders on PYTHONPATH are searched, too)",
             path=path,
         )
     return Path(spec.origin)
@@ -418,16 +418,16 @@ def import_class(key: CodeKey, path: str, method: str = "torque") -> Any:
         difference = describe_new_settings(key)
         reason = f" ({difference})" if difference else ""
         raise CodeWithheld(
-            f"{code} is code from outside, which may not run{reason}: --law FILE lets its file "
-            "(in Python tn.open_log(..., law=FILE))",
+            f"{code} is external code, which may not run{reason}: allow its file with "
+            "--law FILE (in Python: tn.open_log(..., law=FILE))",
             path=path,
         )
 
     source = read_code(code, path, consent.file)
     if source.sha256 != consent.sha256:
         raise ScenarioError(
-            f"the file of {code} is not the one that the scenario names by its hash; restore "
-            f"that file, or write {code!r} in the scenario again to use the present one",
+            f"the file of {code} has changed: its hash is not the permitted one; restore the "
+            f"file, or write {code!r} in the scenario again to use the present file",
             path=path,
         )
     check_class(source, code, path, method)
@@ -492,7 +492,8 @@ def check_class(source: CodeSource, code: str, path: str, method: str = "torque"
     may_inherit_method = node.bases or node.keywords or node.decorator_list
     if not may_inherit_method and method not in identifiers:
         raise ScenarioError(
-            f"{code} is no {kind}: it has no {method}; see {find_page(page)}", path=path
+            f"{code} is not a {kind}: the class has no {method}; see {find_page(page)}",
+            path=path,
         )
 
 
@@ -558,9 +559,9 @@ def name_law_class(kind: type) -> str:
         module = Path(getattr(sys.modules[module], "__file__", None) or "").stem
     if not module or not name.isidentifier():
         raise ScenarioError(
-            f"{name} is not a class in a file, so that no log can name it: write it into a "
-            "file, in a notebook with %%writefile mylaws.py, and import it from there; see "
-            f"{find_page('own-controller.md')}"
+            f"{name} is not defined in a file, so that a log cannot refer to it: write the "
+            "class to a file (in a notebook, with %%writefile mylaws.py) and import it from "
+            f"there; see {find_page('own-controller.md')}"
         )
     return f"{module}:{name}"
 

@@ -16,7 +16,7 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ..errors import ScenarioError
+from ..errors import ScenarioError, count_nouns
 from ..fields import TomlTable, check_keys, field_names, suggest_nearest
 from .delay_models import DELAY_MODELS
 from .imported_code import ImportedLaw, name_law_classes
@@ -144,14 +144,14 @@ def _expand_group(
 
     if vector not in valid_keys:
         hint = suggest_nearest(vector, [*_KIND_KEYS[group], *valid_keys])
-        hint = hint or f"; valid are {', '.join(valid_keys)}"
+        hint = hint or f"; the valid keys are {', '.join(valid_keys)}"
         raise ScenarioError(f"unknown key{hint}", path=f"{group}.{name}")
     kind_key = _KIND_KEYS[group][0]
     owners = ", ".join(kind for kind, keys in keys_by_kind.items() if vector in keys)
     present = ", ".join(dict.fromkeys(kinds.values()))
     raise ScenarioError(
         f"belongs to {kind_key} {owners}, but the scenario has only {present}: set "
-        f"{group}.{kind_key} too",
+        f"{group}.{kind_key}, too",
         path=f"{group}.{name}",
     )
 
@@ -314,8 +314,8 @@ def _check_site_exists(tables: TomlTable, parents: Sequence[str], key: str) -> N
         return
     if parents[1] not in sites:
         hint = suggest_nearest(parents[1], list(sites))
-        hint = hint or f"; its sites are {', '.join(sites)}"
-        raise ScenarioError(f"no such site{hint}", path=key)
+        hint = hint or f"; the sites are {', '.join(sites)}"
+        raise ScenarioError(f"there is no such site{hint}", path=key)
 
 
 def _reach_table(tables: TomlTable, parents: Sequence[str], last: str) -> TomlTable | list[Any]:
@@ -355,8 +355,10 @@ def _list_index(entries: list[Any], name: str, path: str) -> int:
         ScenarioError: There is no such entry.
     """
     if not name.isdecimal() or int(name) >= len(entries):
-        counted = f"it has {len(entries)}, counted from 0" if entries else "the list is empty"
-        raise ScenarioError(f"no such entry: {counted}", path=path)
+        counted = "the list is empty"
+        if entries:
+            counted = f"the list has {count_nouns(len(entries), 'entry')}, counted from 0"
+        raise ScenarioError(f"there is no such entry: {counted}", path=path)
     return int(name)
 
 
@@ -379,7 +381,7 @@ def parse_overrides(overrides: Mapping[str, Any] | Sequence[str]) -> list[Overri
         pair = split_assignment(str(text))
         if pair is None:
             raise ScenarioError(
-                f"an override reads KEY=VALUE, as in control.Kd=5, not {text!r}"
+                f"an override must have the form KEY=VALUE, as in control.Kd=5, not {text!r}"
             )
         pairs.append(pair)
     return pairs

@@ -182,11 +182,13 @@ def _check_bodies(written: Any, path: str) -> Any:
     for name, size in written.items():
         if not _BODY_NAME.fullmatch(name):
             raise ScenarioError(
-                f"a body is named by a to z, 0 to 9 and _, not {name!r}", path=path
+                f"the name of a body may contain only a to z, 0 to 9 and _, not {name!r}",
+                path=path,
             )
         if not _is_box_size(size):
             raise ScenarioError(
-                f"must be three sizes, m, above 0 and up to {_MAX_SIZE_M:g}, is {size!r}",
+                f"must be three sizes in m, each above 0 and at most {_MAX_SIZE_M:g}, but is "
+                f"{size!r}",
                 path=f"{path}.{name}",
             )
     return written
@@ -231,7 +233,8 @@ class PlantPlayer:
         kind = import_class(CodeKey.of(plant), path, plant.method)
         if plant.bodies and not hasattr(kind, "poses"):
             raise ScenarioError(
-                f"{plant.code} has no poses(), which must return their poses",
+                f"{plant.code} has no method poses(), which must return the poses of the "
+                "bodies",
                 path=f"{path}.bodies",
             )
         context = PlantContext(
@@ -296,12 +299,12 @@ class PlantPlayer:
         poses = [[float(number) for number in pose] for pose in self._program.poses()]
         if [len(pose) for pose in poses] != [_POSE_NUMBERS] * self._body_count:
             raise ValueError(
-                f"poses() is {poses}, not seven numbers for each of "
+                f"poses() returned {poses} instead of seven numbers for each of "
                 f"{count_nouns(self._body_count, 'body')}"
             )
         numbers = [number for pose in poses for number in pose]
         if not all(map(math.isfinite, numbers)):
-            raise ValueError(f"poses() is {poses}, which is not finite")
+            raise ValueError(f"poses() returned {poses}, which is not finite")
         return numbers
 
     def _call(self, tick: int, function: Callable[[], T]) -> T:

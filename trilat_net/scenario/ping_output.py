@@ -67,7 +67,7 @@ _WINDOWS_COUNTS = re.compile(r"[^=]*=\s*(\d+),[^=\d]+=\s*(\d+),[^=\d]+=\s*(\d+)\
 _WINDOWS_BREAK = re.compile(r"\^C|\S+[-+]C")
 """Matches the line after the user has interrupted the program, such as "Control-C"."""
 
-_SEVERAL_RUNS = "it has several runs of ping: import each by itself"
+_SEVERAL_RUNS = "the output contains several runs of ping: import each run separately"
 
 
 class PingProbes(NamedTuple):
@@ -134,7 +134,7 @@ def read_ping(text: str, every_s: float) -> PingProbes:
             return _arrange_probes(
                 answers={}, mentioned=set(), first=1, summary=summary, every_s=every_s
             )
-    raise ValueError("no line tells of an answer, as in 'icmp_seq=1 ttl=63 time=60.6 ms'")
+    raise ValueError("no line reports an answer, as in 'icmp_seq=1 ttl=63 time=60.6 ms'")
 
 
 def _parse_summary(pattern: re.Pattern[str], line: str) -> _Summary | None:
@@ -238,7 +238,8 @@ def _read_fping(lines: Sequence[str], every_s: float) -> PingProbes:
 
     if len(hosts) > 1:
         raise ValueError(
-            f"it has {len(hosts)} hosts, {', '.join(sorted(hosts)[:3])}: keep the lines of one"
+            f"the output contains lines of {len(hosts)} hosts, "
+            f"{', '.join(sorted(hosts)[:3])}: keep the lines of only one host"
         )
     return _arrange_probes(
         answers=answers, mentioned=mentioned, first=0, summary=summary, every_s=every_s
@@ -276,17 +277,17 @@ def _arrange_probes(
         end = begin + summary.sent
         if highest >= end:
             raise ValueError(
-                f"its summary counts {summary.sent} packets, but its lines reach number "
-                f"{highest}"
+                f"the summary counts {count_nouns(summary.sent, 'packet')}, but the lines "
+                f"contain sequence numbers up to {highest}"
             )
         if summary.received > len(answers):
             raise ValueError(
-                f"its summary counts {count_nouns(summary.received, 'answer')}, but its lines "
-                f"have {len(answers)}: it was printed with -q, or lines are missing"
+                f"the summary counts {count_nouns(summary.received, 'answer')}, but the lines "
+                f"contain {len(answers)}: ping was run with -q, or lines are missing"
             )
     if end - begin > _MAX_PROBES:
         raise ValueError(
-            f"its summary counts {end - begin} packets, at most {_MAX_PROBES} are read"
+            f"the output covers {end - begin} packets, but at most {_MAX_PROBES} can be read"
         )
 
     numbers = np.arange(begin, end)
@@ -384,13 +385,12 @@ def _read_windows(lines: Sequence[str], every_s: float) -> PingProbes:
         elif (has_header or rtt_ms) and not _WINDOWS_BREAK.fullmatch(line.strip()):
             # a sentence about a missing answer, which ends in a (Chinese or Japanese) full stop
             if not line.endswith((".", "。")):
-                raise ValueError(
-                    f"line {n} is neither an answer nor the sentence of one that is missing"
-                )
+                raise ValueError(f"line {n} reports neither an answer nor a missing answer")
             rtt_ms.append(math.inf)
     if sent is not None and sent != len(rtt_ms):
         raise ValueError(
-            f"its summary counts {sent} packets, but it has lines of {len(rtt_ms)}"
+            f"the summary counts {count_nouns(sent, 'packet')}, but there are lines for "
+            f"{len(rtt_ms)}"
         )
     return PingProbes(
         sent_s=[n * every_s for n in range(len(rtt_ms))],

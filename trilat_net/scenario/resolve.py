@@ -240,7 +240,7 @@ def _resolve_dominance(written: Any, site_names: list[str]) -> TomlTable:
     for name in site_names:
         path = f"dominance.{name}"
         if name not in table:
-            raise ScenarioError("is missing: whom does this site follow?", path=path)
+            raise ScenarioError("is missing; name the sites that this site follows", path=path)
         rows[name] = resolve_dominance_row(table[name], site_names, name, path)
     return rows
 
@@ -364,14 +364,15 @@ def _resolve_user_law(
             key that it must not have.
     """
     if not re.fullmatch(CLASS_PATTERN, code):
-        problem = f"must be as in package.module:Law, is {code!r}"
+        problem = f"must have the form package.module:Law, but is {code!r}"
         raise ScenarioError(problem, path=f"{path}.law")
     inherited = default if default.get("law") == code else {}
     settings = {**inherited, **written}
     settings.pop("law", None)
     if "settings" in settings:
         raise ScenarioError(
-            "the settings of a user's law stand next to its name, as in control.gain = 5",
+            "the settings of a user's law must be written next to the key law, as in "
+            "control.gain = 5",
             path=f"{path}.settings",
         )
     if "sends" in settings:
@@ -420,12 +421,12 @@ def _resolve_sites(tables: TomlTable, draws: Draws, urdf_texts: dict[str, str]) 
     }
     if len(site_tables) > MAX_SITES:
         raise ScenarioError(
-            f"has {count_nouns(len(site_tables), 'site')}, at most {MAX_SITES} are allowed",
+            f"has {count_nouns(len(site_tables), 'site')}, but at most {MAX_SITES} are allowed",
             path="sites",
         )
     if len(site_tables) < 2:
         raise ScenarioError(
-            f"an experiment has at least two sites, this one has {len(site_tables)}",
+            f"an experiment must have at least two sites, but this one has {len(site_tables)}",
             path="sites",
         )
 
@@ -467,8 +468,8 @@ def _join_site_groups(name: str, written: Any, tables: TomlTable) -> TomlTable:
     path = f"sites.{name}"
     if not _SITE_NAME.fullmatch(name) or name in _RESERVED_NAMES:
         raise ScenarioError(
-            "a site's name is lower-case letters, digits and _, beginning with a letter, "
-            f"and not {_RESERVED_NAMES[0]!r}",
+            "the name of a site must consist of lower-case letters, digits and _, begin with "
+            f"a letter, and not be {_RESERVED_NAMES[0]!r}",
             path=path,
         )
     site = dict(check_keys(written, field_names(SiteSpec), path))
@@ -659,7 +660,7 @@ def _resolve_link_inertias(written: Any, draws: Draws, path: str) -> TomlTable:
         inertia = _convert_table(links[name], LinkInertia, link_path)
         if not inertia.list_given_keys():
             keys = ", ".join(field_names(LinkInertia))
-            raise ScenarioError(f"is empty: give {keys}", path=link_path)
+            raise ScenarioError(f"is empty: give at least one of {keys}", path=link_path)
     return links
 
 
@@ -685,7 +686,7 @@ def _list_joint_names(arm_table: TomlTable, urdf_texts: dict[str, str]) -> tuple
     return tuple(joint.name for joint in chain.joints)
 
 
-_BELONGS_TO_CHAIN = "belongs to an arm with a urdf, and this one is planar"
+_BELONGS_TO_CHAIN = "belongs to an arm with a urdf, but this arm is planar"
 
 
 def _model_arm(
@@ -754,17 +755,17 @@ def _check_arm_keys(arm: Arm, table: TomlTable, chains: bool, path: str) -> None
         if key in foreign_keys:
             problem = _BELONGS_TO_CHAIN
             if arm.urdf:
-                problem = f"belongs to the planar arm, and this one is {arm.urdf}"
+                problem = f"belongs to the planar arm, but this arm is {arm.urdf}"
             raise ScenarioError(problem, path=f"{path}.{key}")
     for key in BASE_KEYS:
         if key in table and not chains:
             raise ScenarioError(
                 "has no effect where all arms are planar and share joint angles: "
-                "set task.space, or leave it out",
+                "set task.space, or leave this key out",
                 path=f"{path}.{key}",
             )
     if sum(abs(component) for component in arm.down) < _MIN_DOWN_LENGTH:
-        raise ScenarioError("must point somewhere, is zero", path=f"{path}.down")
+        raise ScenarioError("must be a vector other than zero", path=f"{path}.down")
 
 
 def _check_counts(site: TomlTable, counts: VectorCounts, path: str) -> None:
@@ -818,7 +819,7 @@ def resolve_dominance_row(written: Any, names: list[str], site: str, path: str) 
     row = check_keys(written, names, path)
     for peer, factor in row.items():
         if not is_number(factor):
-            raise ScenarioError(f"must be a number, is {factor!r}", path=f"{path}.{peer}")
+            raise ScenarioError(f"must be a number, but is {factor!r}", path=f"{path}.{peer}")
 
     factors = {name: float(row.get(name, 0.0)) for name in names}
     row_vector = np.array(list(factors.values()))
@@ -932,7 +933,7 @@ def resolve_link(written: Any, base: TomlTable, path: str) -> TomlTable:
     if model != defaults.get("model", model):
         conflict = f"the preset {written['preset']!r} is {defaults['model']!r}"
         raise ScenarioError(
-            f"is {model!r}, but {conflict}: give one of the two", path=f"{path}.model"
+            f"is {model!r}, but {conflict}: give only one of the two", path=f"{path}.model"
         )
 
     file_keys = TRACE_KEYS if model == "trace" else ()
@@ -970,12 +971,15 @@ def _read_trace_file(link: TomlTable, name: str, path: str, folder: Path | None)
     file = link.pop("file", None)
     log_link = link.pop("of", None)
     if "trace" in link and file is not None:
-        raise ScenarioError("give either trace or file", path=f"{path}.file")
+        raise ScenarioError("give either trace or file, not both", path=f"{path}.file")
     if "trace" not in link and file is None:
-        raise ScenarioError("is missing: a table or a log of delays", path=f"{path}.file")
+        raise ScenarioError("is missing; name a table or a log of delays", path=f"{path}.file")
     if file is None:
         if log_link is not None:
-            raise ScenarioError("names a link of the log that file names", path=f"{path}.of")
+            raise ScenarioError(
+                "needs the key file, which must name the log that contains this link",
+                path=f"{path}.of",
+            )
         return link
     if folder is None:
         raise ScenarioError("no file may be named here", path=f"{path}.file")
@@ -1016,17 +1020,21 @@ def resolve_timeline(written: Any, links: TomlTable, names: list[str]) -> list[T
             raise ScenarioError("must be a time in s", path=f"{path}.at_s")
         if at_s < previous_s:
             raise ScenarioError(
-                f"must not be before the change above it, {previous_s:g} s",
+                f"must not be earlier than the previous change, at {previous_s:g} s",
                 path=f"{path}.at_s",
             )
         previous_s = at_s
 
         names_both_or_neither = ("link" in change) == ("dominance" in change)
         if names_both_or_neither:
-            raise ScenarioError("names either a link or, as dominance, a site", path=path)
+            raise ScenarioError(
+                "must name either a link (link = ...) or a site (dominance = ...)", path=path
+            )
         for key in ("link", "dominance"):
             if not isinstance(change.get(key, ""), str):
-                raise ScenarioError(f"must be a name, is {change[key]!r}", path=f"{path}.{key}")
+                raise ScenarioError(
+                    f"must be a name, but is {change[key]!r}", path=f"{path}.{key}"
+                )
 
         change["to"] = resolve_target(change, current_links, names, path)
         if "link" in change:
@@ -1060,7 +1068,7 @@ def resolve_target(
         return _change_link(written, change["link"], current_links, path)
     site = change["dominance"]
     if site not in names:
-        hint = suggest_nearest(site, names) or f"; sites are {', '.join(names)}"
+        hint = suggest_nearest(site, names) or f"; the sites are {', '.join(names)}"
         raise ScenarioError(f"there is no site {site!r}{hint}", path=f"{path}.dominance")
     return resolve_dominance_row(written, names, site, f"{path}.to")
 
@@ -1079,7 +1087,7 @@ def _change_link(written: Any, link: str, current_links: TomlTable, path: str) -
     """
     if link not in current_links:
         names = list(current_links)
-        hint = suggest_nearest(link, names) or f"; links are {', '.join(names)}"
+        hint = suggest_nearest(link, names) or f"; the links are {', '.join(names)}"
         raise ScenarioError(f"there is no link {link!r}{hint}", path=f"{path}.link")
 
     before = current_links[link]
@@ -1089,7 +1097,10 @@ def _change_link(written: Any, link: str, current_links: TomlTable, path: str) -
     if after["model"] == "trace" and after.get("trace") != before.get("trace"):
         raise ScenarioError("a run cannot change to another trace", path=f"{path}.to.model")
     if "outages_s" in written and written["outages_s"] != before.get("outages_s"):
-        raise ScenarioError("belongs to [links], it cannot change", path=f"{path}.to.outages_s")
+        raise ScenarioError(
+            "belongs to [links]; outages cannot be changed during a run",
+            path=f"{path}.to.outages_s",
+        )
 
     after = {**DELAY_MODELS[after["model"]].derive_keys(after), **after}
     if "outages_s" in before:

@@ -84,12 +84,13 @@ def resolve_change(
     change = {**written, "at_s": from_ns / NS_PER_S}
     names_both_or_neither = ("link" in change) == ("dominance" in change)
     if names_both_or_neither:
-        raise ScenarioError("a change names either a link or, as dominance, a site")
+        raise ScenarioError("a change must name either a link (link) or a site (dominance)")
     change["to"] = resolve_target(change, current_links, list(scenario.names), "change")
     # The table of a trace is too long for a record.
     if "link" in change and change["to"]["model"] == "trace":
         raise ScenarioError(
-            "a link with a trace can only be given another model", path="change.to"
+            "a link with a trace can be changed only by setting another model",
+            path="change.to",
         )
 
     try:
@@ -142,8 +143,8 @@ def make_site_order(
     action = scenario.sites[site].on_stale.action
     if action != "glide":
         raise ScenarioError(
-            f"{site} has on_stale.action = {action!r}, and only a site with 'glide' can stop "
-            "and go on without a jump. The whole session ends with trilat stop --end"
+            f"{site} has on_stale.action = {action!r}, but only a site with 'glide' can stop "
+            "and go on without a jump; to end the whole session, use trilat stop --end"
         )
     return Change(at_s=from_ns / NS_PER_S, site=site, order=order, ticks=ticks)
 
@@ -261,7 +262,7 @@ def parse_core_change(scenario: Scenario, site: str, text: str) -> CoreChange:
         change = msgspec.json.decode(text, type=Change)
     except (msgspec.DecodeError, msgspec.ValidationError) as error:
         raise ScenarioError(
-            f"the record names a command that cannot be read: {error}", path=text[:80]
+            f"the record contains a command that cannot be read: {error}", path=text[:80]
         ) from None
     sites = ("", *scenario.names)
     if (
@@ -270,7 +271,8 @@ def parse_core_change(scenario: Scenario, site: str, text: str) -> CoreChange:
         or change.site not in sites
     ):
         raise ScenarioError(
-            "the record names a command for a link or site that does not exist", path=text[:80]
+            "the record contains a command for a link or site that does not exist",
+            path=text[:80],
         )
 
     targets = [name for name in (change.link, change.dominance, change.site) if name]
@@ -278,7 +280,7 @@ def parse_core_change(scenario: Scenario, site: str, text: str) -> CoreChange:
     is_for_site = find_owner(change) == site
     if not is_for_site or len(targets) != 1 or bool(change.site) != is_order:
         raise ScenarioError(
-            f"the record names a command that is not for {site}", path=text[:80]
+            f"the record contains a command that is not for {site}", path=text[:80]
         )
 
     if is_order:

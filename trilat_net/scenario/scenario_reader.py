@@ -64,8 +64,9 @@ def read_shipped(name: str) -> str:
     shipped_names = list_shipped()
     if name not in shipped_names and not (len(name) < _MAX_NAME_LENGTH and file.is_file()):
         raise ScenarioError(
-            f"no scenario of that name{suggest_nearest(name, shipped_names)}; shipped are "
-            f"{', '.join(shipped_names)}; a file is named by its path, as in ./mine.toml",
+            "there is no scenario of that name"
+            f"{suggest_nearest(name, shipped_names)}; the shipped scenarios are "
+            f"{', '.join(shipped_names)}; name a file by its path, as in ./mine.toml",
             source=name,
         )
     return file.read_text(encoding="utf-8")
@@ -266,7 +267,7 @@ def find_site(scenario: Scenario, name: str) -> SiteSpec:
     if name not in scenario.sites:
         hint = suggest_nearest(name, scenario.names)
         raise ScenarioError(
-            f"no site {name!r}{hint}; its sites are {', '.join(scenario.names)}",
+            f"there is no site {name!r}{hint}; the sites are {', '.join(scenario.names)}",
             source=scenario.name,
         )
     return scenario.sites[name]
@@ -310,7 +311,7 @@ def parse_scenario(
         except ScenarioError as error:
             raise ScenarioError(error.problem, path=error.path, source=source) from None
         except RecursionError:
-            raise ScenarioError("is nested too deep", source=source) from None
+            raise ScenarioError("is nested too deeply", source=source) from None
 
 
 def _parse_toml(text: str) -> dict[str, Any]:
@@ -378,7 +379,9 @@ def parse_embedded(text: str, source: str = "") -> Scenario:
     links = [*scenario.links.values(), *changed_links]
     trace_length = sum(len(getattr(link, "trace", "")) for link in links)
     if trace_length > len(text):
-        raise ScenarioError("its traces are not written out, link by link", source=source)
+        raise ScenarioError(
+            "the traces are not written out separately for every link", source=source
+        )
     return scenario
 
 

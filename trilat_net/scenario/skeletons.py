@@ -78,7 +78,7 @@ def _write_skeleton(kind: str, file: Path, *, force: bool) -> list[Path]:
     if file.suffix != ".py" or not is_module_name:
         examples = f"my{kind}.py or my_{kind}.py"
         raise UsageError(
-            f"{file}: a {kind} is in a Python module, whose name is as in {examples}"
+            f"{file}: a {kind} must be in a Python module with a name such as {examples}"
         )
     templates = {
         file: f"_{kind}.txt",
@@ -87,7 +87,7 @@ def _write_skeleton(kind: str, file: Path, *, force: bool) -> list[Path]:
     for new_file in templates:
         refuse_existing(new_file, force=force)
     if _is_other_module(module, file):
-        raise UsageError(f"{file}: Python has a module {module} already; choose another name")
+        raise UsageError(f"{file}: Python already has a module {module}; choose another name")
     for new_file, template in templates.items():
         text = (SHIPPED_FOLDER / template).read_text(encoding="utf-8")
         text = text.replace(f"My{kind.title()}", name_skeleton_class(module, kind))

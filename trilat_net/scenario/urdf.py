@@ -375,7 +375,9 @@ def _parse_xml(text: str) -> Element:
     """
     if len(text) > MAX_CHARACTERS:
         _refuse(
-            "", f"has {count_nouns(len(text), 'character')}, at most {MAX_CHARACTERS} are read"
+            "",
+            f"has {count_nouns(len(text), 'character')}, but at most {MAX_CHARACTERS} can be "
+            "read",
         )
     for declaration in ("<!DOCTYPE", "<!ENTITY"):
         if declaration in text:
@@ -401,7 +403,7 @@ def _parse_xml(text: str) -> Element:
             )
     if root.tag != "robot":
         tag = root.tag[:_MAX_QUOTED_LENGTH]
-        _refuse("", f"its root element is <{tag}>, that of URDF is <robot>")
+        _refuse("", f"the root element must be <robot>, not <{tag}>")
     return root
 
 
@@ -425,7 +427,7 @@ def _name_elements(root: Element, tag: str) -> dict[str, Element]:
         if name in elements:
             _refuse(
                 f"{tag} {_quote(name)}",
-                f"there are two of that name: give every {tag} its own",
+                f"there are two of this name: give every {tag} its own name",
             )
         elements[name] = element
     return elements
@@ -463,7 +465,8 @@ def _read_tree(root: Element) -> _Robot:
         if name not in rooted_links:
             _refuse(
                 _link(name),
-                f"hangs on itself by {_joint(above[name].name)}: joints may not form a loop",
+                f"hangs on itself through {_joint(above[name].name)}: joints must not form a "
+                "loop",
             )
     if not links:
         _refuse("", "has no links")
@@ -482,7 +485,10 @@ def _read_edge(name: str, element: Element, links: Mapping[str, Element]) -> _Ed
     kind = element.get("type", "")
     if kind not in _KINDS:
         hint = suggest_nearest(kind, _KINDS)
-        _refuse(subject, f"is of type {_quote(kind)}, must be one of {', '.join(_KINDS)}{hint}")
+        _refuse(
+            subject,
+            f"is of type {_quote(kind)}, but must be one of {', '.join(_KINDS)}{hint}",
+        )
     ends = []
     for tag in ("parent", "child"):
         end_element = _child(element, tag, subject)
@@ -491,7 +497,7 @@ def _read_edge(name: str, element: Element, links: Mapping[str, Element]) -> _Ed
             hint = suggest_nearest(end, list(links))
             _refuse(
                 subject,
-                f"its <{tag}> is {_link(end)}, and there is no link of that name{hint}",
+                f"its <{tag}> is {_link(end)}, but there is no link of that name{hint}",
             )
         ends.append(end)
     return _Edge(name=name, kind=kind, parent=ends[0], child=ends[1], element=element)
@@ -542,7 +548,8 @@ def _find_base(robot: _Robot) -> str:
     if len(roots) > 1:
         _refuse(
             f"links {_list_names(roots)}",
-            "hang on no joint: connect them, or name the one that the arm stands on as base",
+            "do not hang on a joint: connect these links, or name the link on which the arm "
+            "stands as base",
         )
     return roots[0]
 
@@ -561,8 +568,8 @@ def _find_tip(robot: _Robot, base: str) -> str:
     if len(leaves) > 1:
         _refuse(
             "",
-            f"the arm may end at links {_list_names(leaves)}: name one of them, or a link "
-            "before, as tip",
+            f"the arm may end at links {_list_names(leaves)}: name one of these links, or a "
+            "link before them, as tip",
         )
     return leaves[0]
 
@@ -594,22 +601,22 @@ def _find_path(robot: _Robot, base: str, tip: str) -> list[_Edge]:
         if edge.kind in ("floating", "planar"):
             _refuse(
                 _joint(edge.name),
-                f"is {edge.kind}: joints of an arm are revolute, continuous, prismatic or "
-                f"fixed; give a base behind it, such as {_quote(edge.child)}",
+                f"is {edge.kind}: joints of an arm must be revolute, continuous, prismatic or "
+                f"fixed; choose a base behind this joint, such as {_quote(edge.child)}",
             )
         if edge.element.find("mimic") is not None:
             _refuse(
                 _joint(edge.name),
-                "follows another joint (<mimic>), which has no torque of its own: make it "
-                f"fixed, or give a tip before it, such as {_quote(edge.parent)}",
+                "follows another joint (<mimic>) and has no torque of its own: make this joint "
+                f"fixed, or choose a tip before the joint, such as {_quote(edge.parent)}",
             )
 
     moving = sum(edge.moves for edge in path)
     if not 1 <= moving <= MAX_JOINTS:
         _refuse(
             f"base {_link(base)}, tip {_link(tip)}",
-            f"{count_nouns(moving, 'joint moves', 'joints move')} between them, must be 1 "
-            f"to {MAX_JOINTS}: name others",
+            f"{count_nouns(moving, 'joint moves', 'joints move')} between these links, but 1 "
+            f"to {MAX_JOINTS} joints must move: choose other links",
         )
     # The path was followed from the tip to the base.
     return path[::-1]
@@ -826,8 +833,8 @@ def _read_friction(edge: _Edge, subject: str) -> tuple[float, float]:
             if friction[n] < 0.0:
                 _refuse(
                     subject,
-                    f"its {key} is {friction[n]:g}, must not be negative: it would drive the "
-                    "joint",
+                    f"its {key} must not be negative, but is {friction[n]:g}: a negative value "
+                    "would drive the joint",
                 )
     return friction[0], friction[1]
 
@@ -874,8 +881,8 @@ def _read_limits(edge: _Edge, subject: str, notes: list[str]) -> _JointLimits:
     if min(effort, velocity) < 0.0:
         _refuse(
             subject,
-            f"its limits of effort and velocity are {effort:g} and {velocity:g}, must be "
-            "positive",
+            "its limits of effort and velocity must not be negative, but are "
+            f"{effort:g} and {velocity:g}",
         )
 
     unstated = [
@@ -891,7 +898,7 @@ def _read_limits(edge: _Edge, subject: str, notes: list[str]) -> _JointLimits:
 
     if lower > upper:
         _refuse(
-            subject, f"its lower limit is {lower:g}, must be below the upper one, {upper:g}"
+            subject, f"its lower limit, {lower:g}, must be below the upper limit, {upper:g}"
         )
     if lower == upper:
         _refuse(
@@ -915,7 +922,7 @@ def _child(element: Element, tag: str, subject: str) -> Element | None:
     """
     children = element.findall(tag)
     if len(children) > 1:
-        _refuse(subject, f"has {len(children)} <{tag}>: keep one")
+        _refuse(subject, f"has {len(children)} <{tag}>: keep only one of them")
     return children[0] if children else None
 
 
@@ -952,11 +959,11 @@ def _parse_number(text: str, attribute: str, subject: str, limit: float) -> floa
     stripped = text.strip() if len(text) <= MAX_NUMBER_LENGTH else ""
     value = float(stripped) if _NUMBER.fullmatch(stripped) else math.nan
     if not math.isfinite(value):
-        _refuse(subject, f"its <{attribute}> is {_quote(text)}, must be a finite number")
+        _refuse(subject, f"its <{attribute}> must be a finite number, not {_quote(text)}")
     if abs(value) > limit:
         _refuse(
             subject,
-            f"its <{attribute}> is {value:g}, must be at most {limit:g} (kg, m and rad)",
+            f"its <{attribute}> must be at most {limit:g} (kg, m and rad), but is {value:g}",
         )
     return value
 
@@ -970,7 +977,7 @@ def _read_vector(
     if len(texts) != 3:
         _refuse(
             subject,
-            f"its <{attribute}> has {count_nouns(len(texts), 'number')}, must have three",
+            f"its <{attribute}> must have three numbers, but has {len(texts)}",
         )
     x, y, z = (_parse_number(text, attribute, subject, limit) for text in texts)
     return x, y, z
@@ -991,8 +998,8 @@ def _read_origin(parent: Element, subject: str) -> _Pose:
     if unknown_keys:
         _refuse(
             subject,
-            f"its <origin> has {_quote(min(unknown_keys))}: a frame is given by xyz and rpy "
-            "alone",
+            f"its <origin> has {_quote(min(unknown_keys))}, but a frame may have only xyz and "
+            "rpy",
         )
     offset = _ORIGIN
     if "xyz" in origin.attrib:
@@ -1052,7 +1059,8 @@ def _read_inertial(link: Element, name: str, supplied: LinkInertia | None) -> _I
         other_keys = supplied.list_given_keys()[1:]
         if other_keys:
             raise ScenarioError(
-                "is of a link without mass: leave it out", path=f"{_key(name)}.{other_keys[0]}"
+                "belongs to a link without mass: leave this key out",
+                path=f"{_key(name)}.{other_keys[0]}",
             )
         return None
     if inertial is None and supplied.mass_kg is None:
@@ -1119,9 +1127,9 @@ def _find_mass_problem(inertial: _Inertial) -> str:
     if inertial.lacks == "mass":
         return "its <inertial> has no <mass>"
     if inertial.mass < 0.0:
-        return f"its mass is {inertial.mass:g} kg, must not be negative"
+        return f"its mass must not be negative, but is {inertial.mass:g} kg"
     if inertial.mass == 0.0 and any(map(any, inertial.tensor)):
-        return "has moments of inertia and no mass: give both, or neither"
+        return "has moments of inertia but no mass: give both, or neither"
     return ""
 
 
@@ -1175,9 +1183,9 @@ def _find_moments_problem(moments: Sequence[float], bound: float, slack: float) 
         "kg m^2"
     )
     if smallest < bound:
-        return f"{stated}, and all must be positive"
+        return f"{stated}, but all must be positive"
     if largest - smallest - middle > slack:
-        return f"{stated}, and none of a body's moments exceeds the sum of the other two"
+        return f"{stated}, but no moment of a body exceeds the sum of the other two"
     return ""
 
 
@@ -1232,7 +1240,9 @@ def _lump_bodies(edge: _Edge, bodies: Sequence[_LinkBody], notes: list[str]) -> 
     subject = f"{_link(edge.child)}, which {_joint(edge.name)} moves"
     if not bodies:
         advice = f"give mass_kg and inertia_kg_m2 in [arm.{_key(edge.child)}]"
-        _refuse(subject, f"has no <inertial>, and nothing fixed to it has one; {advice}")
+        _refuse(
+            subject, f"has no <inertial>, and no link fixed to it has an <inertial>; {advice}"
+        )
 
     total = _add_bodies([body.body for body in bodies])
     problem = _find_sum_problem(total)
@@ -1270,7 +1280,10 @@ def _find_sum_problem(total: BodyParameters) -> str:
     """
     mass = total[0]
     if mass < LEAST_MASS_KG:
-        return f"has {mass:g} kg with all that is fixed to it, and a body that moves needs mass"
+        return (
+            f"has {mass:g} kg, including all links that are fixed to it, but a body that moves "
+            "needs mass"
+        )
     x, y, z = (moment / mass for moment in total[1:4])
     # A body of negative mass moves the tensor back to the centre of mass.
     about_centre = _move_body(

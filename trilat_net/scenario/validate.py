@@ -65,8 +65,8 @@ def refuse_external_arms(scenario: Scenario, exempt: Collection[str] = ()) -> No
         )
         if name in scenario.outside:
             problem = (
-                "is external: that arm is outside of the program, and such a scenario runs "
-                "live only; plant = 'simulated' runs it in virtual time"
+                "is external: a scenario with an external arm can only run live; set plant = "
+                "'simulated' to run the scenario in virtual time"
             )
         raise ScenarioError(problem, path=f"sites.{name}.plant", source=scenario.name)
 
@@ -96,7 +96,7 @@ def check_outside_arms(scenario: Scenario) -> None:
         for key in OUTSIDE_LIMITS:
             if getattr(site.limits, key) is None:
                 raise ScenarioError(
-                    "is missing: an arm outside of the program needs limits of its position "
+                    "is missing: an external arm needs limits of its position "
                     "(q_min_rad, q_max_rad), its reference (qd_des_limit_rad_s) and the rate "
                     "of its torque (tau_rate_limit_nm_s), besides tau_limit_nm and "
                     "qd_limit_rad_s",
@@ -105,8 +105,8 @@ def check_outside_arms(scenario: Scenario) -> None:
                 )
         if site.on_stale.action != "glide":
             raise ScenarioError(
-                f"is {site.on_stale.action!r}, and an arm outside of the program needs "
-                "'glide': its site then waits, holds and stops without a jump "
+                f"is {site.on_stale.action!r}, but an external arm needs 'glide', so that its "
+                "site waits, holds and stops without a jump "
                 f"({find_page('links.md')})",
                 path=f"sites.{name}.on_stale.action",
                 source=scenario.name,
@@ -130,8 +130,9 @@ def refuse_live_only(scenario: Scenario) -> None:
         measured_links = [name for name, link in scenario.links.items() if link.measured]
         path = f"links.{measured_links[0]}.model" if measured_links else "timeline"
         raise ScenarioError(
-            "is measured: that is the delay of a real network, and such a scenario runs live "
-            "only; give it a model, as in link.model=constant and link.delay_ms=50",
+            "is 'measured', the delay of a real network: a scenario with such a link can only "
+            "run live; to run the scenario here, set another model, as in link.model=constant "
+            "and link.delay_ms=50",
             path=path,
             source=scenario.name,
         )
@@ -157,8 +158,8 @@ def check_law(name: str, site: SiteSpec, sites: int) -> None:
     law.check(f"{path}.control", sites)
     if law.plugged and site.task.space != "joints":
         raise ScenarioError(
-            f"{law.tag} compares joint by joint, and the space of this task is "
-            f"{site.task.space!r}: choose adaptive, p_d, pd_d or p_f there",
+            f"{law.tag} compares arms joint by joint, but the space of this task is "
+            f"{site.task.space!r}: choose adaptive, p_d, pd_d or p_f",
             path=f"{path}.control.law",
         )
 
@@ -167,9 +168,10 @@ def check_law(name: str, site: SiteSpec, sites: int) -> None:
     feeds_gravity = getattr(law, "gravity", 0.0) * site.arm.g_m_s2 > 0.0
     if not site.arm.known and not learns_arm and feeds_gravity:
         raise ScenarioError(
-            f"{law.tag} takes gravity from the arm's masses, which are unknown (arm.known = "
-            "false): set gravity = 0 if the arm carries itself, arm.g_m_s2 = 0 if it moves in "
-            "a horizontal plane, or choose adaptive, which learns it",
+            f"{law.tag} computes gravity from the arm's masses, which are unknown (arm.known = "
+            "false): set gravity = 0 if the arm compensates gravity itself, set arm.g_m_s2 = 0 "
+            "if the arm moves in a horizontal plane, or choose adaptive, which estimates "
+            "gravity",
             path=f"{path}.control.gravity",
         )
 
@@ -184,14 +186,14 @@ def _check_plant(path: str, site: SiteSpec) -> None:
     external = site.plant != "simulated"
     if not site.arm.known and not external:
         raise ScenarioError(
-            "a simulated arm moves by its masses: leave it true, or set plant = 'external' for "
-            "an arm outside of the program",
+            "the masses of a simulated arm are always known: leave this key true, or set plant "
+            "= 'external' for an external arm",
             path=f"{path}.arm.known",
         )
     if site.arm.dead_man and site.plant != "external":
         raise ScenarioError(
-            "is for an arm outside of the program (plant = 'external'): nobody is near a "
-            "simulated one",
+            "applies only to an external arm (plant = 'external'): nobody is near a simulated "
+            "arm",
             path=f"{path}.arm.dead_man",
         )
     if not external:
@@ -199,8 +201,8 @@ def _check_plant(path: str, site: SiteSpec) -> None:
     for group in ("hands", "environment"):
         if getattr(site, group):
             raise ScenarioError(
-                "an arm that is outside of the program, or a user's own plant, is pushed "
-                "there: leave them out",
+                "applies only to a simulated arm: forces on an external arm, or on a user's "
+                "own plant, act outside the program; leave this list out",
                 path=f"{path}.{group}",
             )
 
@@ -320,13 +322,13 @@ def _check_joint_space(scenario: Scenario) -> None:
     for name, joints in joint_counts.items():
         if spaces[name] != spaces[first]:
             raise ScenarioError(
-                f"is {spaces[name]!r}, and that of {first} is {spaces[first]!r}: all sites "
-                "share one space",
+                f"is {spaces[name]!r}, but the space of {first} is {spaces[first]!r}: all "
+                "sites must use the same space",
                 path=f"sites.{name}.task.space",
             )
         if spaces[name] == "joints" and joints != joint_counts[first]:
             raise ScenarioError(
-                f"its arm has {count_nouns(joints, 'joint')}, and that of {first} has "
+                f"has {count_nouns(joints, 'joint')}, but the arm of {first} has "
                 f"{joint_counts[first]}: joint angles are compared one by one, so all arms "
                 "need the same number of joints, or a task (task.space)",
                 path=f"sites.{name}.arm",
@@ -334,8 +336,8 @@ def _check_joint_space(scenario: Scenario) -> None:
         law = scenario.sites[name].control
         if scenario.arms[name].chain is not None and law.planar:
             raise ScenarioError(
-                f"{law.tag} has the regressor of the planar arm of two links, and this arm is "
-                "a chain: choose adaptive",
+                f"{law.tag} uses the regressor of the planar two-link arm, but this arm is a "
+                "chain: choose adaptive",
                 path=f"sites.{name}.control.law",
             )
 
@@ -353,7 +355,9 @@ def _check_links(scenario: Scenario) -> None:
             raise ScenarioError(problem.problem, path=f"{path}.{problem.key}")
         if path in views and link.measured:
             raise ScenarioError(
-                "is 'measured', and no network carries a picture", path=f"{path}.model"
+                "cannot be 'measured': pictures are not sent over the network, so their delay "
+                "cannot be measured",
+                path=f"{path}.model",
             )
 
 
@@ -388,9 +392,9 @@ def _check_damping(scenario: Scenario) -> None:
             worst = int(np.argmax(np.abs(modes[:, -1])))
             raise ScenarioError(
                 f"damps joint {model.joint_names[worst]} by {damping[worst]:g} N m s/rad in "
-                f"all, {ratio / limit:.3g} times what its inertia can take at {site.rate_hz} "
-                "Hz: lower Kp, Kd or d there, raise rate_hz, or state the drive's "
-                "armature_kg_m2",
+                f"total, {ratio / limit:.3g} times what the inertia of the joint allows at "
+                f"{site.rate_hz} Hz: lower Kp, Kd or d of this joint, raise rate_hz, or state "
+                "the drive's armature_kg_m2",
                 path=f"sites.{name}.control",
             )
 
@@ -408,8 +412,9 @@ def _check_received(scenario: Scenario) -> None:
                 first, first_length = first_senders.setdefault(name, (peer, length))
                 if first_length != length:
                     raise ScenarioError(
-                        f"has {count_nouns(length, 'number')}, and {name} of {first} has "
-                        f"{first_length}; {site} gets both: give them one length or two names",
+                        f"has {count_nouns(length, 'number')}, but {name} of {first} has "
+                        f"{first_length}, and {site} receives both: give the two vectors the "
+                        "same length or different names",
                         path=f"sites.{peer}.control.sends.{name}",
                     )
 
@@ -450,7 +455,7 @@ def _check_energy_law(
             )
     if scheme not in law.kind.schemes:
         raise ScenarioError(
-            f"is {scheme!r}, and {tag} computes energies for a torque that is held during a "
+            f"is {scheme!r}, but {tag} computes energies for a torque that is held during a "
             "tick: choose 'digital'",
             path="scheme",
         )
@@ -482,7 +487,7 @@ def _check_start_poses(scenario: Scenario) -> None:
             raise ScenarioError(
                 f"is {start:g} {unit}{drawn}, beyond a stop of joint {model.joint_names[n]}, "
                 f"which moves from {joint.lower:g} to {joint.upper:g} {unit}: start at most "
-                f"{start_margin(joint):g} {unit} beyond, or set stops = false",
+                f"{start_margin(joint):g} {unit} beyond the stop, or set stops = false",
                 path=path,
             )
 
@@ -503,12 +508,12 @@ def _check_limits(scenario: Scenario, name: str) -> None:
     for key in ("q_min_rad", "q_max_rad"):
         if getattr(site.limits, key) is not None and site.on_stale.action != "glide":
             raise ScenarioError(
-                "applies only with on_stale.action = 'glide', and here that is "
+                "applies only with on_stale.action = 'glide', but the action is "
                 f"{site.on_stale.action!r}",
                 path=f"{path}.{key}",
             )
     if not np.all(np.less(low, high)):
-        raise ScenarioError("must be above q_min_rad everywhere", path=f"{path}.q_max_rad")
+        raise ScenarioError("must be above q_min_rad for every joint", path=f"{path}.q_max_rad")
 
     # `low` and `high` already include the margin for a start beyond the written limits.
     start = np.array(site.q0_rad)
@@ -516,8 +521,9 @@ def _check_limits(scenario: Scenario, name: str) -> None:
     if np.any(is_beyond):
         joint = int(np.argmax(is_beyond))
         raise ScenarioError(
-            f"is {start[joint]:g} rad, beyond q_min_rad or q_max_rad: start at most "
-            f"{START_MARGIN_RAD:g} rad ({START_MARGIN_M:g} m of a sliding joint) beyond",
+            f"is {start[joint]:g} rad, outside the limits q_min_rad and q_max_rad: start at "
+            f"most {START_MARGIN_RAD:g} rad (for a sliding joint, {START_MARGIN_M:g} m) "
+            "outside the limits",
             path=f"sites.{name}.q0_rad[{joint}]",
         )
 
@@ -555,7 +561,8 @@ def _check_task_pose(scenario: Scenario, name: str) -> None:
         if np.abs(row).max() < RANK_TOLERANCE:
             raise ScenarioError(
                 f"has {axis}, along which no joint moves the end effector from its start pose: "
-                "name the axes that the site shall follow, or start elsewhere (q0_rad)",
+                "name only axes that the site can follow, or choose another start pose "
+                "(q0_rad)",
                 path=path,
             )
     if len(followed) > joints:
@@ -574,7 +581,7 @@ def _check_task_pose(scenario: Scenario, name: str) -> None:
             if abs(component) > RANK_TOLERANCE
         )
         raise ScenarioError(
-            f"is a singular pose: its end effector cannot move along {lost_direction}; bend a "
+            f"is a singular pose: the end effector cannot move along {lost_direction}; bend a "
             "joint, or follow fewer axes (task.axes)",
             path=f"sites.{name}.q0_rad",
         )
@@ -611,19 +618,20 @@ def _check_hands(site: SiteSpec, path: str) -> None:
     ]
     if live_indices and site.plant != "simulated":
         raise ScenarioError(
-            "is a live hand, and the arm is outside of the program, or a user's own plant: the "
-            "torque of a person who holds such an arm is measured, as tau_x",
+            "cannot be a live hand, because the arm is external or simulated by a user's own "
+            "plant: the torque of a person who holds such an arm is measured, as tau_x",
             path=f"{path}[{live_indices[0]}].kind",
         )
     if len(live_indices) > 1:
         raise ScenarioError(
-            f"is a second live hand besides {path}[{live_indices[0]}]; an arm has one",
+            f"is a second live hand besides {path}[{live_indices[0]}]; an arm can have only "
+            "one live hand",
             path=f"{path}[{live_indices[1]}].kind",
         )
     for n, hand in enumerate(site.hands):
         if isinstance(hand, ProgramHand) and site.rate_hz % hand.rate_hz:
             raise ScenarioError(
-                f"must divide the site's tick rate, {site.rate_hz} Hz, is {hand.rate_hz}",
+                f"must divide the site's tick rate, {site.rate_hz} Hz, but is {hand.rate_hz}",
                 path=f"{path}[{n}].rate_hz",
             )
 
@@ -645,9 +653,9 @@ def check_links_memory(scenario: Scenario, site: str) -> None:
     size_bytes = links_bytes(setup, needed_pages(setup))
     if size_bytes > MAX_LINKS_BYTES:
         raise ScenarioError(
-            f"its links would take {size_bytes / 2**20:.0f} MiB, at most "
+            f"the links of this site would need {size_bytes / 2**20:.0f} MiB, but at most "
             f"{MAX_LINKS_BYTES >> 20} MiB are allowed: shorten the delays, lower rate_hz, or "
-            "have fewer sites",
+            "use fewer sites",
             path=f"sites.{site}",
         )
 
@@ -671,7 +679,7 @@ def _check_stale_rules(scenario: Scenario) -> None:
         if rule.action == "glide" and rule.silence_ms < 2e3 / slowest_hz:
             raise ScenarioError(
                 f"must be at least {2e3 / slowest_hz:g} ms, two periods of {slowest_hz} Hz, "
-                f"is {rule.silence_ms:g}",
+                f"but is {rule.silence_ms:g}",
                 path=f"sites.{name}.on_stale.silence_ms",
             )
 
@@ -685,8 +693,8 @@ def _check_stale_rules(scenario: Scenario) -> None:
             follows = scenario.dominance[name].get(peer, 0.0) > 0.0
             if follows and delay_ms >= rule.age_ms:
                 raise ScenarioError(
-                    f"must be above the {delay_ms:g} ms of {peer}->{name}, is {rule.age_ms:g}: "
-                    f"the site would never follow {peer}",
+                    f"must be above the delay of {peer}->{name}, {delay_ms:g} ms, but is "
+                    f"{rule.age_ms:g}: otherwise the site would never follow {peer}",
                     path=f"sites.{name}.on_stale.age_ms",
                 )
 
@@ -711,9 +719,9 @@ def _check_lost(scenario: Scenario) -> None:
             )
     if degrading and not any(_can_lose_master(scenario, name) for name in degrading):
         raise ScenarioError(
-            "no master can be lost: a site goes on without a master only if it follows another "
-            "site as well, and if the remaining sites all reach each other (through shares "
-            "above 0)",
+            "degrade has no effect, because no site can go on without a master: that is "
+            "possible only if the site also follows another site, and if the remaining sites "
+            "all reach each other (through shares above 0)",
             path=f"sites.{degrading[0]}.on_stale.on_lost",
         )
 
@@ -780,7 +788,7 @@ def _reword(problem: str, path: str) -> str:
     if problem.startswith("Invalid enum value"):
         value = problem.removeprefix("Invalid enum value ")
         choices = _CHOICES[path.rpartition(".")[2]]
-        return f"is {value}, must be {' or '.join(map(repr, choices))}"
+        return f"is {value}, but must be {' or '.join(map(repr, choices))}"
     if problem.startswith("Object missing required field"):
         return f"{problem.split()[-1].strip('`')} is missing"
     return reword_problem(problem)

@@ -159,7 +159,7 @@ def test_an_undecided_cell_may_run_eight_times_as_long(tmp_path: Path) -> None:
         (["control.d=-1:1:0.5"], ("d[0]", ">= 0")),
         (
             ["sites.s.environment.0.stiffness_n_m=1,2"],
-            ("sites.s.environment.0: no such entry",),
+            ("sites.s.environment.0: there is no such entry",),
         ),
         (["link.delay_ms=0,1", "link.delay_ms=2,3"], ("link.delay_ms: is swept twice",)),
     ],
@@ -183,9 +183,9 @@ def test_a_key_that_nothing_follows_is_refused(tmp_path: Path) -> None:
 def test_a_scenario_that_is_live_only_is_refused() -> None:
     outside = refused("paper", "sites.s.plant=external", over=["control.Kd=1,2"])
     assert "paper: sites.s.plant: is external" in outside
-    assert "live only" in outside
+    assert "only run live" in outside
     measured = refused("paper", "link.model=measured", over=["control.Kd=1,2"])
-    assert "model: is measured: that is the delay of a real network" in measured
+    assert "model: is 'measured', the delay of a real network" in measured
     assert "link.model=constant" in measured
 
 

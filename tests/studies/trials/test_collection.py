@@ -394,7 +394,7 @@ def test_any_metric_may_be_expected_of_run_and_log() -> None:
         ),
         (
             {"chatter_nm": [2, 1]},
-            r"expect.metrics.chatter_nm: must be \[least, most\], is \[2, 1\]",
+            r"expect.metrics.chatter_nm: must be \[least, most\], but is \[2, 1\]",
         ),
         ({"chatter_nm": 1}, "expect.metrics"),
     ],

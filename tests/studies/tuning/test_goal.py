@@ -117,7 +117,7 @@ def test_two_hands_that_disagree_are_refused_with_the_site() -> None:
     [
         (
             "link.model=measured",
-            "links.m2->m1.model: is measured: that is the delay of a real network",
+            "links.m2->m1.model: is 'measured', the delay of a real network",
         ),
         (
             "task.space=position",
@@ -125,7 +125,7 @@ def test_two_hands_that_disagree_are_refused_with_the_site() -> None:
         ),
         (
             "sites.m2.plant=external",
-            "sites.m2.plant: is external: that arm is outside of the program",
+            "sites.m2.plant: is external: a scenario with an external arm can only run live",
         ),
     ],
 )

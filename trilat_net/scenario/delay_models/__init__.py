@@ -232,14 +232,14 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
 
         for n, (start_s, end_s) in enumerate(self.outages_s):
             if end_s <= start_s:
-                problem = f"must end after it begins, reads {start_s:g} to {end_s:g}"
+                problem = f"must end after its start, but is {start_s:g} to {end_s:g}"
                 return KeyProblem(f"outages_s[{n}]", problem)
         reach_ms = self._reach_ms()
         if reach_ms > MAX_DELAY_MS:
             return KeyProblem(
                 "model",
-                f"its delays reach {reach_ms:g} ms; beyond {MAX_DELAY_MS:g} ms they would be "
-                "cut off",
+                f"the delays reach {reach_ms:g} ms, but delays above {MAX_DELAY_MS:g} ms would "
+                "be cut off",
             )
         if self.loss_burst and self.loss:
             return self._find_burst_problem()
@@ -253,12 +253,12 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         """
         if self.loss_burst < 1.0:
             return KeyProblem(
-                "loss_burst", f"must be 0 or at least 1 sample, is {self.loss_burst:g}"
+                "loss_burst", f"must be 0 or at least 1 sample, but is {self.loss_burst:g}"
             )
         if self.loss >= self.loss_bad:
             return KeyProblem(
                 "loss",
-                f"must be below loss_bad = {self.loss_bad:g} in bursts, is {self.loss:g}",
+                f"must be below loss_bad = {self.loss_bad:g} in bursts, but is {self.loss:g}",
             )
 
         chain = self._loss_chain()

@@ -146,7 +146,7 @@ class MeanDeviationDelay(LinkBase, frozen=True, kw_only=True):
             return None
         return KeyProblem(
             "deviation_ms",
-            f"must be from 1/1000 to 10 times delay_ms = {delay_ms:g}, is {deviation_ms:g}",
+            f"must be from 1/1000 to 10 times delay_ms = {delay_ms:g}, but is {deviation_ms:g}",
         )
 
 

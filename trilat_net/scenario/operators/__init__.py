@@ -98,12 +98,12 @@ class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
         """
         normal = getattr(self, "normal", (1.0,))
         if math.hypot(*normal) < 1e-6:
-            return fields.KeyProblem("normal", "must point somewhere, is zero")
+            return fields.KeyProblem("normal", "must be a vector other than zero")
         start_s = getattr(self, "start_s", 0.0)
         end_s = getattr(self, "end_s", fields.MAX_QUANTITY)
         if end_s <= start_s:
             return fields.KeyProblem(
-                "end_s", f"must be later than start_s = {start_s:g}, is {end_s:g}"
+                "end_s", f"must be later than start_s = {start_s:g}, but is {end_s:g}"
             )
         return None
 
@@ -280,12 +280,14 @@ def _find_kind(
         ScenarioError: The key is missing or wrong, or the kind belongs to the other list.
     """
     if "kind" not in entry:
-        raise ScenarioError(f"is missing: {' or '.join(map(repr, kinds))}", path=f"{path}.kind")
+        raise ScenarioError(
+            f"is missing; give {' or '.join(map(repr, kinds))}", path=f"{path}.kind"
+        )
     kind = entry["kind"]
     for group, group_kinds in (("hands", OPERATORS), ("environment", ENVIRONMENTS)):
         is_of_group = isinstance(kind, str) and kind in group_kinds
         if is_of_group and kind not in kinds:
-            raise ScenarioError(f"is {kind!r}, which belongs in {group}", path=f"{path}.kind")
+            raise ScenarioError(f"is {kind!r}, which belongs to {group}", path=f"{path}.kind")
     fields.check_choice(kind, list(kinds), f"{path}.kind")
     return kinds[kind]
 
@@ -326,7 +328,9 @@ def _check_values(
     missing = re.search(r"missing required field `(\w+)`", problem)
     if missing is not None:
         key = missing[1]
-        raise ScenarioError(f"is missing: {describe_values(key)}", path=f"{path}.{key}")
+        raise ScenarioError(
+            f"is missing; the value must be {describe_values(key)}", path=f"{path}.{key}"
+        )
 
     # The location is, for example, `$.points[3][1]`.
     match = re.match(r"`\$\.(\w+)(.*)`", location)
@@ -339,7 +343,7 @@ def _check_values(
             expected = f"a row {POINTS_ROW_TEXT.format(**placeholders)}"
         raise ScenarioError(f"must be {expected}", path=f"{path}.{key}{index_text}")
     value = repr(entry[key])
-    quoted = f", is {value}" if len(value) <= _MAX_QUOTED_LENGTH else ""
+    quoted = f", but is {value}" if len(value) <= _MAX_QUOTED_LENGTH else ""
     raise ScenarioError(f"must be {describe_values(key)}{quoted}", path=f"{path}.{key}")
 
 

@@ -141,7 +141,8 @@ class MovingSpring(ActorBase, frozen=True, kw_only=True):
             return problem
         return fields.KeyProblem(
             "move_end_s",
-            f"must not be before move_start_s = {self.move_start_s:g}, is {self.move_end_s:g}",
+            f"must not be before move_start_s = {self.move_start_s:g}, but is "
+            f"{self.move_end_s:g}",
         )
 
     def _source(self) -> TorqueSource:
@@ -284,7 +285,7 @@ class Multisine(TimedActor, frozen=True, tag="multisine"):
         count = len(self.frequencies_hz)
         if len(self.phases_rad) not in (0, count):
             return fields.KeyProblem(
-                "phases_rad", f"must be {count_nouns(count, 'angle')}, as many as frequencies"
+                "phases_rad", f"must be {count_nouns(count, 'angle')}, one for each frequency"
             )
         return super().find_problem()
 
@@ -419,8 +420,8 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
             if key in entry:
                 other_mode = next(name for name, keys in LIVE_KEYS.items() if key in keys)
                 raise ScenarioError(
-                    f"belongs to a live hand of mode {other_mode!r}; this one is of mode "
-                    f"{mode!r}, which has {', '.join(mode_keys)}",
+                    f"applies only to a live hand with mode {other_mode!r}; this hand has mode "
+                    f"{mode!r}, which uses {', '.join(mode_keys)}",
                     path=f"{path}.{key}",
                 )
             del table[key]
@@ -496,9 +497,9 @@ def _check_frame(frame: list[Any], axes: int, path: str) -> None:
     if not len(frame) == axes == len(lines):
         expected = (
             f"one of {', '.join(DIRECTIONS)} for each of {count_nouns(axes, 'axis')}, and no "
-            "two of one line"
+            "two directions on the same line"
         )
-        raise ScenarioError(f"must be {expected}, is {frame}", path=path)
+        raise ScenarioError(f"must be {expected}, but is {frame}", path=path)
 
 
 LIVE_KEYS = {
