@@ -181,7 +181,7 @@ def test_all_keys_that_contradict_a_session_are_named_at_once() -> None:
     assert message.startswith(f"{SOURCE}: {len(WRONG) + 2} settings cannot be accepted: ")
     assert [key for key in WRONG if f"{key}: " not in message] == []
     assert "root_ca_certificate: /nowhere.pem cannot be read" in message
-    assert "access_control: has no `enabled: true`" in message
+    assert "access_control: must have `enabled: true`" in message
 
 
 def test_all_keys_that_zenoh_refuses_are_named_at_once(tmp_path: Path) -> None:
@@ -273,7 +273,7 @@ def test_certificate_that_cannot_be_read_is_said_before_anything_begins(tmp_path
         ),
         (
             "{access_control: {default_permission: 'deny'}}",
-            "access_control: has no `enabled: true`",
+            "access_control: must have `enabled: true`",
         ),
         (
             "{transport: {link: {tx: {lease: 500}}}}",

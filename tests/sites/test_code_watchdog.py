@@ -86,7 +86,7 @@ def test_a_single_hiccup_is_counted_and_no_more(hiccup_ns: int) -> None:
     overtime = steps.overtime()
     assert ended(steps, overtime) is None
     assert (overtime.hiccups, overtime.longest_tick, overtime.longest_ns) == (1, 700, hiccup_ns)
-    assert "at 1 tick" in overtime.describe_hiccups()
+    assert "in 1 call;" in overtime.describe_hiccups()
 
 
 def test_machine_that_takes_processor_away_is_no_fault_of_law() -> None:

@@ -114,7 +114,7 @@ def test_beyond_the_limit_a_log_is_read_while_it_plays(log_file: Path) -> None:
         (PlaySelection(stop_ns=-(10**9)), r"stop -1 s: is before the beginning"),
         (
             PlaySelection(ChannelFilter(include=("a/b",))),
-            r"no message for this selection; .* like trilat/paper/m1/state",
+            r"no message for this selection; .* form trilat/paper/m1/state",
         ),
     ],
 )

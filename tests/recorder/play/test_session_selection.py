@@ -52,7 +52,7 @@ def test_a_duration_counts_from_the_start_or_from_tick_0() -> None:
     [
         (None, 1.0, 1.0, "stop and duration_s set the same limit"),
         (2.0, 2.0, None, r"stop must be after start \(2 s\), not 2 s"),
-        (None, None, 0.0, "duration_s is more than 0 s"),
+        (None, None, 0.0, "duration_s must be more than 0 s"),
         (float("nan"), None, None, "start must be a number of seconds"),
         (None, float("inf"), None, "stop must be a number of seconds"),
         (1e300, None, None, "start must be a number of seconds"),
