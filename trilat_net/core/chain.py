@@ -114,14 +114,30 @@ _TIP = ("J_lin", "J_ang", "p_base", "axis_base")
 def chain_dtype(joints: int) -> np.dtype[np.void]:
     """Returns the NumPy data type of the row that stores a joint of a chain.
 
-    A row contains the constants of the joint and the work space of the algorithms.
+    A row contains the constants of the joint and the work space of the algorithms. A link is
+    the body that the joint moves, and its frame moves with it. `lin` and `ang` are the linear
+    and the angular part of a spatial vector at the origin of this frame. Positions are in m.
+
+    - Constants: the fields of `ChainJoint` for the axis and the drive; `origin`, the origin of
+      the link's frame in that of the previous link; `slide`, the axis of a prismatic joint in
+      the frame of the previous link, zero for other joints; and the matrices of Rodrigues'
+      formula (`build_chain`): `at_rest` is F, `by_sine` F [a] and `by_cosine` F [a]^2.
+    - Placement: R and p, the orientation and the origin of the link's frame in that of the
+      previous link. `R_base` is the orientation, `p_base` the origin and `axis_base` the axis
+      in the frame of the base.
+    - Motion: V, W, A and f of the recursion at the top of this module.
+    - Dynamics: `bias`, the torque C qd + G with friction, less the torque of the stops;
+      `composite`, the ten inertial parameters of the link and all links after it as one rigid
+      body; and M, the row of the inertia matrix.
+    - End effector: `J_lin` and `J_ang`, the column of its Jacobian.
 
     Args:
-        joints: Number of joints of the chain.
+        joints: Number of joints of the chain, the length of a row of M.
     """
     matrices = ("at_rest", "by_sine", "by_cosine", "R", "R_base")
     vectors = ("axis", "origin", "slide", "p", *_MOTIONS, *_TIP)
     numbers = (*_DRIVE, "bias")
+
     fields: list[Any] = [("prismatic", "i8")]
     fields += [(name, "f8", (3, 3)) for name in matrices]
     fields += [(name, "f8", (3,)) for name in vectors]
@@ -620,6 +636,17 @@ def parameter_gradient(chain: RowArray, gradient: Array) -> None:
     is the difference between the velocities qd and the reference velocities v of the joints.
     `propagate_motion` must have been called for the same qd and v.
 
+    With the spatial velocity s = V - W, the product is the gradient of the sum of s' f over all
+    links. The symbols are those at the top of this module: V is the velocity of the link, W its
+    velocity at v, A its reference acceleration, I its spatial inertia and f the force. In
+
+        s' f = s' I A + 1/2 s' (V x* I W + W x* I V - I (V x W))
+
+    the identity s' (V x* F) = -(V x s)' F gives each term the form x' I y, which is linear in
+    the parameters of the link:
+
+        s' f = s' I A - 1/2 (V x s)' I W - 1/2 (W x s)' I V - 1/2 s' I (V x W)
+
     Args:
         chain: Data of the n joints, one row per joint.
         gradient: Receives Y' r, ten numbers per link, shape (10 n,).
@@ -641,11 +668,12 @@ def parameter_gradient(chain: RowArray, gradient: Array) -> None:
         V_x_s = _motion_cross(V, s)
         W_x_s = _motion_cross(W, s)
         V_x_W = _motion_cross(V, W)
+
         first = LINK_PARAMETERS * i
         end = first + LINK_PARAMETERS
         for p in range(first, end):
             gradient[p] = 0.0
-        # s' (V x* I W) = -(V x s)' I W, so each term has the form x' I y.
+        # The four terms of s' f, in the order of the equation.
         _add_products(factor=1.0, x=s, y=A, first=first, gradient=gradient)
         _add_products(factor=-0.5, x=V_x_s, y=W, first=first, gradient=gradient)
         _add_products(factor=-0.5, x=W_x_s, y=V, first=first, gradient=gradient)

@@ -204,10 +204,20 @@ def _compile_law(torque: Callable[..., Any], form: _Form) -> Any:
         """Collects the input of the control law, and calls the law's method `torque`.
 
         Nothing is copied: the law reads and writes the arrays of its site, the process that
-        runs one arm.
+        runs one arm. The numbers and vectors come as arrays of floats. A view of a part of such
+        an array gives the law the same memory as a record, whose fields have the names of the
+        numbers or vectors.
+
+        Args:
+            law: Numbers of the law: its gains and what it remembers.
+            site: Row of the site, shape (1,).
+            links: Rows of the links from the peers, the other sites, in scenario order.
+            received: Vectors that came from each peer, one row per peer.
+            sent: Vectors that this law sends: those for all peers, then those for each peer.
         """
         s = site[0]
-        # Conditional expressions: Numba removes the branch whose type does not apply.
+        # A layout that is None stands for vectors that do not exist. Numba knows the layouts
+        # when it compiles, and removes the branch whose type does not apply.
         from_peers = () if received_dtype is None else received.reshape(-1).view(received_dtype)
         to_peers = () if sent_dtype is None else sent[to_all_size:sent_end].view(sent_dtype)
         to_all = None if to_all_dtype is None else sent[:to_all_size].view(to_all_dtype)[0]
@@ -235,6 +245,7 @@ def _compile_law(torque: Callable[..., Any], form: _Form) -> Any:
             inertia=s.M,
             bias=s.bias,
         )
+        # `compute` is the compiled method, whose `self` is the record of the law's numbers.
         compute(law[:law_size].view(law_dtype)[0], now)
 
     numba_types: Any = numba
@@ -419,22 +430,27 @@ class CompiledLaw:
         arrays.site["remembered"] = self._remembered
 
     def bind(self) -> None:
-        """Compiles the function with which `compute` calls the law.
+        """Compiles the stage that calls the law, for the types of this site's arrays.
 
-        The compilation takes seconds. Without this call, the first tick would wait for it.
+        The stage is `law_stage`, which `compute` calls in each tick, a period of the control
+        loop. The compilation takes seconds. Without this call, the first tick would wait for
+        it.
         """
-        a = self._arrays
-        assert a.channel is not None
+        arrays = self._arrays
+        assert arrays.channel is not None
+        # Only the types of the arguments count: any integers serve as tick and time.
+        example_tick = 0
+        example_t_ns = 0
         self._stage = bind_leaf(
             law_stage,
-            0,
-            0,
+            example_tick,
+            example_t_ns,
             self.address,
             self.row,
-            a.site,
-            a.links,
-            a.chain,
-            a.channel,
+            arrays.site,
+            arrays.links,
+            arrays.chain,
+            arrays.channel,
             self._sent,
         )
 

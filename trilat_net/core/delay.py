@@ -142,36 +142,48 @@ sqrt(-2 log 2^-53) by Box and Muller, and -log 2^-53.
 def _longest_us(model: LinkModel, trace: Points | None) -> float:
     """Returns an upper bound of the delays of a model, us.
 
-    The bound follows from the bounds of the model's random numbers.
+    The bound follows from the bounds of the model's random numbers: the largest normal number
+    is `_LARGEST_NORMAL`, and the largest exponential number of mean 1 is
+    `_LARGEST_EXPONENTIAL`. The limit MAX_DELAY_US is not applied, except to the log-normal
+    delay, whose exponential might overflow.
 
     Args:
-        model: The model.
-        trace: Points of its trace, or None.
+        model: The model. `DelayKind` states what its numbers `location`, `scale`, `extra` and
+            `weight` mean for each kind of delay.
+        trace: Points of its trace, rows of time and delay, see `Points`; None for other kinds.
     """
     location = model.location
     scale = model.scale
     extra = model.extra
     weight = abs(model.weight)
     if model.kind == DelayKind.GAMMA:
-        # The method of Marsaglia and Tsang at its largest normal number, see `standard_gamma`.
+        # Marsaglia and Tsang draw d (1 + x / sqrt(9 d))^3 with a normal number x, see
+        # `standard_gamma`. They draw a shape below 1 as the shape increased by 1.
         d = extra + (extra < 1.0) - 1.0 / 3.0
         return scale * d * (1.0 + _LARGEST_NORMAL / math.sqrt(9.0 * d)) ** 3
+
     if model.kind == DelayKind.LOG_NORMAL:
-        return math.exp(min(location + _LARGEST_NORMAL * scale, math.log(MAX_DELAY_US)))
+        largest_exponent = math.log(MAX_DELAY_US)
+        return math.exp(min(location + _LARGEST_NORMAL * scale, largest_exponent))
+
     if model.kind == DelayKind.AR1:
-        # The sum over all past draws, each at its largest: sqrt(1 - c^2) / (1 - c).
+        # With the correlation c, draw n samples ago counts sqrt(1 - c^2) c^n. The sum over all
+        # past draws, each at its largest, is sqrt(1 - c^2) / (1 - c).
         gain = math.sqrt((1.0 + weight) / (1.0 - weight)) if weight < 1.0 else math.inf
         return location + _LARGEST_NORMAL * scale * gain
-    return {
+
+    longest_in_trace_us = 0.0 if trace is None else float(np.max(trace[:, 1], initial=0))
+    bounds_us = {
         DelayKind.CONSTANT: location,
         DelayKind.UNIFORM: location + scale,
         DelayKind.NORMAL: location + _LARGEST_NORMAL * scale,
         DelayKind.HYPER_EXPONENTIAL: location + _LARGEST_EXPONENTIAL * max(scale, extra),
         DelayKind.SINE: location + abs(scale),
-        DelayKind.TRACE: 0.0 if trace is None else float(np.max(trace[:, 1], initial=0)),
+        DelayKind.TRACE: longest_in_trace_us,
         DelayKind.MEASURED: 0.0,
         DelayKind.CUSTOM: location,
-    }[DelayKind(model.kind)]
+    }
+    return bounds_us[DelayKind(model.kind)]
 
 
 def max_delay_us(models: Sequence[LinkModel], traces: Sequence[Points | None]) -> int:
@@ -215,11 +227,19 @@ _LOOP = int(TraceEnd.LOOP)
 def draw_delay_us(key: DrawKey, sample: int, purpose: int, model: Row) -> float:
     """Draws a random delay from a distribution that has no memory, us, not rounded.
 
+    The random numbers are a function of the key, the sample and the purpose. Therefore the same
+    arguments always give the same delay. `DelayKind` states what the parameters `location`,
+    `scale`, `extra` and `weight` of the model mean for each distribution.
+
     Args:
         key: Key of the link, from which all its random numbers follow.
-        sample: Index of the sample.
-        purpose: DELAY for the sample, COPY for its duplicate.
+        sample: Index of the sample, the state that a site sends in one tick.
+        purpose: Selects random numbers that are independent of each other: DELAY for the
+            sample, COPY for its duplicate.
         model: Model of the delay, a row of LINK_MODEL_DTYPE.
+
+    Returns:
+        The delay. If the model has no such distribution, it is the constant `location`.
     """
     location: float = model.location
     scale: float = model.scale
@@ -229,6 +249,7 @@ def draw_delay_us(key: DrawKey, sample: int, purpose: int, model: Row) -> float:
         return location + scale * (2.0 * u - 1.0)
     if model.kind == _NORMAL:
         # The mean is not negative, so each attempt succeeds with a probability of at least 1/2.
+        # If all attempts fail, the delay is the mean.
         for attempt in range(64):
             x = location + scale * standard_normal(key, sample, purpose, attempt)
             if x >= 0.0:
@@ -238,6 +259,7 @@ def draw_delay_us(key: DrawKey, sample: int, purpose: int, model: Row) -> float:
     if model.kind == _LOG_NORMAL:
         return math.exp(location + scale * standard_normal(key, sample, purpose, 0))
     if model.kind == _HYPER:
+        # u selects one of two exponential distributions, and v is the draw from it.
         u, v = uniforms(key, sample, purpose, 0)
         mean = extra if u < model.weight else scale
         return location - mean * math.log(v)
@@ -328,26 +350,32 @@ def custom_delay_us(
 ) -> float:
     """Computes the delay of a sample by the compiled function of a user's delay model.
 
-    The delay is limited to the maximum that the user's model declares.
+    The delay is limited to the maximum that the user's model declares. The function has two
+    arguments: the parameters of the user's model, and the row of the delay model. It reads its
+    input from the fields `key`, `sample` and `stamp_ns` of the row, and writes the delay into
+    the field `drawn_us`, see `plugged`.
 
     Args:
         key: Seed of all random numbers of the link.
         sample: Index of the sample.
         stamp_ns: Time at which the sample was sent, ns since the start of the session.
-        model: The delay model. The function finds its input in it and writes the delay into it.
-            The field `location` is the maximum delay, us.
-        points: Table with the parameters of all models. Each row holds two of them.
+        model: The delay model, a row of LINK_MODEL_DTYPE. The field `call` is the address of
+            the function. The field `location` is the maximum delay, us.
+        points: Table with the parameters of all models, which are floats in an array of
+            integers. Each row holds two of them.
 
     Returns:
         The delay in us, not rounded.
     """
+    # The key is an unsigned number, the field a signed one with the same bits.
     model.key = np.int64(key)
     model.sample = sample
     model.stamp_ns = stamp_ns
+
     first = model.trace_first
     count = model.trace_count
-    numbers = points[first : first + count].reshape(-1).view(np.float64)
-    call_address(model.call, (numbers, model))
+    model_parameters = points[first : first + count].reshape(-1).view(np.float64)
+    call_address(model.call, (model_parameters, model))
     drawn_us: float = min(model.drawn_us, model.location)
     return drawn_us
 

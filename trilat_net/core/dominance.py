@@ -241,33 +241,46 @@ def fold_ramps(t_ns: int, count: int, ramps: Array) -> int:
     progress. Its start values are stored in row 0. Therefore `apply_ramps` computes exactly the
     same factors as before for all times from `t_ns` on.
 
+    The table changes as follows, if m is the row of the last ramp that has started:
+
+        row 0                   factors at the start of the session
+                                -> factors at the start of ramp m
+        rows 1 to m - 1         older ramps, removed
+        rows m to count - 1     -> rows 1 to count - m
+
     Args:
         t_ns: Present time, ns since the start of the session.
         count: Number of filled rows of `ramps`.
-        ramps: Ramps, as in `apply_ramps`; changed in place.
+        ramps: Ramps in the order of their starts, shape (R, RAMP_COLUMNS + P) for P peers;
+            changed in place. A row contains the start and the end of a ramp, ns, and the P
+            factors at its end.
 
     Returns:
         The number of rows that are left.
     """
-    last = int(np.searchsorted(ramps[1:count, 0], t_ns, side="right"))
-    if last < 2:
-        return count
-    before = ramps[0, RAMP_COLUMNS:].copy()
+    last_started = int(np.searchsorted(ramps[1:count, 0], t_ns, side="right"))
+    if last_started < 2:
+        return count  # no ramp is older than the last one that has started
+
+    # The factors at the start of the current ramp, from ramp to ramp.
+    factors = ramps[0, RAMP_COLUMNS:].copy()
     current = 0
-    for n in range(1, last + 1):
+    for following in range(1, last_started + 1):
         start_ns, end_ns = ramps[current, :RAMP_COLUMNS]
-        for j, after in enumerate(ramps[current, RAMP_COLUMNS:]):
-            before[j] = _interpolate(
-                t_ns=ramps[n, 0],
+        for j, factor_at_end in enumerate(ramps[current, RAMP_COLUMNS:]):
+            factors[j] = _interpolate(
+                t_ns=ramps[following, 0],
                 start_ns=start_ns,
                 end_ns=end_ns,
-                before=before[j],
-                after=after,
+                before=factors[j],
+                after=factor_at_end,
             )
-        current = n
-    ramps[0, RAMP_COLUMNS:] = before
-    ramps[1 : count - last + 1] = ramps[last:count].copy()
-    return count - last + 1
+        current = following
+
+    ramps[0, RAMP_COLUMNS:] = factors
+    rows_left = 1 + count - last_started
+    ramps[1:rows_left] = ramps[last_started:count].copy()
+    return rows_left
 
 
 _RUN = int(Mode.RUN)

@@ -77,31 +77,45 @@ _LARGE = 20.0
 def tanh(x: float) -> float:
     """Returns the hyperbolic tangent, to two units in the last place; NaN for NaN.
 
-    Small arguments use a rational function. Larger ones use 1 - 2 / (exp(2 |x|) + 1), with the
-    exponential as 2^n (1 + 2 P / (Q - P)).
+    The method and the coefficients of all polynomials are those of Cephes (`tanh` and `exp`).
+    Arguments with |x| < 0.625 use a rational function of x^2, where P and Q are polynomials:
+
+        tanh(x) = x + x^3 P(x^2) / Q(x^2)
+
+    Larger arguments use 1 - 2 / (exp(2 |x|) + 1) with the sign of x. The exponential is
+
+        exp(2 |x|) = 2^n exp(y),    y = 2 |x| - n log 2
+        exp(y) = 1 + 2 y P(y^2) / (Q(y^2) - y P(y^2))
+
+    where n is the integer nearest to 2 |x| / log 2, and P and Q are other polynomials.
     """
-    z = x * x
-    size = abs(x)
-    if size < _SMALL:
-        above = -9.64399179425052238628e-1 * z - 9.92877231001918586564e1
-        above = above * z - 1.61468768441708447952e3
-        below = z + 1.12811678491632931402e2
-        below = below * z + 2.23548839060100448583e3
-        below = below * z + 4.84406305325125486048e3
-        return x + x * z * (above / below)
-    if size >= _LARGE:
+    square = x * x
+    magnitude = abs(x)
+    if magnitude < _SMALL:
+        # Horner's scheme.
+        P = -9.64399179425052238628e-1 * square - 9.92877231001918586564e1
+        P = P * square - 1.61468768441708447952e3
+        Q = square + 1.12811678491632931402e2
+        Q = Q * square + 2.23548839060100448583e3
+        Q = Q * square + 4.84406305325125486048e3
+        return x + x * square * (P / Q)
+    if magnitude >= _LARGE:
         return 1.0 if x > 0.0 else -1.0
-    # Only NaN fails both comparisons.
-    if not size < _LARGE:
+    # NaN fails both this comparison and the previous one.
+    is_nan = not magnitude < _LARGE
+    if is_nan:
         return math.nan
-    n = math.floor(2.0 * size * _LOG_2_OF_E + 0.5)
-    y = (2.0 * size - n * _LOG_2_HIGH) - n * _LOG_2_LOW
-    z = y * y
-    P = 1.26177193074810590878e-4 * z + 3.02994407707441961300e-2
-    P = y * (P * z + 9.99999999999999999910e-1)
-    Q = 3.00198505138664455042e-6 * z + 2.52448340349684104192e-3
-    Q = Q * z + 2.27265548208155028766e-1
-    Q = Q * z + 2.0
+
+    n = math.floor(2.0 * magnitude * _LOG_2_OF_E + 0.5)
+    # log 2 has two parts, so that the first product is exact.
+    y = (2.0 * magnitude - n * _LOG_2_HIGH) - n * _LOG_2_LOW
+    square = y * y
+    # Horner's scheme for y P and Q.
+    P = 1.26177193074810590878e-4 * square + 3.02994407707441961300e-2
+    P = y * (P * square + 9.99999999999999999910e-1)
+    Q = 3.00198505138664455042e-6 * square + 2.52448340349684104192e-3
+    Q = Q * square + 2.27265548208155028766e-1
+    Q = Q * square + 2.0
     exponential = (1.0 + 2.0 * P / (Q - P)) * float(1 << int(n))
     tangent = 1.0 - 2.0 / (exponential + 1.0)
     return tangent if x > 0.0 else -tangent
