@@ -155,36 +155,62 @@ class GapRepair:
             self.probe()
 
     def _send_request(self, now_ns: int) -> None:
-        """Sends the next request, if a message is missing and the request is due."""
+        """Sends the next request to the site, if messages are missing and the request is due.
+
+        A message that has just been noticed as missing may only be late. Therefore the first
+        request is due `GRACE_NS` after that. The due time then stays in the past, so that a
+        request without a reply is repeated at once after its timeout. A reply sets a new due
+        time, see `_accept_reply`. If nothing is missing any more, the due time is cleared.
+
+        The caller ensures that no other request is open.
+
+        Args:
+            now_ns: Present time on the monotonic clock, in ns.
+        """
         request = self._make_request()
         if request is None:
             self._due_ns = None
             return
-        if self._due_ns is None:
+        was_nothing_missing = self._due_ns is None
+        if was_nothing_missing:
             self._due_ns = now_ns + GRACE_NS
-        if now_ns >= self._due_ns:
-            self._turns.remove(request.channel)
-            self._turns.append(request.channel)
-            replies = self._bus.query(self._key, encode(request))
-            self._open = _OpenRequest(request, replies, now_ns)
+        assert self._due_ns is not None
+        if now_ns < self._due_ns:
+            return
+
+        # The requested channel goes to the end of the list, so that the others are next.
+        self._turns.remove(request.channel)
+        self._turns.append(request.channel)
+        replies = self._bus.query(self._key, encode(request))
+        self._open = _OpenRequest(request, replies, now_ns)
 
     def _make_request(self) -> BackfillRequest | None:
-        """Returns the next request. None if no message is missing and no probe is scheduled.
+        """Chooses the channel and the numbers of the messages that are requested next.
 
-        The gaps of a channel are requested in ascending order, and again from the first one
-        after the last one.
+        The channels take turns, and the one that was requested longest ago is examined first.
+        The gaps of a channel are requested in ascending order. After the gap with the highest
+        numbers, the search begins again at the lowest ones, because replies may be incomplete.
+
+        A probe requests the messages after the last known one. It reveals whether the site has
+        published messages of which nothing has arrived.
+
+        Returns:
+            A request for at most `_request_size` consecutive messages of one channel. None if
+            no message is missing and no probe is scheduled.
         """
         for channel in self._turns:
             account = self._reception.accounts[channel]
-            gap = account.find_requestable_gap(self._next_numbers[channel])
-            if gap is None:
-                gap = account.find_requestable_gap()
-            if gap is None and channel in self._probes:
-                gap = (account.last + 1, account.last + self._request_size)
-            if gap is not None:
-                first, last = gap
-                last = min(last, first + self._request_size - 1)
-                return BackfillRequest(channel=channel, first=first, last=last)  # type: ignore[arg-type]
+            next_gap = account.find_requestable_gap(self._next_numbers[channel])
+            first_gap = account.find_requestable_gap() if next_gap is None else None
+            requested_range = next_gap or first_gap
+            if requested_range is None and channel in self._probes:
+                requested_range = (account.last + 1, account.last + self._request_size)
+            if requested_range is None:
+                continue
+
+            first, last_missing = requested_range
+            last = min(last_missing, first + self._request_size - 1)
+            return BackfillRequest(channel=channel, first=first, last=last)  # type: ignore[arg-type]
         return None
 
     def _receive_reply(
@@ -202,14 +228,14 @@ class GapRepair:
         round_trip_ns = now_ns - open_request.sent_ns
         while (reply := open_request.replies.poll()) is not None:
             try:
-                past = self._decode(reply[1], request)
+                backfill = self._decode(reply[1], request)
             except WireError as error:
                 self._dropped[error.reason] += 1
                 continue
             self._timeout_ns = min(max(ANSWER_NS[0], 4 * round_trip_ns), ANSWER_NS[1])
             self._request_size = min(2 * self._request_size, BACKFILL_MESSAGES)
             self._open = None
-            yield from self._accept_reply(past, request, now_ns)
+            yield from self._accept_reply(backfill, request, now_ns)
             return
 
         if round_trip_ns >= self._timeout_ns:
@@ -218,41 +244,58 @@ class GapRepair:
             self._open = None
 
     def _decode(self, payload: bytes, request: BackfillRequest) -> Backfill:
-        """Decodes a reply, and checks that it answers the request.
+        """Decodes a reply to a request, and checks that it belongs to this request.
+
+        If the site no longer stores the first requested messages, the reply begins at a higher
+        number than requested. But it cannot begin after the number of messages that the site
+        has published so far, which the reply states. A probe requests messages that may not
+        exist. A reply that begins exactly at the requested number is therefore always valid.
+
+        Args:
+            payload: The encoded reply of the site.
+            request: The request that is open.
+
+        Returns:
+            The reply: consecutive messages of one channel.
 
         Raises:
-            WireError: The reply is not valid, or answers something else.
+            WireError: The reply is not valid, comes from another process, or contains other
+                messages than those that were requested.
         """
-        past = decode(payload, Backfill)
-        self._reception.check_sender(past)
-        if past.channel != request.channel or past.first > max(past.made, request.first):
+        backfill = decode(payload, Backfill)
+        self._reception.check_sender(backfill)
+        published = backfill.made
+        highest_first = max(published, request.first)
+        is_other_channel = backfill.channel != request.channel
+        if is_other_channel or backfill.first > highest_first:
             raise WireError(
                 "out of range",
-                f"the reply has {past.channel} from number {past.first} on, of {past.made}, "
-                f"but {request.channel} from number {request.first} on was requested",
+                f"the reply has {backfill.channel} from number {backfill.first} on, of "
+                f"{published}, but {request.channel} from number {request.first} on was "
+                "requested",
             )
-        return past
+        return backfill
 
     def _accept_reply(
-        self, past: Backfill, request: BackfillRequest, now_ns: int
+        self, backfill: Backfill, request: BackfillRequest, now_ns: int
     ) -> Iterator[RepairedMessage]:
         """Counts the messages of a reply, yields those that are new, and schedules a request.
 
         Args:
-            past: The reply.
+            backfill: The reply.
             request: The request that it answers.
             now_ns: Present time on the monotonic clock, in ns.
         """
-        channel = past.channel
+        channel = backfill.channel
         account = self._reception.accounts[channel]
         self._probes.discard(channel)
-        self._reception.add_expected(channel, past.made)
-        if past.first > request.first:
+        self._reception.add_expected(channel, backfill.made)
+        if backfill.first > request.first:
             # The site no longer has the messages before the first one of the reply.
-            account.abandon_below(past.first)
+            account.abandon_below(backfill.first)
 
         is_useful = False
-        for number, payload in enumerate(past.payloads, past.first):
+        for number, payload in enumerate(backfill.payloads, backfill.first):
             if not payload:
                 continue  # the site skipped this tick, as a record states
             try:
@@ -270,7 +313,7 @@ class GapRepair:
                 is_useful = True
                 yield channel, message, payload
 
-        next_number = past.first + len(past.payloads)
+        next_number = backfill.first + len(backfill.payloads)
         self._next_numbers[channel] = max(next_number, request.first + 1)
         gap = account.find_requestable_gap(request.first)
         self._due_ns = now_ns

@@ -281,18 +281,26 @@ class BatchBuilder:
 
 
 def _find_equal_numbers(rows: Ints) -> Ints:
-    """Finds the messages with the same channel and number as another message.
+    """Finds the messages that have the same channel and number as another message.
+
+    Such messages may be copies of each other. The messages are sorted by channel and number, so
+    that equal ones are neighbours, and each one is compared with the next.
 
     Args:
-        rows: The messages, see `MessageBatch.rows`.
+        rows: Table with a row per message, shape (K, 5), see `MessageBatch.rows`.
 
     Returns:
-        Their indices in ascending order.
+        The rows of these messages in ascending order, shape (R,). It includes every message
+        that occurs more than once, also its first occurrence.
     """
     numbers = rows[:, _NUMBER]
     channels = rows[:, _CHANNEL]
+    # The last key of np.lexsort is the most important one.
     order = np.lexsort((numbers, channels))
+    # The columns of the channel and of the number are adjacent in the table.
     identities = rows[order, _CHANNEL : _NUMBER + 1]
-    differences = np.diff(identities, axis=0)
-    equals_next = (differences == 0).all(axis=1)
-    return np.union1d(order[1:][equals_next], order[:-1][equals_next])
+    differences_to_next = np.diff(identities, axis=0)
+    equals_next = (differences_to_next == 0).all(axis=1)
+    later_rows = order[1:][equals_next]
+    earlier_rows = order[:-1][equals_next]
+    return np.union1d(later_rows, earlier_rows)

@@ -101,8 +101,12 @@ class MessageSource:
         self.strays = 0
         self._header = header
         self._batch = batch
+        # Items that were fetched in advance and not returned yet: pieces of the log, the end of
+        # a round, or the error that ended the reading.
         self._ahead: deque[ReadPiece | RoundEnd | LogError] = deque()
+        # Size of the payloads in these pieces, in bytes.
         self._ahead_bytes = 0
+        # Bytes of the pipe that do not form a complete item yet.
         self._received = bytearray()
         self._process: multiprocessing.process.BaseProcess | None = None
         self.restart()
@@ -132,6 +136,11 @@ class MessageSource:
     def poll(self) -> MessageBatch | None:
         """Returns the next messages to play, if any are available. It never waits.
 
+        Each call removes one item from the queue `_ahead`. The item is either a piece of the
+        log, the end of the round, or the error of the process that reads the log. The end of
+        the round also reports the strays, messages that are played out of order, and the
+        damaged ("torn") files. `restart` begins the next round.
+
         Returns:
             The messages. None if none are available now, or if the round has ended (`ended`).
 
@@ -144,11 +153,14 @@ class MessageSource:
         if isinstance(item, LogError):
             raise item
         if isinstance(item, ReadPiece):
+            # The list is changed in place, because others refer to the same header.
             self._header.topics[:] = item.topics
             self._ahead_bytes -= len(item.batch.data)
             return item.batch
-        self.strays += item.strays
-        self._header.torn.update(item.torn)
+
+        round_end: RoundEnd = item
+        self.strays += round_end.strays
+        self._header.torn.update(round_end.torn)
         self.ended = True
         return None
 
@@ -220,6 +232,10 @@ def sort_messages(
     A message may be late in the file, because a site sent it again after a loss. Therefore
     messages are stored for some time before they are yielded. The memory for this is limited.
 
+    A stored message is yielded when a message arrives that is later by the horizon. To sort in
+    larger parts, this happens at most once per step of the log. The first part is yielded when
+    the horizon and one step have been read, and then one part after each further step.
+
     Args:
         messages: The messages, in the order of the file.
         horizon_ns: Largest delay of a message in the file that is corrected, in ns of the log.
@@ -232,19 +248,23 @@ def sort_messages(
         late in the file to be put in order.
     """
     sorter = _MessageSorter()
-    newest_ns = -(2**62)
+    before_all_ns = -(2**62)
+    after_all_ns = 1 << 62
+    newest_ns = before_all_ns
     next_release_ns = None
     for message in messages:
         sorter.add(message)
-        newest_ns = max(newest_ns, message[0])
+        t_ns = message[0]
+        newest_ns = max(newest_ns, t_ns)
         if next_release_ns is None:
             next_release_ns = newest_ns + horizon_ns + step_ns
         if newest_ns >= next_release_ns:
             yield sorter.release_until(newest_ns - horizon_ns)
+            # The horizon is full from now on, so that a step completes the next part.
             next_release_ns = newest_ns + step_ns
         elif sorter.memory > limit_bytes:
             yield sorter.release_half()
-    yield sorter.release_until(1 << 62)
+    yield sorter.release_until(after_all_ns)
 
 
 class _MessageSorter:

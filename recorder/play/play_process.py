@@ -220,17 +220,27 @@ class Playback:
             clock.sleep_until(clock.monotonic_ns() + POLL_NS)
 
     def _linger(self) -> None:
-        """Replies to requests until the recorders have every message, or send none."""
+        """Stays on the network after the last message, so that recorders can complete the log.
+
+        In place of the original sites, it replies to recorders that request missing messages.
+        It returns in the first of these cases:
+
+        - No recorder has sent a request for `LINGER_NS`.
+        - `LAST_EVENT_NS` have passed since all recorders reported that they stored everything.
+        - The playback was stopped.
+        """
         clock = self.clock
         stand_ins = self._stand_ins
-        give_up_ns = clock.monotonic_ns() + LINGER_NS
-        while clock.monotonic_ns() < give_up_ns and not self.stopped():
-            if stand_ins.serve_queries():
-                give_up_ns = clock.monotonic_ns() + LINGER_NS
-                continue
-            # Messages of the recorders may still be in transit.
+        leave_ns = clock.monotonic_ns() + LINGER_NS
+        while clock.monotonic_ns() < leave_ns and not self.stopped():
+            has_replied_to_request = stand_ins.serve_queries()
+            if has_replied_to_request:
+                leave_ns = clock.monotonic_ns() + LINGER_NS
+                continue  # further requests may be waiting
+
             if stand_ins.have_stored(stand_ins.recorders):
-                give_up_ns = min(give_up_ns, clock.monotonic_ns() + LAST_EVENT_NS)
+                # The process leaves soon, but further events of recorders may be in transit.
+                leave_ns = min(leave_ns, clock.monotonic_ns() + LAST_EVENT_NS)
             clock.sleep_until(clock.monotonic_ns() + POLL_NS)
 
 

@@ -164,16 +164,26 @@ class LatenessHistogram:
     def summary(self) -> LatenessSummary | None:
         """Computes the statistics of all messages that were counted.
 
+        The p-th percentile is the smallest lateness up to which at least p percent of the
+        messages were counted. The comparison 100 * (messages up to here) >= p * (all messages)
+        uses integers, so that it is exact.
+
         Returns:
-            Median, 99th percentile and maximum of the lateness. None if no message was counted.
+            Median, 99th percentile and maximum of the lateness, in us. None if no message was
+            counted.
         """
-        sums = np.cumsum(self._counts)
-        if not sums[-1]:
+        # The index of each entry is the lateness in us. The last entry is the overflow bin,
+        # which counts all messages from LATENESS_LIMIT_US on.
+        counts_up_to = np.cumsum(self._counts)
+        total = counts_up_to[-1]
+        if not total:
             return None
-        # The first lateness up to which 50 % and 99 % of the messages were counted, in
-        # integers.
-        percentiles = np.searchsorted(100 * sums, sums[-1] * np.array([50, 99])).tolist()
-        p50_us, p99_us = (us if us < LATENESS_LIMIT_US else self.max_us for us in percentiles)
+        percents = np.array([50, 99])
+        bins_us = np.searchsorted(100 * counts_up_to, total * percents).tolist()
+        # The overflow bin has no lateness of its own. The maximum stands for it.
+        p50_us, p99_us = (
+            bin_us if bin_us < LATENESS_LIMIT_US else self.max_us for bin_us in bins_us
+        )
         return LatenessSummary(p50_us, p99_us, self.max_us)
 
 
@@ -256,9 +266,12 @@ class Player:
         self._spin_ns = 0 if low_cpu else SPIN_NS
         # Publishing functions, by the number of the channel.
         self._publishers: list[Publish] = []
+        # Time on the clock at which other work was done last.
         self._served_ns = 0
+        # Time of the newest message in the log.
         self._position_ns = 0
         self._published = 0
+        # Messages that `prepare` has waited for, and that are played first.
         self._first_batch: MessageBatch | None = None
 
     def prepare(self) -> int | None:
@@ -277,15 +290,26 @@ class Player:
     def play(self, pace: Pace, *, loop: bool = False) -> None:
         """Plays all messages, until the end of the log or until the playback is stopped.
 
+        A round is one pass through the log. The next round begins `LOOP_PAUSE_NS` after the
+        last message of the present one.
+
+        Every message is stored in the history before it is played, because recorders may
+        request it again. A log that is entirely in memory is stored once, in the first round.
+        Of a log that is read while it is played, the history holds only recent messages, which
+        differ in each round. Therefore it is cleared before the next round.
+
         Args:
             pace: Start time and speed of the playback, from which the deadlines of the messages
                 follow.
             loop: True to play the log again and again, until the playback is stopped.
         """
+        is_log_in_memory = self._source.whole
         while not self._stopped():
             self.rounds += 1
+            is_first_round = self.rounds == 1
+            # The method is called until it returns None, at the end of the round.
             for batch in iter(self._wait_for_batch, None):
-                if self.rounds == 1 or not self._source.whole:
+                if is_first_round or not is_log_in_memory:
                     self._history.add(batch)
                 for piece in batch.pieces():
                     self._play_piece(piece, pace)
@@ -293,9 +317,11 @@ class Player:
                         return
             if not loop:
                 return
-            pace = pace.later(self._position_ns - pace.start_ns + LOOP_PAUSE_NS)
+
+            round_ns = self._position_ns - pace.start_ns + LOOP_PAUSE_NS
+            pace = pace.later(round_ns)
             self._source.restart()
-            if not self._source.whole:
+            if not is_log_in_memory:
                 self._history.clear()
 
     def _wait_for_batch(self) -> MessageBatch | None:
@@ -312,9 +338,20 @@ class Player:
     def _play_piece(self, piece: MessageBatch, pace: Pace) -> None:
         """Publishes some messages at their deadlines. Returns early if the playback is stopped.
 
+        For each message, the method has four steps:
+
+        1. It waits for the deadline, and meanwhile does other work, such as replies to other
+           programs. If the playback is late, so that there is no time left, the other work is
+           done every `SERVICE_EVERY_NS` nevertheless.
+        2. It notes by how much the message is late.
+        3. It publishes the message. The network blocks this call while a receiver is slow. If
+           it blocks for longer than `HELD_NS`, the duration counts as waiting for a receiver.
+           If it blocks for longer than `CUT_NS`, the receiver has been disconnected (a stall).
+        4. It counts the message.
+
         Args:
-            piece: The messages.
-            pace: The deadlines.
+            piece: The messages, in the order of playing.
+            pace: Converts the times of the messages in the log to deadlines on the clock.
         """
         clock = self._clock
         read_clock = clock.monotonic_ns
@@ -323,24 +360,28 @@ class Player:
         for t_ns, channel, number, payload in piece.messages():
             self._position_ns = t_ns
             due_ns = pace.due_ns(t_ns)
-            start_ns = read_clock()
-            if start_ns < due_ns:
-                if not self._use_slack(due_ns, start_ns):
+            publish_ns = read_clock()
+            if publish_ns < due_ns:
+                is_continued = self._use_slack(due_ns, publish_ns)
+                if not is_continued:
                     return
-                start_ns = wait_until(clock, due_ns, self._spin_ns)
-            elif start_ns - self._served_ns > SERVICE_EVERY_NS:
+                publish_ns = wait_until(clock, due_ns, self._spin_ns)
+            elif publish_ns - self._served_ns > SERVICE_EVERY_NS:
                 self._serve()
                 if self._stopped():
                     return
-                start_ns = read_clock()
-            add_lateness(start_ns - due_ns)
+                publish_ns = read_clock()
+            add_lateness(publish_ns - due_ns)
 
-            # A channel is declared on the network before its first message.
+            # A channel is declared on the network before its first message. Channels are
+            # numbered consecutively, so that their publishers form a list.
             while len(self._publishers) <= channel:
-                self._publishers.append(self._publisher(len(self._publishers)))
+                new_channel = len(self._publishers)
+                self._publishers.append(self._publisher(new_channel))
                 self.counts.append(0)
-            self._publishers[channel](payload)
-            duration_ns = read_clock() - start_ns
+            publish = self._publishers[channel]
+            publish(payload)
+            duration_ns = read_clock() - publish_ns
             if duration_ns > HELD_NS:
                 self.held_ns += duration_ns
                 self.stalls += duration_ns > CUT_NS

@@ -231,6 +231,7 @@ class _PlayedChannel:
             if topic not in header.topics:
                 header.topics.append(topic)
             self.channel_number = header.topics.index(topic)
+        # Number of events so far, for events that contain no number.
         self._event_count = 0
         # Index of each start of the site, by its boot.
         self._starts: dict[int, int] = {}
@@ -238,9 +239,17 @@ class _PlayedChannel:
     def find_number(self, item: McapMessage, t_ns: int) -> int:
         """Finds the number by which a message is ordered among the messages of its channel.
 
-        For a record of a site, it is the number of the control period (tick). The statistics
-        and the events of a site are counted. For other messages, it is the time. The messages
-        of a channel are played in the order of their numbers.
+        The messages of a channel are played in the order of their numbers. There are three
+        kinds of numbers, so that this order is that of the original publication:
+
+        - Records and statistics of a site have the number that follows from their control
+          period (tick). A site that was started again continues these numbers.
+        - Events of a site are numbered from 0 in each start of the site. To distinguish the
+          starts, a multiple of `NUMBERS_OF_A_START` is added.
+        - Other messages have no number. Their time takes its place.
+
+        The method must be called once for each message of the file, in the order of the file,
+        because it counts the events and notes each new start.
 
         Args:
             item: The message, as the file contains it.
@@ -253,14 +262,19 @@ class _PlayedChannel:
             return number_message(self.kind, item.sequence, self.rate_hz)
         if self.kind != topics.EVENT:
             return t_ns
+
         header = _decode_header(item.payload)
+        event_index = self._event_count
         self._event_count += 1
-        if header.n < 0:
-            # Events have no number before version 3 of the schema. They are counted instead.
-            return self._event_count - 1
-        start = self._starts.setdefault(header.boot, len(self._starts))
-        number = min(header.n, NUMBERS_OF_A_START - 1)
-        return min(start * NUMBERS_OF_A_START + number, _LAST)
+        has_number = header.n >= 0
+        if not has_number:
+            # Before version 3 of the schema, events have no number. They are counted instead.
+            return event_index
+        # A new boot belongs to the next start of the site: the first one has the index 0.
+        start_index = self._starts.setdefault(header.boot, len(self._starts))
+        # A damaged file may contain numbers that are too large.
+        number_in_start = min(header.n, NUMBERS_OF_A_START - 1)
+        return min(start_index * NUMBERS_OF_A_START + number_in_start, _LAST)
 
 
 class SessionReader:

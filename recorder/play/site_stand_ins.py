@@ -355,13 +355,21 @@ class SiteStandIns:
         return self._boots.get(site, first_start)
 
     def _reply_backfill(self, site: str, query: Query) -> None:
-        """Replies to the request of a recorder in the name of a site.
+        """Sends messages again that a recorder has missed, in the name of the original site.
+
+        The reply is called a backfill. It contains messages that were played before, and it
+        states the boot of the site's start that is being played, because the recorder accepts
+        only replies of that start.
+
+        The history and the recorder number events differently. A site numbers its events from 0
+        in each start, and so does the recorder. The history numbers them over all starts: it
+        adds `NUMBERS_OF_A_START` for each earlier start.
 
         Args:
             site: Name of the site.
-            query: The request.
+            query: The encoded request, with the means to reply to it.
         """
-        start, boot = self._find_start(site)
+        start_index, boot = self._find_start(site)
 
         def find_requested(request: BackfillRequest) -> tuple[int, list[bytes], int]:
             """Finds the messages that a recorder requests because it has missed them.
@@ -371,17 +379,20 @@ class SiteStandIns:
 
             Returns:
                 The number of the first message in the reply, the encoded messages, and the
-                number of messages that the site has published on this channel so far.
+                number of messages that the site has published on this channel so far. The
+                numbers are those of the recorder.
             """
             channel = self._find_channel(site, request.channel)
+            # Number in the history minus number of the recorder.
             offset = 0
             if request.channel == topics.EVENT:
-                # The recorder numbers the events of the present start from 0.
-                offset = start * NUMBERS_OF_A_START
-            played = self._history.next_numbers.get(channel, 0) - offset
-            first, payloads = self._history.find_messages(
+                offset = start_index * NUMBERS_OF_A_START
+            published = self._history.next_numbers.get(channel, 0) - offset
+            first_in_history, payloads = self._history.find_messages(
                 channel, request.first + offset, request.last + offset
             )
-            return max(first - offset, 0), payloads, max(played, 0)
+            # Messages of earlier starts would have negative numbers.
+            first = max(first_in_history - offset, 0)
+            return first, payloads, max(published, 0)
 
         self.refilled += answer_backfill(query, site, boot, find_requested)
