@@ -364,7 +364,7 @@ def test_an_embedded_text_is_whole_and_names_no_file() -> None:
     with pytest.raises(ScenarioError, match=r"arm.urdf: no file may be named here"):
         parse_embedded(SIX)
     long = {"urdf": {"arm6.urdf": ARM6 + " " * MAX_CHARACTERS}}
-    with pytest.raises(ScenarioError, match=f"at most {MAX_CHARACTERS} are read"):
+    with pytest.raises(ScenarioError, match=f"at most {MAX_CHARACTERS} can be read"):
         six(**long)
 
 
@@ -381,7 +381,7 @@ def test_a_file_lies_beside_the_scenario(tmp_path: Path) -> None:
     with pytest.raises(ScenarioError, match=r"mine.urdf cannot be read: not UTF-8"):
         load_scenario(file)
     (tmp_path / "mine.urdf").write_text(ARM6 + " " * MAX_CHARACTERS)
-    with pytest.raises(ScenarioError, match=f"at most {MAX_CHARACTERS} are read"):
+    with pytest.raises(ScenarioError, match=f"at most {MAX_CHARACTERS} can be read"):
         load_scenario(file)
 
 

@@ -132,7 +132,7 @@ def test_what_is_not_of_a_form_is_refused(
 def test_there_is_no_other_form_and_no_other_way(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="irtt, ping, csv"):
         import_trace(tmp_path, "xml")
-    with pytest.raises(UsageError, match="half, whole"):
+    with pytest.raises(UsageError, match="half or whole"):
         import_trace(tmp_path, "ping", way="send")
     with pytest.raises(ScenarioError, match="cannot be read"):
         import_trace(tmp_path / "nowhere", "csv")

@@ -281,7 +281,8 @@ def _find_kind(
     """
     if "kind" not in entry:
         raise ScenarioError(
-            f"is missing; give {' or '.join(map(repr, kinds))}", path=f"{path}.kind"
+            f"is missing; the value must be {' or '.join(map(repr, kinds))}",
+            path=f"{path}.kind",
         )
     kind = entry["kind"]
     for group, group_kinds in (("hands", OPERATORS), ("environment", ENVIRONMENTS)):
