@@ -127,7 +127,7 @@ def test_a_changed_hand_is_found(held: Log) -> None:
         ),
         (
             {"sites.m1.hands": [{"kind": "live", "mode": "tip", "torque_limit_nm": 2.0}]},
-            "of mode 'joint'",
+            "with mode 'joint'",
         ),
         ({"sites.m1.hands": [{"kind": "live", "mode": "foot"}]}, "must be one of"),
     ],

@@ -140,7 +140,7 @@ def test_shipped_arms_weigh_and_reach_what_their_makers_say() -> None:
         (
             {"sites.m1.environment": [{**WALL, "normal": [0, 0, 0]}]},
             "environment[0].normal",
-            "somewhere",
+            "other than zero",
         ),
         (
             {"sites.m1.hands": [{**PULSE, "peak_nm": [1.0, 2.0]}]},

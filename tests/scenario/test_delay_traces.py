@@ -71,7 +71,7 @@ def test_a_trace_keeps_its_points_to_the_microsecond(rows: list[tuple[int, int]]
         ("", "has no points"),
         ("t_s,delay_ms\n# nothing\n", "has no points"),
         ("0,5\n1,nan\n", "point 2: the delay must be from 0 to 10000 ms or 'lost', but is nan"),
-        ("0,10000.1\n", "point 1: its delay"),
+        ("0,10000.1\n", "point 1: the delay"),
         ("0,5\ninf,5\n", "point 2: the time must be finite"),
         ("-1,5\n", "point 1: the time must be finite and not negative"),
         ("0,5\n2,5\n1,5\n", "point 3: the time, 1 s, must be later"),

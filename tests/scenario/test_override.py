@@ -90,7 +90,7 @@ def test_key_counts_for_those_whose_law_or_model_has_it() -> None:
         (["limits.tau_limit=5"], ["limits.tau_limit", "did you mean 'tau_limit_nm'"]),
         (["control=5"], ["control", "must be a table"]),
         (["nonsense.x=5"], ["nonsense", "unknown key"]),
-        (["control.Kd.2=5"], ["control.Kd.2", "it has 2, counted from 0"]),
+        (["control.Kd.2=5"], ["control.Kd.2", "the list has 2 entries, counted from 0"]),
         (["control.Kdd.1=5"], ["control.Kdd.1", "did you mean 'Kd'"]),
     ],
     ids=str,

@@ -215,11 +215,11 @@ def test_unfinished_output_says_that_its_end_is_unknown(
         ),
         (IPUTILS + summary(9, 9), "counts 9 answers, but the lines contain 0"),
         (IPUTILS + answers(1) + IPUTILS + answers(1), "several runs of ping"),
-        ("a : [0], 64 bytes, 1.0 ms\nb : [0], 64 bytes, 1.0 ms", "it has 2 hosts, a, b"),
-        (IPUTILS + summary(10**9, 0), "at most 16777216 are read"),
+        ("a : [0], 64 bytes, 1.0 ms\nb : [0], 64 bytes, 1.0 ms", "lines of 2 hosts, a, b"),
+        (IPUTILS + summary(10**9, 0), "at most 16777216 can be read"),
         (
             "Reply from 192.0.2.7: bytes=32 time=1ms TTL=53\nsomething else\n",
-            "line 2 is neither",
+            "line 2 reports neither",
         ),
     ],
 )

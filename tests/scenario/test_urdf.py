@@ -300,7 +300,7 @@ def test_files_that_the_text_names_are_not_opened() -> None:
         ('ixx="0.02"', 'ixx="0.02kg"', ["link 'upper'", "inertia ixx", "'0.02kg'"]),
         ('ixx="0.02"', 'ixx="nan"', ["link 'upper'", "finite"]),
         ('ixx="0.02"', 'ixx="1e400"', ["link 'upper'", "finite"]),
-        ('xyz="0.1 0 0"', 'xyz="0.1 0"', ["link 'upper'", "2 numbers", "three"]),
+        ('xyz="0.1 0 0"', 'xyz="0.1 0"', ["link 'upper'", "three numbers, but has 2"]),
         ('xyz="0.1 0 0"', 'xyz="425 0 0"', ["link 'upper'", "425", "100"]),
         ('xyz="0 0 0.5"', 'xyz="0 0 x"', ["joint 'one'", "'x'"]),
         ('xyz="0 0 0.5"', 'quat_xyzw="0 0 0 1"', ["joint 'one'", "'quat_xyzw'", "rpy"]),

@@ -144,7 +144,7 @@ def _expand_group(
 
     if vector not in valid_keys:
         hint = suggest_nearest(vector, [*_KIND_KEYS[group], *valid_keys])
-        hint = hint or f"; the valid keys are {', '.join(valid_keys)}"
+        hint = hint or f"; valid keys are {', '.join(valid_keys)}"
         raise ScenarioError(f"unknown key{hint}", path=f"{group}.{name}")
     kind_key = _KIND_KEYS[group][0]
     owners = ", ".join(kind for kind, keys in keys_by_kind.items() if vector in keys)
