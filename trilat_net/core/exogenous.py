@@ -124,9 +124,15 @@ _NUMBERS = ("a", "b", "K", "B")
 def torque_source_dtype(width: int) -> np.dtype[np.void]:
     """Returns the NumPy data type that stores the parameters of an operator or an environment.
 
-    If the operator or environment is a function that a user wrote, `call` is its address. The
-    function reads its input from the fields `t_s`, `coordinates`, `at` and `speed`, and writes
-    the force or torque into `effort`.
+    There is one row per operator or environment. It contains the fields of `TorqueSource`, and
+    in addition:
+
+    - `table_first` and `table_count` select the rows of the common table that belong to this
+      operator or environment: recorded torques, sines, or parameters of a user's function.
+    - The other additional fields serve a function that a user wrote. `call` is its address. It
+      reads its input from `t_s` (time since the start of the session, s), `coordinates` (their
+      number), `at` (position of the arm, rad or m) and `speed` (derivative of `at`), and writes
+      the force or torque into `effort`, N or N m.
 
     Args:
         width: Largest length of the vectors of all operators and environments.
@@ -134,7 +140,7 @@ def torque_source_dtype(width: int) -> np.dtype[np.void]:
     integers = ("kind", "sampled", "table_first", "table_count", "call", "coordinates")
     scalars = (*_SCALARS, "t_s")
     vectors = (*_NUMBERS, "at", "speed", "effort")
-    # The fields of 64-bit integers, 64-bit floats and vectors follow one another.
+    # Integers, scalars and vectors follow one another, all of 64 bits: the row has no gaps.
     fields: list[Any] = [(name, "i8") for name in integers]
     fields += [(name, "f8") for name in scalars]
     fields += [(name, "f8", (width,)) for name in vectors]
@@ -262,13 +268,21 @@ def _spring_along(
 
 @leaf
 def _target_progress(actor: Row, t_s: float) -> Pair:
-    """Returns the progress of a target from `a` to `b`, and its rate, 1/s.
+    """Returns the progress of a target on its path from `a` to `b`, and its rate, 1/s.
+
+    A spring of an operator pulls the arm to this target. The target of a script moves along a
+    minimum-jerk path. The target of a live hand is at `a` and moves by b - a per second.
 
     Args:
-        actor: Row of the actor.
-        t_s: Time since the epoch, s.
+        actor: Row of the operator, see `torque_source_dtype`.
+        t_s: Time since the epoch, the common start of the session, s.
+
+    Returns:
+        The progress, 0 to 1, for the position a + progress (b - a) of the target, and its
+        derivative, for the velocity rate (b - a).
     """
-    if actor.kind >= _LIVE_TIP:
+    is_live_hand = actor.kind >= _LIVE_TIP  # the live kinds have the largest numbers
+    if is_live_hand:
         # `a` is the present target, and `b` the target one second later.
         return 0.0, 1.0
     return minimum_jerk(t_s, actor.move_start_s, actor.move_end_s)
@@ -276,11 +290,14 @@ def _target_progress(actor: Row, t_s: float) -> Pair:
 
 @leaf
 def _live_share(actor: Row, square: float) -> float:
-    """Returns the factor of a live hand's force that acts: its grip, reduced to its limit.
+    """Returns the factor that reduces the force of a live hand to its grip and its limit.
+
+    A live hand is a person or program that moves the arm during the run. The part `grip` of its
+    force acts, and the norm of the force before this reduction is at most `limit`.
 
     Args:
-        actor: Row of the actor.
-        square: Square of the norm of the whole force.
+        actor: Row of the live hand, with `grip`, 0 to 1, and `limit`, N or N m.
+        square: Square of the norm of the whole force, N^2 or N^2 m^2.
     """
     share: float = actor.grip
     if square > actor.limit * actor.limit:
@@ -290,20 +307,29 @@ def _live_share(actor: Row, square: float) -> float:
 
 @leaf
 def _spring_force(actor: Row, t_s: float, at: Vector, speed: Vector) -> Pair:
-    """Returns the force of an operator's spring and damper along two coordinates, N or N m.
+    """Returns the force of an operator, who pulls the arm to a target, N or N m.
+
+    A spring and a damper act between the arm and the target along two coordinates. A live hand,
+    an operator who moves the arm during the run, is limited and acts only as far as it grips.
+    The kind LIVE_FORCE has no spring: its force is given.
 
     Args:
-        actor: Row of the actor.
+        actor: Row of the operator, see `torque_source_dtype`.
         t_s: Time since the epoch, s.
         at: Position of the arm along the coordinates, rad or m.
-        speed: Derivative of the position.
+        speed: Derivative of the position, rad/s or m/s.
+
+    Returns:
+        The force along each of the two coordinates.
     """
     progress, rate = _target_progress(actor, t_s)
     x = _spring_along(actor=actor, i=0, progress=progress, rate=rate, at=at[0], speed=speed[0])
     y = _spring_along(actor=actor, i=1, progress=progress, rate=rate, at=at[1], speed=speed[1])
-    if actor.kind < _LIVE_TIP:
+    is_scripted = actor.kind < _LIVE_TIP  # the live kinds have the largest numbers
+    if is_scripted:
         return x, y
     if actor.kind == _LIVE_FORCE:
+        # `a` is the given force, which replaces that of the spring.
         x = actor.a[0]
         y = actor.a[1]
     square = x * x + y * y

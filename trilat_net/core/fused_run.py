@@ -167,20 +167,28 @@ def _accept_prompt_records(
 ) -> int:
     """Accepts a peer's records with a stamp before time t, as if they arrived without delay.
 
+    A site is the process that runs one arm. The receiver is a site, and the peer another site
+    whose records it receives. A record contains the results of one tick, a period of the
+    control loop. Its stamp is the nominal time of this tick. Acceptance stores the record until
+    the simulated delay of the link has passed.
+
     Args:
         k: The tick of the receiver.
-        t_ns: Its nominal time, ns since the epoch.
-        rate_hz: Its tick rate, Hz.
-        peer: The row of the peer.
+        t_ns: Time t of this tick, ns since the epoch, the common start of the session.
+        rate_hz: Tick rate of the receiver, Hz.
+        peer: State of the peer.
         records: The number of records that the peer has made.
-        next_sample: The first record that was not accepted yet.
-        sent: The last records of the peer.
+        next_sample: The first record that was not accepted yet, by its tick of the peer.
+        sent: The last records of the peer, in a ring buffer: record n is at n modulo its
+            length.
         link: The link from the peer.
 
     Returns:
         The first record that is not accepted yet.
     """
-    while next_sample < records and sent.t_ns[next_sample & (sent.t_ns.shape[0] - 1)] < t_ns:
+    # The length of the ring is a power of two, so a modulo is a mask of the lower bits.
+    ring_mask = sent.t_ns.shape[0] - 1
+    while next_sample < records and sent.t_ns[next_sample & ring_mask] < t_ns:
         _accept_record(
             k=k, rate_hz=rate_hz, peer=peer, sample=next_sample, sent=sent, link=link
         )
@@ -192,22 +200,33 @@ def _accept_prompt_records(
 def _apply_recorded_hand(
     i: int, k: int, actors: TorqueSourceRows, feed: ReplayedInputs
 ) -> None:
-    """Writes the recorded action of the live hand of a site into its row.
+    """Repeats what a person did with the arm of a site in a tick of a recorded run.
+
+    A live hand is a person or program that moves the arm during the run. A simulated spring
+    pulls the arm to the target of the hand. The grip, the target and the target one second
+    later are written into the row of the live hand. Nothing happens if the site has no live
+    hand, or after the end of the recorded run.
 
     Args:
         i: Index of the site.
-        k: The tick.
-        actors: Operators and environments of the site.
-        feed: Inputs of the recorded run.
+        k: The tick, a period of the site's control loop.
+        actors: Operators and environments of the site. The fields `a` and `b` of a live hand
+            are its target and its target one second later, m or rad.
+        feed: Inputs of the recorded run. `feed.hands` contains for each site and tick the grip,
+            0 to 1, the coordinates of the target, and those of the target one second later.
     """
-    if feed.hand_indices[i] < 0 or k >= feed.hands.shape[1]:
+    index = feed.hand_indices[i]
+    has_live_hand = index >= 0
+    if not has_live_hand or k >= feed.hands.shape[1]:
         return
-    hand: Row = actors[feed.hand_indices[i]]
-    size = (feed.hands.shape[2] - 1) // 2
+    hand: Row = actors[index]
+    coordinates = (feed.hands.shape[2] - 1) // 2
+    first_target = 1
+    first_target_ahead = first_target + coordinates
     hand.grip = feed.hands[i, k, 0]
-    for n in range(min(size, hand.a.shape[0])):
-        hand.a[n] = feed.hands[i, k, 1 + n]
-        hand.b[n] = feed.hands[i, k, 1 + size + n]
+    for n in range(min(coordinates, hand.a.shape[0])):
+        hand.a[n] = feed.hands[i, k, first_target + n]
+        hand.b[n] = feed.hands[i, k, first_target_ahead + n]
 
 
 @leaf
@@ -420,20 +439,28 @@ def _compute_torque(
     chain: RowArray | None,
     laws: LawArrays | None,
 ) -> None:
-    """Runs stage 6, the torque, of a site.
+    """Computes the torque of a site's control law, stage 6 of a tick (see `kernel`).
+
+    A law is built in, or a user wrote it. `torque_stage` computes the torque of built-in laws,
+    and does nothing for users' laws. `law_stage` calls a user's law that was compiled. The
+    driver of the simulation has called a user's law in plain Python before.
 
     Args:
-        i: Index of the site.
-        progress: Progress of the site.
+        i: Index of the site, the process that runs one arm.
+        progress: Progress of the site, with the tick and its nominal time.
         arrays: Arrays of all sites.
-        chain: Rows of the site's chain, or None for the planar arm.
-        laws: The users' compiled laws. A law in plain Python was called by the driver before.
+        chain: Rows of the site's chain of joints, or None for the planar arm.
+        laws: The users' compiled laws. None if no site has one. The address of a law is 0 for a
+            site that has no compiled law.
     """
     if laws is None:
         torque_stage(arrays.site[i], chain)
         return
+    # The channel contains the numbers that other sites' laws send to this law. A site with a
+    # compiled law has one.
     channel = channel_of(arrays.channel, i)
-    if laws.addresses[i] == 0 or channel is None:
+    is_compiled = laws.addresses[i] != 0
+    if not is_compiled or channel is None:
         torque_stage(arrays.site[i], chain)
         return
     law_stage(

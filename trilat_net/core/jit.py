@@ -218,23 +218,31 @@ class _LeafCacheImpl(CompileResultCacheImpl):
     def rebuild(self, context: Any, kept: Any) -> Any:
         """Converts the content of a cache file to a compiled function.
 
-        Numba itself loads machine code. For LLVM code, which only other compiled functions
-        call, this method creates Numba's objects.
+        A leaf is a function with the decorator `leaf`. Numba itself loads the machine code of a
+        leaf. For the LLVM code of an inner leaf, which only other leaves call, this method
+        creates the objects that Numba has after a compilation. It uses private names of Numba,
+        because Numba has no interface for this.
 
         Args:
             context: Numba's description of the target processor.
-            kept: Content of the file, as `CompileResult._reduce` wrote it.
+            kept: Content of the file, as `CompileResult._reduce` wrote it. The first entry is
+                what `_LeafLibrary.serialize_using_object_code` returned, and the others are
+                arguments of `compile_result` in a fixed order.
 
         Returns:
             Numba's description of the compiled function.
         """
         name, kind, code = kept[0]
-        if kind != _INNER:
+        is_inner = kind == _INNER
+        if not is_inner:
             return super().rebuild(context, kept)
+
         library = _LeafLibrary(context.codegen(), name)
         library.is_inner = True
+        # No machine code is to be made: the library counts as complete with its LLVM code.
         library._finalized = True
         library._final_module = parse_bitcode(code)
+        # The order of `CompileResult._reduce`.
         names = (
             "fndesc",
             "environment",
@@ -265,14 +273,19 @@ class _CompressedFiles(IndexDataCacheFile):
     def save(self, key: Any, code: Any) -> None:
         """Writes compiled code to a file, and adds the file to the index of the cache.
 
+        The index contains the name of the file for each key. Numba numbers the files. Two
+        processes that compile at the same time may then choose the same number. A hash of the
+        key instead of a number makes the names differ.
+
         Args:
             key: Types of the arguments and the processor, for which the code was compiled.
             code: The compiled code, as Numba serialises it.
         """
         names = self._load_index()
-        first, _, last = self._data_name(0).rpartition(".0.")
+        # Numba's name for file 0 is "FUNCTION.0.SUFFIX": the hash replaces the number.
+        prefix, _, suffix = self._data_name(0).rpartition(".0.")
         digest = hashlib.sha256(repr(key).encode()).hexdigest()[:8]
-        name = f"{first}.{digest}.{last}"
+        name = f"{prefix}.{digest}.{suffix}"
         names[key] = name
         self._save_index(names)
         self._save_data(name, code)
@@ -353,18 +366,22 @@ class _LeafCache(FunctionCache):
         return None if kept is None else self._impl.rebuild(context, kept)
 
     def save_inner(self, argument_types: Any, result: Any) -> None:
-        """Stores the LLVM code of a function, which only other compiled functions can call.
+        """Stores the LLVM code of an inner leaf, which only other compiled functions can call.
 
-        Nothing is stored if there is no cache directory in which files can be written.
+        The code is kept in files of its own, besides those of the machine code that Python
+        calls. Nothing is stored if there is no cache directory in which files can be written.
 
         Args:
             argument_types: Numba's types of the arguments.
             result: Numba's description of the compiled function.
         """
-        if _CACHE is not None:
-            self._impl.locator.ensure_cache_path()
-            key = self._index_key(argument_types, result.codegen)
-            self._inner.save(key, self._impl.reduce(result))
+        has_cache = _CACHE is not None
+        if not has_cache:
+            return
+        self._impl.locator.ensure_cache_path()
+        key = self._index_key(argument_types, result.codegen)
+        content = self._impl.reduce(result)
+        self._inner.save(key, content)
 
 
 class _LeafLibrary(JITCodeLibrary):
@@ -415,10 +432,12 @@ class _LeafCompiler(Compiler):
     depth = 0
 
     def compile_extra(self, function: Any) -> Any:
-        """Compiles a Python function to machine code that Python can call, or to LLVM code.
+        """Compiles a leaf to machine code that Python can call, or to LLVM code.
 
-        LLVM code is produced while the compilation of another function is in progress, because
-        the new function is then a part of this other function. Numba calls this method.
+        A leaf is a function with the decorator `leaf`. While the compilation of another leaf is
+        in progress, this leaf is compiled because the other leaf calls it. It is then an inner
+        leaf. Only LLVM code is produced, which becomes a part of the other leaf. Numba calls
+        this method.
 
         Args:
             function: The Python function.
@@ -432,17 +451,23 @@ class _LeafCompiler(Compiler):
         state.library.enable_object_caching()
         state.library.is_inner = is_inner
         if is_inner:
+            # No machine code, and no wrappers by which Python or C could call it.
             state.flags.no_compile = True
             state.flags.no_cpython_wrapper = True
             state.flags.no_cfunc_wrapper = True
+
+        # A leaf that Numba compiles meanwhile is an inner leaf.
         _LeafCompiler.depth += 1
         try:
             result = super().compile_extra(function)
         finally:
             _LeafCompiler.depth -= 1
+
         if is_inner:
             return _as_inner(result)
-        # The environments of inner leaves have no wrapper that would set them.
+        # Compiled code finds the global variables of a function in its environment. Usually the
+        # wrapper of a function sets it. The inner leaves that this leaf contains have no
+        # wrapper, so their environments are set now, when their code is executable.
         for environment in result._find_referenced_environments():
             result.library.codegen.set_env(environment.env_name, environment)
         return result
@@ -492,7 +517,8 @@ class _Leaf(CPUDispatcher):
 
         If Python calls the function, machine code is produced. If another function that is
         being compiled calls it, LLVM code is produced, which is then optimised together with
-        its caller.
+        its caller. `overloads` contains the compiled forms of the function, machine code or
+        LLVM code, by the types of the arguments.
 
         Args:
             signature: Types of the arguments, in a form that Numba accepts.
@@ -504,13 +530,18 @@ class _Leaf(CPUDispatcher):
         with global_compiler_lock:
             argument_types, return_type = normalize_signature(signature)
             known: Any = self.overloads.get(argument_types)
-            if _LeafCompiler.depth == 0:
+            is_called_from_python = _LeafCompiler.depth == 0
+            if is_called_from_python:
                 if known is not None and getattr(known.library, "is_inner", False):
+                    # Python cannot call LLVM code. Without this entry, Numba compiles again.
                     del self.overloads[argument_types]
                 return super().compile(signature)
+
+            # A compiled caller can use machine code and LLVM code alike.
             if known is None:
                 known = self._cache.load_inner(argument_types, self.targetctx)
                 if known is None:
+                    # Report the compilation, as Numba's own method does.
                     data = {"dispatcher": self, "args": argument_types}
                     with event.trigger_event("numba:compile", data=data):
                         known = self._compiler.compile(argument_types, return_type)
@@ -565,20 +596,27 @@ class _NamedCache(_LeafCache):
 def compile_named(
     function: Callable[..., None], name: str, signature: Any, **options: Any
 ) -> Any:
-    """Compiles a function that has variables of an outer function, and stores it under a name.
+    """Compiles a closure, and stores its machine code on disk under a name.
 
-    If a function with this name was compiled before, it is loaded. The name is part of the
-    symbols of the machine code: no two such functions may have the same name in any process.
+    A closure is a function that uses variables of an outer function. If a closure with this
+    name was compiled before, its code is loaded. The caller therefore derives the name from all
+    that the code depends on. The name is part of the symbols of the machine code: no two such
+    functions may have the same name in any process.
 
     Args:
-        function: The function.
+        function: The closure. Its qualified name is changed to `name`.
         name: Name of the function.
         signature: Signature of the function, as Numba has it.
-        **options: Options of `numba.njit`.
+        **options: Options of `numba.njit`. The options that all leaves have in common, such as
+            no counting of references, take precedence.
+
+    Returns:
+        Numba's dispatcher of the compiled function.
     """
     function.__qualname__ = name
-    # Loaded code must count no references either, so the options hold in both cases.
+    # The common options apply to new and to loaded code alike: neither counts references.
     dispatcher = numba.njit(**{**options, **_OPTIONS})(function)
+    # Numba's own cache cannot store closures under a given name.
     dispatcher._cache = cast(Any, _NamedCache)(function)
     dispatcher.compile(signature)
     return dispatcher

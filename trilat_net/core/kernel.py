@@ -107,24 +107,31 @@ def _adapts(s: SiteRow) -> bool:
 
 @leaf
 def _update_estimate(k: int, s: SiteRow, chain: RowArray | None) -> None:
-    """Runs stage 5, the estimate: the trapezoid rule for Eq. (15).
+    """Updates the estimate of the arm's dynamic parameters by one tick, stage 5 of a tick.
+
+    The estimate theta follows Eq. (15) of the paper, dtheta/dt = -Gamma Y' r, where Gamma is
+    the matrix of the adaptation gains, Y the regressor and r the filtered error. The trapezoid
+    rule with the period h gives
 
         theta_k = theta_{k-1} - h/2 Gamma (Y'r_{k-1} + Y'r_k)
 
-    The rule is explicit, because Y' r does not depend on the estimate. The sum of both ends of
-    the period is multiplied by h/2. DIGITAL advances the estimate in stage 8 instead.
+    The rule is explicit, because Y' r does not depend on the estimate. The scheme DIGITAL
+    advances the estimate by the Euler rule at the end of the tick instead, in stage 8.
 
     Args:
         k: The tick.
-        s: Row of the site.
+        s: Row of the site. `Yr` is Y' r of tick k. `Yr_before` is that of tick k - 1, and is
+            overwritten with the sum of both; stage 8 sets it anew.
         chain: Rows of the chain, or None.
     """
+    # `_adapts` is evaluated last, because it is the costly condition.
     if s.scheme == _DIGITAL or k == s.first or s.law != _ADAPTIVE or not _adapts(s):
         return
     for p in range(s.Yr.shape[0]):
         s.Yr_before[p] += s.Yr[p]
+    sum_of_both_ticks = s.Yr_before
     half_h_s = 0.5 / s.rate_hz
-    _advance_estimate(s, chain, half_h_s, s.Yr_before)
+    _advance_estimate(s, chain, half_h_s, sum_of_both_ticks)
 
 
 @leaf
@@ -358,9 +365,15 @@ def channel_of(channel: ChannelArrays | None, peer: int) -> ChannelArrays | None
 def link_arrays(arrays: SiteArrays, peer: int) -> LinkArrays:
     """Returns the arrays of the link from one peer, as views of the arrays of the site.
 
+    A site is the process that runs one arm, and a peer another site that sends its samples
+    (states). `LinkArrays` describes the arrays of a link. Nearly all of them are rows of the
+    site's arrays, one row per peer. `state` is a slice, because it must stay an array, of
+    shape (1,). `points` is the table of all links of the site, in which each link has rows of
+    its own.
+
     Args:
         arrays: Arrays of the site.
-        peer: Index of the peer.
+        peer: Index of the peer, in scenario order.
     """
     return LinkArrays(
         state=arrays.links[peer : peer + 1],

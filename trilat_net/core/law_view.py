@@ -166,11 +166,13 @@ class PlainLaw:
         Raises:
             LawFailed: The law raised an exception, or returned an invalid result.
         """
-        a = self._arrays
-        setup = self._setup
-        self._update(k, t_ns, a.site, a.links, a.chain)
-        now = self._read(k)
-        results = call_law(self._law, setup.name, now, self._collect_sent)
+        arrays = self._arrays
+        # Write the input of the law into the arrays, and read it from there as lists.
+        self._update(k, t_ns, arrays.site, arrays.links, arrays.chain)
+        law_input = self._read(k)
+        results = call_law(self._law, self._setup.name, law_input, self._collect_sent)
+
+        # `call_law` has checked that the results are finite and of the right length.
         limit = self._limit
         self._views["tau"][:] = np.clip(results.torque, -limit, limit)
         self._views["theta_hat"][:] = results.theta_hat

@@ -132,8 +132,10 @@ def calendar_pages(
 ) -> int:
     """Computes how many entries the ring buffer needs in which delayed samples wait.
 
-    There is one entry for each period of the receiver's control loop in which a sample may be
-    used first. The default arguments give the largest number that any link needs.
+    A sample is the state that another arm's process sends. The ring buffer is called the
+    calendar, and its entries pages. There is one page for each period of the receiver's control
+    loop in which a sample may be used first. The default arguments give the largest number that
+    any link needs.
 
     Args:
         rate_hz: Rate of the receiver's control loop, Hz.
@@ -141,10 +143,13 @@ def calendar_pages(
         ahead_ns: Longest time by which the clock of a sender may be ahead of the receiver, ns.
 
     Returns:
-        The number of entries, a power of two.
+        The number of pages, a power of two, so that a modulo is a mask of the lower bits.
     """
-    span = span_ticks(delay_us * 1000 + ahead_ns, rate_hz)
-    return 1 << (span + 2).bit_length()
+    longest_wait_ticks = span_ticks(delay_us * 1000 + ahead_ns, rate_hz)
+    # Two ticks more: the present tick, and one tick because a sample is never used at the time
+    # when it was sent. 1 << n.bit_length() is the next power of two above n.
+    least_pages = longest_wait_ticks + 2
+    return 1 << least_pages.bit_length()
 
 
 @leaf
@@ -164,15 +169,24 @@ def release_tick(tick: int, rate_hz: int, link: LinkArrays) -> int:
     """
     row: LinkRow = link.state[0]
     dues = link.dues
+    # Computes the due times, the times of delivery, up to this sample if that is not done yet.
     schedule_deliveries(
         sample=tick, link=row, models=link.models, dues=dues, points=link.points
     )
-    due_ns = dues[tick % dues.shape[0]]
-    if due_ns == LOST or tick <= row.scheduled - dues.shape[0]:
+    kept = dues.shape[0]
+    due_ns = dues[tick % kept]  # a ring buffer
+    # The entry of an older sample contains the due time of a newer one.
+    oldest_kept = row.scheduled - kept + 1
+    if due_ns == LOST or tick < oldest_kept:
         return LOST
-    if due_ns <= _FILED:
+
+    # After the arrival of a sample, the entry is `_FILED` minus the due time.
+    has_arrived = due_ns <= _FILED
+    if has_arrived:
         due_ns = _FILED - due_ns
-    return first_tick_at(max(due_ns, tick_ns(tick, row.rate_hz) + 1), rate_hz)
+    # A sample is never used at the time when it was sent.
+    stamp_ns = tick_ns(tick, row.rate_hz)
+    return first_tick_at(max(due_ns, stamp_ns + 1), rate_hz)
 
 
 @leaf
@@ -295,9 +309,12 @@ def accept_sample(
 def release_sample(k: int, rate_hz: int, link: LinkArrays) -> None:
     """Puts into use the newest sample of a peer whose delay has passed in tick k.
 
-    If there is no such sample, the last sample stays in use. Every tick must be released once,
-    in order. The deliveries of all samples with a stamp up to the time t_k of the tick are
-    scheduled here, so that the first sample after a long silence costs no more than any other.
+    If there is no such sample, the last sample stays in use. This function must be called once
+    in each tick of the receiver, in order. Otherwise samples stay in the calendar, the ring
+    buffer with a page per tick in which `accept_sample` has put them.
+
+    The due times of all samples with a stamp up to the time t_k of the tick are computed here,
+    so that the first sample after a long silence costs no more than any other.
 
     Args:
         k: Tick of the receiver.
@@ -307,23 +324,28 @@ def release_sample(k: int, rate_hz: int, link: LinkArrays) -> None:
     row: LinkRow = link.state[0]
     row.new = 0
     calendar = link.calendar
-    sample = k if row.rate_hz == rate_hz else k * row.rate_hz // rate_hz
+    # The last tick of the peer that has begun by now.
+    peer_tick = k if row.rate_hz == rate_hz else k * row.rate_hz // rate_hz
     schedule_deliveries(
-        sample=sample, link=row, models=link.models, dues=link.dues, points=link.points
+        sample=peer_tick, link=row, models=link.models, dues=link.dues, points=link.points
     )
+
+    # The page of tick k. The number of pages is a power of two, so a modulo is a mask.
     page = k & (calendar.shape[0] - 1)
-    slot: SampleRow = calendar[page]
-    newest = slot.tick
-    if newest < 0:
+    waiting: SampleRow = calendar[page]
+    newest = waiting.tick
+    is_page_empty = newest < 0
+    if is_page_empty:
         return
-    slot.tick = -1
+
+    waiting.tick = -1  # empties the page
     if newest > row.used:
         row.used = newest
         row.used_ns = tick_ns(k, rate_hz)
         row.new = 1
-        put(row.q, slot.q)
-        put(row.qd, slot.qd)
-        put(row.tau_x, slot.tau_x)
+        put(row.q, waiting.q)
+        put(row.qd, waiting.qd)
+        put(row.tau_x, waiting.tau_x)
         _use_sent(link.channel, page)
     else:
-        row.superseded += 1
+        row.superseded += 1  # a newer sample is in use
