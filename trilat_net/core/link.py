@@ -146,8 +146,8 @@ def calendar_pages(
         The number of pages, a power of two, so that a modulo is a mask of the lower bits.
     """
     longest_wait_ticks = span_ticks(delay_us * 1000 + ahead_ns, rate_hz)
-    # Two ticks more: the present tick, and one tick because a sample is never used at the time
-    # when it was sent. 1 << n.bit_length() is the next power of two above n.
+    # Two ticks more: the present tick, and a reserve of one tick for rounding.
+    # 1 << n.bit_length() is the next power of two above n.
     least_pages = longest_wait_ticks + 2
     return 1 << least_pages.bit_length()
 

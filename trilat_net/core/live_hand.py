@@ -307,21 +307,29 @@ def advance_hand(
 
 
 def _move_target(rules: HandRules, memory: HandMemory) -> HandMemory:
-    """Returns the state one period later: target moved, grip firmer or weaker.
+    """Returns the state one period later: the target has moved, the grip is firmer or weaker.
+
+    The target moves with its velocity `rate`. The grip, a factor of the force from 0 to 1,
+    grows while a sender holds the arm, and fades after that. It needs GRIP_NS for the whole
+    range. When it has faded, nobody holds the arm, and no target is left.
 
     Args:
-        rules: Limits of the hand.
-        memory: State after the previous tick.
+        rules: Limits of the hand, and the rate of the control loop.
+        memory: State after the previous tick (period of the loop), with a target.
     """
     h_s = 1.0 / rules.rate_hz
+    # The period, 1e9 / rate_hz in ns, as a part of GRIP_NS.
     grip_step = 1e9 / (GRIP_NS * rules.rate_hz)
     # A list instead of a generator: it is faster, and this runs in each tick.
     target = tuple([x + v * h_s for x, v in zip(memory.target, memory.rate, strict=True)])
-    if memory.source:
+    is_held = memory.source != 0
+    if is_held:
         return memory._replace(target=target, grip=min(memory.grip + grip_step, 1.0))
+
     grip = max(memory.grip - grip_step, 0.0)
     if grip > 0.0:
         return memory._replace(target=target, grip=grip)
+    # Only the last sender is remembered, because its old messages may still arrive.
     return HandMemory(before=memory.before)
 
 
@@ -329,10 +337,21 @@ def _move_target(rules: HandRules, memory: HandMemory) -> HandMemory:
 def find_stopping_speed(distance: float, acceleration: float, h_s: float) -> float:
     """Returns the largest speed from which a target can stop within a distance, Eq. (L1).
 
+    The target moves in steps of one period h, with an acceleration of at most a. With the unit
+    a h of speed and a h^2 of distance, the speed falls by 1 per period, and the distance to the
+    goal is D. The target can stop from the whole speed n in n more periods, which takes the
+    distance n (n + 1) / 2. Therefore n is the largest integer with n (n + 1) / 2 <= D. The
+    remaining distance is divided among the n + 1 periods:
+
+        speed = n + (D - n (n + 1) / 2) / (n + 1) = D / (n + 1) + n / 2
+
     Args:
         distance: Distance to the goal, m or rad.
-        acceleration: Largest acceleration, m/s^2 or rad/s^2.
-        h_s: Period of the ticks, s.
+        acceleration: Largest acceleration a, m/s^2 or rad/s^2.
+        h_s: Period h of the ticks, s.
+
+    Returns:
+        The speed, m/s or rad/s.
     """
     speed_step = acceleration * h_s
     D = distance / (speed_step * h_s)
@@ -515,17 +534,30 @@ def _take_hold(
 ) -> HandMemory:
     """Returns the state after a message by which a sender takes hold of a free arm.
 
+    A simulated spring pulls the arm to a target, which moves to the goal of the message. The
+    grip is the factor of the spring's force, 0 to 1. While the grip of an earlier hold fades,
+    its target still exists and moves. The new hold then continues with this grip, target and
+    velocity, so that the force does not jump. Otherwise it starts without force, at the pose of
+    the arm.
+
     Args:
         rules: Limits of the hand.
-        memory: State before the message. An earlier grip may still fade.
-        t_ns: Nominal time of the tick, ns since the epoch.
+        memory: State before the message. Nobody holds the arm.
+        t_ns: Nominal time of the tick, ns since the epoch, the common start of the session.
         command: The message.
         locate: Function that returns the arm's pose now.
+
+    Returns:
+        The state. The target arrives at its goal after GLIDE_NS.
     """
     zeros = (0.0,) * rules.size
-    target = memory.target
-    if not target:
-        target = tuple(map(float, locate())) if rules.starts_at_arm else zeros
+    is_earlier_grip_fading = bool(memory.target)
+    if is_earlier_grip_fading:
+        target = memory.target
+    elif rules.starts_at_arm:
+        target = tuple(map(float, locate()))
+    else:
+        target = zeros  # the target is a force
     held = HandMemory(
         source=command.source,
         number=command.number,
@@ -535,7 +567,8 @@ def _take_hold(
         received_ns=t_ns,
         before=memory.before,
     )
-    return _aim(rules, held, command, t_ns + GLIDE_NS)
+    arrives_ns = t_ns + GLIDE_NS
+    return _aim(rules, held, command, arrives_ns)
 
 
 def _aim(
@@ -578,31 +611,44 @@ def _find_fading_rate(rules: HandRules, memory: HandMemory) -> tuple[float, ...]
 def _find_limited_rate(
     rules: HandRules, memory: HandMemory, left_s: float
 ) -> tuple[float, ...]:
-    """Returns the velocity of a target whose acceleration is limited, see Eq. (L1).
+    """Returns the velocity of a target whose speed and acceleration are limited.
 
-    Both limits are balls in the space of velocities. The last and the desired velocity lie
-    within the limits, and so does any velocity between them.
+    The desired velocity points to the goal. Its size is the smallest of three speeds: the speed
+    limit, the speed that reaches the goal in the time that is left, and the largest speed from
+    which the target can stop at the goal, Eq. (L1) at the top of this module. The velocity
+    changes from the last to the desired velocity in a straight line, by at most the
+    acceleration limit times the period.
+
+    The norms of velocities and accelerations are limited. The last and the desired velocity
+    lie within the speed limit, and so does any velocity between them.
 
     Args:
         rules: The limits of the hand.
-        memory: Its state, with the target already moved.
+        memory: Its state, with the target already moved, the goal, and the last velocity
+            `rate`, m/s or rad/s.
         left_s: Time that remains until the target arrives at the goal, s.
+
+    Returns:
+        The velocity of the target, m/s or rad/s per coordinate.
     """
     h_s = 1.0 / rules.rate_hz
     offset = [goal - x for goal, x in zip(memory.goal, memory.target, strict=True)]
-    # Sums in a loop: the order of additions is that of `_glide_tick`.
-    square = 0.0
+    # `_glide_tick` computes the same in compiled code. Loops add in the same order as it does.
+    squared_distance = 0.0
     for x in offset:
-        square += x * x
-    distance = math.sqrt(square)
+        squared_distance += x * x
+    distance = math.sqrt(squared_distance)
+
+    arriving_speed = distance / left_s
     stopping_speed = _plain_stopping_speed(distance, rules.acceleration_limit, h_s)
-    speed = min(rules.speed_limit, distance / left_s, stopping_speed)
+    speed = min(rules.speed_limit, arriving_speed, stopping_speed)
     speed_per_distance = speed / distance if distance > 0.0 else 0.0
     changes = [speed_per_distance * x - v for x, v in zip(offset, memory.rate, strict=True)]
-    square = 0.0
+
+    squared_change = 0.0
     for change in changes:
-        square += change * change
-    change_norm = math.sqrt(square)
+        squared_change += change * change
+    change_norm = math.sqrt(squared_change)
     largest_change = rules.acceleration_limit * h_s
     factor = largest_change / change_norm if change_norm > largest_change else 1.0
     return tuple(v + factor * change for v, change in zip(memory.rate, changes, strict=True))
