@@ -37,17 +37,40 @@ _PLAIN: dict[int, Callable[..., None]] = {}
 def _call_compiled(_context: Any, address: Any, arguments: Any) -> Any:
     """Generates the call of a compiled function, which returns nothing, by its address.
 
-    An exception of the function propagates to the caller.
+    Numba calls this function when it compiles a caller of `call_address`. An exception of the
+    called function propagates to its caller.
+
+    Args:
+        _context: Numba's typing context.
+        address: Numba's type of the address, an integer.
+        arguments: Numba's type of the tuple of arguments.
+
+    Returns:
+        The signature, as Numba expects it of an intrinsic, and the function that generates the
+        LLVM code of the call.
     """
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        """Generates the LLVM code, in the calling convention of Numba.
+
+        Args:
+            context: Numba's description of the target processor.
+            builder: Appends LLVM instructions to the caller.
+            signature: The signature of the intrinsic.
+            values: The LLVM values of the address and of the tuple.
+
+        Returns:
+            The LLVM value of None, the result of the call.
+        """
         convention = context.call_conv
         address_value, tuple_value = values
         argument_types = tuple(signature.args[1])
+        # Convert the integer to a pointer to a function.
         function_type = convention.get_function_type(types.none, argument_types)
         pointer = builder.inttoptr(address_value, function_type.as_pointer())
         unpack: Any = cgutils.unpack_tuple
         argument_values = unpack(builder, tuple_value)
+        # A function returns a status, which states whether an exception was raised.
         status, _ = convention.call_function(
             builder, pointer, types.none, argument_types, argument_values
         )
@@ -55,6 +78,7 @@ def _call_compiled(_context: Any, address: Any, arguments: Any) -> Any:
             convention.return_status_propagate(builder, status)
         return context.get_dummy_value()
 
+    # A Numba type that is called with types of arguments is a signature: this one returns None.
     return types.none(address, arguments), generate
 
 
@@ -128,18 +152,34 @@ def list_numbers(model: Any) -> Array:
 def _compile(
     function: Callable[..., None], form: np.dtype[np.void], row: np.dtype[np.void]
 ) -> Any:
-    """Returns the compiled form of a function, called with an array of numbers and a row.
+    """Compiles a function of a user's model, so that machine code can call it.
+
+    The function takes the parameters of its model as a record. The simulation has the
+    parameters as an array of floats. Therefore the result takes this array, and gives the
+    function a view of it as a record.
 
     Args:
-        function: The function.
-        form: Layout of the numbers of its model.
-        row: Layout of the row.
+        function: The function of the model, called with the parameters and with a row.
+        form: Layout of the parameters: name and shape of each one, all of them floats.
+        row: Layout of the row, from which the function reads its input and into which it
+            writes its result.
+
+    Returns:
+        The compiled function, called with the array of the parameters and with the row. If
+        Numba is disabled, a Python function.
     """
-    count = form.itemsize // 8
+    count = form.itemsize // 8  # floats of 8 bytes
     compute = numba.njit(**_OPTIONS)(function)
 
     def call(numbers: Any, now: Any) -> None:
-        compute(numbers[:count].view(form)[0], now)
+        """Calls the function with the parameters of its model as a record.
+
+        Args:
+            numbers: The parameters, possibly followed by other floats.
+            now: The row.
+        """
+        model = numbers[:count].view(form)[0]
+        compute(model, now)
 
     if _config.DISABLE_JIT:
         return call
@@ -147,10 +187,13 @@ def _compile(
     row_type = numba_types.from_dtype(row)
     signature = types.none(types.float64[::1], row_type)
     sources = digest_sibling_sources(function)
-    if sources:
+    is_part_of_this_package = bool(sources)
+    if is_part_of_this_package:
+        # The machine code is stored on disk, under a name from all that it depends on.
         text = f"{sources} {function.__module__} {function.__qualname__} {form} {row}"
         digest = hashlib.sha256(text.encode()).hexdigest()
         return compile_named(call, f"own_{digest[:32]}", signature, **_OPTIONS)
+    # A user's function may depend on files that are unknown: it is compiled in each process.
     return numba.njit(signature, **_OPTIONS)(call)
 
 

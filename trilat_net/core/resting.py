@@ -233,15 +233,22 @@ def advance_rest_reference(t_ns: int, ticks: int, site: SiteRow) -> None:
 
 @leaf
 def _brakes(t_ns: int, site: SiteRow) -> bool:
-    """Returns True while the arm brakes.
+    """Returns True while the arm brakes, which is the first part of its rest.
 
-    It brakes for at least LEAST_STOP_S, until the reference rests, and while a joint is fast.
+    An arm at rest follows a reference, a position of each joint that slows down to zero
+    velocity. The arm brakes for at least LEAST_STOP_S, while the reference of a joint moves,
+    and while the arm is fast (its damping alone exceeds a torque limit).
+
+    Args:
+        t_ns: Time, ns since the epoch, the common start of the session.
+        site: Row of the site. While the arm is at rest, `return_from_ns` is the start of the
+            rest.
     """
     elapsed_ns = t_ns - site.return_from_ns
     brakes = elapsed_ns < LEAST_STOP_S * NS_PER_S or is_fast(site)
     for i in range(site.joints):
-        _, rate = _read_reference(site, i)
-        brakes = brakes or rate != 0.0
+        _, reference_velocity = _read_reference(site, i)
+        brakes = brakes or reference_velocity != 0.0
     return brakes
 
 
@@ -290,27 +297,39 @@ def add_rest_torque(k: int, t_ns: int, site: SiteRow) -> None:
     """Adds damping and an integral term to the torque of an arm at rest, and limits the sum.
 
     The sum w - B s is added to the torque `tau`. B is the damping in N m s/rad, and s the
-    filtered deviation of a joint from its reference in rad/s. The integral term w carries a
-    constant load. At the start of the rest, it is the part of the previous torque that the
-    control law does not explain. The torque before the limit is stored in `u`.
+    filtered deviation of a joint from its reference in rad/s. The torque before the limit is
+    stored in `u`.
+
+    The integral term w, in N m, carries a constant load, for example unknown gravity:
+
+    - At the start of the rest, it is the part of the previous torque that the control law does
+      not explain. The faster the arm moves, the smaller this part is made; it is zero in the
+      first tick of a run, which has no previous torque.
+    - While the arm brakes, w may act in the direction of motion and so delay the stop. Then its
+      magnitude is reduced by B |qd| in each tick, at most to zero. qd is the joint velocity.
+    - After this tick, `advance_rest` integrates it.
 
     Args:
         k: Number of the control period.
         t_ns: Time of the period, ns since the start of the session.
-        site: State of the site (the process that runs the arm); changed.
+        site: State of the site (the process that runs the arm); changed. `tau_held` is w, and
+            `return_from_ns` the start of the rest.
     """
+    starts_to_rest = t_ns == site.return_from_ns
     brakes = _brakes(t_ns, site)
-    held_part = 0.0
+    # The part of an unexplained torque that is kept, smaller for a faster arm.
+    kept_part = 0.0
     if k > site.first:
-        held_part = max(0.0, 1.0 - find_brake_ratio(site))
+        kept_part = max(0.0, 1.0 - find_brake_ratio(site))
     for i in range(site.joints):
         qd = site.qd[i]
         damping = site.damping[i]
         w = site.tau_held[i]
-        if t_ns == site.return_from_ns:
+        if starts_to_rest:
             unexplained = site.tau_before[i] - site.tau[i]
-            w = held_part * unexplained
-        if brakes and w * qd > 0.0:
+            w = kept_part * unexplained
+        acts_along_motion = w * qd > 0.0
+        if brakes and acts_along_motion:
             w = _shrink(w, damping * qd)
         torque = site.tau[i] + w - damping * _find_slip(site, i)
         if not isfinite(torque):

@@ -170,16 +170,18 @@ def _times_rows(row: Three, a: Three, b: Three, c: Three) -> Three:
 def compose_rotations(turn: Three, vector: Three) -> Three:
     """Returns the rotation `vector`, followed by the rotation `turn` about base axes.
 
-    All three are rotation vectors: the direction is the axis, the length the angle in rad.
+    All three are rotation vectors: the direction is the axis, the length the angle in rad. With
+    the rotation matrices T of `turn` and R of `vector`, the result is the rotation vector of
+    T R. `relative_rotation` returns that of T X' for a matrix X. Therefore X is the inverse R'.
 
     Args:
         turn: Rotation vector of the second rotation.
         vector: Rotation vector of the first rotation.
     """
-    turn_matrix = rotation_matrix(turn)
+    second_matrix = rotation_matrix(turn)
     inverse_vector = scale(-1.0, vector)
-    inverse = rotation_matrix(inverse_vector)
-    return relative_rotation(turn_matrix, inverse)
+    first_matrix_inverse = rotation_matrix(inverse_vector)
+    return relative_rotation(second_matrix, first_matrix_inverse)
 
 
 @leaf
@@ -233,24 +235,30 @@ def angular_velocity(turn: Three, rate: Three) -> Three:
 def rotation_vector_rate(turn: Three, velocity: Three) -> Three:
     """Returns the derivative of a rotation vector at an angular velocity, rad/s.
 
-    The function is the inverse of `angular_velocity`.
+    With the rotation vector u, its length a (the angle), and the angular velocity w about base
+    axes, the derivative is w times the inverse of the left Jacobian:
+
+        u' = w - 1/2 u x w + c u x (u x w),    c = (1 - (a / 2) cos(a / 2) / sin(a / 2)) / a^2
+
+    For small angles, c is the series 1/12 + a^2 / 720 + a^4 / 30240. The function is the
+    inverse of `angular_velocity`.
 
     Args:
-        turn: The rotation vector, rad.
-        velocity: The angular velocity, rad/s.
+        turn: The rotation vector u, rad.
+        velocity: The angular velocity w, rad/s.
     """
     angle = length(turn)
     a2 = angle * angle
     if angle < _SHORT:
         a4 = a2 * a2
-        twice_gain = 1.0 / 12.0 + a2 / 720.0 + a4 / 30240.0
+        c = 1.0 / 12.0 + a2 / 720.0 + a4 / 30240.0
     else:
         half_angle = 0.5 * angle
-        s, c = sincos(half_angle)
-        twice_gain = (1.0 - half_angle * c / s) / a2
-    once = cross(turn, velocity)
-    twice = cross(turn, once)
-    once_part = scale(-0.5, once)
-    twice_part = scale(twice_gain, twice)
-    correction = add(once_part, twice_part)
+        sine, cosine = sincos(half_angle)
+        c = (1.0 - half_angle * cosine / sine) / a2
+    u_x_w = cross(turn, velocity)
+    u_x_u_x_w = cross(turn, u_x_w)
+    first_order_part = scale(-0.5, u_x_w)
+    second_order_part = scale(c, u_x_u_x_w)
+    correction = add(first_order_part, second_order_part)
     return add(velocity, correction)
