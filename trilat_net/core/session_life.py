@@ -121,14 +121,28 @@ def _all_heard(t_ns: int, silence_ns: int, links: RowArray) -> bool:
 
 @leaf
 def _alignment_s(site: SiteRow) -> float:
-    """Returns the duration T of the alignment whose offset starts at `q_held`, s."""
-    distance = 0.0
+    """Returns the duration T of an alignment, s.
+
+    An alignment is the smooth return of an arm to its peers, in the mode RETURN. An offset is
+    added to the reference of the peers, and falls from its start value to zero within T. The
+    largest slope of its polynomial is 1.5 times its mean slope, so with
+
+        T = 1.5 distance / align_speed
+
+    the offset is no faster than the limit `align_speed`. T is at least MIN_ALIGN_NS.
+
+    Args:
+        site: Row of the site. `q_held` is the start value of the offset, rad or m. For a pose,
+            its last three coordinates are a rotation vector, rad. `align_speed` counts for each
+            linear coordinate, rad/s or m/s, and for the angle of the rotation, rad/s.
+    """
+    longest_distance = 0.0
     for i in range(count_linear_coordinates(site)):
-        distance = max(distance, abs(site.q_held[i]))
+        longest_distance = max(longest_distance, abs(site.q_held[i]))
     if has_orientation(site):
         angle = length(three(site.q_held[3:]))
-        distance = max(distance, angle)
-    needed_s = 1.5 * distance / site.align_speed
+        longest_distance = max(longest_distance, angle)
+    needed_s = 1.5 * longest_distance / site.align_speed
     duration_s: float = max(MIN_ALIGN_NS * 1e-9, needed_s)
     return duration_s
 
@@ -176,12 +190,15 @@ def _start_alignment(t_ns: int, site: SiteRow, reason: int, q: Array, qd: Array)
 
 @leaf
 def _leave_rest(t_ns: int, site: SiteRow, reason: int) -> None:
-    """Starts an alignment from the reference of an arm at rest.
+    """Starts an alignment, by which an arm at rest returns to its peers.
+
+    The alignment starts from the reference at rest, the motion that the law of the resting arm
+    follows. This reference is first written into `q_followed` and `qd_followed`.
 
     Args:
         t_ns: Time, ns since the epoch, the common start of the session.
-        site: Row of the site.
-        reason: Reason of the change of mode.
+        site: Row of the site, the process that runs the arm; changed.
+        reason: Reason of the change of mode, a `LifeReason`.
     """
     put_rest_reference(site, site.q_followed, site.qd_followed)
     _start_alignment(
@@ -309,10 +326,23 @@ def _apply_order(t_ns: int, site: SiteRow) -> None:
 def _update_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
     """Changes the mode for a fault of the motion, or for silent or returning peers.
 
+    The first of these changes that applies is made (the modes are explained at the top of this
+    module, and the code calls the mode RETURN `_ALIGN`):
+
+        any mode        a fault of the motion                       -> FAULT
+        WAITING         all peers are heard                         -> RETURN
+        HOLD            all peers are heard, not in the tick        -> RETURN
+                        in which HOLD was entered
+        RUN, RETURN     a peer is silent                            -> HOLD
+        RUN, RETURN     a peer was dropped or restored              -> RETURN
+        RETURN          the time of the alignment has passed        -> RUN
+
     Args:
         t_ns: Time, ns since the epoch, the common start of the session.
-        site: Row of the site.
-        links: Rows of the site's links.
+        site: Row of the site, the process that runs the arm. `return_from_ns` is the time of
+            the last change to rest, to an alignment or to RUN. `regrouped` is the reason if a
+            peer was dropped or restored in this tick, otherwise 0.
+        links: Rows of the site's links, one per peer.
     """
     fault = _find_fault(site)
     if fault >= 0 and site.mode != _FAULT:
@@ -323,13 +353,15 @@ def _update_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
     heard = _all_heard(t_ns, site.stale_ns, links)
     moves = site.mode == _RUN or site.mode == _ALIGN
     elapsed_ns = t_ns - site.return_from_ns
+    entered_now = elapsed_ns == 0
     if heard and site.mode == _WAITING:
         _leave_rest(t_ns, site, _PEERS_HERE)
-    elif heard and site.mode == _HOLD and elapsed_ns != 0:
+    elif heard and site.mode == _HOLD and not entered_now:
         _leave_rest(t_ns, site, _PEERS_BACK)
     elif not heard and moves:
         enter_rest(t_ns, _HOLD, _PEER_SILENT, site)
     elif site.regrouped and moves:
+        # The set of followed peers has changed: align from where the reference would be now.
         _extrapolate_reference(site)
         _start_alignment(
             t_ns=t_ns, site=site, reason=site.regrouped, q=site.q_followed, qd=site.qd_followed
@@ -374,24 +406,34 @@ def update_session_life(t_ns: int, site: SiteRow, links: RowArray) -> None:
 def _find_offset(t_ns: int, duration_s: float, site: SiteRow, i: int) -> tuple[float, float]:
     """Returns the offset of a coordinate from the peers' reference, and its rate.
 
-    The polynomial is that at the top of this module.
+    While the arm returns smoothly to its peers (an alignment), the offset falls to zero within
+    the time T. It is the cubic Hermite polynomial with the start value D, the start rate D' and
+    zero value and rate at the end:
+
+        offset(x) = D (1 - 3 x^2 + 2 x^3) + T D' x (1 - x)^2
+        d offset / dx = T D' (1 - x) (1 - 3 x) - 6 D x (1 - x)
 
     Args:
         t_ns: Time, ns since the epoch, the common start of the session.
         duration_s: Duration T of the alignment, s.
-        site: Row of the site.
+        site: Row of the site. The alignment started at `return_from_ns`, with D in `q_held` and
+            D' in `qd_held`.
         i: The coordinate.
+
+    Returns:
+        The offset, rad or m, and its rate, rad/s or m/s.
     """
     x = (t_ns - site.return_from_ns) * 1e-9 / duration_s
     remaining = 1.0 - x
-    start = site.q_held[i]
-    start_slope = duration_s * site.qd_held[i]
-    from_start = start * (1.0 - x * x * (3.0 - 2.0 * x))
-    from_slope = start_slope * x * remaining * remaining
-    slope_part = start_slope * remaining * (1.0 - 3.0 * x)
-    offset_part = start * 6.0 * x * remaining
-    slope = slope_part - offset_part
-    return from_start + from_slope, slope / duration_s
+    D = site.q_held[i]
+    T_D_rate = duration_s * site.qd_held[i]
+    value_part = D * (1.0 - x * x * (3.0 - 2.0 * x))
+    rate_part = T_D_rate * x * remaining * remaining
+    # The derivatives of both parts with respect to x, the second one with the opposite sign.
+    slope_of_rate_part = T_D_rate * remaining * (1.0 - 3.0 * x)
+    fall_of_value_part = D * 6.0 * x * remaining
+    slope = slope_of_rate_part - fall_of_value_part
+    return value_part + rate_part, slope / duration_s
 
 
 @leaf

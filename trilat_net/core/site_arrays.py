@@ -550,24 +550,38 @@ def select_site(stacked: SiteArrays, i: int, layout: Layout) -> SiteArrays:
 def _stack_channels(
     setups: Sequence[SiteSetup], channels: Sequence[ChannelArrays]
 ) -> ChannelArrays:
-    """Returns the channels of several sites stacked.
+    """Stacks the arrays for the numbers that control laws send, over several sites.
 
-    Their columns become those of the peer's record, which contains the numbers that the peer
-    sends to all sites and then those for each site.
+    A site is the process that runs one arm, and its peers are the other sites. The law of a
+    peer sends A numbers to all sites, and E numbers to each of them. A single site receives
+    only the A + E numbers that are meant for it. In a simulation of all sites, it reads the
+    record of the peer, which contains the numbers for all of its receivers:
+
+        a single site:  A to all | E to this site
+        record:         A to all | E to receiver 0 | E to receiver 1 | ...
+
+    Therefore the column of a number to each site grows by E for each receiver before this site.
 
     Args:
         setups: Setups of the sites.
-        channels: Channels of the sites; their columns are changed.
+        channels: Arrays of each site. `columns` contains for each peer the index of each number
+            that the law of the site reads, or -1. It is changed in place.
+
+    Returns:
+        The arrays with a first axis for the site, filled up to equal lengths.
     """
     for setup, channel in zip(setups, channels, strict=True):
         for link, columns in zip(setup.links, channel.columns, strict=True):
             to_all = link.channel.count_numbers(per_peer=False)
             to_each = link.channel.count_numbers(per_peer=True)
-            columns[columns >= to_all] += link.index_at_peer * to_each
+            are_to_this_site = columns >= to_all
+            columns[are_to_this_site] += link.index_at_peer * to_each
+
     waiting = _stack_padded([channel.waiting for channel in channels])
     received = _stack_padded([channel.received for channel in channels])
     columns = _stack_padded([channel.columns for channel in channels])
     for channel, padded in zip(channels, columns, strict=True):
+        # Padding with zeros would mean column 0: -1 stands for a number that is not sent.
         count = channel.columns.shape[1]
         padded[:, count:] = -1
     return ChannelArrays(waiting, received, columns)

@@ -314,15 +314,19 @@ class Layout(NamedTuple):
 
         A site is the process that runs one arm. By the rule `glide`, its arm comes to rest
         while another site is silent, see `session_life`. The values are the state of this rule,
-        from which a run can be continued.
+        from which a run can be continued. They come first in `mem`:
+
+        - the values that every site in joint space stores,
+        - in task space, the reference that brings the joints to rest (`rest_columns`),
+        - if the site continues without a lost site, a value for each peer: whether it is lost.
 
         Args:
             peers: Number of the other sites from which this site receives data.
-            degrades: True if the site continues without a lost site. The state then has a
-                further value for each peer.
+            degrades: True if the site continues without a lost site.
         """
-        end: int = self.rest_columns(peers).stop
-        return end + peers * degrades
+        end_of_reference: int = self.rest_columns(peers).stop
+        lost_peer_values = peers * degrades  # none if it does not
+        return end_of_reference + lost_peer_values
 
     def rest_columns(self, peers: int) -> slice:
         """Finds the reference that brings the joints to rest, in the field `mem` of a record.
