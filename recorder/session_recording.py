@@ -94,14 +94,16 @@ class Recording:
         self._writer = writer
         self._scenario = scenario
         self._bus = bus
+        # A boot is the random number that identifies one start of a site's process.
         # Boot of the start that is being recorded, by site.
-        self._boots = dict(epoch.boots)
-        # Boot of a start that may be recorded next, by site.
-        self._candidates = dict[str, int]()
+        self._recorded_boots = dict(epoch.boots)
+        # Boot of a start that may be recorded next, by site. `_admit_starts` decides.
+        self._next_boots = dict[str, int]()
         # Boots of the starts that other sites have admitted to the session.
-        self._admitted: set[int] = set()
-        # Site and boot of starts that have disappeared before they were recorded.
-        self._vanished: set[tuple[str, str]] = set()
+        self._admitted_boots: set[int] = set()
+        # Site and boot (as text) of starts that disappeared from the network while they were
+        # not the recorded start of their site.
+        self._vanished_starts: set[tuple[str, str]] = set()
         # Time at which every site should have left, on the monotonic clock.
         self._end_ns = epoch.mono_ns + round(scenario.duration_s * 1e9) + LAST_NS
         self._sites = {
@@ -137,39 +139,41 @@ class Recording:
         }
         self.accounts.update(self._recorder_accounts)
         # Sites about which "stored" was published.
-        self._stored: set[str] = set()
-        # Sites that have disappeared from the network.
-        self._gone: set[str] = set()
-        # Time at which these sites disappeared, on the monotonic clock.
-        self._gone_ns: dict[str, int] = {}
+        self._stored_sites: set[str] = set()
+        # Sites whose recorded start has disappeared, as the network reports.
+        self._gone_sites: set[str] = set()
+        # Time at which this was first noticed, on the monotonic clock in ns, by site.
+        self._noticed_gone_ns: dict[str, int] = {}
         # Number of messages for which the queue had no room, at the end.
         self._overflowed = 0
 
     def join_late(self, now_ns: int) -> None:
-        """Announces that the recorder has joined a session that is running.
+        """Announces that the recorder has joined a running session, and requests old messages.
 
-        It also requests the earlier messages, which the sites keep in their buffers for some
-        time.
+        The recorder publishes the event "late" with the time at which it joins, and an event
+        "lost" for each site that is not present. The sites keep their messages in buffers for
+        some time. The newest messages of each site are requested (a probe), and their numbers
+        then show which earlier messages are missing. `write` requests those as well.
 
         Args:
             now_ns: Present time on the monotonic clock, in ns.
         """
-        t_ns = now_ns - self.epoch.mono_ns
-        sites = ", ".join(name for name in self._sites if name not in self._gone)
+        since_epoch_ns = now_ns - self.epoch.mono_ns
+        present_sites = [name for name in self._sites if name not in self._gone_sites]
         self.publisher.publish(
             "late",
-            f"the recorder joins at t = {t_ns / 1e9:.3f} s; "
-            f"it requests the earlier messages from {sites}",
-            t_ns=t_ns,
+            f"the recorder joins at t = {since_epoch_ns / 1e9:.3f} s; "
+            f"it requests the earlier messages from {', '.join(present_sites)}",
+            t_ns=since_epoch_ns,
         )
-        for name in self._gone:
-            self.publisher.publish("lost", f"{name} is gone", about=name, t_ns=t_ns)
+        for name in self._gone_sites:
+            self.publisher.publish("lost", f"{name} is gone", about=name, t_ns=since_epoch_ns)
         for repair in self._repairs.values():
             repair.probe()
 
     def assume_gone(self) -> None:
         """Regards every site as gone until the network reports that it is present."""
-        self._gone = set(self._sites)
+        self._gone_sites = set(self._sites)
 
     def write(self, queue: InboundQueue, now_ns: int) -> None:
         """Writes the messages that have arrived into the log, and requests missing messages.
@@ -187,30 +191,35 @@ class Recording:
         for name, repair in list(self._repairs.items()):
             self._repair_gaps(name, repair, now_ns)
         for name, site in self._sites.items():
-            if site.is_complete and name not in self._stored:
-                self._stored.add(name)
+            if site.is_complete and name not in self._stored_sites:
+                self._stored_sites.add(name)
                 self._publish_stored(site, now_ns)
 
     def _repair_gaps(self, name: str, repair: GapRepair, now_ns: int) -> None:
-        """Writes requested messages of a site that have arrived, and requests more.
+        """Writes messages that a site sent again on request, and requests further missing ones.
+
+        Three time scales occur: the monotonic clock, the time since the epoch (the start of the
+        session), and the Unix time, which the log states as the time of arrival.
 
         Args:
             name: Name of the site.
             repair: Requests the missing messages of the site.
             now_ns: Present time on the monotonic clock, in ns.
         """
-        t_ns = now_ns - self.epoch.mono_ns
-        self._sites[name].since_ns = t_ns
-        gone_since_ns = self._find_gone_since_ns(name, now_ns)
+        since_epoch_ns = now_ns - self.epoch.mono_ns
+        # By this time, the reception judges whether a message is from the future.
+        self._sites[name].since_ns = since_epoch_ns
+        gone_since_ns = self._update_gone_since_ns(name, now_ns)
         # If a message arrived after the site was reported as gone, the site can still reply.
-        is_present = gone_since_ns is None or gone_since_ns > self._gone_ns[name]
+        is_present = gone_since_ns is None or gone_since_ns > self._noticed_gone_ns[name]
         for channel, message, payload in repair.poll(now_ns, alive=is_present):
             key = topics.key(self.session, name, channel)
             sent_ns = max(message.t_ns, 0)  # a log contains no times before the epoch
-            log_time_ns = self.epoch.unix_ns + t_ns
+            log_time_ns = self.epoch.unix_ns + since_epoch_ns
             self._writer.add(
                 key, payload, sent_ns, log_time_ns, message.sequence, message.content
             )
+            # An event may state that the site has admitted the next start of another site.
             self._note_admission(message.content)
 
     def _publish_stored(self, site: SiteReception, now_ns: int) -> None:
@@ -245,19 +254,22 @@ class Recording:
     def _admit_starts(self) -> None:
         """Begins to record the next start of each site that was started again.
 
-        A second start may also be a mistake. Therefore it is recorded only if the previous
-        start has disappeared or ended, or if another site has admitted the new start.
+        A start is one execution of the site's process. A second start may also be a mistake, so
+        that two processes act as the same site. Therefore the next start is recorded only if
+        the previous one has disappeared or ended, or if another site of the session has
+        admitted the new start. Until then it remains in `_next_boots`.
         """
-        for name, boot in list(self._candidates.items()):
+        for name, boot in list(self._next_boots.items()):
             previous = self._sites[name]
-            has_left = name in self._gone or name not in self._boots
+            has_left = name in self._gone_sites or name not in self._recorded_boots
             has_ended = previous.final_ticks is not None
-            is_admitted = boot in self._admitted
+            is_admitted = boot in self._admitted_boots
             if not (has_left or has_ended or is_admitted):
                 continue
 
-            del self._candidates[name]
-            self._boots[name] = boot
+            # The reception of the new start continues the counts of the previous one.
+            del self._next_boots[name]
+            self._recorded_boots[name] = boot
             site = SiteReception(self._scenario, name, boot, previous)
             repair = GapRepair(self._bus, self.session, site, self.dropped)
             repair.probe()
@@ -268,12 +280,15 @@ class Recording:
                 self._channels[key] = (site, channel)
                 self.accounts[key] = site.accounts[channel]
 
-            self._stored.discard(name)
-            self._gone_ns.pop(name, None)
-            if (name, str(boot)) in self._vanished:
-                self._gone.add(name)
+            # What was known about the presence of the previous start no longer applies. The new
+            # start may have disappeared already, before it was recorded.
+            self._stored_sites.discard(name)
+            self._noticed_gone_ns.pop(name, None)
+            has_new_start_vanished = (name, str(boot)) in self._vanished_starts
+            if has_new_start_vanished:
+                self._gone_sites.add(name)
             else:
-                self._gone.discard(name)
+                self._gone_sites.discard(name)
 
     def _note_start(self, name: str, payload: bytes) -> None:
         """Notes the next start of a site, if a message is its event of joining.
@@ -289,26 +304,41 @@ class Recording:
         if event.kind not in ("coming", "join") or event.member != name:
             return
         if event.boots.get(name) == event.boot and self._scenario.sites_may_return:
-            self._candidates[name] = event.boot
+            self._next_boots[name] = event.boot
             self._admit_starts()
 
     def _note_admission(self, event: object) -> None:
-        """Evaluates an event by which a site reports about the start of another site.
+        """Evaluates an event by which one site reports that another site was started again.
 
-        The event "admit" states that the site has admitted the start. The event `LAST` states
-        how many ticks the site received before the start. Other messages are ignored.
+        There are two such events, and both state the boot, the random number that identifies
+        the new start:
+
+        - "admit": The reporting site has admitted the new start to the session. If this start
+          is not recorded yet, it will be recorded now.
+        - `LAST`: The number of ticks that the reporting site had received before the new start.
+          It is evaluated when the new start is being recorded, because it shows how many
+          messages of the previous start are missing.
+
+        Args:
+            event: Any decoded message of a site. Messages other than these events are ignored.
         """
         if not isinstance(event, Event) or event.about not in self._sites:
             return
-        boot = event.boots.get(event.about)
-        is_recorded = boot == self._boots.get(event.about)
+        restarted_site = event.about
+        boot = event.boots.get(restarted_site)
+        is_recorded = boot == self._recorded_boots.get(restarted_site)
         if event.kind == LAST and is_recorded:
-            self._sites[event.about].count_previous_start(event.ticks)
-        if event.kind != "admit" or boot is None or is_recorded:
+            self._sites[restarted_site].count_previous_start(event.ticks)
+        is_new_admission = event.kind == "admit" and boot is not None and not is_recorded
+        if not is_new_admission:
             return
-        if self._scenario.sites_may_return and len(self._admitted) < STARTS_KEPT:
-            self._admitted.add(boot)
-            self._candidates[event.about] = boot
+
+        assert boot is not None
+        # The limit bounds the memory if a faulty site admits invented starts.
+        has_room = len(self._admitted_boots) < STARTS_KEPT
+        if self._scenario.sites_may_return and has_room:
+            self._admitted_boots.add(boot)
+            self._next_boots[restarted_site] = boot
             self._admit_starts()
 
     def _read(self, key: str, payload: bytes) -> tuple[SiteReception, SiteMessage]:
@@ -340,30 +370,36 @@ class Recording:
     def _write_site_message(self, key: str, payload: bytes, mono_ns: int) -> None:
         """Writes an event or statistics of a site, unless they were written before.
 
+        The log states two times of a message: that of sending, in ns since the epoch (the start
+        of the session), and that of arrival, as Unix time.
+
         Args:
-            key: Key under which the message arrived.
+            key: Key under which the message arrived. It names the site and the channel.
             payload: The message.
             mono_ns: Time of the arrival on the monotonic clock, in ns.
 
         Raises:
             WireError: The message is not valid.
         """
-        since_ns = mono_ns - self.epoch.mono_ns
+        arrived_since_epoch_ns = mono_ns - self.epoch.mono_ns
         if key not in self._channels:
             raise WireError("stranger", f"a message arrived under the unknown key {key}")
-        self._channels[key][0].since_ns = since_ns
+        recorded_site, channel = self._channels[key]
+        # By this time, the reception judges whether the message is from the future.
+        recorded_site.since_ns = arrived_since_epoch_ns
+        # If the message is the first one of the site's next start, `site` is a new object.
         site, message = self._read(key, payload)
-        channel = self._channels[key][1]
         if channel == topics.EVENT:
             self._note_admission(message.content)
-        if not site.accept(channel, message, mono_ns):
+        is_new = site.accept(channel, message, mono_ns)
+        if not is_new:
             return
 
         sent_ns = message.t_ns
         if sent_ns < 0 and channel == topics.EVENT:
             # An event from before the epoch is stored with the time of its arrival.
-            sent_ns = since_ns
-        log_time_ns = self.epoch.unix_ns + since_ns
+            sent_ns = arrived_since_epoch_ns
+        log_time_ns = self.epoch.unix_ns + arrived_since_epoch_ns
         self._writer.add(key, payload, sent_ns, log_time_ns, message.sequence, message.content)
 
     def _write_block(self, key: str, block: bytes, mono_ns: int) -> None:
@@ -386,10 +422,15 @@ class Recording:
             add(key, payload, record.sent_ns, log_time_ns, record.tick, record)
 
     def _write_recorder_message(self, key: str, payload: bytes, mono_ns: int) -> None:
-        """Writes an event or statistics of this recorder.
+        """Writes an event or statistics of this recorder, after a check that they are its own.
+
+        The recorder puts its own messages into the queue of received messages. But other
+        processes can publish under the same keys, for example a second recorder. Their messages
+        are refused: a message must state the boot, the random number that identifies this start
+        of the recorder.
 
         Args:
-            key: Key of the message.
+            key: Key of the message, that of the events or of the statistics of recorders.
             payload: The message.
             mono_ns: Time of the arrival on the monotonic clock, in ns.
 
@@ -397,22 +438,27 @@ class Recording:
             WireError: The message is from another recorder, or is not valid.
         """
         account = self._recorder_accounts[key]
-        since_ns = mono_ns - self.epoch.mono_ns
-        content: Event | None = None
+        since_epoch_ns = mono_ns - self.epoch.mono_ns
+        event: Event | None = None
         if key.endswith(topics.STATS):
             boot = decode(payload, RecorderStats).boot
-            number = account.expected  # statistics contain no number
+            # Statistics contain no number. The next one in the account makes each of them new.
+            number = account.expected
         else:
-            content = decode(payload, Event)
-            if content.member != topics.RECORDER:
-                raise WireError("stranger", f"{content.member} published under {key}")
-            boot = content.boot
-            number = content.n
+            event = decode(payload, Event)
+            if event.member != topics.RECORDER:
+                raise WireError("stranger", f"{event.member} published under {key}")
+            boot = event.boot
+            number = event.n
         if boot != self.publisher.info.boot:
             raise WireError("another recorder", f"another process published under {key}")
-        if number >= 0 and account.receive(number, mono_ns):
-            log_time_ns = self.epoch.unix_ns + since_ns
-            self._writer.add(key, payload, since_ns, log_time_ns, number, content)
+
+        is_new = number >= 0 and account.receive(number, mono_ns)
+        if is_new:
+            # The message was sent when it arrived, because sender and receiver are the same.
+            sent_ns = since_epoch_ns
+            log_time_ns = self.epoch.unix_ns + since_epoch_ns
+            self._writer.add(key, payload, sent_ns, log_time_ns, number, event)
 
     def note_presence(self, key: str, alive: bool) -> None:
         """Notes that a site appeared on the network, or disappeared from it.
@@ -420,45 +466,57 @@ class Recording:
         The network announces each start of a site by a token, which disappears with the
         process.
 
+        A token may belong to another start than the one that is being recorded: an earlier one,
+        or one that may be recorded later. It says nothing about the recorded start. But its
+        disappearance is noted in case that start is recorded later, because the network does
+        not report it again (`_admit_starts`). The number of such notes is limited.
+
         Args:
-            key: Key of the token, which contains the name of the site and the number of its
-                start.
+            key: Key of the token, which contains the name of the site and the boot, the random
+                number that identifies the start.
             alive: True if the token appeared, False if it disappeared.
         """
-        parts = topics.parse_key(key)
-        if parts is None or parts.member not in self._sites:
+        token = topics.parse_key(key)
+        if token is None or token.member not in self._sites:
             return
-        if str(self._boots.get(parts.member)) != parts.boot:
-            if not alive and len(self._vanished) < STARTS_KEPT:
-                self._vanished.add((parts.member, parts.boot))
+        recorded_boot = str(self._recorded_boots.get(token.member))  # keys contain text
+        is_recorded_start = recorded_boot == token.boot
+        if not is_recorded_start:
+            if not alive and len(self._vanished_starts) < STARTS_KEPT:
+                self._vanished_starts.add((token.member, token.boot))
         elif alive:
-            self._gone.discard(parts.member)
+            self._gone_sites.discard(token.member)
         else:
-            self._gone.add(parts.member)
+            self._gone_sites.add(token.member)
 
-    def _find_gone_since_ns(self, site: str, now_ns: int) -> int | None:
-        """Returns the time since when a site is gone. None if it is present.
+    def _update_gone_since_ns(self, site: str, now_ns: int) -> int | None:
+        """Notes when a site was first found gone, and returns since when it has been silent.
 
-        When a connection is established again, the network may report that a site disappeared
-        after it has reported the return. Therefore, if a message arrives so late that it cannot
-        have been in transit (`UNDER_WAY_NS`), the site is present nevertheless. It then counts
-        as gone since the arrival of that message.
+        The caller uses the result to decide how long it still waits for the site.
+
+        When a connection is established again, the network may report the return of a site
+        first, and its earlier disappearance afterwards. The report "gone" is then wrong, which
+        only the messages of the site reveal: a message that arrives more than `UNDER_WAY_NS`
+        after the report cannot have been in transit. In this case, the wait begins anew with
+        each message. As long as messages arrive, the site is thus never given up.
 
         Args:
             site: Name of the site.
             now_ns: Present time on the monotonic clock, in ns.
 
         Returns:
-            The time on the monotonic clock, in ns.
+            The time from which to wait, on the monotonic clock, in ns: the time at which the
+            site was found gone or, in the case above, the arrival of its last message. None if
+            the network reports the site as present.
         """
-        if site not in self._gone:
-            self._gone_ns.pop(site, None)
+        if site not in self._gone_sites:
+            self._noticed_gone_ns.pop(site, None)
             return None
-        gone_ns = self._gone_ns.setdefault(site, now_ns)
-        last_ns = self._sites[site].last_received_ns
-        if last_ns is None or last_ns < gone_ns + UNDER_WAY_NS:
-            return gone_ns
-        return last_ns
+        noticed_ns = self._noticed_gone_ns.setdefault(site, now_ns)
+        last_message_ns = self._sites[site].last_received_ns
+        if last_message_ns is None or last_message_ns < noticed_ns + UNDER_WAY_NS:
+            return noticed_ns
+        return last_message_ns
 
     def is_over(self, now_ns: int) -> bool:
         """Finds out whether the recording can end, because no site can send any more messages.
@@ -480,9 +538,9 @@ class Recording:
         How long the recorder waits for a site that is gone depends on whether its end and all
         its messages are known.
         """
-        if site in self._stored:
+        if site in self._stored_sites:
             return True
-        since_ns = self._find_gone_since_ns(site, now_ns)
+        since_ns = self._update_gone_since_ns(site, now_ns)
         if since_ns is None:
             return False
 

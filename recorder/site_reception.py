@@ -233,6 +233,7 @@ class SiteReception:
             channel: make_decoder(CHANNEL_TYPES[channel], layout=layout)
             for channel in SITE_CHANNELS
         }
+        # Gap between the previous start and this one, by channel.
         self._start_gaps = {
             channel: StartGap(self.accounts[channel], count_under_way(channel, self._rate_hz))
             for channel in (topics.STATE, topics.LINK)
@@ -494,7 +495,13 @@ class SiteReception:
             self.accounts[channel].mark_unpublished(*numbers)
 
     def _begin_start(self, first_tick: int) -> None:
-        """States that no messages exist for the ticks between the previous start and this one.
+        """Counts the messages between the previous start of the site and this one.
+
+        A site that was started again continues at a later tick. The messages of the ticks in
+        between count as unpublished instead of missing. If the previous start ended properly,
+        it has stated how many ticks it executed, and its messages up to there still count as
+        missing. If it was killed, that number is unknown and counts as 0. Reports of other
+        sites may correct this, see `count_previous_start`.
 
         Args:
             first_tick: First tick of this start.
@@ -503,9 +510,9 @@ class SiteReception:
         if self._before is not None and self._before.final_ticks is not None:
             previous_ticks = self._before.final_ticks
         for channel, gap in self._start_gaps.items():
-            first = count_messages(channel, first_tick, self._rate_hz)
-            published = count_messages(channel, previous_ticks, self._rate_hz)
-            gap.begin_next_start(first, published)
+            first_number = count_messages(channel, first_tick, self._rate_hz)
+            previously_published = count_messages(channel, previous_ticks, self._rate_hz)
+            gap.begin_next_start(first_number, previously_published)
 
     @property
     def lacks_messages(self) -> bool:

@@ -66,17 +66,26 @@ class RangeSet:
     def insert(self, first: int, last: int) -> None:
         """Inserts a range of consecutive numbers, none of which the set contains yet.
 
+        If the set contains the number before the range, the range extends that one. It is not
+        merged with a range directly behind it, which would only save memory. If there are too
+        many ranges afterwards, those with the lowest numbers are forgotten.
+
         Args:
             first: First number of the range.
             last: Last number of the range, which belongs to it.
         """
-        index = self._count_started(first)
+        index = self._count_started(first)  # the new range belongs at this index
         if index > 0:
             previous_first, previous_last = self._ranges[index - 1]
-            if previous_last == first - 1:
+            continues_previous = previous_last == first - 1
+            if continues_previous:
                 self._ranges[index - 1] = previous_first, last
                 return
         self._ranges.insert(index, (first, last))
+        self._forget_lowest()
+
+    def _forget_lowest(self) -> None:
+        """Removes the ranges with the lowest numbers if there are more than permitted."""
         del self._ranges[: -self._max_ranges]
 
     def remove(self, number: int, last: int | None = None) -> bool:
@@ -102,7 +111,7 @@ class RangeSet:
         remaining = [part for part in (before, after) if part[0] <= part[1]]
         index = self._count_started(number) - 1
         self._ranges[index : index + 1] = remaining
-        del self._ranges[: -self._max_ranges]
+        self._forget_lowest()
         return True
 
     def find(self, number: int) -> tuple[int, int] | None:
@@ -233,28 +242,32 @@ class Account:
     def mark_unpublished(self, first: int, published: int = 0) -> int:
         """Notes that the missing numbers just below a number never had a message.
 
-        This happens when the sender skips numbers, or is killed and started again. The numbers
+        This happens when the sender skips numbers, or is killed and started again. The missing
+        numbers form a range that ends just below `first`. Those of them from `published` on
         count as unpublished instead of missing.
 
         Args:
             first: Number of the first message after the gap. It is the first message that the
                 sender published after its next start, or after the numbers that it skipped.
-            published: Number of messages that are known to exist nevertheless. Messages among
-                them that were not received stay missing.
+            published: Number of messages that are known to have been published before the gap.
+                They have the numbers below `published`. Those of them that were not received
+                stay missing.
 
         Returns:
-            The lowest number that now counts as unpublished. It is `first` if no number does.
+            The lowest number that counts as unpublished from now on. It is `first` if there is
+            no such number.
         """
         self.add_expected(first)
         gap = self._gaps.find(first - 1)
-        if gap is None:
+        if gap is None:  # the message just below was received
             return first
-        lowest = max(gap[0], published)
-        if lowest >= first:
+        gap_first, _ = gap
+        lowest_unpublished = max(gap_first, published)
+        if lowest_unpublished >= first:
             return first
-        self._gaps.remove(lowest, first - 1)
-        self.unpublished += first - lowest
-        return lowest
+        self._gaps.remove(lowest_unpublished, first - 1)
+        self.unpublished += first - lowest_unpublished
+        return lowest_unpublished
 
     def mark_missing(self, first: int, last: int) -> None:
         """Counts numbers as missing that had been counted as unpublished.
@@ -384,6 +397,14 @@ class StartGap:
     arrive before or after the next start. A few messages were still in transit to the recorder
     when the site was killed. These count as unpublished.
 
+    The numbers of the gap are divided at one point, which only moves up:
+
+        received | missing | unpublished | next start
+                 ^         ^             ^
+                 |         |             _next_first
+                 |         _first_unpublished
+                 _first_silent
+
     Args:
         account: Account of the channel.
         under_way: Largest number of messages that may have been in transit.
@@ -392,11 +413,12 @@ class StartGap:
     def __init__(self, account: Account, under_way: int) -> None:
         self._account = account
         self._under_way = under_way
-        # Number of messages that the earlier start published, as other sites report.
+        # Largest number of messages that the earlier start published, as other sites report.
         self._reported = 0
-        # First number that never arrived.
+        # First number of the gap: no message from this number on to the next start arrived. It
+        # is -1 until the next start is known.
         self._first_silent = -1
-        # First number that counts as unpublished.
+        # First number that counts as unpublished. It is -1 until the next start is known.
         self._first_unpublished = -1
         # First number of the next start. It is -1 until the next start is known.
         self._next_first = -1
@@ -404,21 +426,24 @@ class StartGap:
     def begin_next_start(self, first: int, published: int) -> None:
         """Evaluates the gap before the next start of the site, once that start is known.
 
-        The site was killed and has been started again. The missing messages before the next
-        start now count as unpublished, except the messages that the site is known to have
-        published. Only the first call has an effect.
+        The site was killed and has been started again. The missing messages just before the
+        next start now count as unpublished in the account, except the messages that the site
+        itself is known to have published. Reports of other sites that arrived earlier are then
+        evaluated. They may turn some of these numbers into missing ones again. Only the first
+        call has an effect.
 
         Args:
-            first: Number of the first message after the next start.
-            published: Number of messages that the site itself stated to have published before
-                it was started again. It is 0 if the site was killed before it could state the
-                number.
+            first: Number of the first message that belongs to the next start.
+            published: Number of messages of the earlier start, as that start itself stated when
+                it ended. It is 0 if the site was killed before it could state the number.
         """
-        if self._next_first < 0:
-            self._next_first = first
-            self._first_silent = self._account.mark_unpublished(first, published)
-            self._first_unpublished = self._first_silent
-            self.note_published(self._reported)
+        is_evaluated = self._next_first >= 0
+        if is_evaluated:
+            return
+        self._next_first = first
+        self._first_silent = self._account.mark_unpublished(first, published)
+        self._first_unpublished = self._first_silent
+        self.note_published(self._reported)
 
     def note_published(self, published: int) -> None:
         """Takes into account how many messages the site published before it was killed.
@@ -426,18 +451,26 @@ class StartGap:
         Other sites report this number, because they received samples, the states that a site
         sends. Missing messages before the next start first count as unpublished, because they
         may have been in transit when the site was killed. If the reported number shows that
-        more messages were lost than can have been in transit, the lost messages count as
-        missing instead.
+        more messages were lost than can have been in transit, all lost messages count as
+        missing instead: the numbers from `_first_unpublished` to below the reported number.
+
+        Before the next start is known, the report is only stored. `begin_next_start` evaluates
+        it later.
 
         Args:
-            published: Number of messages that the site published at least.
+            published: Number of messages that the site published at least. They have the
+                numbers below it.
         """
         self._reported = max(self._reported, published)
-        published = min(published, self._next_first)
-        is_beyond_under_way = published - self._first_silent > self._under_way
-        if is_beyond_under_way and published > self._first_unpublished >= 0:
-            self._account.mark_missing(self._first_unpublished, published - 1)
-            self._first_unpublished = published
+        # Messages of the next start do not belong to the gap.
+        published_before = min(published, self._next_first)
+        lost = published_before - self._first_silent
+        are_too_many_for_transit = lost > self._under_way
+        is_next_start_known = self._first_unpublished >= 0
+        has_news = published_before > self._first_unpublished
+        if are_too_many_for_transit and is_next_start_known and has_news:
+            self._account.mark_missing(self._first_unpublished, published_before - 1)
+            self._first_unpublished = published_before
 
 
 def describe_unknown_ends(sites: Sequence[str]) -> str:
@@ -649,6 +682,13 @@ class SessionAccounts:
     def receive_event(self, topic: str, number: int, event: Event) -> bool:
         """Counts an event, and evaluates what it states about the ticks of a site.
 
+        Each start of a site numbers its events from 0. Therefore each start has an account of
+        its own, the object that counts its events. The boot in the event, a random number,
+        identifies the start. The first start uses the account that `open_channel` created, and
+        `_accounts` refers to that of the newest start. If there are more than `MAX_STARTS`
+        starts, which only a faulty sender causes, the newest account counts the events of all
+        further ones.
+
         Args:
             topic: Topic of the event.
             number: Number of the event.
@@ -658,15 +698,19 @@ class SessionAccounts:
             False if the event had been received before.
         """
         starts = self._starts.setdefault(topic, {})
-        if event.boot not in starts and len(starts) < MAX_STARTS:
-            starts[event.boot] = Account() if starts else self._accounts[topic]
-            self._accounts[topic] = starts[event.boot]
+        is_new_start = event.boot not in starts
+        if is_new_start and len(starts) < MAX_STARTS:
+            is_first_start = not starts
+            new_account = self._accounts[topic] if is_first_start else Account()
+            starts[event.boot] = new_account
+            self._accounts[topic] = new_account
         account = starts.get(event.boot, self._accounts[topic])
 
-        # In a later part of a log, the first start is counted from its first event in this
-        # part.
-        first_start = next(iter(starts.values()))
-        if account is first_start:
+        # In a later part of a log, only the first start can have events in an earlier part. It
+        # is counted from its first event in this part, which `count_message` notes. Any further
+        # start is counted from 0.
+        first_account = next(iter(starts.values()))
+        if account is first_account:
             is_new = self.count_message(topic, number, account)
         else:
             is_new = account.receive(number)
@@ -676,18 +720,28 @@ class SessionAccounts:
     def apply_event(self, event: Event) -> None:
         """Learns from an event how many ticks the sites executed or skipped.
 
-        For example, the "end" event of a site states the number of ticks that it executed.
-        Events that state nothing about ticks are ignored.
+        These kinds of events state something about ticks, the periods of the control loop:
+
+        - "end": number of ticks that the sender executed until it ended. A number beyond the
+          duration of the scenario is reduced to it, because the site has ended in any case.
+        - "join": first tick of the sender when it joins the running session. An impossible tick
+          is ignored, because it would leave a gap up to that tick.
+        - `OVERRUN`: ticks that the sender skipped because it was late.
+        - `LAST`: number of ticks of another site that the sender received before that site was
+          started again.
+
+        Other events are ignored, and so are events of members that are not sites.
 
         Args:
             event: The event.
         """
-        if event.member not in self._rates_hz or event.ticks < 0:
+        sender = event.member
+        if sender not in self._rates_hz or event.ticks < 0:
             return
         if event.kind == "end":
-            self._end_ticks[event.member] = min(event.ticks, self._ticks[event.member])
-            self.add_expected_ticks(event.member, self._end_ticks[event.member])
-        elif event.kind == "join" and event.ticks <= self._ticks[event.member]:
+            self._end_ticks[sender] = min(event.ticks, self._ticks[sender])
+            self.add_expected_ticks(sender, self._end_ticks[sender])
+        elif event.kind == "join" and event.ticks <= self._ticks[sender]:
             self._apply_join(event)
         elif event.kind == OVERRUN:
             self._apply_overrun(event)
@@ -706,17 +760,22 @@ class SessionAccounts:
             gap.begin_next_start(first, published)
 
     def _apply_overrun(self, event: Event) -> None:
-        """Handles the event of a site that skipped ticks.
+        """Counts the ticks that a site skipped as unpublished, as its event lists them.
 
-        Its command lists ranges "first-last".
-
+        Args:
+            event: Event of the kind `OVERRUN`. Its command contains ranges of skipped ticks in
+                the form "first-last", and its ticks are the number of ticks that have passed.
+                Ranges that are not below this number are not valid, and are ignored.
         """
+        # More than 12 digits are no number of a tick.
         ranges = re.findall(r"(\d{1,12})-(\d{1,12})", event.command)
         for first_digits, last_digits in ranges:
             first = int(first_digits)
             last = int(last_digits)
-            if first <= last < event.ticks:
-                self.mark_skipped_ticks(event.member, last + 1, last + 1 - first)
+            is_valid = first <= last < event.ticks
+            if is_valid:
+                next_tick = last + 1
+                self.mark_skipped_ticks(event.member, next_tick, next_tick - first)
 
     def _apply_last(self, event: Event) -> None:
         """Handles the event that states how many ticks of a peer's earlier start arrived."""
