@@ -316,7 +316,7 @@ class Layout(NamedTuple):
         while another site is silent, see `session_life`. The values are the state of this rule,
         from which a run can be continued. They come first in `mem`:
 
-        - the values that every site in joint space stores,
+        - the values that every such site stores, for example when each peer was heard last,
         - in task space, the reference that brings the joints to rest (`rest_columns`),
         - if the site continues without a lost site, a value for each peer: whether it is lost.
 

@@ -142,21 +142,26 @@ class Site:
         self._keeps_forces = self._reflects or self._hand is not None
 
     def _find_hand(self, index: int) -> tuple[Array, Array, Array]:
-        """Returns the fields of the live hand (an operator who moves the arm during the run).
+        """Returns the numbers of the live hand, which change during the run.
+
+        A live hand is a person or program that moves the arm during the run. A simulated spring
+        pulls the arm to the target of the hand, with a force that is multiplied by the grip.
 
         Args:
             index: Index of the live hand among the operators and environments.
 
         Returns:
-            The grip, the target, and the target one second later, as views of the row.
+            The grip, shape (1,), the target, and the target one second later, as views: who
+            writes into them changes the row of the live hand.
         """
         actors = self._arrays.actors
-        size = (self.layout.hand - 3) // 2
-        return (
-            actors["grip"][index : index + 1],
-            actors["a"][index, :size],
-            actors["b"][index, :size],
-        )
+        # The field `hand` of a record has grip, number, source, target and rate of the target.
+        coordinates = (self.layout.hand - 3) // 2
+        # The field `a` of a live hand is its target, and `b` the target one second later.
+        grip = actors["grip"][index : index + 1]
+        target = actors["a"][index, :coordinates]
+        target_ahead = actors["b"][index, :coordinates]
+        return grip, target, target_ahead
 
     def _plug_law(self, setup: SiteSetup) -> None:
         """Creates the user's law of a setup, if any, and compiles the stages around it.
@@ -200,20 +205,25 @@ class Site:
     def start_at(self, k: int) -> None:
         """Makes tick `k` the first tick of a site that joins a running session.
 
-        The site must not have made a tick. Its arm stands at the start pose, no sample of a
-        peer is in use or waits, and the channels of its links are in the state of tick k - 1.
+        The site must not have made a tick. Its arm stands at the start pose, no sample (state)
+        of a peer is in use or waits, and the links have the state of tick k - 1: the models of
+        delay and loss have processed all samples that the peers have sent by then.
 
         Args:
             k: The first tick.
         """
-        if k <= self._site["first"]:
+        links_may_be_ahead = k <= self._site["first"]
+        if links_may_be_ahead:
+            # The links may be ahead of tick k: start them anew.
             self.restore_links(k, [None] * len(self.peers), ())
         self._site["first"] = k
         for n, link in enumerate(self._links):
             peer_hz = int(link["rate_hz"])
-            sample = (k - 1) * peer_hz // self.rate_hz
-            if sample >= 0:
-                find_release(n, sample, self._arrays)
+            last_sample = (k - 1) * peer_hz // self.rate_hz
+            if last_sample >= 0:
+                # Not for its result: it advances the random models of the link to this sample.
+                find_release(n, last_sample, self._arrays)
+        # Copies of samples that were sent before the site joined do not count.
         self._links["copies"] = 0
 
     def step(self, tick: TickInput) -> TickRecord:
@@ -278,7 +288,10 @@ class Site:
         )
 
     def _compute_tick(self, k: int, t_ns: int, count: int) -> list[float]:
-        """Runs the eight stages of a tick on the buffers.
+        """Runs the eight stages of a tick (see `kernel`) on the buffers.
+
+        Without a user's law, one compiled function runs all stages. A user's law is called
+        between two compiled functions, of the stages before the torque and after it.
 
         Args:
             k: The tick.
@@ -290,13 +303,26 @@ class Site:
         """
         if self._law is None:
             if self._tick is None:
+                # Compile at the first tick, for arguments with the types of three integers.
                 self._tick = bind_leaf(site_tick, 0, 0, 0, *self._tick_arrays)
             self._tick(k, t_ns, count, *self._tick_arrays)
             return []
-        a = self._arrays
-        self._sense(k, t_ns, count, a, self._buffers)
+
+        arrays = self._arrays
+        # Stages 1 to 5: accept, release, reference, errors, estimate.
+        self._sense(k, t_ns, count, arrays, self._buffers)
+        # Stage 6: torque.
         memory = self._compute_law(k, t_ns)
-        self._act(k, t_ns, a.site, a.actors, a.table, a.chain, self._buffers.record)
+        # Stages 7 and 8: emit, advance. The limits of the torque come first.
+        self._act(
+            k,
+            t_ns,
+            arrays.site,
+            arrays.actors,
+            arrays.table,
+            arrays.chain,
+            self._buffers.record,
+        )
         return memory
 
     def _write_measurement(self, measured: PlantState) -> None:
@@ -308,11 +334,19 @@ class Site:
         s.sensed = [-torque for torque in measured.tau_x] or 0.0
 
     def _compute_law(self, k: int, t_ns: int) -> list[float]:
-        """Runs stage 6 of a user's law, and returns the law's memory.
+        """Computes the torque by the user's law (stage 6 of a tick), and returns its memory.
 
-        Under the rule `glide` a law that fails gives NaN as torque, which leads to FAULT. The
-        law is not called again until the fault is reset, and then continues from the memory
-        that it had before the failure.
+        The law writes the torque into the row of the site. Its memory are the numbers that it
+        keeps from tick to tick.
+
+        The rule `glide` brings the arm to rest when something fails. Under this rule, a law
+        that fails gives NaN as torque. `act_stages` then enters the mode FAULT with the reason
+        NOT_FINITE. The law is not called again until the fault is reset, and then continues
+        from the memory that it had before the failure.
+
+        Args:
+            k: The tick.
+            t_ns: Nominal time of the tick, ns since the epoch.
 
         Raises:
             LawFailed: The law failed, and the site is not under the rule `glide`.
@@ -321,9 +355,12 @@ class Site:
         s: Row = self._site[0]
         if not self._glides:
             return self._law.compute(k, t_ns)
-        if s.mode == Mode.FAULT and s.reason == LifeReason.NOT_FINITE:
+
+        has_failed_before = s.mode == Mode.FAULT and s.reason == LifeReason.NOT_FINITE
+        if has_failed_before:
             s.tau = math.nan
             return self._law_memory
+
         try:
             self._law_memory = self._law.compute(k, t_ns)
         except LawFailed as failure:
@@ -363,36 +400,49 @@ class Site:
     def _apply_hand(self, vector: Sequence[float]) -> Sequence[float]:
         """Writes the action of a live hand into its row, and returns the `hand` of the record.
 
+        A live hand is a person or program that moves the arm during the run.
+
         Args:
-            vector: The action, see `live_hand`. Empty if nobody holds the arm.
+            vector: The action in the form of `HandInForce`: how firmly the arm is gripped, to
+                which target it is pulled, and the velocity of the target. Empty if nobody
+                holds the arm.
 
         Returns:
             The action in force. Empty if the site has no live hand.
         """
         if self._hand is None:
             return ()
+        # Views of the row: the assignments change its numbers.
         grip, target, target_ahead = self._hand
         action = list(vector) or empty_hand_vector(len(target))
         hand = HandInForce.read(action)
         grip[0] = hand.grip
         target[:] = hand.target
+        # The target one second later: its position plus its velocity times 1 s.
         motion = zip(hand.target, hand.rate, strict=True)
-        target_ahead[:] = [x + v for x, v in motion]
+        target_ahead[:] = [position + velocity for position, velocity in motion]
         return action
 
     def _compute_crc(self, packed_bytes: int, arrivals: int) -> int:
         """Returns the checksum of the arrivals in the buffers, `TickRecord.rx_crc`.
 
+        An arrival is a sample (the state of a peer) that came since the last tick. Only what
+        the site uses is part of the checksum: peer, tick and motion of each arrival, then the
+        forces if the site reflects forces, then the numbers that the peers' laws send if the
+        law of this site reads such numbers.
+
         Args:
-            packed_bytes: Number of bytes of the packed arrivals.
+            packed_bytes: Number of bytes of the packed arrivals: peers, ticks and motions.
             arrivals: Number of arrivals.
         """
         crc = zlib.crc32(self._arrival_bytes[:packed_bytes])
         if self._reflects:
-            force_bytes = arrivals * 8 * self.layout.shared
+            bytes_per_float = 8
+            force_bytes = arrivals * bytes_per_float * self.layout.shared
             crc = zlib.crc32(self._force_bytes[:force_bytes], crc)
         if self._received_counts:
             peers = self._buffers.arrivals["peer"][:arrivals].tolist()
+            # Row n of `sent` belongs to arrival n. The rows are longer than what a peer sends.
             for n, peer in enumerate(peers):
                 count = self._received_counts[peer]
                 sent = self._buffers.sent[n, :count]
@@ -402,12 +452,27 @@ class Site:
     def _held_memory(self) -> list[float]:
         """Returns the part of `TickRecord.mem` that belongs to the site and not to its law.
 
+        A run can be continued from the records of a tick. These are the numbers of the site
+        that the next tick needs and that no other field of the record contains. A site that is
+        not under the rule `glide`, which brings arms to rest, has only the first two items:
+
+        - `q_held`: the reference (position that the arm follows) that is held, or the start
+          value of an offset that falls to zero,
+        - `return_from_ns`: the time at which the present rest, return or run began, ns,
+        - `qd_held`: the rate of `q_held`,
+        - `reason`: why the mode changed last, a `LifeReason`,
+        - `used_ns`: for each peer the time at which its last sample came into use, ns,
+        - `tau_held`: the torque of each joint that carries a constant load at rest, N m,
+        - `q_rest`, `qd_rest`: the reference that brings the joints to rest, only in task space,
+        - `gone`: the state of each peer, only if the site continues without lost peers.
+
         `restore_state` reads the same numbers in the same order.
         """
         return_from_ns = float(self._return_from_ns.item())
         memory = [*self._q_held.tolist(), return_from_ns]
         if not self._glides:
             return memory
+
         memory += self._qd_held.tolist()
         memory.append(float(self._reason.item()))
         memory += map(float, self._used_ns.tolist())

@@ -69,19 +69,28 @@ def update_pose(s: Row, chain: RowArray) -> None:
     """Computes the motion of the end effector from that of the joints.
 
     The pose x, its velocity xd, the Jacobian J and the derivative of J are written into the row
-    of the site.
+    of the site. The coordinates are a position, or a position and a rotation vector. They refer
+    to the frame that all arms share.
 
     Args:
-        s: Row of the site, with q and qd; written.
+        s: Row of the site, with the joint positions q and velocities qd; written. `tip` is the
+            end effector's position in the frame of the last link, m, `tip_back` the inverse of
+            its orientation in this frame, and `scale` the size of the shared coordinates in
+            relation to this arm.
         chain: Rows of the chain, after `place_joints`.
     """
+    # This also writes the frames of the links and the columns of J in base axes.
     position = place_end_effector(chain, s.tip)
-    task_position = scale(s.scale, position)
-    put_three(s.x[:3], task_position)
+    shared_position = scale(s.scale, position)
+    put_three(s.x[:3], shared_position)
     if s.shared == POSE:
+        # The orientation of the end effector is R_base tip_back', which this function converts
+        # to a rotation vector.
         last: Row = chain[chain.shape[0] - 1]
         orientation = relative_rotation(last.R_base, s.tip_back)
         put_three(s.x[3:], orientation)
+
+    # J and xd = J qd
     J = s.J
     xd = s.xd
     for j in range(s.shared):
@@ -194,29 +203,38 @@ def update_orientation_reference(s: Row, links: RowArray) -> None:
 def _factor(s: Row, damping: float) -> None:
     """Writes the factors L D L' of J J' + damping I into the lower part of `s.A`.
 
-    An axis that is not followed has a row of zeros in J, and gets a unit pivot.
+    L is a lower triangular matrix with ones on its diagonal, and D a diagonal matrix. They are
+    stored together: D on the diagonal of A, and L below it. Row by row, with the matrix
+    B = J J' + damping I,
+
+        L_jk D_k = B_jk - sum_{p < k} L_jp L_kp D_p    for k < j
+        D_j      = B_jj - sum_{p < j} L_jp^2 D_p
+
+    J has a row of zeros for each axis that is not followed. There 1 is added to the diagonal of
+    B, so that its pivot D_j is not zero. If another pivot vanishes, the arm cannot move along
+    the axis, and L is zero in its column.
 
     Args:
-        s: Row of the site.
-        damping: The damping.
+        s: Row of the site. `axes` is 1 for each axis that is followed, otherwise 0.
+        damping: The damping, in the unit of J J'. It is zero except near singular poses.
     """
     J = s.J
     A = s.A
     for j in range(s.shared):
         for k in range(j + 1):
-            total = 0.0
+            entry = 0.0  # of B, then of L or D
             if k == j:
-                total = damping + 1.0 - s.axes[j]
+                entry = damping + 1.0 - s.axes[j]
             for i in range(s.joints):
-                total += J[j, i] * J[k, i]
+                entry += J[j, i] * J[k, i]
             for p in range(k):
                 pivot = A[p, p]
                 product = A[j, p] * A[k, p]
-                total -= product * pivot
+                entry -= product * pivot
             if k < j:
                 pivot = A[k, k]
-                total = total / pivot if pivot > TINY else 0.0
-            A[j, k] = total
+                entry = entry / pivot if pivot > TINY else 0.0
+            A[j, k] = entry
 
 
 @leaf
@@ -243,22 +261,31 @@ def _solve(s: Row, b: Array, y: Array) -> None:
 
 @leaf
 def _factor_damped(s: Row) -> None:
-    """Masks J and Jd by the followed axes, and factors J J' with its damping.
+    """Factors J J' with the damping that it needs near singular poses.
 
-    The damping is the amount by which 1 / trace((J J')^-1) is below the square of
-    `s.singular_value`.
+    The number 1 / trace((J J')^-1) is a lower bound of the square of the least singular value
+    of J. The damping is the amount by which it is below the square of `s.singular_value`, and
+    zero otherwise. The trace is that of the axes that are followed. It is computed from the
+    factors without damping, by solving for each column of the inverse.
+
+    Args:
+        s: Row of the site. J and its derivative Jd get rows of zeros for axes that are not
+            followed. The factors are written into A, see `_factor`. `b` and `y` are work space.
     """
     for j in range(s.shared):
         mask = s.axes[j]
         for i in range(s.joints):
             s.J[j, i] *= mask
             s.Jd[j, i] *= mask
+
     _factor(s, 0.0)
     limit = s.singular_value * s.singular_value
     trace = 0.0
     for j in range(s.shared):
         pivot = s.A[j, j]
-        if not pivot > TINY:
+        is_singular = not pivot > TINY  # also for NaN
+        if is_singular:
+            # The true trace is infinite. This value makes the lower bound practically zero.
             trace = 1.0 / TINY
         # Solving for a unit vector gives a column of the inverse.
         for k in range(s.shared):
@@ -266,9 +293,11 @@ def _factor_damped(s: Row) -> None:
         _solve(s, s.b, s.y)
         diagonal = s.y[j]
         trace += diagonal * s.axes[j]
+
     lower_bound = 1.0 / trace if trace > 0.0 else limit
     if lower_bound < limit:
-        _factor(s, limit - lower_bound)
+        damping = limit - lower_bound
+        _factor(s, damping)
 
 
 @leaf
@@ -375,14 +404,22 @@ def add_task_torque(s: Row, gains: Array, values: Array, factor: float, torque: 
 def update_wrench(s: Row) -> None:
     """Computes the force and torque at the end effector that correspond to tau_x.
 
-    This wrench is (J J')^-1 J tau_x, where J is the Jacobian of the end effector and tau_x the
-    exogenous torque of the joints. It is written into the row of the site.
+    This wrench is the solution of
+
+        J J' wrench = J tau_x
+
+    where J is the Jacobian of the end effector and tau_x the exogenous torque of the joints,
+    which comes from operators and environments. The torque ON the arm is -tau_x. J J' must have
+    been factored before, with its damping near singular poses (`update_task_errors`).
+
+    Args:
+        s: Row of the site, with the torque ON each joint in `on_arm`, N m. The wrench is
+            written into it, N and N m, one number per shared coordinate.
     """
-    b = s.b
-    # b = J tau_x; `on_arm` is -tau_x.
+    J_tau_x = s.b
     for j in range(s.shared):
-        b[j] = 0.0
+        J_tau_x[j] = 0.0
         for i in range(s.joints):
-            on_joint = s.on_arm[i]
-            b[j] -= s.J[j, i] * on_joint
-    _solve(s, b, s.wrench)
+            torque_on_joint = s.on_arm[i]
+            J_tau_x[j] -= s.J[j, i] * torque_on_joint
+    _solve(s, J_tau_x, s.wrench)

@@ -78,12 +78,20 @@ def theta_from_links(links: ArmLinks) -> Array:
 def is_positive_definite(theta: Array) -> bool:
     """Returns True if the inertia matrix of the planar arm is positive definite in any pose.
 
-    Otherwise the parameters describe no real arm. The determinant of the inertia matrix is
-    smallest for the stretched arm, so only this pose is checked. The check has a margin for
-    rounding.
+    Otherwise the parameters describe no real arm. With the angle q2 of the second joint, the
+    inertia matrix is
+
+        M = | theta_1 + 2 theta_2 cos(q2)    theta_3 + theta_2 cos(q2) |
+            | theta_3 + theta_2 cos(q2)      theta_3                   |
+
+        det M = theta_1 theta_3 - theta_3^2 - theta_2^2 cos(q2)^2
+
+    The determinant is smallest for the stretched arm, q2 = 0, so only this pose is checked. The
+    check has a margin for rounding.
 
     Args:
-        theta: Dynamic parameters of the arm, shape (5,).
+        theta: Dynamic parameters of the arm, shape (5,), see `theta_from_links`. The first
+            three are inertias, kg m^2.
     """
     theta_1 = theta[0]
     theta_2 = theta[1]
@@ -137,8 +145,20 @@ def regressor(g: float, q: Vector, qd: Vector, v: Vector, a: Vector) -> tuple[Fi
 
         Y theta = M(q) a + C(q, qd) v + G(q)
 
-    The paper prints Y(q, qd, qdd) only, Eq. (5), which is the case v = qd and a = qdd. Eq. (12)
-    needs the two velocities separately.
+    The vector theta has five parameters, see `theta_from_links`: three of the inertia and two
+    of gravity. With qi the angle of joint i, the equation of motion in these parameters is
+
+        M = | theta_1 + 2 theta_2 cos(q2)    theta_3 + theta_2 cos(q2) |
+            | theta_3 + theta_2 cos(q2)      theta_3                   |
+
+        C = theta_2 sin(q2) | -qd2    -(qd1 + qd2) |
+                            |  qd1     0           |
+
+        G = g | theta_4 cos(q1) + theta_5 cos(q1 + q2) |
+              | theta_5 cos(q1 + q2)                   |
+
+    Column j of Y contains the factors of theta_j. The paper prints Y(q, qd, qdd) only, Eq. (5),
+    which is the case v = qd and a = qdd. Eq. (12) needs the two velocities separately.
 
     Args:
         g: Gravitational acceleration, m/s^2.
@@ -146,16 +166,21 @@ def regressor(g: float, q: Vector, qd: Vector, v: Vector, a: Vector) -> tuple[Fi
         qd: Joint velocities, on which C depends, rad/s.
         v: Reference velocity, which C multiplies, rad/s.
         a: Reference acceleration, which M multiplies, rad/s^2.
+
+    Returns:
+        The rows of Y for the torques of the first and the second joint.
     """
     s1, c1 = sincos(q[0])
     s2, c2 = sincos(q[1])
-    c12 = c1 * c2 - s1 * s2
+    c12 = c1 * c2 - s1 * s2  # cos(q1 + q2)
     a1 = a[0]
     a2 = a[1]
     outer_rate = qd[0] + qd[1]
-    # The first row of C v is -theta_2 sin(q2) times this sum.
+    # The first row of C v is -theta_2 sin(q2) times this sum, the second row theta_2 times
+    # `centrifugal_2`.
     coriolis_1 = qd[1] * v[0] + outer_rate * v[1]
     centrifugal_2 = s2 * qd[0] * v[0]
+    # The factor of theta_2 in the first row of M a.
     inertial_1 = c2 * (2.0 * a1 + a2)
     y12 = inertial_1 - s2 * coriolis_1
     y22 = c2 * a1 + centrifugal_2

@@ -70,19 +70,30 @@ def advance_estimate(s: Row, gain_s: float, Yr: Vector) -> None:
 def update_torque(s: Row) -> None:
     """Computes the motor torque of a built-in control law, limited to the range of the motors.
 
-    The law is either the adaptive law or a law that compensates a known gravity torque
-    (`control.damped_torque`). The adaptive law includes its robust term, a bounded torque
-    against disturbances.
+    The adaptive law estimates the parameters of the arm:
+
+        tau = Y theta_hat - Kp r - Kd ed - rho r / sqrt(r^2 + width^2)
+
+    The last term is its robust term, a torque of at most rho against disturbances. It is left
+    out if rho is 0. The other law compensates a known gravity torque G:
+
+        tau = G(q) - K e - d qd - Kd ed + k_f felt
+
+    `control` explains the symbols, see `adaptive_torque`, `robust_torque` and `damped_torque`.
 
     Args:
-        s: State of the site (the process that runs the arm); the torque is written into it.
+        s: State of the site (the process that runs the arm), with the errors and the gains of
+            each joint; the torque is written into it.
     """
+    # The limit applies to the sum of all terms, below.
+    no_limit = inf
     if s.law == _ADAPTIVE:
         Y = (five(s.Y[0]), five(s.Y[1]))
         tau = control.adaptive_torque(
-            Y=Y, theta_hat=five(s.theta_hat), Kp=s.Kp, Kd=s.Kd, r=s.r, ed=s.ed, limit=inf
+            Y=Y, theta_hat=five(s.theta_hat), Kp=s.Kp, Kd=s.Kd, r=s.r, ed=s.ed, limit=no_limit
         )
-        if s.rho[0] > 0.0 or s.rho[1] > 0.0:
+        has_robust_term = s.rho[0] > 0.0 or s.rho[1] > 0.0
+        if has_robust_term:
             robust_0 = control.robust_torque(s.rho[0], s.width[0], s.r[0])
             robust_1 = control.robust_torque(s.rho[1], s.width[1], s.r[1])
             tau = (tau[0] - robust_0, tau[1] - robust_1)
@@ -99,7 +110,7 @@ def update_torque(s: Row) -> None:
             e=s.e,
             ed=s.ed,
             felt=s.felt,
-            limit=inf,
+            limit=no_limit,
         )
     tau_0 = control.limit_torque(tau[0], s.tau_limit[0])
     tau_1 = control.limit_torque(tau[1], s.tau_limit[1])

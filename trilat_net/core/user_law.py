@@ -61,30 +61,33 @@ def _make_operator(operate: Callable[[Any, Any], Any]) -> Any:
     """Returns an arithmetic method of `LawVector` that works number by number.
 
     Args:
-        operate: The operation on two numbers.
+        operate: The operation on two numbers, for example `operator.add`.
+
+    Returns:
+        The method. Its arguments are the vector of which it is a method, and the other operand.
     """
 
-    def compute(numbers: "LawVector", other: Any) -> Any:
-        """Applies an arithmetic operation to two vectors, or to a vector and a number.
+    def compute(vector: "LawVector", other: Any) -> Any:
+        """Applies the operation `operate` to two vectors, or to a vector and a number.
 
         Args:
-            numbers: The first vector.
+            vector: The first vector.
             other: A vector with as many numbers, or a single number.
 
         Returns:
             The resulting vector. NotImplemented if `other` is of another type.
         """
         if isinstance(other, Real):
-            return LawVector([operate(number, other) for number in numbers])
+            return LawVector([operate(number, other) for number in vector])
         if not isinstance(other, list | tuple):
-            # An array computes the result itself, as an array.
+            # Python then asks `other`: a NumPy array computes the result itself, as an array.
             return NotImplemented
-        if len(other) != len(numbers):
-            count = count_nouns(len(numbers), "number")
+        if len(other) != len(vector):
+            count = count_nouns(len(vector), "number")
             raise ValueError(
                 f"cannot combine a vector of {count} with a vector of {len(other)}"
             )
-        return LawVector(map(operate, numbers, other))
+        return LawVector(map(operate, vector, other))
 
     return compute
 
