@@ -100,11 +100,23 @@ class AdaptiveRobust(AdaptiveBox):
         )
 
     def condition(self, situation: LawSituation) -> StabilityCondition:
-        """Evaluates which bound of the errors is proved for this law in a scenario.
+        """States the bound on the errors that is proved for this law in a scenario.
 
-        The proof uses an energy function of all sites. The bound is a power in W: the part of
-        the energy that this site dissipates per time does not exceed it on average. This is a
-        weaker statement than convergence of the errors to zero.
+        The errors do not converge to zero, because friction or an operator may disturb the arm
+        with up to `rho_nm` at each joint. Proved is a bound on their mean over time. In V, the
+        energy function of the stability proof, site i (the process of one arm) dissipates a
+        power that consists of beta_i r' Kp r and a term for the disagreement of the sites. r is
+        the filtered error in rad/s, Kp a damping gain in N m s/rad, and beta_i the weight of
+        the site in V. The mean of this power is at most
+
+            beta_i ROBUST_RESIDUE sum rho width    in W, summed over the joints of the site.
+
+        The factor `ROBUST_RESIDUE` (0.3003) limits what the smooth robust term lets through. At
+        each joint, rho is the largest disturbance in N m, and width the value of r in rad/s at
+        which the robust term opposes it with 0.71 rho.
+
+        The proof assumes that all delays are constant, and that the true parameters theta of
+        the arm are within the box, the bounds in which the law searches for them.
 
         Args:
             situation: The site, its peers (the other sites) and the delays between them.
@@ -114,8 +126,9 @@ class AdaptiveRobust(AdaptiveBox):
             otherwise.
         """
         pairs = zip(self.rho_nm, self.width_rad_s, strict=True)
-        joint_bounds = [rho * width for rho, width in pairs]
-        bound_w = ROBUST_RESIDUE * sum(joint_bounds)
+        bounds_per_joint = [rho * width for rho, width in pairs]
+        bound_w = ROBUST_RESIDUE * sum(bounds_per_joint)
+        # The longest delay is NaN if any delay varies.
         delays_vary = bool(np.isnan(situation.longest_s))
         delays = "to be constant, and vary here" if delays_vary else "constant"
         text = (

@@ -85,38 +85,57 @@ class Authority(ControlLaw):
             now.tau[i] = tau
 
     def linear_gains(self, theta: Array) -> Gains | None:
-        """Returns the damping of this law for the linear analysis.
+        """Returns the damping and gravity compensation of this law for the linear analysis.
 
-        The gains are written for the built-in law tau = G - d qd, where G is the gravity
-        torque, d the damping in N m s/rad and qd the joint velocity. `linear_form` adds the
-        springs.
+        The complete torque of this law is
+
+            tau = G - d qd + K sum_j alpha_j leads_j (q_j - q)
+
+        The gains describe the first two terms, which have the form of a law that the analysis
+        knows (`Law.KNOWN`): G is the compensating gravity torque, d the damping in N m s/rad
+        and qd the joint velocity. The springs in the sum are not of that form. Therefore they
+        are left out here, and `linear_form` adds them.
 
         Args:
             theta: Parameters of the arm's dynamics, such as masses, shape (P,), where P is
                 their number.
         """
-        known = (theta * self.gravity).tolist()
-        return Gains(Law.KNOWN, d=self.d, known=known)
+        # The gravity torque is linear in the parameters: scaled parameters scale the torque
+        # by `gravity`, the ratio of the compensated gravity torque to the true one.
+        compensated_parameters = theta * self.gravity
+        return Gains(Law.KNOWN, d=self.d, known=compensated_parameters.tolist())
 
     def linear_form(self, situation: LinearSituation) -> LinearForm | None:
         """Returns the springs of this law as blocks of the linear analysis.
 
         The linear analysis considers small motions around a pose at rest. Each spring pulls the
-        arm of this site towards the arm of a user, so the torque depends on both positions.
+        arm of this site (the process of one arm) towards the arm of a user:
+
+            tau = K sum_j alpha_j leads_j (q_j - q)
+
+        tau is the torque, q the position of the arm, q_j the position that peer j sends, and
+        alpha_j the weight with which this arm follows peer j. leads_j is 1 if peer j is a user
+        and 0 otherwise.
+
+        A block `form.add(row, column, gain)` says that the row contains gain times the column.
+        The row "tau" is the torque, the column "q" the position, the column ("from", j) the
+        vector that peer j sends, and the row ("to", j) the vector that is sent to peer j.
 
         Args:
             situation: The site, its peers (the other sites) and their laws.
         """
-        form = LinearForm(len(situation.inertia))
+        joints = len(situation.inertia)
+        form = LinearForm(joints)
         K = np.array(self.K)
         for j in situation.peers:
+            # A site with another law has no flag `leads` and is not followed.
             peer_leads = getattr(situation.laws[j], "leads", False)
-            alpha = situation.alpha[situation.site, j]
+            alpha = situation.alpha[situation.site, j]  # weight with which this site follows j
             share = alpha * float(peer_leads)
             stiffness = share * K
             form.add("tau", "q", -stiffness)
             form.add("tau", ("from", j), stiffness)
-            form.add(("to", j), "q", 1.0)
+            form.add(("to", j), "q", 1.0)  # every site sends its position
         return form
 
     def explain_idle_shares(self, situation: LawSituation) -> str:

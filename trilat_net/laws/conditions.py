@@ -173,25 +173,43 @@ def judge_position_exchange(
 def _judge_two_sites(
     situation: LawSituation, K: Array, d: Array, scope: str
 ) -> StabilityCondition:
-    """Returns the condition of two sites, 4 d1 d2 >= (T1 + T2)^2 K1 K2.
+    """Evaluates the stability condition of two arms that are coupled by springs with dampers.
+
+    The condition is due to Nuno, Basanez, Ortega and Spong, IJRR 28, 2009:
+
+        4 d1 d2 >= (T1 + T2)^2 K1 K2
+
+    K1 and K2 are the stiffnesses of the two springs, d1 and d2 the dampings of the two arms.
+    T1 + T2 is the sum of the delays in both directions.
+
+    A torque that is held for the period h acts h / 2 later. Therefore each d is reduced by
+    K h / 2, and the sum of the delays is increased by h. Each stiffness is multiplied by the
+    weight with which its site follows the other. Both weights are 1 if a session has only two
+    sites; they can be less if the two sites are a part of a larger session.
 
     Args:
-        situation: The situation of the site.
-        K: Stiffness of each site per joint, shape (2, n).
-        d: Damping of each site per joint, shape (2, n).
-        scope: Sentence on the arms for which the condition is sufficient.
+        situation: The situation of the site, with the delays and the hold time h.
+        K: Stiffness of each site per joint, N m/rad, shape (2, n), where n is the number of
+            joints.
+        d: Damping of each site per joint, N m s/rad, shape (2, n).
+        scope: Part of the text that says for which arms the condition is sufficient.
+
+    Returns:
+        The condition with its numbers. It holds if it is met at every joint, and no damping is
+        negative after the reduction.
     """
     hold_s = situation.hold_s
     alpha = situation.alpha
     effective_d = d - 0.5 * K * hold_s
     round_trip_s = float(situation.delay_s.sum()) + hold_s
-    shares = alpha[0, 1] * alpha[1, 0]
-    coupling = shares * K[0] * K[1]
+    product_of_weights = alpha[0, 1] * alpha[1, 0]
+    coupling = product_of_weights * K[0] * K[1]
     left_side = 4.0 * effective_d[0] * effective_d[1]
     right_side = round_trip_s**2 * coupling
     excess = float((left_side - right_side).min())
     # A condition that holds with equality passes in spite of rounding errors.
     tolerance = 1e-9 * float(d.max()) ** 2
+    # Two negative dampings have a positive product, so the signs are checked separately.
     is_damped = bool((effective_d >= 0.0).all())
     holds = excess >= -tolerance and is_damped
 
@@ -250,19 +268,34 @@ def _judge_several_sites(
 
 
 def _find_common_motion_share(count: float) -> float:
-    """Returns the damping per K T that the common motion of all sites needs for held torques.
+    """Returns how much damping all sites need so that their common motion dies away.
 
-    With n = 2 T / h + 1, the delay in halves of a tick, this is
+    In the common motion, all arms move alike. Each is pulled by a spring with the stiffness K
+    towards the position that the others had before the delay T, and is braked by a damper d. If
+    the motion oscillates with the angular frequency w, the delayed spring acts like a damper
+    K sin(w T) / w, which is negative for w T between pi and 2 pi. In continuous time, d must
+    therefore exceed the maximum of -K sin(w T) / w, so that
 
-        -min sin(n x) / (n sin x)
+        d / (K T) = -min sin(x) / x,    x = w T    (the constant `COMMON_MOTION_SHARE`).
+
+    If torques are held for the period h, the delay is T + h / 2 = n h / 2 with
+    n = 2 T / h + 1. With x = w h / 2, the condition becomes
+
+        (d - K h / 2) / (K (T + h / 2)) = -min sin(n x) / (n sin x),    n x from pi to 2 pi.
+
+    The minimum is found on a grid of 1001 points, which is fine enough for a smooth function.
 
     Args:
-        count: The number n.
+        count: The number n: the delay in halves of the period h.
+
+    Returns:
+        The ratio of damping to stiffness times delay, dimensionless.
     """
-    angles = np.linspace(np.pi, 2.0 * np.pi, 1001)
-    x = angles[1:-1] / count
-    ratio = np.sin(count * x) / (count * np.sin(x))
-    return float(-ratio.min())
+    phases = np.linspace(np.pi, 2.0 * np.pi, 1001)  # n x, the phase lag over the delay
+    # The ends are left out: the sine is zero there, and for n = 1 the divisor as well.
+    x = phases[1:-1] / count
+    damping_ratio = np.sin(count * x) / (count * np.sin(x))
+    return float(-damping_ratio.min())
 
 
 BlockKey = str | tuple[str, int]

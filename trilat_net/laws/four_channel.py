@@ -196,8 +196,20 @@ class FourChannel(ControlLaw):
     def linear_form(self, situation: LinearSituation) -> LinearForm | None:
         """Returns two terms for the linear analysis that `linear_gains` cannot express.
 
-        The terms are the acceleration of the peers (the other arms), which is fed forward, and
-        the torque that the operator or environment exerts on the arm itself.
+        `linear_gains` returns the gains of the gravity torque, the spring, the damper and the
+        torque on the peers (the other arms). The two remaining terms of the torque tau are
+
+            force_own tau_h + acceleration M sum_j alpha_j qdd_j
+
+        tau_h is the torque that the operator or environment exerts on the arm itself, M the
+        inertia matrix of the arm, qdd_j the acceleration that peer j sends, and alpha_j the
+        weight with which this site (the process of the arm) follows peer j. `force_own` and
+        `acceleration` are gains.
+
+        A block `form.add(row, column, gain)` says that the row contains gain times the column.
+        The row "tau" is the torque, the column "tau_h" the torque on the arm, the column
+        ("from", j) the vector that peer j sends, and the row ("to", j) the vector that is sent
+        to peer j.
 
         Args:
             situation: The site, its arm, and the weights with which it follows its peers.
@@ -207,14 +219,16 @@ class FourChannel(ControlLaw):
         """
         if not self.acceleration and not any(self.force_own):
             return None
-        joints = len(situation.inertia)
+        M = situation.inertia
         sends_acceleration = self.acceleration > 0.0
-        form = LinearForm(joints, sends_acceleration=sends_acceleration)
+        form = LinearForm(len(M), sends_acceleration=sends_acceleration)
         form.add("tau", "tau_h", self.force_own)
         for j in situation.peers:
             alpha = situation.alpha[situation.site, j]
             gain = self.acceleration * alpha
-            form.add("tau", ("from", j), gain * situation.inertia)
+            form.add("tau", ("from", j), gain * M)
+            # This block only names peer j as a receiver. With `sends_acceleration`, the
+            # analysis itself inserts the acceleration that is sent.
             form.add(("to", j), "q", 0.0)
         return form
 

@@ -74,19 +74,34 @@ class Impedance(ControlLaw):
     def torque(self, now: LawInput) -> None:
         """Computes the torque of the arm in one period of the control loop.
 
-        The method first computes the acceleration that a mass M on a spring K and a damper B
-        would have under the forces on the arm. It then computes the torque that gives the arm
-        this acceleration. At the slave, it also sends the measured torque of the environment to
-        the masters.
+        First, the acceleration qdd is computed that a mass M on a spring K and a damper B would
+        have:
+
+            M qdd = tau_h + sum_j f_j - B (qd - qd_ref) - K (q - q_ref)
+
+        q and qd are the positions and velocities of the joints, tau_h is the torque of the
+        operator or environment on the arm, and f_j the force that peer j (another arm) sent. At
+        a master, an arm that a person moves, the reference q_ref is the start pose and qd_ref
+        is zero. At the slave, the reference is q_des and qd_des, the weighted motion of the
+        masters, and the force f_j = alpha_j tau_h is sent to master j, where alpha_j is the
+        weight with which the slave follows it.
+
+        Then the torque tau is computed that gives the arm this acceleration:
+
+            tau = C qd + G + M_arm qdd - tau_h
+
+        where C qd is the Coriolis torque, G the gravity torque and M_arm the inertia matrix of
+        the arm.
 
         Args:
             now: Inputs and outputs of the law in this period. The torque is written into
-                `now.tau`.
+                `now.tau`. `now.bias` is C qd + G, and `now.tau_x` is -tau_h.
         """
-        follows = 1.0 if self.follows else 0.0
+        follows = 1.0 if self.follows else 0.0  # a master's reference and sent force vanish
         for i in range(now.joints):
             q = now.q[i]
-            if now.k == 0:
+            is_first_period = now.k == 0
+            if is_first_period:
                 self.start[i] = q
             start = self.start[i]
             target_offset = now.q_des[i] - start
@@ -104,7 +119,7 @@ class Impedance(ControlLaw):
             spring = self.K[i] * error
             force -= damper + spring
             self.qdd[i] = force / self.M[i]
-        # The inner loop gives the arm the acceleration of the impedance.
+        # The inner loop gives the arm this acceleration. Its torque contains -tau_h = tau_x.
         for i in range(now.joints):
             tau = now.bias[i] + now.tau_x[i]
             for j in range(now.joints):
@@ -127,21 +142,34 @@ class Impedance(ControlLaw):
     def linear_form(self, situation: LinearSituation) -> LinearForm | None:
         """Returns the spring, the damper and the forces of this law for the linear analysis.
 
-        The linear analysis considers small motions around a pose at rest. The law gives the
-        arm, whose inertia matrix is A, the apparent inertia M. Therefore all its terms are
-        multiplied by A inv(M). At the slave, the result also contains the force that it sends
-        to the masters.
+        The linear analysis considers small motions around a pose at rest. The law gives the arm
+        the acceleration of a mass M on a spring K and a damper B. For an arm with the inertia
+        matrix A, the torque (without gravity) is
+
+            tau = A inv(M) (tau_h + sum_j f_j - B (qd - qd_des) - K (q - q_des)) - tau_h
+
+        q and qd are the positions and velocities of the joints, tau_h is the torque of the
+        operator or environment on the arm, and f_j the force that peer j (another arm) sends.
+        The desired motion q_des, qd_des belongs to the slave, the arm that follows; at the
+        other arms these terms are missing. The slave sends alpha_j tau_h to peer j, where
+        alpha_j is the weight with which it follows this peer; the other arms send zero.
+
+        A block `form.add(row, column, gain)` says that the row contains gain times the column.
+        The column ("from", j) is the force f_j, and the row ("to", j) the force that is sent to
+        peer j.
 
         Args:
             situation: The site, its arm, and the weights with which it follows the other sites.
         """
         n = len(situation.inertia)
         form = LinearForm(n)
+        # M, B and K are diagonal: one number per joint, or a single number for all joints.
         M = np.array(self.M)
         B = np.array(self.B)
         K = np.array(self.K)
         inverse_M = np.broadcast_to(1.0 / M, n)
-        inertia_ratio = situation.inertia @ np.diag(inverse_M)
+        inertia_ratio = situation.inertia @ np.diag(inverse_M)  # A inv(M)
+        # Multiplying by a vector scales the columns, as the diagonal matrices K and B would.
         stiffness = inertia_ratio * K
         damping = inertia_ratio * B
         force_gain = inertia_ratio - np.eye(n)
@@ -154,8 +182,9 @@ class Impedance(ControlLaw):
             form.add("tau", "qd_des", damping)
         for j in situation.peers:
             alpha = situation.alpha[situation.site, j]
+            sent_share = self.follows * alpha  # zero unless this arm is the slave
             form.add("tau", ("from", j), inertia_ratio)
-            form.add(("to", j), "tau_h", self.follows * alpha)
+            form.add(("to", j), "tau_h", sent_share)
         return form
 
     def explain_idle_shares(self, situation: LawSituation) -> str:  # noqa: ARG002

@@ -388,10 +388,17 @@ class EnergyLaw(ControlLaw):
 
 
 def _derive_settings(kind: type[ControlLaw], tag: str) -> type[LawSettings]:
-    """Returns the class that stores the gains of a law in a scenario.
+    """Creates the class that stores the gains of a law in a scenario.
 
-    Annotations of the law and its base classes become fields. Methods and class variables that
-    depend on gains alone are taken over.
+    A law is written as one class, whose instances compute torques while an arm is controlled. A
+    scenario, the description of an experiment, needs only the gains of the law: it reads and
+    checks them long before, and without, such an instance. Therefore a second class is derived,
+    a frozen record (`msgspec.Struct`), so that no author of a law has to write the gains twice.
+
+    Annotations of the law and its base classes become the fields of the record; each has a
+    default, which is the value of the class attribute. Methods and class variables that need
+    nothing but the gains are copied (see `_depends_on_gains`), so that for example the
+    stability condition can be evaluated from the record.
 
     Args:
         kind: The class of the law.
@@ -399,14 +406,16 @@ def _derive_settings(kind: type[ControlLaw], tag: str) -> type[LawSettings]:
     """
     hints: dict[str, Any] = {}
     namespace: dict[str, Any] = {}
+    # Base classes come first, so that attributes of the law itself replace theirs.
     for base in reversed(kind.__mro__):
-        if base is ControlLaw or not issubclass(base, ControlLaw):
+        is_law_class = issubclass(base, ControlLaw) and base is not ControlLaw
+        if not is_law_class:
             continue
         annotations = inspect.get_annotations(base).items()
         hints |= {name: hint for name, hint in annotations if not _is_class_variable(hint)}
         attributes = vars(base).items()
         namespace |= {key: value for key, value in attributes if _depends_on_gains(key, value)}
-    namespace["kind"] = kind
+    namespace["kind"] = kind  # `LawSettings.kind` refers back to the class of the law
     namespace["__doc__"] = kind.__doc__
     fields = [(name, hint, getattr(kind, name)) for name, hint in hints.items()]
     settings: Any = msgspec.defstruct(
@@ -432,18 +441,27 @@ def _is_class_variable(hint: Any) -> bool:
 
 
 def _depends_on_gains(name: str, value: Any) -> bool:
-    """Returns True for an attribute of a law's class that its `Settings` take over.
+    """Returns True if an attribute of a law's class is copied to the record of its gains.
 
-    Methods that need an instance at a site are not taken over.
+    The record of gains, the class `Settings`, is derived from the class of a law (see
+    `_derive_settings`). It has the gains, but not the state that an instance of the law has
+    while it controls an arm.
+
+    - Functions and properties are copied if they use the gains alone. `begin`, `torque` and
+      `energies` need the state, and Python's special methods belong to the class itself.
+    - Other attributes are copied if they are declared by `LawSettings`, the base class of all
+      records, for example `planar`. The rest are details of the law.
 
     Args:
         name: Name of the attribute.
         value: The function, property or class variable.
     """
-    if inspect.isfunction(value) or isinstance(value, property):
+    is_method = inspect.isfunction(value) or isinstance(value, property)
+    if is_method:
         is_special = name.startswith("__")
-        needs_instance = name in ("begin", "torque", "energies")
-        return not (is_special or needs_instance)
+        needs_state = name in ("begin", "torque", "energies")
+        return not (is_special or needs_state)
+    # Other attributes: class variables that the base class of the records declares.
     return name in LawSettings.__annotations__
 
 

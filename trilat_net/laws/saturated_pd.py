@@ -53,12 +53,20 @@ class SaturatedPd(ControlLaw):
     needs_theta: ClassVar = True
 
     def torque(self, now: LawInput) -> None:
-        """Computes the torque of one tick by the equation of the class.
+        """Computes the torque of the arm in one tick, a period of the control loop.
 
-        The torque is written into `now.tau`.
+            tau = G - sum_j alpha_j P tanh(K (q - q_j) / P) - d qd
+
+        tau is the torque, q and qd are position and velocity of a joint, and q_j the position
+        of peer j, another arm. G is the gravity torque times the gain `gravity`, and d the
+        damping in N m s/rad. Each peer pulls like a spring with the stiffness K (N m/rad) while
+        the distance is small. The hyperbolic tangent never exceeds 1, so the pull of all peers
+        together never exceeds P (N m). It is divided among the peers by the dominance factors
+        alpha_j, the weights with which this arm follows them.
 
         Args:
-            now: Inputs and outputs of the law in this tick.
+            now: Inputs and outputs of the law in this tick. The torque is written into
+                `now.tau`.
         """
         for i in range(now.joints):
             q = now.q[i]
@@ -77,16 +85,22 @@ class SaturatedPd(ControlLaw):
     def linear_gains(self, theta: Array) -> Gains | None:
         """Returns the gains of an unsaturated spring and a damper, for the linear analysis.
 
-        For small position errors the spring does not saturate, so this law equals tau = G - K e
-        - d qd. Here G is the gravity torque, K the stiffness, e the position error, d the
-        damping and qd the joint velocity.
+        For small position errors e the spring does not saturate, so this law equals
+
+            tau = G - K e - d qd
+
+        This is a law that the analysis knows (`Law.KNOWN`, the law with known parameters). G is
+        the gravity torque with which the law compensates gravity, K the stiffness in N m/rad, d
+        the damping in N m s/rad and qd the joint velocity.
 
         Args:
             theta: Parameters of the arm's dynamics, such as masses, shape (P,), where P is
                 their number.
         """
-        known = (theta * self.gravity).tolist()
-        return Gains(Law.KNOWN, K=self.K, d=self.d, known=known)
+        # The gravity torque is linear in the parameters: scaled parameters scale the torque
+        # by `gravity`, the ratio of the compensated gravity torque to the true one.
+        compensated_parameters = theta * self.gravity
+        return Gains(law=Law.KNOWN, K=self.K, d=self.d, known=compensated_parameters.tolist())
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
         """Evaluates the stability of this law, and whether its torques stay within limits.
@@ -101,6 +115,7 @@ class SaturatedPd(ControlLaw):
         Args:
             situation: The site, its peers (the other sites), its torque limits and the delays.
         """
+        # The condition of P+d, a spring K to the peers and a damper d.
         condition = judge_position_exchange(situation, "K", "d")
         if not situation.gravity_nm:
             text = f"{condition.text}; and tau_limit_nm above gravity + P + d |qd|"

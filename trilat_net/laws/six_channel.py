@@ -34,26 +34,35 @@ class SixChannel(FourChannel):
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
         """Evaluates the stability condition of the four-channel law for two users and a slave.
 
-        The condition is not met if the dominance factors, the weights with which the arms
-        follow each other, do not all follow from one factor a (see `complementary_shares`).
-        Otherwise its text states the factor a and the weights with which the torques of the
-        operators balance at rest.
+        The sites, the processes that run one arm each, are user 1, user 2 and the slave, in
+        this order. All dominance factors, the weights with which the arms follow each other,
+        must follow from one number a, the authority of user 1 (see `complementary_shares`).
 
         Args:
-            situation: The three sites and the dominance factors.
+            situation: The three sites and the dominance factors: row i of `alpha` contains the
+                weights with which site i follows the others.
+
+        Returns:
+            Not met, if the dominance factors do not follow from one number. Otherwise the
+            condition of the four-channel law, which may be undecided. Its text then begins with
+            a, and with the weights beta with which the torques of the operators add up to zero
+            at rest.
         """
-        a = float(situation.alpha[2, 0])
+        user_1 = 0
+        slave = 2
+        a = float(situation.alpha[slave, user_1])  # the slave follows user 1 with the weight a
         expected_shares = complementary_shares(a)
         if not np.allclose(situation.alpha, expected_shares):
             text = "the shares are not those of one factor: see six_channel in docs/laws.md"
             return StabilityCondition(False, text)
+
         weights = complementary_weights(a)
         beta = ", ".join(f"{weight:.4g}" for weight in weights)
+        prefix = f"factor a = {a:g}, weights beta = ({beta}); "
         condition = FourChannel.condition(self, situation)
-        text = f"factor a = {a:g}, weights beta = ({beta}); "
         if condition is None:
-            return StabilityCondition(None, text)
-        return StabilityCondition(condition.holds, text + condition.text)
+            return StabilityCondition(None, prefix)
+        return StabilityCondition(condition.holds, prefix + condition.text)
 
 
 def complementary_shares(a: float) -> Array:
@@ -80,8 +89,18 @@ def complementary_weights(a: float) -> tuple[float, float, float]:
     """Computes the weights beta with which the operators' torques add up to zero at rest.
 
     While all arms rest, sum_i beta_i tau_i = 0, where tau_i is the torque of the operator or
-    environment on arm i, in N m. The weights hold for the dominance factors that
-    `complementary_shares` returns.
+    environment on arm i, in N m.
+
+    The weights follow from the matrix A of the dominance factors (`complementary_shares`),
+    whose row i contains the weights with which arm i follows the others. At rest, springs
+    balance the torques, tau = K (q - A q), where K is the stiffness and q the positions.
+    Therefore beta is a vector with beta A = beta, written out
+
+        beta_1 = a beta_2 + a beta_3
+        beta_2 = (1 - a) beta_1 + (1 - a) beta_3
+        beta_3 = a beta_1 + (1 - a) beta_2
+
+    Such a vector may be multiplied by any number; here it is not scaled to a certain sum.
 
     Args:
         a: Authority of user 1, from 0 to 1.

@@ -83,10 +83,25 @@ class Sync(ControlLaw):
     def torque(self, now: LawInput) -> None:
         """Computes the torque and the new estimate of the parameters in one tick.
 
-        The regressor Y of the planar arm is evaluated once for both.
+        A tick is one period h of the control loop. The law is
+
+            r = qd + Lambda q
+            tau = K (r_des - r) + Y theta_hat,    r_des = qd_des + Lambda q_des
+            rate of theta_hat = -Gamma Y' r
+
+        q and qd are the positions and velocities of the two joints. q_des and qd_des are those
+        of the peers, the other arms, averaged with the weights with which this arm follows
+        them. K (N m s/rad), Lambda (1/s) and Gamma are gains. theta_hat is the estimate of the
+        arm's parameters, and Y the regressor: the matrix that gives, times the parameters, the
+        torque of the arm's dynamics along the reference velocity v = -Lambda q with the
+        acceleration a = -Lambda qd. Y' is its transpose. r is also qd - v.
+
+        The regressor is evaluated once for the torque and the estimate. The estimate is
+        integrated by the trapezoid rule: the mean of the old and the new rate, times h.
 
         Args:
-            now: Inputs and outputs of the law in this tick.
+            now: Inputs and outputs of the law in this tick. The torque is written into
+                `now.tau`, and the estimate into `now.theta_hat`.
         """
         half_h = 0.5 * now.h_s
         Lambda_1 = self.Lambda[0]
@@ -96,11 +111,13 @@ class Sync(ControlLaw):
         v = (-Lambda_1 * q[0], -Lambda_2 * q[1])
         a = (-Lambda_1 * qd[0], -Lambda_2 * qd[1])
         r = (qd[0] - v[0], qd[1] - v[1])
+        # K (r_des - r)
         for i in range(2):
             position_part = self.Lambda[i] * now.q_des[i]
             peer_output = now.qd_des[i] + position_part
             disagreement = peer_output - r[i]
             now.tau[i] = self.K[i] * disagreement
+        # The two rows of Y, one per joint.
         first, second = regressor(
             g=self.g_m_s2,
             q=q,
@@ -109,12 +126,14 @@ class Sync(ControlLaw):
             a=a,
         )
         for p in range(len(self.Yr)):
-            Yr = first[p] * r[0] + second[p] * r[1]
+            Yr = first[p] * r[0] + second[p] * r[1]  # entry p of Y' r
+            # The trapezoid rule needs the entry of the previous tick, so it starts at tick 1.
             if now.k > 0:
                 gain_s = half_h * self.Gamma[p]
                 Yr_sum = self.Yr[p] + Yr
                 self.theta_hat[p] -= gain_s * Yr_sum
             self.Yr[p] = Yr
+            # Add Y theta_hat, one parameter after the other.
             estimate = self.theta_hat[p]
             now.theta_hat[p] = estimate
             now.tau[0] += first[p] * estimate

@@ -79,12 +79,19 @@ class Tanks(EnergyLaw):
         the gravity torque of the previous control period.
 
         Args:
-            facts: Facts about the site that are known before the run.
+            facts: Facts about the site (the process that runs the arm) that are known before
+                the run.
         """
+        # Whether the tank limits the torque. The compiled `torque` needs a bool.
         self.guarded = bool(self.guarded)
+        # Part of the tank's energy that is sent to the peers in each control period.
         self.packet = float(self.packet_1_s) / facts.rate_hz
+        # Motion of a joint in a control period h because of its acceleration, a h^2 / 2, rad.
         self.extra_step = 0.5 * self.acceleration_rad_s2 / facts.rate_hz**2
+        # State: sum of the energy received from each peer so far, J.
         self.E_seen = [0.0] * len(facts.peers)
+        # State: gravity torque in the previous control torque, per joint, N m. It carries the
+        # weight of the arm, and its work does not count.
         self.carried = [0.0] * facts.joints
 
     def torque(self, now: LawInput) -> None:
@@ -155,23 +162,36 @@ class Tanks(EnergyLaw):
         """Computes the energies that show whether the law was passive in a run.
 
         Each arm has an energy tank, the amount of energy that its controller may still spend.
-        The result contains the energy in the tank, the energy sent to each peer (another arm),
-        the energy received from each peer, and the energy that the arm gave to the controller.
+        All energies are in J. In the records, of which there is one per control period,
+
+        - "E" is the sum of the energy sent to a peer (another arm) so far;
+        - "E_seen" is the sum of the energy received so far, one column per peer;
+        - "H" is the energy in the tank;
+        - "carried" is the part of the torque that compensates gravity, N m. Its work does not
+          come from the tank, so it is subtracted from the torque.
 
         Args:
-            seen: Records of the site in the run, one per control period.
+            seen: Records of the site (the process that runs the arm) in the run.
+
+        Returns:
+            The energy sent to each peer (`gave`) and received from it (`took`), the energy that
+            the arm gave to the controller (`port`), and the energy in the tank (`store`).
+            Nothing is booked as dissipated (`taken`): damping moves energy into the tank.
         """
-        gave = [peer.sent["E"] for peer in seen.peers]
+        sent_energies = [peer.sent["E"] for peer in seen.peers]
         E_seen = seen.memory["E_seen"]
-        took = [E_seen[:, j : j + 1] for j in range(len(gave))]
+        # A slice of one column keeps the shape (K, 1), where K is the number of records.
+        received_energies = [E_seen[:, j : j + 1] for j in range(len(sent_energies))]
         coupling_torque = seen.tau - seen.memory["carried"]
-        port = -sum_work(coupling_torque, seen.q)
+        # `sum_work` is the work of the controller on the arm; the arm gave the opposite.
+        energy_from_arm = -sum_work(coupling_torque, seen.q)
+        dissipated_energy = np.zeros(len(energy_from_arm))
         return LawEnergies(
-            gave=gave,
-            took=took,
-            port=port,
+            gave=sent_energies,
+            took=received_energies,
+            port=energy_from_arm,
             store=seen.to_all["H"],
-            taken=np.zeros(len(port)),
+            taken=dissipated_energy,
             gravity=self.gravity,
         )
 
