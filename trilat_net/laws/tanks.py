@@ -82,7 +82,7 @@ class Tanks(EnergyLaw):
             facts: Facts about the site (the process that runs the arm) that are known before
                 the run.
         """
-        # Whether the tank limits the torque. The compiled `torque` needs a bool.
+        # Whether the tank limits the torque, as a bool of this instance.
         self.guarded = bool(self.guarded)
         # Part of the tank's energy that is sent to the peers in each control period.
         self.packet = float(self.packet_1_s) / facts.rate_hz

@@ -85,35 +85,43 @@ def book_leader_work(
 def observe_leader(law: Any, now: LawInput, j: int, i: int) -> None:
     """Updates how much energy the leader's arm may still take out of a coupling.
 
-    A coupling connects the leader to an arm that follows it. The energy grows by the amount
-    that the follower has reported since the previous control period. If work is computed from
-    the motion of the arm (`energy` = "step"), the work of the arm in the previous period is
-    included as well.
+    A coupling connects the leader to an arm that follows it. The leader feels a torque of the
+    coupling. It may take only energy out of the coupling that the follower has put in:
+
+        W_led = reserve + E_followed + (sum of the work of the leader where it is negative)
+
+    W_led is the energy that the leader may still take out (the result), J. E_followed is the
+    sum of all energy that the follower has put in, as its messages report it. It grows from
+    period to period, and only the growth since the previous period is added here. If the work
+    is computed from the motion of the arm (`energy` = "step"), this function also adds the work
+    of the previous period, because the motion is known only now. Otherwise the work of each
+    period is added in that period, by `Tdpa.torque`.
 
     Args:
-        law: The law; the energy known so far and the last report of the follower are changed.
-        now: Inputs and outputs of the law in this period; the energy is written as W_led.
+        law: The law. `law.E_known` is the last report of the follower, which is updated, and
+            `law.F_led` the torque that the leader felt in the previous period, N m.
+        now: Inputs and outputs of the law in this period. W_led is stored in the message to the
+            follower, which keeps the value of the previous period until then.
         j: Index of the peer (the other arm) that follows.
         i: Index of the joint.
     """
-    index = j * now.joints + i
+    index = j * now.joints + i  # position in lists with one entry per coupling and joint
     sent = now.sent[j]
     received = now.received[j]
-    known_energy = sent.W_led[i] if now.k > 0 else law.reserve_J
+    available_energy = sent.W_led[i] if now.k > 0 else law.reserve_J
     reported_energy = received.E_followed[i]
-    known_energy += reported_energy - law.E_known[index]
+    available_energy += reported_energy - law.E_known[index]
     law.E_known[index] = reported_energy
     if law.by_step:
-        # The step of the previous period, which is known now.
-        step = now.q[i] - now.q_before[i]
-        known_energy += book_leader_work(
+        last_step = now.q[i] - now.q_before[i]
+        available_energy += book_leader_work(
             now=now,
             j=j,
             i=i,
             torque=law.F_led[index],
-            step=step,
+            step=last_step,
         )
-    sent.W_led[i] = known_energy
+    sent.W_led[i] = available_energy
 
 
 @compiled
@@ -263,29 +271,38 @@ def limit_follower_velocity(
 ) -> float:
     """Reduces the velocity of a followed peer if the known energy does not cover its work.
 
-    The peer is another arm, the leader of this coupling. The reduced velocity is stored as
-    `law.v_led`; later it moves the goal to which the spring pulls this arm.
+    This arm follows a peer, another arm, by a spring and a damper whose goal moves with the
+    velocity of the peer. If the goal moves with the velocity v during a period h, the force F
+    of spring and damper does the work F v h. This work must not exceed the known energy: the
+    energy that the peer is known to have put in and that is not spent (`find_known_energy`). If
+    the work is too large, the velocity is reduced so that it equals the known energy:
+
+        F v_reduced h = known energy,    v_reduced = v + (known energy - F v h) / (F h)
+
+    The velocity is stored as `law.v_led`; later it moves the goal.
 
     Args:
-        law: The law; the velocity of the coupling is written.
+        law: The law. `law.v_led` is written. If `law.controlled` is False, for comparisons, no
+            velocity is reduced.
         now: Inputs and outputs of the law in this control period.
         j: Index of the peer that is followed.
         i: Index of the joint.
-        force: Part of the torque of spring and damper that belongs to this peer, N m.
-        price: Energy that this period is expected to need besides the force times the motion of
-            the peer, J.
+        force: F, the part of the torque of spring and damper that belongs to this peer, N m.
+        price: Energy that this period is expected to need besides F v h, J. It is set aside
+            first, if work is computed from the motion of the arm (`law.by_step`).
 
     Returns:
         The known energy that remains, J. It is negative if the unreduced velocity of the peer
         costs more than is known.
     """
-    index = j * now.joints + i
+    index = j * now.joints + i  # position in lists with one entry per coupling and joint
     h = now.h_s
     peer_velocity = now.peers[j].qd[i]
     known_J = find_known_energy(law, now, j, i)
     if law.by_step:
         known_J = max(known_J - price, 0.0)
     law.v_led[index] = peer_velocity
+    # Negative work costs nothing: it puts energy into the coupling.
     cost_J = max(force * peer_velocity * h, 0.0)
     remaining_J: float = known_J - cost_J
     has_force = abs(force) > _SLACK_NM
@@ -359,23 +376,28 @@ def find_affordable_velocity(
     """Returns the largest velocity of a followed peer that the known energy covers, rad/s.
 
     The peer is another arm. Its velocity moves the goal to which a spring pulls this arm, and
-    the torque of the spring does work. The velocity is reduced if this work would exceed the
-    energy that the peer is known to have put in.
+    the torque of the spring does work. Delays could make this work larger than the energy that
+    the peer has put in, so that the arms would be driven by energy from nowhere. Therefore the
+    velocity is reduced if its work would exceed the energy that the peer is known to have put
+    in and that is not spent (`find_known_energy`).
 
     Args:
-        law: The law, with its energy accounts.
+        law: The law. `law.v_led` is the velocity of the peer, which may have been reduced
+            before, in rad/s. If `law.controlled` is False, for comparisons, it is returned.
         now: Inputs and outputs of the law in this control period.
         j: Index of the peer that is followed.
         i: Index of the joint.
-        force: Torque of spring and damper at the joint, N m.
+        force: Torque of spring and damper at the joint, N m. The weight `alpha`, with which
+            this arm follows the peer, decides which part of it belongs to the peer.
     """
-    index = j * now.joints + i
-    # The work of the force per velocity of the goal in a period.
-    work = now.peers[j].alpha * force * now.h_s
+    index = j * now.joints + i  # position in lists with one entry per coupling and joint
+    # Work in this period for each rad/s of the velocity, J s/rad. It has the sign of the force.
+    work_per_velocity = now.peers[j].alpha * force * now.h_s
     known_J = max(find_known_energy(law, now, j, i), 0.0)
     velocity = float(law.v_led[index])
-    if law.controlled and work * velocity > known_J:
-        return known_J / work
+    if law.controlled and work_per_velocity * velocity > known_J:
+        # The work is positive, so the quotient has the sign of the velocity and is smaller.
+        return known_J / work_per_velocity
     return velocity
 
 
@@ -388,22 +410,39 @@ def book_follower(
     force: float,
     drift: float,
 ) -> None:
-    """Books the energy at the follower's end of the coupling to peer j.
+    """Books the energy of one period at the follower's end of the coupling to peer j.
 
-    If work is computed by step, torque and energy belong to the velocity in use. In the
-    published law, which computes work by velocity, both belong to the leader's velocity, and
-    the change that the controller makes to it is booked separately.
+    The coupling connects this arm, the follower, to the peer that leads it. The peer's velocity
+    moves the goal of a spring and damper, which pull the arm with the force F. Sums of energy
+    since the start, J:
+
+        E_led        energy that the leader has put into the coupling, as it reports it
+        E_moved      energy taken out of the coupling by moving the goal
+        E_followed   energy that this end has put in, which the leader may take out
+        E_yielded    energy saved by moving the goal more slowly than the leader, minus the
+                     energy that drift compensation took
+        W_followed   energy that this end may still take out:
+
+                     W_followed = E_led + reserve - E_moved + E_yielded
+
+    In a period h, a goal with the velocity v takes out F v h, or puts in -F v h if this is
+    negative. There are two forms of the law for v:
+
+    - If work is computed from motion (`law.by_step`), v is the velocity in use, `law.v_led`,
+      which the controller may have reduced. No energy is saved then.
+    - In the published law, v is the velocity of the leader. The difference to the velocity in
+      use saves F (v - v_led) h.
 
     Args:
         law: The law; its accounts of the coupling are changed.
         now: Inputs and outputs of the law in this tick.
         j: Index of the peer that is followed.
         i: Index of the joint.
-        force: Part of the following force that belongs to the peer, N m.
-        drift: The coupling's part of the energy that drift compensation takes, J. Energy that
-            drift compensation returns stays at this end.
+        force: F, the part of the torque of spring and damper that belongs to the peer, N m.
+        drift: Energy that moving the goal back towards the peers takes from this coupling (the
+            compensation of drift), J. Negative if it returns energy, which stays at this end.
     """
-    index = j * now.joints + i
+    index = j * now.joints + i  # position in lists with one entry per coupling and joint
     h = now.h_s
     sent = now.sent[j]
     used_velocity = law.v_led[index]
@@ -413,11 +452,11 @@ def book_follower(
         law.E_moved[index] += energy
     else:
         sent.E_followed[i] -= energy
-    yielded_J = force * (velocity - used_velocity) * h
-    law.E_yielded[index] += yielded_J - drift
-    known_J = now.received[j].E_led[i] + law.reserve_J
+    saved_J = force * (velocity - used_velocity) * h
+    law.E_yielded[index] += saved_J - drift
+    put_in_J = now.received[j].E_led[i] + law.reserve_J
     moved_J = law.E_moved[index]
-    sent.W_followed[i] = known_J - moved_J + law.E_yielded[index]
+    sent.W_followed[i] = put_in_J - moved_J + law.E_yielded[index]
 
 
 @compiled
@@ -425,15 +464,28 @@ def charge_unpaid_energy(law: Any, now: LawInput, i: int, spring: float) -> None
     """Subtracts energy that the follower used in the last period from the couplings' accounts.
 
     Before a control period, each coupling (the connection to an arm that is followed) pays for
-    the predicted work. The true work is known only afterwards. If the arm and its spring
-    received more energy than was paid, this function subtracts the difference from the accounts
-    of the couplings. If they received less, it pays earlier differences back, but no more than
-    these.
+    the predicted work. The true work is known only afterwards:
 
-    Nothing is subtracted in the published form of the law, which computes work by velocity.
+        unpaid = force (step of the arm) + (growth of the spring's energy) - paid
+
+    where `force` is the torque of spring and damper during the period and `paid` the predicted
+    work. If the result is positive, the arm and its spring received more energy than was paid.
+    The difference is charged to the couplings, in proportion to the weights alpha with which
+    the arm follows its peers. If it is negative, earlier charges are paid back, but no more
+    than these.
+
+    Accounts of each coupling, J: `E_moved` is the energy taken out so far, and `lent` the part
+    of it that was charged by this function and not paid back. `E_yielded` is the energy saved
+    by slower motion. `E_settled` is the energy taken out on balance, E_moved - E_yielded, now
+    that the true work is known; it is recorded to verify the run.
+
+    Nothing is charged in the published form of the law, which computes work by velocity
+    (`law.by_step` is False), nor in the first period.
 
     Args:
-        law: The law; its energy accounts are changed.
+        law: The law; its energy accounts are changed. `law.alignment_step` is the motion with
+            which the goal was shifted while the arm is aligned with its leaders, rad. It costs
+            no energy, so the arm's step is measured relative to it.
         now: Inputs and outputs of the law in this period.
         i: Index of the joint.
         spring: Energy in the joint's spring now, J.
@@ -443,11 +495,13 @@ def charge_unpaid_energy(law: Any, now: LawInput, i: int, spring: float) -> None
     arm_work = law.force[i] * arm_step
     spring_before = law.spring[i]
     unpaid = arm_work + spring - spring_before - law.paid[i]
+    is_charged = law.by_step and now.k > 0
     for j in range(len(now.peers)):
-        index = j * now.joints + i
-        if law.by_step and now.k > 0:
+        index = j * now.joints + i  # position in lists with one entry per coupling and joint
+        if is_charged:
             peer_part = now.peers[j].alpha * unpaid
-            charged = max(peer_part, -law.lent[index])
+            largest_repayment = law.lent[index]
+            charged = max(peer_part, -largest_repayment)
             law.E_moved[index] += charged
             law.lent[index] += charged
         moved_J = law.E_moved[index]
@@ -695,39 +749,55 @@ class Tdpa(EnergyLaw):
     """False switches the controllers off, for comparison: energies are only observed."""
 
     def begin(self, facts: LawContext) -> None:
-        """Creates the energy accounts of both ends of each coupling, and the work space.
+        """Prepares the law before a run: creates its energy accounts and its work space.
 
-        A coupling joins a leader and a follower, and each end keeps an account of the energy
-        that it may spend. Lists per coupling and joint are flat: joint i of peer j has the
+        This arm has two couplings with each peer, another arm: one as the leader of the peer,
+        and one as its follower. As a follower, the arm is pulled to a moving goal by a spring
+        and a damper. Each end of a coupling keeps an account of the energy that it may take
+        out. Lists with one number per coupling and joint are flat: joint i of peer j has the
         index j n + i, where n is the number of joints.
+
+        Args:
+            facts: Facts about the site (the process that runs the arm) that are known before
+                the run.
         """
         n = facts.joints
         couplings = n * len(facts.peers)
-        self.by_step = self.energy == "step"
-        self.controlled = bool(self.controlled)
+
+        # Constants.
+        self.by_step = self.energy == "step"  # work is torque times motion, see `energy`
+        self.controlled = bool(self.controlled)  # as a bool of this instance
+        # Energy that the leader's controller does not plan to spend, J. It covers periods that
+        # cost more than predicted.
         self.floor = 0.5 * self.reserve_J if self.by_step else 0.0
         limits = np.zeros(n) + facts.tau_limit_nm
-        self.tau_limit = limits.tolist()
-        self.goal = [0.0] * n
-        self.predicted_step = [0.0] * n
-        self.low = [0.0] * n
+        self.tau_limit = limits.tolist()  # largest torque per joint, N m
+
+        # Per joint.
+        self.goal = [0.0] * n  # goal of the spring, rad
+        self.predicted_step = [0.0] * n  # motion expected in the coming period, rad
+        self.low = [0.0] * n  # bounds of the coupling's torque that keep tau in its limits, N m
         self.high = [0.0] * n
-        self.torque_change = [0.0] * n
-        self.alignment_step = [0.0] * n
-        self.F_led = [0.0] * couplings
-        self.F_now = [0.0] * couplings
-        self.v_led = [0.0] * couplings
-        self.E_known = [0.0] * couplings
-        self.E_moved = [0.0] * couplings
-        self.E_yielded = [0.0] * couplings
-        self.lent = [0.0] * couplings
-        self.E_settled = [0.0] * couplings
-        self.left_J = [0.0] * couplings
-        self.carried = [0.0] * n
-        self.spring = [0.0] * n
-        self.force = [0.0] * n
-        self.paid = [0.0] * n
-        self.inverse = [0.0] * (n * n)
+        self.torque_change = [0.0] * n  # change of the arm's torque in this period, N m
+        self.alignment_step = [0.0] * n  # shift of the goal in half a period, rad
+
+        # Per coupling and joint.
+        self.F_led = [0.0] * couplings  # torque felt as a leader in the last period, N m
+        self.F_now = [0.0] * couplings  # the same torque while it is being computed, N m
+        self.v_led = [0.0] * couplings  # velocity of the leader as the goal uses it, rad/s
+        self.E_known = [0.0] * couplings  # energy that the follower has reported last, J
+        self.E_moved = [0.0] * couplings  # energy taken out by following, J
+        self.E_yielded = [0.0] * couplings  # energy saved by following more slowly, J
+        self.lent = [0.0] * couplings  # part of E_moved that was charged afterwards, J
+        self.E_settled = [0.0] * couplings  # E_moved - E_yielded with the true work, J
+        self.left_J = [0.0] * couplings  # energy that remains in this period, J
+
+        # Per joint.
+        self.carried = [0.0] * n  # gravity torque within the last torque, N m
+        self.spring = [0.0] * n  # energy in the spring, J
+        self.force = [0.0] * n  # torque of spring and damper, N m
+        self.paid = [0.0] * n  # predicted work that the couplings have paid, J
+        self.inverse = [0.0] * (n * n)  # inverse of the inertia matrix, row by row
 
     def torque(self, now: LawInput) -> None:
         """Computes the torque of one tick, and sends torques and energies to the peers.
@@ -858,27 +928,37 @@ class Tdpa(EnergyLaw):
         return "" if follows else "K = 0 and B = 0 follow nobody"
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:  # noqa: ARG002
-        """Evaluates whether the law keeps the session passive.
+        """States under which assumptions the law keeps the session passive.
 
-        The law is passive for any delays and lost messages, if operators and environments are
-        passive. It pays for energy in advance and therefore predicts the motion of the arm.
-        Half of the reserve of energy covers errors of the prediction, which the text states.
+        Passive means that the law never gives more energy than it received. The law has this
+        property for all gains, delays, lost messages and shares (the weights with which the
+        arms follow each other), so the condition is always met. Only the assumptions differ:
 
-        With `energy` = "velocity", as the law was published, the text instead states the energy
-        that its accounts miss.
+        - With `energy` = "step", work is torque times motion, which is exact. But energy is
+          paid before a tick (a period of the control loop), and the motion in it is predicted.
+          If another torque changes the acceleration, the prediction is wrong, and half of
+          `reserve_J` pays for the difference. Changes of up to `acceleration_rad_s2` are
+          planned for.
+        - With `energy` = "velocity", as the law was published, work is torque times velocity
+          times the period h. This leaves out the acceleration qdd within a tick, and with it a
+          work of up to tau qdd h^2 / 2, where tau is the torque.
+
+        Returns:
+            The assumptions as a text, with a condition that holds.
         """
-        text = (
+        passive_coupling = (
             "couplings are passive for any delays, jitter, loss and shares, where "
             f"{PASSIVE_OUTSIDE}"
         )
         if self.energy == "velocity":
             leak = "up to tau qdd h^2 / 2 per tick, which the accounts by velocity miss"
-            return StabilityCondition(True, f"{text}, {leak}")
-        beyond = ""
+            return StabilityCondition(True, f"{passive_coupling}, {leak}")
+
+        planned_change = ""
         if self.acceleration_rad_s2:
-            beyond = f" beyond {self.acceleration_rad_s2:g} rad/s^2"
-        text += (
+            planned_change = f" beyond {self.acceleration_rad_s2:g} rad/s^2"
+        reserve = (
             ", while half of reserve_J pays for changes of acceleration by other torques in a "
-            f"tick{beyond}"
+            f"tick{planned_change}"
         )
-        return StabilityCondition(True, text)
+        return StabilityCondition(True, passive_coupling + reserve)
