@@ -495,10 +495,9 @@ def charge_unpaid_energy(law: Any, now: LawInput, i: int, spring: float) -> None
     arm_work = law.force[i] * arm_step
     spring_before = law.spring[i]
     unpaid = arm_work + spring - spring_before - law.paid[i]
-    is_charged = law.by_step and now.k > 0
     for j in range(len(now.peers)):
         index = j * now.joints + i  # position in lists with one entry per coupling and joint
-        if is_charged:
+        if law.by_step and now.k > 0:
             peer_part = now.peers[j].alpha * unpaid
             largest_repayment = law.lent[index]
             charged = max(peer_part, -largest_repayment)

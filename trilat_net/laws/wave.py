@@ -124,15 +124,23 @@ def replay_wave(
 def conceal_wave(law: Any, index: int, energy: float, h: float) -> float:
     """Returns the wave that acts on the arm in a period in which no message has arrived.
 
-    The previous wave is repeated. It is limited so that the energy that has arrived and not
-    been used would last for the time `CONCEALED_S`. The repeated wave anticipates the missing
-    one. Therefore its time integral is subtracted from the integral of the lost waves, which
-    the arm is to receive later.
+    A wave w in sqrt(W) carries the power w^2 / 2. The previous wave is repeated, but it is
+    limited so that the energy E that has arrived and not been used would last for the time
+    T = `CONCEALED_S`, which means w^2 T / 2 <= E.
+
+    Two accounts of the law concern the missing waves. `owed_U` is the time integral of the
+    waves that were lost and that the arm has yet to receive, sqrt(W) s. The repeated wave
+    replaces a missing one. Therefore its integral w h is subtracted from `owed_U`, so that the
+    arm does not receive it again after a later message has stated the integral of the missing
+    waves. `held_s` is the time for which waves have been repeated since the last message.
+
+    If lost waves of the same sign are owed from earlier, a part of them is added to the
+    repeated wave (`replay_wave`).
 
     Args:
         law: The law, with its accounts.
         index: Index of the line and joint in the law's lists.
-        energy: Energy that has arrived and not been used, J.
+        energy: Energy E that has arrived and not been used, J.
         h: Control period, s.
 
     Returns:
@@ -145,8 +153,8 @@ def conceal_wave(law: Any, index: int, energy: float, h: float) -> float:
     bounded_above = min(largest_wave, last_wave)
     held = max(-largest_wave, bounded_above)
     played: float = held
+    # The product is positive if the owed waves have the sign of the repeated one.
     if law.owed_U[index] * held > 0.0:
-        # Earlier waves are owed in the same direction.
         spent = 0.5 * held * held * h
         remaining = energy - spent
         played = replay_wave(
@@ -346,13 +354,20 @@ def close_wave_period(law: Any, now: LawInput, i: int) -> None:
 def send_waves(law: Any, now: LawInput, i: int, committed: float) -> None:
     """Scales down the waves of a joint if the site does not have the energy to send them.
 
-    The site, the process of one arm, keeps an account H of the energy that it may send. The
-    energy of the waves is subtracted from H and added to the sums that the peers (the other
-    arms) receive.
+    A wave u in sqrt(W) that lasts for a control period h carries the energy u^2 h / 2. The
+    site, the process of one arm, keeps an account H of the energy that it may send, J. A part
+    of H is not available: the energy stored in the springs, the energy that the coming period
+    needs (`committed`), and half of the initial reserve. That half is kept because the motion
+    in the coming period is only predicted and may cost more.
+
+    Each message to a peer (another arm) contains the wave u and two sums since the start, from
+    which the peer can learn what lost messages contained: U, the sum of u h in sqrt(W) s, and
+    E, the sum of the energies in J.
 
     Args:
         law: The law, with its accounts.
-        now: Inputs and outputs of the law in this control period. The waves in it are scaled.
+        now: Inputs and outputs of the law in this control period. It contains the waves, which
+            are scaled, and the sums and H, which are updated.
         i: Index of the joint.
         committed: Energy that the coming period needs for other purposes, J.
     """
@@ -363,12 +378,13 @@ def send_waves(law: Any, now: LawInput, i: int, committed: float) -> None:
     for j in range(peers):
         wave = now.sent[j].u[i]
         requested += 0.5 * wave * wave * h
-    spring = law.spring[i]
+    spring_energy = law.spring[i]
     kept_reserve = 0.5 * law.reserve
-    free = H[i] - spring - committed - kept_reserve
+    free = H[i] - spring_energy - committed - kept_reserve
     available = max(free, 0.0)
     scale = 1.0
     if requested > available:
+        # The energy is proportional to the square of the waves.
         scale = math.sqrt(available / requested)
 
     for j in range(peers):
@@ -472,12 +488,17 @@ class Wave(EnergyLaw):
         another site. Lists with one number per line and joint are flat: joint i of peer j has
         the index j n + i, where n is the number of joints.
 
+        Waves are in sqrt(W): a wave w carries the power w^2 / 2.
+
         Args:
             facts: Facts about the site that are known before the run.
         """
         n = facts.joints
         peers = len(facts.peers)
         ends = n * peers
+
+        # Impedance of each line, N m s/rad. "shares" means that the author of the scenario
+        # stated no line by name.
         lines = {} if self.lines == "shares" else self.lines
         self.impedance: list[float] = []
         for peer in facts.peers:
@@ -487,24 +508,34 @@ class Wave(EnergyLaw):
             else:
                 impedances = np.zeros(n) + line
                 self.impedance += impedances.tolist()
+        # A number in place of the text, because `torque` is compiled.
         self.playing = RECEPTIONS.index(self.reception)
-        self.q_sd = [0.0] * ends
-        self.wave = [0.0] * ends
-        self.U_seen = [0.0] * ends
-        self.E_seen = [0.0] * ends
-        self.owed_U = [0.0] * ends
-        self.owed_s = [0.0] * ends
-        self.held_s = [0.0] * ends
-        self.stamp = [-1.0] * peers
-        self.rate = [1.0] * peers
-        self.reserve = float(self.reserve_J)
+
+        # Per line and joint.
+        self.q_sd = [0.0] * ends  # end of the spring that moves with the line, rad
+        self.wave = [0.0] * ends  # wave of the newest message, sqrt(W)
+        self.U_seen = [0.0] * ends  # integral of all waves, from that message, sqrt(W) s
+        self.E_seen = [0.0] * ends  # energy of all waves, from that message, J
+        self.owed_U = [0.0] * ends  # integral of lost waves not played yet, sqrt(W) s
+        self.owed_s = [0.0] * ends  # duration of these lost waves, s
+        self.held_s = [0.0] * ends  # time since the newest message, s
+
+        # Per line.
+        self.stamp = [-1.0] * peers  # tick in which the newest message was sent, -1: none yet
+        self.rate = [1.0] * peers  # filtered increase of the stamp per tick
+
+        # Constants.
+        self.reserve = float(self.reserve_J)  # initial energy, J
         limits = np.zeros(n) + facts.tau_limit_nm
-        self.tau_limit = limits.tolist()
-        self.played = [0.0] * ends
-        self.carried = [0.0] * n
-        self.spring_gain_J = [0.0] * n
-        self.spring = [0.0] * n
-        self.damped = [0.0] * n
+        self.tau_limit = limits.tolist()  # largest torque per joint, N m
+
+        self.played = [0.0] * ends  # wave played in the last tick, per line and joint, sqrt(W)
+
+        # Per joint.
+        self.carried = [0.0] * n  # gravity torque within the last torque, N m
+        self.spring_gain_J = [0.0] * n  # energy that the springs will gain in this tick, J
+        self.spring = [0.0] * n  # energy in the springs, J
+        self.damped = [0.0] * n  # energy that the dampers have dissipated so far, J
 
     def torque(self, now: LawInput) -> None:
         """Computes the torque of one control period, and sends waves to the other arms.
@@ -589,24 +620,39 @@ class Wave(EnergyLaw):
     def energies(self, seen: LawRecords) -> LawEnergies:
         """Computes the energies that show whether the law was passive in a run.
 
-        The result contains, for each peer (another arm), the energy of the waves sent to it and
-        the energy of its waves that acted on this arm. It also contains the energy H that this
-        site keeps (the energy of its springs included), the energy that the dampers dissipated,
-        and the energy that the arm gave to its controller.
+        All energies are in J. In the records, of which there is one per control period,
+
+        - "E" is the energy of all waves so far, sent to or received from a peer (another arm);
+        - "W" is the part of the received energy whose waves have not acted on the arm yet, so
+          that E - W is the energy that was used;
+        - "H" is the energy that this site (the process of the arm) may still send, the energy
+          of its springs included;
+        - "damped" is the energy that the dampers have dissipated, per joint;
+        - "carried" is the part of the torque that compensates gravity, N m. Its work has
+          nothing to do with waves, so it is subtracted from the torque.
+
+        The gain beta divides the torque of the waves. On the side of the waves, the work of the
+        arm is therefore larger by the factor beta.
 
         Args:
-            seen: Records of the site in the run, one per control period.
+            seen: Records of the site in the run.
+
+        Returns:
+            The energy sent to each peer (`gave`) and used of its waves (`took`), the energy
+            that the arm gave to its controller (`port`), H (`store`), the dissipated energy
+            (`taken`), and W, which the site observed itself (`observed`).
         """
         sent_energies = []
         used_energies = []
-        known_energies = []
+        unused_energies = []
         for peer in seen.peers:
-            known = peer.sent["W"]
+            unused = peer.sent["W"]  # sent only so that it is recorded
             received = peer.received["E"]
             sent_energies.append(peer.sent["E"])
-            used_energies.append(received - known)
-            known_energies.append(known)
+            used_energies.append(received - unused)
+            unused_energies.append(unused)
         coupling_torque = seen.tau - seen.memory["carried"]
+        # Work of the controller on the arm; the arm gave the opposite.
         work = sum_work(coupling_torque, seen.q)
         damped = seen.memory["damped"]
         return LawEnergies(
@@ -615,7 +661,7 @@ class Wave(EnergyLaw):
             port=-self.beta * work,
             store=seen.to_all["H"],
             taken=damped.sum(axis=1),
-            observed=known_energies,
+            observed=unused_energies,
             weight=self.beta,
             gravity=self.gravity,
         )
@@ -693,15 +739,20 @@ class Wave(EnergyLaw):
         return replace(cast(Any, self), lines=lines)
 
     def explain_idle_shares(self, situation: LawSituation) -> str:
-        """Explains to the user that impedances decide how strongly an arm follows others.
+        """Explains to the user why the dominance factors of a site have no effect.
 
-        Sites i and j, the processes of two arms, exchange waves over a line with the impedance
-        b_ij. Site i follows site j with the weight b_ij / sum_k b_ik. The dominance factors of
-        the scenario, which are the weights that its author wants, have an effect only if the
-        impedances were computed from them.
+        A dominance factor ("share") is the weight with which a site, the process of one arm,
+        should follow another site. With this law, the impedances of the lines decide instead:
+        sites i and j exchange waves over a line with the impedance b_ij, and site i follows
+        site j with the weight b_ij / sum_k b_ik. The dominance factors have an effect only if
+        the impedances were computed from them (`resolve_shares`).
+
+        This is possible only if the factors are reversible. With b_ij = D_i alpha_ij, each line
+        must have one impedance for both directions, so positive numbers D_i are needed with
+        D_i alpha_ij = D_j alpha_ji for all sites i and j.
 
         Args:
-            situation: The site, and the dominance factors of the scenario.
+            situation: The site, and the dominance factors alpha of the scenario.
 
         Returns:
             A sentence for the user. Empty if the weights equal the dominance factors.
@@ -710,6 +761,8 @@ class Wave(EnergyLaw):
         impedances = np.zeros(len(situation.names))
         for index, peer in enumerate(situation.names):
             if peer != site:
+                # The first joint stands for all. Impedances that are computed from dominance
+                # factors have the same ratios at every joint.
                 joint_impedances = self.find_impedances(site, peer)
                 impedances[index] = joint_impedances[0]
         total_impedance = impedances.sum()
@@ -720,6 +773,8 @@ class Wave(EnergyLaw):
             return ""
 
         explanation = "lines share as b_ij / sum b_ik"
+        # Without impedances from the user, the law computes them from the factors if these are
+        # reversible. Only if they are not is this the cause of the difference.
         are_chosen_by_user = bool(self.lines)
         if are_chosen_by_user or find_balancing_weights(situation.alpha) is not None:
             return explanation
@@ -747,15 +802,19 @@ class Wave(EnergyLaw):
     def linear_gains(self, theta: Array) -> Gains | None:
         """Returns gains for the linear analysis that only compensate gravity.
 
-        The linear analysis considers small motions around a pose at rest. `linear_form` adds
-        the waves, which cause all other torques of this law.
+        The linear analysis considers small motions around a pose at rest. It knows the law with
+        known parameters (`Law.KNOWN`), whose torque is the gravity torque for the parameters
+        `known` plus springs and dampers, which are left out here. `linear_form` adds the waves,
+        which cause all other torques of this law.
 
         Args:
             theta: Parameters of the arm's dynamics, such as masses, shape (P,), where P is
                 their number.
         """
-        compensated = theta * self.gravity
-        return Gains(Law.KNOWN, known=compensated.tolist())
+        # The gravity torque is linear in the parameters: scaled parameters scale the torque
+        # by `gravity`, the ratio of the compensated gravity torque to the true one.
+        compensated_parameters = theta * self.gravity
+        return Gains(Law.KNOWN, known=compensated_parameters.tolist())
 
     def linear_form(self, situation: LinearSituation) -> LinearForm | None:
         """Returns the torque and the sent waves as functions of motion and received waves.
@@ -800,7 +859,23 @@ class Wave(EnergyLaw):
         return form
 
     def _add_spring_end(self, form: LinearForm, j: int, state: str, b: Array) -> None:
-        """Adds the small motions of a line's end with K and B, whose state is q_sd.
+        """Adds the equations of a line that pulls the arm by a spring to the linear form.
+
+        A line is the virtual connection over which two sites, the processes of one arm each,
+        exchange waves. The received wave v moves one end of a spring K with a damper B in
+        parallel; q_sd is the position of this end. The other end is the arm with the position q
+        and the velocity qd. With the impedance b of the line and c = sqrt(2 b), the rate of
+        q_sd, the force F of spring and damper, the torque tau on the arm and the sent wave u
+        are
+
+            rate = (c v - K q_sd + K q + B qd) / (b + B)
+            F    = K (q_sd - q) + B (rate - qd)
+            tau  = F / beta
+            u    = v - (c / b) F
+
+        Each is linear in the four columns v, q_sd, q and qd. A block `form.add(row, column,
+        gain)` says that the row contains gain times the column. The row of a state is its rate;
+        ("from", j) is the wave received from peer j, and ("to", j) the wave sent to it.
 
         Args:
             form: The law's linear form, which is extended.
@@ -814,7 +889,8 @@ class Wave(EnergyLaw):
         damping = b + B
         received = ("from", j)
         sent = ("to", j)
-        # Per column the derivative of q_sd, and the force without the part B times it.
+        # For each column: its gain in the rate of q_sd, and its gain in F without the term
+        # B times the rate, which the loop adds.
         columns: tuple[tuple[BlockKey, Array, Any], ...] = (
             (received, c / damping, 0.0),
             (state, -K / damping, K),
