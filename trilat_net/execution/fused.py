@@ -220,19 +220,23 @@ class RunInputs(NamedTuple):
 
 
 def make_prompt_inputs(sites: int) -> RunInputs:
-    """Returns the inputs of an undisturbed run.
+    """Returns the inputs of a run that receives nothing from outside.
 
-    In such a run, every sample arrives as soon as it has been sent, no setting changes, and no
-    live operator acts. The delays that the scenario states for its links are still applied.
+    A site is a simulated process that runs one arm. In such a run, every sample (the state that
+    a site sends to the others) arrives promptly, in the first tick after it was sent. No
+    setting changes, and no live operator (person or program) moves an arm. The delays that the
+    scenario states for its links are still applied, by the receivers.
 
     Args:
         sites: Number of sites of the scenario.
     """
+    most_peers = max(sites - 1, 1)
+    # Arrays for 0 ticks tell the compiled loop that nothing was recorded, see `ReplayedInputs`.
     feed = ReplayedInputs(
-        first=np.zeros((sites, max(sites - 1, 1), 0), np.int64),
+        first=np.zeros((sites, most_peers, 0), np.int64),
         samples=np.zeros(0, np.int64),
         hands=np.zeros((sites, 0, 1)),
-        hand_indices=np.full(sites, -1),
+        hand_indices=np.full(sites, -1),  # -1: the site has no live operator
     )
     return RunInputs(feed)
 
@@ -314,21 +318,28 @@ class FusedRun:
     def _allocate_records(self, keep: int) -> RecentRecords:
         """Allocates memory for the recent records of every site.
 
-        A record must be stored until `pop_records` returns it, until the slowest peer has
-        received it, and, in a repeated run, until the latest sample has arrived.
+        A record is the stored result of one tick (period of the control loop). It must be
+        stored until `pop_records` returns it, until the slowest peer has received it, and, in a
+        repeated run, until the latest sample has arrived.
+
+        Args:
+            keep: Number of recent records of each site that `pop_records` must find.
 
         Returns:
-            Arrays for as many records per site as are needed, rounded up to a power of two.
+            Ring buffers for at least as many records per site as are needed. Their length is a
+            power of two, so that the compiled loop finds the place of a tick with a bit mask.
         """
-        count = len(self._layouts)
+        site_count = len(self._layouts)
         fastest_hz = int(self._progress["rate_hz"].max())
+        # Ticks of the fastest site until the latest sample arrives, with a margin for rounding.
         late_ticks = self._inputs.late_ns * fastest_hz // NS_PER_S + 2
-        needed = max(_find_largest_ratio(self._scenario) + 1, keep, late_ticks)
-        pages = 1 << needed.bit_length()
+        ticks_per_slow_tick = _find_largest_ratio(self._scenario)
+        needed = max(ticks_per_slow_tick + 1, keep, late_ticks)
+        pages = 1 << needed.bit_length()  # the least power of two above `needed`
         floats = max(layout.floats for layout in self._layouts)
         return RecentRecords(
-            t_ns=np.zeros((count, pages), dtype=np.int64),
-            rows=np.zeros((count, pages, floats)),
+            t_ns=np.zeros((site_count, pages), dtype=np.int64),
+            rows=np.zeros((site_count, pages, floats)),
         )
 
     def _connect_hands(
@@ -337,55 +348,66 @@ class FusedRun:
         """Connects live operators to their sites, and allocates memory for their actions.
 
         A live operator is a person or program that moves an arm while the run is in progress.
+        The compiled loop reads the actions from `self._inputs`. There is space for no tick yet;
+        `plan` adds it.
 
         Args:
             hands: Live operators, by site.
-            setups: Setups of the sites.
+            setups: Setups of the sites, in the order of the scenario.
         """
-        rows = [-1] * len(setups)
-        sizes = []
+        hand_indices = [-1] * len(setups)  # -1: the site has no live operator
+        coordinate_counts = []
         for i, setup in enumerate(setups):
             if setup.name in hands:
                 self._hands[i] = hands[setup.name]
-                rows[i] = _find_live_row(setup)
-                sizes.append(_count_coordinates(setup))
-        if not sizes:
+                hand_indices[i] = _find_live_row(setup)
+                coordinate_counts.append(_count_coordinates(setup))
+        if not coordinate_counts:
             return
-        size = max(sizes)
-        actions = np.zeros((len(setups), 0, 1 + 2 * size))
-        feed = self._inputs.feed._replace(hands=actions, hand_indices=np.array(rows))
+
+        most_coordinates = max(coordinate_counts)
+        # Columns: grip, target, and target one second later, see `_write_actions`.
+        actions = np.zeros((len(setups), 0, 1 + 2 * most_coordinates))
+        feed = self._inputs.feed._replace(hands=actions, hand_indices=np.array(hand_indices))
         self._inputs = self._inputs._replace(feed=feed)
 
     def _plug_laws(self, setups: Sequence[SiteSetup]) -> None:
         """Creates the users' control laws, and connects them to the arrays of the run.
 
         A law that can be compiled is called within the compiled loop. A law in plain Python is
-        called between the stages of a tick.
+        called between the stages of a tick. The laws are stored in `self._laws`, and the arrays
+        that the compiled loop needs in `self._law_arrays`, which stays None without users'
+        laws.
 
         Args:
             setups: Setups of the sites, in the order of the scenario.
         """
         self._laws: dict[int, PlainLaw | CompiledLaw] = {}
         self._law_arrays: LawArrays | None = None
-        if self._tables.channel is None:
+        # The arrays for numbers that laws send exist only if a site has a user's law.
+        has_user_laws = self._tables.channel is not None
+        if not has_user_laws:
             return
-        count = len(setups)
-        sent_size = max(setup.channel.record_size for setup in setups)
-        sent = np.zeros((count, sent_size))
+
+        site_count = len(setups)
+        most_sent_numbers = max(setup.channel.record_size for setup in setups)
+        sent = np.zeros((site_count, most_sent_numbers))
         for i, setup in enumerate(setups):
             if setup.law_factory is not None:
                 arrays = select_site(self._tables, i, setup.layout)
                 law = setup.law_factory(setup.law_context())
-                channel = sent[i, : setup.channel.record_size]
-                self._laws[i] = plug_law(law, setup, arrays, channel)
+                sent_by_law = sent[i, : setup.channel.record_size]
+                self._laws[i] = plug_law(law, setup, arrays, sent_by_law)
 
-        # The loop calls a compiled law by its address, with its numbers as a row of one array.
+        # The loop calls a compiled law by its address, with its gains and memory as a row of
+        # one array.
         compiled = {i: law for i, law in self._laws.items() if isinstance(law, CompiledLaw)}
-        addresses = np.zeros(count, dtype=np.int64)
-        row_size = max((len(law.row) for law in compiled.values()), default=0)
-        rows = np.zeros((count, row_size))
+        addresses = np.zeros(site_count, dtype=np.int64)
+        longest_row = max((len(law.row) for law in compiled.values()), default=0)
+        rows = np.zeros((site_count, longest_row))
         for i, compiled_law in compiled.items():
             rows[i, : len(compiled_law.row)] = compiled_law.row
+            # The law and the loop share the row, so that both see the same memory of the law.
             compiled_law.row = rows[i]
             addresses[i] = compiled_law.address
         self._law_arrays = LawArrays(addresses, rows, sent)
@@ -415,51 +437,67 @@ class FusedRun:
             self._step_until(last_ns)
 
     def _step_until(self, last_ns: int) -> None:
-        """Executes the planned ticks up to a time, in pieces between the calls of programs.
+        """Executes the planned ticks up to a time, and calls users' programs in between.
 
-        Within a piece, no operator's program needs the state of an arm, and no plant moves.
+        The programs act as operators, or compute the motion of an arm (plants). A program needs
+        the state of the arm at a certain time. Therefore the compiled loop pauses before the
+        tick of this time, and the program is called. Between two pauses, the loop executes many
+        ticks at once.
 
         Args:
-            last_ns: The time, in ns after the epoch.
+            last_ns: Time of the last tick to be executed, in ns after the epoch, the common
+                start time of the sites.
         """
         while self.has_programs and self.diverged_s is None:
+            # Both methods call a program if it is due, and return when it is due again.
             pauses_ns = [self._request_actions(i) for i in self._hands]
             pauses_ns += [self._move_plant(i) for i in self._plants]
             next_pause_ns = min(pauses_ns)
             if next_pause_ns > last_ns:
                 break
-            self._step_piece(next_pause_ns - 1)
+            self._step_piece(next_pause_ns - 1)  # up to the last tick before the pause
         self._step_piece(last_ns)
+        # The arms of plants move on by the last tick, as all other arms did within the loop.
         for i in self._plants:
             self._move_plant(i)
 
     def _move_plant(self, i: int) -> int:
         """Lets a user's plant move the arm of a site up to the next tick of the site.
 
-        A plant is a program that computes the motion of an arm. The new state of the arm is
-        copied to the arrays of the run.
+        A plant is a program that computes the motion of an arm, and a tick is a period of the
+        site's control loop. The plant moves once per tick, by the control torque of the last
+        executed tick. The new state of the arm is copied to the arrays of the run, from which
+        the next tick reads it.
 
         Args:
             i: Index of the site.
 
         Returns:
-            Time at which the plant must move again, in ns. `NEVER_NS` after the last tick.
+            Time before which the plant must move again, in ns after the epoch. `NEVER_NS` after
+            the last tick.
         """
-        k = int(self._progress[i]["tick"])
+        next_tick = int(self._progress[i]["tick"])
         plant = self._plants[i]
-        if k > self._plant_ticks[i]:
-            torque = self._last_row(i)[self._torque_columns[i]]
-            plant.move(k - 1, torque.tolist())
-        self._plant_ticks[i] = k
+        # If no tick was executed since the last call, the arm has moved this far already.
+        has_new_torque = next_tick > self._plant_ticks[i]
+        if has_new_torque:
+            last_record = self._last_row(i)
+            control_torque = last_record[self._torque_columns[i]]
+            plant.move(next_tick - 1, control_torque.tolist())
+        self._plant_ticks[i] = next_tick
+
         joints = self._layouts[i].joints
         site = self.arrays(i).site[0]
         site["q"][:joints] = plant.state.q
         site["qd"][:joints] = plant.state.qd
-        # A plant that does not know the torque of contacts returns an empty tau_x.
+        # `tau_x` is subtracted in the equation of motion, whereas `sensed` is the torque ON the
+        # arm. A plant that does not know the torque of contacts returns an empty tau_x.
         site["sensed"][:joints] = [-torque for torque in plant.state.tau_x] or 0.0
-        if self._progress[i]["t_ns"] == NEVER_NS:
+
+        has_finished = self._progress[i]["t_ns"] == NEVER_NS
+        if has_finished:
             return NEVER_NS
-        return tick_ns(k + 1, plant.rate_hz)
+        return tick_ns(next_tick + 1, plant.rate_hz)
 
     def _request_actions(self, i: int) -> int:
         """Requests the next actions of an operator, if the site has executed the previous ones.
@@ -482,17 +520,23 @@ class FusedRun:
         return tick_ns(self._action_ends[i], int(progress["rate_hz"]))
 
     def _step_piece(self, last_ns: int) -> None:
-        """Executes the planned ticks up to a time, without calling operators or plants.
+        """Executes the planned ticks up to a time for which no user's program is needed.
+
+        These programs are those of operators and plants (simulated arms). Control laws are
+        called. If a user's law is plain Python, the loop over the ticks runs in Python too.
+        Otherwise the whole loop is compiled.
 
         Args:
-            last_ns: The time, in ns after the epoch.
+            last_ns: Time of the last tick to be executed, in ns after the epoch, the common
+                start time of the sites.
 
         Raises:
             LawFailed: A user's control law failed.
         """
         compiled = [law for law in self._laws.values() if isinstance(law, CompiledLaw)]
+        has_plain_law = len(compiled) < len(self._laws)
         try:
-            if len(compiled) < len(self._laws):
+            if has_plain_law:
                 self._run_plain_until(last_ns)
             else:
                 run_until(
@@ -511,9 +555,11 @@ class FusedRun:
         except LawFailed:
             raise
         except Exception as error:
-            # A compiled law may raise any error. The laws know whether it is theirs.
+            # A compiled law may raise any error. Each law knows whether the error is its own.
             failures = [law.find_failure(error) for law in compiled]
-            raise next(filter(None, failures), error) from None
+            law_failures = filter(None, failures)
+            # An error that comes from no law is raised unchanged.
+            raise next(law_failures, error) from None
 
     def _run_plain_until(self, last_ns: int) -> None:
         """Executes ticks as `run_until` does, calling laws in plain Python between the stages.
@@ -573,25 +619,37 @@ class FusedRun:
     def plan(self, ticks: Sequence[int]) -> None:
         """Sets how many ticks each site will execute in total, and allocates memory for them.
 
+        A tick is a period of a site's control loop. The memory for the largest values in
+        intervals of 50 ms (buckets), and for the actions of live operators, becomes longer. The
+        values in it are kept.
+
         Args:
             ticks: Total number of ticks of each site, in the order of the scenario. Ticks that
                 have been executed already are included.
         """
         progress: Row
-        for progress, count in zip(self._progress, ticks, strict=True):
-            progress.ticks = count
-            if progress.tick < count:
+        for progress, planned_ticks in zip(self._progress, ticks, strict=True):
+            progress.ticks = planned_ticks
+            has_more_ticks = progress.tick < planned_ticks
+            if has_more_ticks:
+                # After its last planned tick, a site has the next time `NEVER_NS`.
                 progress.t_ns = tick_ns(progress.tick, progress.rate_hz)
+
         pairs = zip(ticks, self._progress["rate_hz"], strict=True)
-        longest_s = max(count / rate_hz for count, rate_hz in pairs)
-        buckets = math.ceil(longest_s * BUCKETS_PER_S) + 1
-        peaks = np.full((len(ticks), buckets, self._peaks.shape[2]), -1.0)
-        peaks[:, : self._peaks.shape[1]] = self._peaks
+        longest_s = max(planned_ticks / rate_hz for planned_ticks, rate_hz in pairs)
+        bucket_count = math.ceil(longest_s * BUCKETS_PER_S) + 1
+        column_count = self._peaks.shape[2]
+        # -1 marks a bucket in which no tick has been executed.
+        peaks = np.full((len(ticks), bucket_count, column_count), -1.0)
+        old_bucket_count = self._peaks.shape[1]
+        peaks[:, :old_bucket_count] = self._peaks
         self._peaks = peaks
+
         if self._hands:
             feed = self._inputs.feed
             actions = np.zeros((len(ticks), max(ticks), feed.hands.shape[2]))
-            actions[:, : feed.hands.shape[1]] = feed.hands
+            old_tick_count = feed.hands.shape[1]
+            actions[:, :old_tick_count] = feed.hands
             self._inputs = self._inputs._replace(feed=feed._replace(hands=actions))
 
     @cached_property
@@ -896,27 +954,39 @@ def explain_not_repeatable(log: Log, *, own_laws: bool = False) -> str:
 def read_run_inputs(log: Log) -> RunInputs:
     """Reads from a log everything that is needed to repeat its run.
 
-    These inputs are the ticks in which samples arrived, the changes of settings, and the
-    actions of live operators. The run must be repeatable, see `explain_not_repeatable`.
+    These inputs are the ticks (periods of the control loop) in which samples of other sites
+    arrived, the changes of settings, and the actions of live operators (persons or programs
+    that moved an arm). The run must be repeatable, see `explain_not_repeatable`.
 
     Args:
         log: Log of the run.
+
+    Returns:
+        The inputs, ready for `FusedRun`.
 
     Raises:
         LogError: The log contains a text that is not a change of the scenario.
     """
     ticks = max(len(log[name]) for name in log.sites)
     changes = _read_changes(log)
-    models = [change.model for _, _, change in changes if change.model is not None]
-    longest_us = max_delay_us(models, [None] * len(models)) if models else 0
+    new_models = [change.model for _, _, change in changes if change.model is not None]
+    longest_us = 0
+    if new_models:
+        no_traces = [None] * len(new_models)  # a change cannot set a recorded delay trace
+        longest_us = max_delay_us(new_models, no_traces)
 
     # In a log of virtual time, all samples arrived at once.
     feed = make_prompt_inputs(len(log.scenario.names)).feed
     late_ns = 0
     if log.driver != "virtual":
-        first, samples, late_ns = _read_arrivals(log, ticks)
-        feed = feed._replace(first=first, samples=samples)
-    return RunInputs(_add_hands(feed, log, ticks), changes, late_ns, longest_us)
+        first_arrivals, sample_ticks, late_ns = _read_arrivals(log, ticks)
+        feed = feed._replace(first=first_arrivals, samples=sample_ticks)
+    return RunInputs(
+        feed=_add_hands(feed, log, ticks),
+        changes=changes,
+        late_ns=late_ns,
+        longest_us=longest_us,
+    )
 
 
 def _read_changes(log: Log) -> list[tuple[int, int, CoreChange]]:
@@ -977,54 +1047,77 @@ def _read_arrivals(log: Log, ticks: int) -> tuple[IntArray, IntArray, int]:
 
 
 def _add_hands(feed: ReplayedInputs, log: Log, ticks: int) -> ReplayedInputs:
-    """Returns a feed with the recorded actions of live operators.
+    """Adds the recorded actions of live operators to the inputs of a repeated run.
+
+    A live operator is a person or program that moved an arm while the log was recorded.
 
     Args:
-        feed: The feed.
-        log: The log.
+        feed: Inputs of the run without operators.
+        log: Log whose actions are added.
         ticks: Largest number of ticks of a site.
+
+    Returns:
+        The inputs with the actions in `hands` and with `hand_indices`. They are unchanged if no
+        site has a live operator.
     """
     names = log.scenario.names
     setups = [log.scenario.setup(name) for name in names]
-    rows = [_find_live_row(setup) for setup in setups]
-    if max(rows) < 0:
+    hand_indices = [_find_live_row(setup) for setup in setups]  # -1: no live operator
+    has_operators = max(hand_indices) >= 0
+    if not has_operators:
         return feed
-    size = max(_count_coordinates(setup) for setup in setups)
-    actions = np.zeros((len(setups), ticks, 1 + 2 * size))
+
+    most_coordinates = max(_count_coordinates(setup) for setup in setups)
+    # Columns: grip, target, and target one second later, see `_write_actions`.
+    actions = np.zeros((len(setups), ticks, 1 + 2 * most_coordinates))
     for i, name in enumerate(names):
-        if rows[i] >= 0:
+        if hand_indices[i] >= 0:
             _write_actions(actions[i], 0, log[name].hand)
-    return feed._replace(hands=actions, hand_indices=np.array(rows))
+    return feed._replace(hands=actions, hand_indices=np.array(hand_indices))
 
 
-def _write_actions(feed_actions: Array, k: int, actions: Array) -> None:
-    """Writes actions of an operator into a feed.
+_TARGET_COLUMN = 3
+"""First column of the target in an action. It follows grip, number and source."""
 
-    An action contains a target and its velocity. A feed contains the target, and the sum of
-    target and velocity: the position that the target would reach after one second.
+
+def _write_actions(feed_actions: Array, first_tick: int, actions: Array) -> None:
+    """Converts the actions of an operator to the form that the compiled loop reads.
+
+    A live operator is a person or program that moves the arm of a site. It prescribes m target
+    coordinates. The two forms of an action have these columns:
+
+    - Action of the operator (`HandInForce`): firmness of the grip; number of the operator's
+      message; source of the message; target (m columns); velocity of the target (m columns).
+    - Action in the feed (`ReplayedInputs.hands`): firmness of the grip; target (M columns); the
+      position that the target would reach after one second, the sum of target and velocity (M
+      columns). M is the largest m of all sites. The columns beyond m stay zero.
 
     Args:
-        feed_actions: Actions of one site in a `ReplayedInputs`, shape (K, 1 + 2 size).
-        k: Tick of the first action.
-        actions: Actions with a row per tick, in the form of `HandInForce`.
+        feed_actions: Actions of one site in the feed, one row per tick, shape (K, 1 + 2 M). The
+            converted actions are written into this array.
+        first_tick: Tick of the first action.
+        actions: Actions of the operator, one row per tick, shape (ticks, 3 + 2 m).
     """
-    count = (actions.shape[1] - 3) // 2
-    size = (feed_actions.shape[1] - 1) // 2
-    target = actions[:, 3 : 3 + count]
-    rate = actions[:, 3 + count :]
-    rows = feed_actions[k : k + len(actions)]
-    rows[:, 0] = actions[:, 0]
-    rows[:, 1 : 1 + count] = target
-    rows[:, 1 + size : 1 + size + count] = target + rate
+    coordinates = (actions.shape[1] - _TARGET_COLUMN) // 2
+    most_coordinates = (feed_actions.shape[1] - 1) // 2
+    grip = actions[:, 0]
+    target = actions[:, _TARGET_COLUMN : _TARGET_COLUMN + coordinates]
+    velocity = actions[:, _TARGET_COLUMN + coordinates :]
+
+    rows = feed_actions[first_tick : first_tick + len(actions)]
+    rows[:, 0] = grip
+    rows[:, 1 : 1 + coordinates] = target
+    second_part = 1 + most_coordinates
+    rows[:, second_part : second_part + coordinates] = target + velocity
 
 
 def _count_coordinates(setup: SiteSetup) -> int:
-    """Returns the number of coordinates of a site's live operator.
+    """Returns the number of target coordinates of a site's live operator.
 
     An action contains the three numbers grip, number and source, followed by the target and the
-    rate of each coordinate, see `HandInForce`.
+    velocity of each coordinate, see `HandInForce`.
     """
-    return (setup.layout.hand - 3) // 2
+    return (setup.layout.hand - _TARGET_COLUMN) // 2
 
 
 def _find_live_row(setup: SiteSetup) -> int:
