@@ -217,11 +217,17 @@ def _check_log(
 def _check_virtual_time(
     log: Log, result: VerifyResult, progress: Progress | None
 ) -> Iterator[Finding]:
-    """Yields the findings of the comparison of a log with simulations of its scenario.
+    """Yields the findings of the comparison of a log with two simulations of its scenario.
 
-    In the first simulation, samples arrive as in the log. In the second one, they arrive at
-    once. The second one is left out if the run must differ from it by its nature, for example
-    because arms are external.
+    The simulations run in virtual time, without real clocks and without a network. They differ
+    in how a sample, the state that one site sends to another, arrives:
+
+    - "virtual time fed with the log's arrivals": each sample arrives when it did in the log.
+      All records must be equal, up to the first gap of the log.
+    - "plain virtual time": each sample arrives at once. The records must be equal up to the
+      first sample that the real network delivered too late or lost. This simulation is left out
+      if the run differs from it by its nature, for example because an arm was external. The log
+      is not to blame for that, so the finding passes.
 
     Args:
         log: The log.
@@ -231,9 +237,9 @@ def _check_virtual_time(
     """
     comparison = compare_with_virtual(log, progress)
     # The arrivals in a gap are unknown, so a difference after the first gap is excused.
-    first_gap = min((first for _, first, _ in result.gaps), default=None)
+    first_gap_tick = min((first for _, first, _ in result.gaps), default=None)
     label = "virtual time fed with the log's arrivals"
-    yield _check_comparison(label, comparison.fed, first_gap)
+    yield _check_comparison(label, comparison.fed, first_gap_tick)
 
     reason = ""
     if log.scenario.external:
@@ -241,18 +247,20 @@ def _check_virtual_time(
     elif log.scenario.measured:
         reason = "a link was measured, not modelled"
     if reason and log.driver != "virtual":
-        yield Finding("plain virtual time", f"is another run: {reason}", True)
+        passed = True
+        yield Finding("plain virtual time", f"is another run: {reason}", passed)
         return
 
-    late = comparison.late
-    lost = comparison.lost
-    absent = count_nouns(len(late), "late sample")
-    if late:
-        absent += f", the first: {late[0]}"
-    if lost:
-        absent += f"; {len(lost)} lost on the way, the first: {lost[0]}"
-    label = f"plain virtual time ({absent})"
-    yield _check_comparison(label, comparison.plain, comparison.excused_from)
+    late_samples = comparison.late
+    lost_samples = comparison.lost
+    description = count_nouns(len(late_samples), "late sample")
+    if late_samples:
+        description += f", the first: {late_samples[0]}"
+    if lost_samples:
+        description += f"; {len(lost_samples)} lost on the way, the first: {lost_samples[0]}"
+    label = f"plain virtual time ({description})"
+    first_affected_tick = comparison.excused_from
+    yield _check_comparison(label, comparison.plain, first_affected_tick)
 
 
 def _check_coverage(log: Log, result: VerifyResult) -> Finding:
@@ -285,16 +293,30 @@ def _check_coverage(log: Log, result: VerifyResult) -> Finding:
 
 
 def _check_execution(result: VerifyResult, recorded: str) -> Finding:
-    """Returns the finding on the repeated execution.
+    """Returns the finding that says whether executing the log again gave the same records.
+
+    A record is the stored result of one tick, a period of the control loop of a site. The text
+    of the finding begins with the number of identical records. Every circumstance that limits
+    the comparison is appended: missing records, ticks that a site did not execute because it
+    had left the session, sites that were not executed again, records that could not be judged,
+    and differences.
 
     Args:
-        result: Result of the execution.
+        result: Result of executing the log again.
         recorded: Subject and verb of a sentence on sites whose records were copied, such as
             "m1 stands". Empty if all sites were executed.
     """
-    method = "tick by tick to 1e-9: another platform made it"
+    if not result.records:
+        no_code_was_withheld = not result.withheld  # otherwise the check was not possible
+        return Finding(
+            "executed again", "no records to execute", False, judged=no_code_was_withheld
+        )
+
     if result.whole_run:
         method = "whole runs, bit for bit"
+    else:
+        # Another platform rounds differently, so numbers agree only within a tolerance.
+        method = "tick by tick to 1e-9: another platform made it"
     text = f"{result.identical}/{count_nouns(result.records, 'record')} identical ({method})"
     if result.gaps:
         text += f"; no records of {_describe_gaps(result.gaps)}"
@@ -302,15 +324,14 @@ def _check_execution(result: VerifyResult, recorded: str) -> Finding:
         text += f"; not made, between two starts: {_describe_gaps(result.absences)}"
     if recorded:
         text += f"; {recorded} as recorded"
-        if result.coverage.share < result.min_coverage:
+        # Copied records can only be judged with the log from which they were copied.
+        source_is_missing = result.coverage.share < result.min_coverage
+        if source_is_missing:
             text += ", not judged: the log that the rerun was made of is not beside it"
     if result.unjudged:
         text += f"; {result.unjudged} behind gaps could not be judged"
     if result.first:
         text += f"; {result.differing} differ, the first: {result.first}"
-
-    if not result.records:
-        return Finding("executed again", "no records to execute", False, not result.withheld)
     return Finding("executed again", text, result.agreed)
 
 

@@ -626,20 +626,34 @@ def _describe_limits(result: Rerun) -> Iterator[str]:
 
 
 def _describe_site_limits(effect: SiteEffect, absent_ticks: int) -> Iterator[str]:
-    """Yields sentences about facts that limit the result for one site.
+    """Yields sentences about missing data of the log that limit the rerun of one site.
+
+    A site is a process that runs one arm, a tick is a period of its control loop, and its
+    record in the log is the stored result. There is a sentence for each of these facts:
+
+    - Ticks could not be executed because the log contains too little, so that their recorded
+      results were copied.
+    - Ticks have no record. They were executed with assumed arrivals of samples.
+    - The site had left the live session for some ticks, which are executed nevertheless.
+    - Samples (states of other sites) arrived, but the log does not contain them. The ticks were
+      executed without these samples.
+    - No tick could be executed.
 
     Args:
-        effect: Effect of the rerun on the site.
+        effect: Difference that the rerun makes to the site, with the numbers of these ticks and
+            samples.
         absent_ticks: Number of ticks that the site did not execute in the live session, because
             it had left.
     """
     name = effect.site
     if effect.stands:
-        kept = count_nouns(effect.stands, "record stands as it is", "records stand as they are")
-        yield f"{name}: {kept}: too little is known to execute more"
+        copied = count_nouns(
+            effect.stands, "record stands as it is", "records stand as they are"
+        )
+        yield f"{name}: {copied}: too little is known to execute more"
     if effect.assumed:
-        unknown = count_nouns(effect.assumed, "tick has", "ticks have")
-        yield f"{name}: {unknown} no record in the log: the arrivals are assumed"
+        unrecorded = count_nouns(effect.assumed, "tick has", "ticks have")
+        yield f"{name}: {unrecorded} no record in the log: the arrivals are assumed"
     if absent_ticks:
         ticks = count_nouns(absent_ticks, "tick")
         yield (
@@ -647,38 +661,48 @@ def _describe_site_limits(effect: SiteEffect, absent_ticks: int) -> Iterator[str
             "executed as if it had been there"
         )
     if effect.lacking:
-        lost = count_nouns(effect.lacking, "sample that arrived is", "samples that arrived are")
-        yield f"{name}: {lost} not in the log: executed without"
+        missing = count_nouns(
+            effect.lacking, "sample that arrived is", "samples that arrived are"
+        )
+        yield f"{name}: {missing} not in the log: executed without"
     if not effect.executed:
         yield f"{name}: nothing could be executed"
 
 
 def _describe_later_changes(result: Rerun) -> Iterator[str]:
-    """Yields sentences about changed settings that the scenario changes again during the run.
+    """Yields sentences about settings of the rerun that were changed again during the run.
 
-    The user's change of a link or dominance factor then applies only up to that time.
+    A link, or the dominance factors of a site (how strongly it follows each of its peers), can
+    change at certain times: by the timeline of the scenario, or by commands that the log
+    contains. The rerun repeats these changes. A setting that the user of the rerun changed
+    therefore applies only up to the first of them.
 
     Args:
         result: The log and its rerun.
     """
-    keys = [change.key for change in result.request.changes]
+    keys_set_by_user = [change.key for change in result.request.changes]
 
-    # Links, or sites whose dominance factors change, in the timeline or by requests in the log.
-    owners = [change.link or change.dominance for change in result.request.scenario.timeline]
-    for name in result.request.replaced:
+    # A changed object is a link, such as "m1->s", or a site whose dominance factors change.
+    timeline = result.request.scenario.timeline
+    changed_objects = [change.link or change.dominance for change in timeline]
+    for name in result.request.replaced:  # only the executed sites
         for commands in result.before.commands(name).values():
             for command in commands:
-                if command.order is not None:
+                is_order = command.order is not None  # for example to stop; changes no setting
+                if is_order:
                     continue
-                if command.peer < 0:
-                    owners.append(name)
+                changes_dominance = command.peer < 0
+                if changes_dominance:
+                    changed_objects.append(name)
                 else:
-                    owners.append(f"{result.before[name].peers[command.peer]}->{name}")
+                    sender = result.before[name].peers[command.peer]
+                    changed_objects.append(f"{sender}->{name}")
 
     # The dictionary removes duplicates and keeps the order.
-    for owner in dict.fromkeys(owners):
-        prefix = f"links.{owner}." if "->" in owner else f"dominance.{owner}."
-        if any(key.startswith(prefix) for key in keys):
+    for owner in dict.fromkeys(changed_objects):
+        is_link = "->" in owner
+        prefix = f"links.{owner}." if is_link else f"dominance.{owner}."
+        if any(key.startswith(prefix) for key in keys_set_by_user):
             yield (
                 f"{owner} changes during the run, in the log and in the rerun: from that "
                 "change on the setting of the run holds"

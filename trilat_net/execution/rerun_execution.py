@@ -325,23 +325,28 @@ def describe_rerun_changes(request: RerunRequest) -> list[str]:
 def _describe_changes(request: RerunRequest) -> Iterator[tuple[str, str, str]]:
     """Yields the parts of a description for every change.
 
+    The keys of changed values have the form group.owner.key, for example "sites.m1.control.Kd",
+    "links.m1->s.delay_ms" or "dominance.s.m1". Keys without an owner, such as "duration_s",
+    concern the whole scenario. If another link model or control law replaces the one of the
+    log, several values of the same owner differ. They are described together, once.
+
     Yields:
         The subject ("link" or the name of a key), its owner (a link or site, or empty for the
         whole scenario), and the change as a text.
     """
-    described: set[str] = set()
+    replaced_objects: set[str] = set()  # as group.owner
     for change in request.changes:
         group, _, rest = change.key.partition(".")
         owner, _, key = rest.partition(".")
         replacement = _describe_replacement(request, group, owner, key)
-        if replacement is None:
+        if replacement is None:  # the change concerns a single value
             values = f"{_shorten(change.before)} -> {_shorten(change.after)}"
             if group == "sites":
                 yield key, owner, values
             else:
                 yield change.key, "", values
-        elif f"{group}.{owner}" not in described:
-            described.add(f"{group}.{owner}")
+        elif f"{group}.{owner}" not in replaced_objects:
+            replaced_objects.add(f"{group}.{owner}")
             yield replacement
 
 
@@ -495,8 +500,17 @@ class RerunSite:
     def execute_tick(self) -> RerunTick:
         """Executes the next tick of the site.
 
-        If the log does not contain enough to execute the tick, its record is copied from the
-        log.
+        A tick is a period of the control loop. It can be executed only if the state of the site
+        before it is known (certain). There are three cases:
+
+        - The state follows from the previous tick: the tick is executed.
+        - The state is uncertain, for example after a gap of the log, but the two records before
+          the tick determine it: the state is restored, and the tick is executed.
+        - The state stays uncertain: the record of the tick is copied from the log.
+
+        Afterwards, `k` is the next tick. In a gap, which has no records to copy and to compare,
+        ticks are executed only if settings were changed, because then the result is new there
+        too. Otherwise the gap is skipped.
 
         Returns:
             The tick with its record.
@@ -505,11 +519,11 @@ class RerunSite:
             LogError: The log lists more changes than a site accepts, or contains an impossible
                 record.
         """
-        row = self._rows.get(self.k)
+        row = self._rows.get(self.k)  # None: the log has no record of the tick
         try:
             if row is not None and not self._certain and self._inputs.can_resume(row):
-                changes = [change for _, change in self._inputs.pop_changes(self.k - 1)]
-                self._inputs.resume(self._site, row, changes)
+                changes_in_gap = [change for _, change in self._inputs.pop_changes(self.k - 1)]
+                self._inputs.resume(self._site, row, changes_in_gap)
                 self._certain = True
             if self._certain or row is None:
                 tick = self._execute(row)
@@ -521,7 +535,8 @@ class RerunSite:
         self.diverged = tick.mode is Mode.DIVERGED
         self.k += 1
         executes_gaps = self._changed and self._certain
-        if not executes_gaps and self.k not in self._rows:
+        is_gap = self.k not in self._rows
+        if is_gap and not executes_gaps:
             self._skip_gap()
         return tick
 
@@ -740,29 +755,45 @@ class RerunExecution:
             del recent[next(iter(recent))]
 
     def _find_ready(self, pending: Sequence[tuple[int, int, int]]) -> int:
-        """Returns the position of the first pending tick whose arrivals have been computed.
+        """Chooses the site that executes its next tick, by its index in a list.
 
-        The result is 0 if there is no such tick, so that the execution always goes on.
+        A tick can be executed once all samples that arrive in it are known. The earliest such
+        tick is chosen. If no tick is ready, because each site waits for a sample of another
+        one, the earliest tick is chosen all the same: the execution must go on, and the missing
+        samples then count as not contained in the log.
 
         Args:
-            pending: Next tick of each site, as (time in ns, index of the site, tick), in order
-                of time.
+            pending: Next tick of each executed site that has not finished, as (time in ns,
+                index of the site among the executed sites, tick), in order of time.
+
+        Returns:
+            Index of the chosen entry in `pending`.
         """
-        for position, (_, index, k) in enumerate(pending):
-            if self._is_ready(self._request.replaced[index], k):
+        for position, (_, site_index, k) in enumerate(pending):
+            receiver = self._request.replaced[site_index]
+            if self._is_ready(receiver, k):
                 return position
-        return 0
+        earliest = 0
+        return earliest
 
     def _is_ready(self, receiver: str, k: int) -> bool:
-        """True if every sample that arrives in a tick has been computed, or never will be.
+        """True if a site does not have to wait for samples that arrive in its next tick.
+
+        A sample is the state that a sender publishes in one tick. It is ready if the sender has
+        executed this tick, or has finished and never will. The samples of a sender that is not
+        executed in this rerun are in the log, so they are always ready.
 
         Args:
             receiver: Name of the site.
-            k: The tick.
+            k: Number of its next tick.
         """
-        peers = self._log[receiver].peers
-        for peer, tick, _ in self.sites[receiver].deliveries.entries.get(k, ()):
-            sender = self.sites.get(peers[peer])
-            if sender is not None and not sender.is_done and tick >= sender.k:
+        sender_names = self._log[receiver].peers
+        arrivals = self.sites[receiver].deliveries.entries.get(k, ())
+        for peer_index, sent_tick, _ in arrivals:
+            sender = self.sites.get(sender_names[peer_index])
+            if sender is None or sender.is_done:
+                continue
+            is_computed = sent_tick < sender.k  # `sender.k` is the next tick of the sender
+            if not is_computed:
                 return False
         return True

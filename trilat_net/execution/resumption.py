@@ -45,7 +45,14 @@ def read_output(state: State, peers: tuple[str, ...]) -> TickRecord:
     """Converts a record of a log to the object that an execution of the same tick returns.
 
     A tick is one period of the control loop, and a record is its stored result. The object can
-    be compared with the result of executing the tick again by `Site.step`.
+    be compared with the result of executing the tick again by `Site.step`. Most fields are the
+    same in both forms, and are explained there. Three fields differ:
+
+    - The mode is a word in the log. An unknown word, as in the log of another version, becomes
+      "diverged".
+    - `used`, the tick of the newest sample in use, is given by the name of the peer in the log,
+      and by the index of the peer in the object. -1 stands for no sample.
+    - `mem`, the memory of the site, is empty unless it is complete.
 
     Args:
         state: Record of a tick, as the log contains it.
@@ -53,8 +60,10 @@ def read_output(state: State, peers: tuple[str, ...]) -> TickRecord:
             scenario.
     """
     mode = MODES.get(state.mode, MODES["diverged"]).mode
-    # A complete memory contains more numbers than the pose with which it begins.
-    mem = state.mem if len(state.mem) > len(state.q_des) else []
+    # The memory begins with a pose, which has as many numbers as `q_des`. A memory without
+    # further numbers is not complete.
+    has_complete_memory = len(state.mem) > len(state.q_des)
+    mem = state.mem if has_complete_memory else []
     return TickRecord(
         tick=state.tick,
         t_ns=state.t_ns,
@@ -261,9 +270,14 @@ class RecordedInputs(Generic[Change]):
         """True if the log contains enough to restore a site's state before a given record.
 
         A site is a process that runs one arm, and a record contains the results of one tick
-        (period of its control loop). The records of the two ticks before must exist. The log
-        must also contain the received data that the site used, unless it rested at a position
-        of its own.
+        (period of its control loop). There are two conditions:
+
+        - The records of the two ticks before must exist. The last one contains the state of the
+          arm and of the control law. The control torque of the tick before it is needed too,
+          because it is part of the state of the control loop.
+        - The log must contain the samples (states of other sites) that the site used in the
+          last tick, because it may use them again. This does not matter for a site that rests
+          at a position of its own, because such a site ignores the samples.
 
         Args:
             row: Index of the record, among the records of the site.
@@ -274,13 +288,16 @@ class RecordedInputs(Generic[Change]):
         if row < 2:
             return False
         tick = states[row].tick
-        if [states[row - 2].tick, states[row - 1].tick] != [tick - 2, tick - 1]:
+        ticks_before = [states[row - 2].tick, states[row - 1].tick]
+        if ticks_before != [tick - 2, tick - 1]:
             return False
-        if detached and states[row - 1].mode in RESTING_MODES:
+
+        last = states[row - 1]
+        if detached and last.mode in RESTING_MODES:
             return True
-        in_use = read_output(states[row - 1], self._part.peers).used
-        pairs = zip(in_use, self.samples, strict=True)
-        return all(used < 0 or used in samples for used, samples in pairs)
+        used_ticks = read_output(last, self._part.peers).used  # of each peer; -1 for no sample
+        pairs = zip(used_ticks, self.samples, strict=True)
+        return all(used_tick < 0 or used_tick in samples for used_tick, samples in pairs)
 
     def resume(self, site: Site, row: int, changes: Sequence[CoreChange] = ()) -> None:
         """Restores the state that a site had at a given point of a log, after missing records.
@@ -300,58 +317,77 @@ class RecordedInputs(Generic[Change]):
         for change in changes:
             site.apply_change(change, states[row].t_ns)
 
-        before = read_output(states[row - 2], peers)
+        # For each link the site stores the sample (state of a peer) that it uses, and newer
+        # samples that have arrived, but wait until the delay of the link has passed.
+        before_last = read_output(states[row - 2], peers)
         last = read_output(states[row - 1], peers)
-        in_use: list[Arrival | None] = []
-        waiting: list[Arrival] = []
-        for peer, used in enumerate(last.used):
-            in_use.append(self._find_in_use(peer, used, len(last.q_des)))
+        samples_in_use: list[Arrival | None] = []
+        waiting_samples: list[Arrival] = []
+        for peer, used_tick in enumerate(last.used):
+            samples_in_use.append(self._find_in_use(peer, used_tick, len(last.q_des)))
             # A sample that is older than the one in use is never used again.
-            self.lacking[peer] = {tick for tick in self.lacking[peer] if tick >= used}
+            self.lacking[peer] = {tick for tick in self.lacking[peer] if tick >= used_tick}
+
             rate_hz = site.peer_rate_hz(peer)
-            certain, self.assumed[peer] = self._find_waiting(row, peer, used, rate_hz)
+            certain, self.assumed[peer] = self._find_waiting(row, peer, used_tick, rate_hz)
             waiting_ticks = sorted(certain | self.assumed[peer])
-            arrivals, missing = self.find_arrivals([(peer, tick, 0) for tick in waiting_ticks])
+            # The latency, last in an entry, is only recorded. It does not affect the site.
+            entries = [(peer, tick, 0) for tick in waiting_ticks]
+            arrivals, missing = self.find_arrivals(entries)
             self.add_lacking(missing)
-            waiting += arrivals
+            waiting_samples += arrivals
 
-        site.restore_links(states[row].tick, in_use, waiting[-MAX_ARRIVALS:])
-        site.restore_state(before, last)
+        # A site accepts at most `MAX_ARRIVALS` samples at once: keep the last ones.
+        site.restore_links(states[row].tick, samples_in_use, waiting_samples[-MAX_ARRIVALS:])
+        site.restore_state(before_last, last)
 
-    def _find_in_use(self, peer: int, used: int, size: int) -> Arrival | None:
-        """Returns the sample of a peer that is in use. None before the first sample.
+    def _find_in_use(self, peer: int, used_tick: int, coordinates: int) -> Arrival | None:
+        """Returns the sample of a peer that the site used in its last tick before a gap.
+
+        A sample is the state that a peer, another site, sent in one of its ticks. If the log
+        does not contain it, a sample of zeros takes its place. This happens only for a site
+        that holds a position of its own and therefore does not use the sample, see
+        `can_resume`. The sample is remembered in `lacking`.
 
         Args:
             peer: Index of the peer.
-            used: Tick of the sample. -1 before the first sample.
-            size: Number of coordinates of the sample.
+            used_tick: Tick in which the peer sent the sample. -1 before the first sample.
+            coordinates: Number of coordinates of the sample.
+
+        Returns:
+            The sample. None before the first sample.
         """
-        sample = self.samples[peer].get(used)
+        sample = self.samples[peer].get(used_tick)
         if sample is None:
-            if used < 0:
+            if used_tick < 0:
                 return None
-            # Only a site that rests with a reference of its own is resumed without the sample.
-            # It does not use the zeros.
-            unknown = (0.0,) * size
-            sample = Arrival(peer, used, unknown, unknown)
-            self.lacking[peer].add(used)
-        arrival = make_arrival(peer, used, sample)
-        return select_peer_channels([arrival], self._links)[0]
+            zeros = (0.0,) * coordinates
+            sample = Arrival(peer=peer, tick=used_tick, q=zeros, qd=zeros)
+            self.lacking[peer].add(used_tick)
+        arrival = make_arrival(peer, used_tick, sample)
+        [arrival_for_site] = select_peer_channels([arrival], self._links)
+        return arrival_for_site
 
     def is_uncertain(self, state: State, output: TickRecord) -> bool:
-        """True if a tick used a sample that is not known for certain.
+        """True if a difference of a record may be due to missing data of the log.
 
-        The arrival of such a sample was assumed, or its content is missing from the log.
+        In each tick, a site uses the newest sample (state) of each other site, its peers. The
+        tick is uncertain if the arrival of such a sample was assumed, because no record lists
+        it, or if the content of the sample is missing from the log.
 
         Args:
             state: Record of the tick in the log.
             output: Result of executing the same tick again.
         """
-        for peer, name in enumerate(self._part.peers):
-            logged = state.used.get(name, -1)
-            executed = output.used[peer]
-            assumed = self.assumed[peer]
-            if logged in assumed or executed in assumed or logged in self.lacking[peer]:
+        for peer, peer_name in enumerate(self._part.peers):
+            # Ticks of the used samples. -1 before the first sample.
+            used_in_log = state.used.get(peer_name, -1)
+            used_in_execution = output.used[peer]
+            assumed_ticks = self.assumed[peer]
+            if used_in_log in assumed_ticks or used_in_execution in assumed_ticks:
+                return True
+            # The execution itself cannot use a sample whose content is missing.
+            if used_in_log in self.lacking[peer]:
                 return True
         return False
 
@@ -412,18 +448,25 @@ class RecordedInputs(Generic[Change]):
 
     @cached_property
     def _listings(self) -> "list[_PeerListing]":
-        """For each peer, the records that list its samples."""
-        listings = [_PeerListing({}, [], []) for _ in self.samples]
+        """For each peer (site that sends samples), which records list samples from it.
+
+        The record of a tick lists the samples that arrived in this tick. The index answers two
+        questions quickly: in which record is a sample listed first, and which sample does the
+        next record after a gap list.
+        """
+        listings = [_PeerListing(first_rows={}, rows=[], first_ticks=[]) for _ in self.samples]
         for row, state in enumerate(self._part.states):
-            for peer, tick, _ in state.rx:
+            for peer, sample_tick, _ in state.rx:
                 # A damaged record may list any peer.
-                if not 0 <= peer < len(listings):
+                is_known_peer = 0 <= peer < len(listings)
+                if not is_known_peer:
                     continue
                 listing = listings[peer]
-                listing.first_rows.setdefault(tick, row)
-                if not listing.rows or listing.rows[-1] != row:
+                listing.first_rows.setdefault(sample_tick, row)
+                is_first_in_record = not listing.rows or listing.rows[-1] != row
+                if is_first_in_record:
                     listing.rows.append(row)
-                    listing.first_ticks.append(tick)
+                    listing.first_ticks.append(sample_tick)
         return listings
 
 
