@@ -297,6 +297,9 @@ class VerifyResult:
         contains some sites that were copied from an older log. They are checked with that log,
         which gives a separate result.
 
+        Numbers are added, and lists are joined. The sum is a whole run, or intact, only if both
+        results are.
+
         Args:
             other: Result for the further sites. It does not change.
         """
@@ -307,13 +310,15 @@ class VerifyResult:
         self.gaps = self.gaps + other.gaps
         self.absences = self.absences + other.absences
         self.withheld = self.withheld + other.withheld
+        # No ticks are expected of sites that may not be executed.
         for name in other.withheld:
             self.coverage.expected.pop(name, None)
         self.whole_run &= other.whole_run
+        # This coverage expects the ticks of all sites already. Only the judged ticks are new.
         self.coverage.judged.update(other.coverage.judged)
         self._keep_first(other.first)
         if not other.integrity.passed:
-            self.integrity = other.integrity
+            self.integrity = other.integrity  # one failed log suffices to fail the whole check
 
     def add_difference(self, difference: RecordDifference) -> None:
         """Counts one more record that differs from the repeated execution.
@@ -407,24 +412,29 @@ class SiteVerifier:
         """
         result = self._result
         name = self._log.name
-        judged_before = result.records - result.unjudged
-        next_tick = 0
+        judged_before = result.records - result.unjudged  # of sites that were executed before
+        next_tick = 0  # the tick whose record is expected next
         for row, state in enumerate(self._log.states):
             if report is not None and row % PROGRESS_EVERY == 0:
                 report(result.records)
             result.records += 1
 
-            # The tick of the previous record is repeated.
-            if state.tick == next_tick - 1 and state.boot not in self._starts:
+            # Two records of the same tick cannot come from one run of the site.
+            is_known_boot = state.boot in self._starts
+            is_repeated = state.tick == next_tick - 1
+            if is_repeated and not is_known_boot:
                 result.add_difference(
                     self._make_difference(state, "tick", state.tick, next_tick)
                 )
                 continue
 
-            is_other_boot = state.boot != self._boot and state.boot in self._starts
+            # A site that left and returned has a new start (boot).
+            is_other_boot = state.boot != self._boot and is_known_boot
             if self._boot is None or is_other_boot:
                 next_tick = self._change_start(row, next_tick)
-            if state.tick != next_tick + count_skipped_ticks(state.cmd):
+            # A site that was late skipped ticks, which is no gap. Its record states how many.
+            expected_tick = next_tick + count_skipped_ticks(state.cmd)
+            if state.tick != expected_tick:
                 result.gaps.append((name, next_tick, state.tick - 1))
                 self._certain = False
             next_tick = state.tick + 1
@@ -435,7 +445,14 @@ class SiteVerifier:
             result.gaps.append((name, next_tick, self._last_tick))
 
     def _execute_record(self, row: int, state: State) -> None:
-        """Executes the tick of a record if the site's state is certain, and counts the record.
+        """Judges a record: executes its tick again, and compares the result with the record.
+
+        The tick can be executed if the state of the site before it is certain, that is, if the
+        state follows from the tick before. If the state is uncertain, it is restored from the
+        two records before, if possible. Otherwise only the sender of the record is checked.
+
+        The record is counted in the result as identical, as different, or as unjudged. After a
+        control law has failed, all further records of the site are unjudged.
 
         Args:
             row: Row of the record.
@@ -443,12 +460,14 @@ class SiteVerifier:
         """
         result = self._result
         try:
+            # On request, the site is replaced now and then, to find state outside of records.
             if self._resume_every and state.tick % self._resume_every == 0:
                 self._replace_site(row, state)
             if not self._certain and self._can_resume(row):
                 changes_in_gap, _ = self._parse_changes(state.tick - 1)
                 self._inputs.resume(self._site, row, changes_in_gap)
                 self._certain = True
+
             if self._certain and not self._law_failed:
                 self._verify_record(row, state)
             elif difference := self._find_other_sender(state):
@@ -458,7 +477,9 @@ class SiteVerifier:
         except LawFailed as failure:
             self._law_failed = True
             result.add_difference(describe_law_failure(failure)._replace(tick=state.tick))
-        except ValueError as error:  # more changes than a site accepts
+        except ValueError as error:
+            # The log lists more changes than a site accepts in one tick, so that the changes
+            # ("cmd") cannot be those of a real run.
             self._certain = False
             difference = RecordDifference(
                 site=self._log.name,
@@ -478,45 +499,57 @@ class SiteVerifier:
     def _change_start(self, row: int, next_tick: int) -> int:
         """Continues with another start (boot) of the site, to which a record belongs.
 
-        A site that left the session and returned has several starts. The ticks between two
-        starts are absences or gaps.
+        A site that left the session and returned has several starts, each with a new number
+        (boot). Between the last record of the previous start and the first tick of this start,
+        there may be two ranges of ticks:
+
+        - A gap: the site executed these ticks, but their records are missing from the log.
+        - An absence, after the gap: the site did not execute these ticks, because it had left.
+
+        Both are added to the result. The site of this start begins in its initial state.
 
         Args:
-            row: Row of the record.
+            row: Row of the first record of the start.
             next_tick: Tick that was expected next.
 
         Returns:
-            Tick that is expected next. It is the first tick of the start, if the log states
-            this tick.
+            Tick that is expected next: the first tick of the start. If the log does not state
+            this tick, or if it has been examined already, the site is not restarted, and the
+            result is `next_tick`.
         """
         name = self._log.name
         self._boot = self._log.states[row].boot
         self._start_row = row
-        first = self._starts.get(self._boot)
-        if first is None or first < next_tick:
+        first_tick = self._starts.get(self._boot)
+        if first_tick is None or first_tick < next_tick:
             return next_tick
 
-        # The ticks before the absence are missing from the log.
-        first_absent = max(self._absences.get(first, first), next_tick)
-        if next_tick < first_absent:
-            self._result.gaps.append((name, next_tick, first_absent - 1))
-        if first_absent < first:
-            self._result.absences.append((name, first_absent, first - 1))
+        # An absence ends right before the first tick of a start.
+        absence_start = self._absences.get(first_tick, first_tick)
+        first_absent_tick = max(absence_start, next_tick)
+        if next_tick < first_absent_tick:
+            self._result.gaps.append((name, next_tick, first_absent_tick - 1))
+        if first_absent_tick < first_tick:
+            self._result.absences.append((name, first_absent_tick, first_tick - 1))
 
-        # The remaining changes before this tick concern the previous start.
-        self._inputs.pop_changes(first - 1)
+        # The remaining changes before this tick concern the previous start, so drop them.
+        self._inputs.pop_changes(first_tick - 1)
         self._applied.clear()
         self._site = Site(self._setup)
-        self._site.start_at(first)
-        self._start_tick = first
-        self._certain = True
-        return first
+        self._site.start_at(first_tick)
+        self._start_tick = first_tick
+        self._certain = True  # the initial state of a site is known
+        return first_tick
 
     def _replace_site(self, row: int, state: State) -> None:
-        """Replaces the site by a new one that is restored from the two records before a row.
+        """Replaces the executed site by a new one, whose state is still to be restored.
 
         A law must keep all its state in its `memory`, which the records contain. Other state is
         lost by the replacement, so that the following records differ and the fault is found.
+
+        This method only marks the state as uncertain. The caller then restores it from the two
+        records before the next one, as after a gap of the log. Nothing happens if the state is
+        uncertain already, or cannot be restored.
 
         Args:
             row: Row of the next record.
@@ -526,6 +559,7 @@ class SiteVerifier:
             return
         self._site = Site(self._setup)
         self._certain = False
+        # Settings are not part of the state. The new site gets them as the old one got them.
         if self._start_tick:
             self._site.start_at(self._start_tick)
         for change in self._applied:
@@ -615,6 +649,16 @@ class SiteVerifier:
     def _parse_changes(self, tick: int) -> tuple[list[CoreChange], RecordDifference | None]:
         """Returns the changes up to a tick that have not been executed yet.
 
+        A change is a new model of a link, or new dominance factors (how strongly the site
+        follows its peers), or an order to the site. The log contains its text. An invalid text
+        proves that the log is not that of a real run, so the difference is reported.
+
+        A site accepts at most `MAX_RAMPS` changes in one tick. Valid changes are also stored in
+        `_applied`, so that `_replace_site` can repeat them.
+
+        Args:
+            tick: Last tick whose changes are returned.
+
         Returns:
             The changes before the first invalid one, and the difference that reports the
             invalid one. None in place of the difference if all changes are valid.
@@ -632,8 +676,9 @@ class SiteVerifier:
                     computed="a change of one of its links or of its shares",
                 )
                 return changes, difference
-        self._applied += changes[:MAX_RAMPS]
-        return changes[:MAX_RAMPS], None
+        accepted_changes = changes[:MAX_RAMPS]
+        self._applied += accepted_changes
+        return accepted_changes, None
 
     def _check_arrivals(
         self, state: State

@@ -344,7 +344,8 @@ Its arguments are the site and the number of the site's next tick.
 def check_virtual(scenario: Scenario) -> None:
     """Checks that a scenario can run in virtual time, before anything is written.
 
-    In virtual time, all sites are simulated in one process. There are no real robots.
+    In virtual time, all sites (simulated processes that each run one arm) run in one process. A
+    real robot cannot take part. An arm whose motion a user's program computes can.
 
     Args:
         scenario: Description of the experiment.
@@ -353,11 +354,14 @@ def check_virtual(scenario: Scenario) -> None:
         ScenarioError: An arm is a real robot, a user's control law cannot be created, or the
             file of the law has another hash than the scenario states.
     """
-    simulated_by_user = set(scenario.external) - set(scenario.outside)
+    # Arms that this program does not simulate are real robots, or belong to users' programs.
+    real_robots = set(scenario.outside)
+    simulated_by_user = set(scenario.external) - real_robots
     refuse_external_arms(scenario, simulated_by_user)
     for name, spec in scenario.sites.items():
         if isinstance(spec.control, ImportedLaw):
-            # created only for its checks
+            # A site creates its control law, and raises an error if this is not possible. The
+            # site itself is not needed.
             Site(scenario.setup(name))
 
 

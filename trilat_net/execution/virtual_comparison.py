@@ -287,7 +287,21 @@ def compare_with_virtual(log: Log, progress: Progress | None = None) -> VirtualC
         commands = {name: log.commands(name) for name in scenario.names}
         hands = {name: partial(find_recorded_hand, log[name]) for name in scenario.names}
 
-        def execute(network: Network | None, before: int) -> Iterator[tuple[str, TickRecord]]:
+        def execute(
+            network: Network | None, ticks_before: int
+        ) -> Iterator[tuple[str, TickRecord]]:
+            """Simulates the scenario with the changes, operators and external arms of the log.
+
+            The ticks are executed one by one, while the results are read.
+
+            Args:
+                network: Network that delivers the samples. None for one in which they arrive at
+                    once.
+                ticks_before: Number of ticks of earlier simulations, for the progress.
+
+            Yields:
+                Name of the site, and record of the tick.
+            """
             ticks = virtual.execute_virtual(
                 scenario=scenario,
                 network=network,
@@ -296,10 +310,10 @@ def compare_with_virtual(log: Log, progress: Progress | None = None) -> VirtualC
                 ends=log.last_ticks,
                 hands=hands,
             )
-            for count, (site, _, output) in enumerate(ticks):
-                if progress is not None and count % PROGRESS_EVERY == 0:
-                    progress(before + count, total)
-                yield site.name, output
+            for executed_ticks, (site, _, record) in enumerate(ticks):
+                if progress is not None and executed_ticks % PROGRESS_EVERY == 0:
+                    progress(ticks_before + executed_ticks, total)
+                yield site.name, record
 
         arrivals = {name: _read_arrivals(log, name) for name in log.sites}
         fed = compare_records(log, execute(RecordedNetwork(arrivals, peers), 0), arrivals=True)

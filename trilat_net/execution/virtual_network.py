@@ -143,19 +143,25 @@ class RecordedNetwork:
         """True if all samples that the log lists for tick `k` of a receiver have been sent.
 
         In a live session, a site whose loop ran late may have received samples with later times
-        than that of its own tick. The senders of such samples must run first.
+        than that of its own tick. The senders of such samples must run first. Meanwhile this
+        method is called repeatedly. Each call continues with the first sample that had not been
+        sent when the last call ended.
+
+        Args:
+            receiver: Name of the receiving site.
+            k: Number of its next tick.
         """
-        peers = self._peers[receiver]
-        entries = self._schedule[receiver].get(k, ())
+        sender_names = self._peers[receiver]
+        arrivals = self._schedule[receiver].get(k, ())  # (index of the sender, tick, latency)
         checked_tick, sent_count = self._checked[receiver]
         if checked_tick != k:
             sent_count = 0
-        for peer, tick, _ in entries[sent_count:]:
-            if (peers[peer], tick) not in self._sent:
+        for sender_index, sent_tick, _ in arrivals[sent_count:]:
+            if (sender_names[sender_index], sent_tick) not in self._sent:
                 break
             sent_count += 1
         self._checked[receiver] = (k, sent_count)
-        return sent_count == len(entries)
+        return sent_count == len(arrivals)
 
     def deliver(self, receiver: str, k: int) -> list[Arrival]:
         """Returns the samples that, according to the log, arrive in tick `k` of a receiver.
