@@ -773,8 +773,7 @@ class RerunExecution:
             receiver = self._request.replaced[site_index]
             if self._is_ready(receiver, k):
                 return position
-        earliest = 0
-        return earliest
+        return 0  # the earliest
 
     def _is_ready(self, receiver: str, k: int) -> bool:
         """True if a site does not have to wait for samples that arrive in its next tick.

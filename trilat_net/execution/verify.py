@@ -478,8 +478,7 @@ class SiteVerifier:
             self._law_failed = True
             result.add_difference(describe_law_failure(failure)._replace(tick=state.tick))
         except ValueError as error:
-            # The log lists more changes than a site accepts in one tick, so that the changes
-            # ("cmd") cannot be those of a real run.
+            # The log lists more changes ("cmd") than a site accepts.
             self._certain = False
             difference = RecordDifference(
                 site=self._log.name,
@@ -653,8 +652,8 @@ class SiteVerifier:
         follows its peers), or an order to the site. The log contains its text. An invalid text
         proves that the log is not that of a real run, so the difference is reported.
 
-        A site accepts at most `MAX_RAMPS` changes in one tick. Valid changes are also stored in
-        `_applied`, so that `_replace_site` can repeat them.
+        At most `MAX_RAMPS` changes can wait at a site; more are left out. The changes are also
+        stored in `_applied`, so that `_replace_site` can repeat them.
 
         Args:
             tick: Last tick whose changes are returned.
