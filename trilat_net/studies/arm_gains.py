@@ -191,25 +191,38 @@ class ArmGains(Result):
         yield self.line
 
     def _describe_edge(self) -> Iterator[str]:
-        """Yields the lines that describe the edge and the sampled-data limit."""
+        """Yields the lines about the limits of k, where the stiffness is K = k m.
+
+        m is the inertia of a joint, and k has the unit 1/s^2. The limits, see the attribute
+        `edge`, are the values of k from which on
+
+        - small motions grow: in the loop as it is, with a constant delay, and in continuous
+          time ("none" if they never grow there). This is the edge of stability;
+        - the damping, which grows with sqrt(k), reverses a velocity in every tick (control
+          period).
+
+        The lines also tell which joints move at the edge, with which frequency, in which pose
+        the edge is lowest, and which of the two limits bounds the stiffness.
+        """
         edge = self.edge
-        moves = tuple(edge["moves"])
-        root = CharacteristicRoot(0j, 1, moves)
+        # Only the text about the moving states is needed, so the value of the root is arbitrary.
+        moving_states = tuple(edge["moves"])
+        motion = CharacteristicRoot(s=0j, multiplicity=1, states=moving_states).description
         yield (
             f"edge: K = {edge['k_per_s2']:.4g} /s^2 times inertia "
-            f"({root.description}; {edge['omega_rad_s']:.4g} rad/s)"
+            f"({motion}; {edge['omega_rad_s']:.4g} rad/s)"
         )
-        continuous = "none"
+        continuous_text = "none"
         continuous_per_s2 = edge["continuous_per_s2"]
         if continuous_per_s2 is not None:
-            continuous = f"{continuous_per_s2:.4g}"
+            continuous_text = f"{continuous_per_s2:.4g}"
         yield (
             f"  {edge['constant_per_s2']:.4g} with a constant delay of {self.age_ms:.4g} ms; "
-            f"{continuous} in continuous time; the {edge['bound']} bounds K"
+            f"{continuous_text} in continuous time; the {edge['bound']} bounds K"
         )
         yield f"  damping swings from tick to tick from {edge['limit_per_s2']:.4g} on"
-        angles = ", ".join(f"{q:.3g}" for q in edge["pose"])
-        yield f"  least in the pose {angles}"
+        pose_text = ", ".join(f"{q:.3g}" for q in edge["pose"])
+        yield f"  least in the pose {pose_text}"
 
 
 def _format_cell(value: Any) -> str:
@@ -449,22 +462,33 @@ class _GainSearch:
         self._fit_inertia()
 
     def _fit_inertia(self) -> None:
-        """Reduces the inertia m until the damping of the lightest motion keeps its margin.
+        """Reduces the inertias m of the joints, so that the damping suits the tick rate.
 
-        The gains are proportional to m, but a motion that several joints share can be lighter
-        than each of them. The m of a joint is reduced the more, the more the joint takes part
-        in the lightest motion. Since another motion may then be the lightest, this is repeated
-        in small steps.
+        The gains are proportional to the inertia m of a joint, about its own axis: the damping
+        is 2 zeta sqrt(k) m, in N m s/rad. A motion of several joints together can have a
+        smaller inertia than m. Relative to this inertia, the damping is larger by a ratio r,
+        the largest eigenvalue of m M^-1, where M is the inertia matrix:
+
+            damping per inertia = 2 zeta sqrt(k) r, in 1/s
+
+        Above the sampled-data limit (one or two times the tick rate), the motion would swing
+        from tick to tick. The method reduces m until r is so small that the damping keeps its
+        margin to this limit, at the least k that the search considers.
+
+        Only those joints matter that take part in the lightest motion, the one with the ratio
+        r. The m of the joint with the largest participation is multiplied by a factor below 1,
+        and that of another joint by the factor to the power of its relative participation.
+        Since another motion may then be the lightest, this is repeated in small steps.
         """
-        damping_per_inertia = 2.0 * self._damping * math.sqrt(self._least_k)
-        divisor = damping_per_inertia * self._margin
-        allowed_ratio = self._largest_damping_per_s / divisor
+        damping_per_inertia_per_s = 2.0 * self._damping * math.sqrt(self._least_k)
+        damping_with_margin_per_s = damping_per_inertia_per_s * self._margin
+        allowed_ratio = self._largest_damping_per_s / damping_with_margin_per_s
         ratio, participation = self._find_lightest()
         largest_ratio = allowed_ratio * (1.0 + _EDGE_TOLERANCE)
         while ratio > largest_ratio:
-            exponents = participation / participation.max()
-            step = max(allowed_ratio / ratio, _FITTING_STEP)
-            self.inertia = self.inertia * step**exponents
+            relative_participation = participation / participation.max()
+            factor = max(allowed_ratio / ratio, _FITTING_STEP)
+            self.inertia = self.inertia * factor**relative_participation
             ratio, participation = self._find_lightest()
 
     def _find_lightest(self) -> tuple[float, Array]:
@@ -687,8 +711,8 @@ class _GainSearch:
 
         For each delay, the result is the least k at which small motions of the sampled control
         loop grow, where the stiffness of each joint is k times its inertia. The delays are
-        whole numbers of control periods on a geometric scale, up to four times the delay of the
-        loop.
+        whole numbers of ticks (control periods) on a geometric scale, from one tick up to four
+        times the delay of the loop, but at least up to eight ticks.
 
         Args:
             pose: Pose of all arms, shape (n,), in rad or m, for n joints.
@@ -696,16 +720,19 @@ class _GainSearch:
         Returns:
             Pairs of a delay, in s, and the value of k, in 1/s^2.
         """
-        longest_ticks = max(4.0 * self.age_s * self.rate_hz, 8.0)
+        loop_delay_ticks_4 = 4.0 * self.age_s * self.rate_hz
+        longest_ticks = max(loop_delay_ticks_4, 8.0)
         geometric_ticks = np.geomspace(1.0, longest_ticks, _CURVE_POINTS)
-        ages_ticks = np.round(geometric_ticks)
-        ages_s = np.unique(ages_ticks) / self.rate_hz
+        delays_ticks = np.round(geometric_ticks)
+        delays_s = np.unique(delays_ticks) / self.rate_hz
         curve = []
-        for age_s in ages_s:
-            loop = self.fix_age(age_s)
-            start = (2.0 * self._damping / age_s) ** 2
-            k, _ = self.find_least_edge(loop, [pose], start)
-            curve.append((float(age_s), k))
+        for delay_s in delays_s:
+            loop = self.fix_age(delay_s)
+            # Up to k = (2 zeta / delay)^2, even the heaviest mass is stable, see `__init__`. So
+            # the search starts there.
+            stable_k = (2.0 * self._damping / delay_s) ** 2
+            edge_k, _ = self.find_least_edge(loop, [pose], stable_k)
+            curve.append((float(delay_s), edge_k))
         return curve
 
     def confirm(

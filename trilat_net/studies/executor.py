@@ -174,11 +174,15 @@ class _Feed(Generic[T]):
     def pop_batch(self, *, idle: bool) -> list[tuple[int, T]]:
         """Removes the next batch from the queue.
 
-        Items whose worker died come first, and form a batch of their own.
+        An item whose worker died is run again before new items, as a batch of its own. An item
+        in its last attempt is a suspect: it probably kills its worker. It runs while no other
+        batch is in flight, so that it cannot take other items with it.
+
+        Otherwise the batch consists of new items. From the mean duration of the finished items
+        follows how many items take about `batch_s`.
 
         Args:
-            idle: True if no batch is in flight. An item that probably kills its worker leaves
-                the queue only then.
+            idle: True if no batch is in flight.
 
         Returns:
             Pairs of the number of an item and the item. Empty if no item can run now.
@@ -190,11 +194,16 @@ class _Feed(Generic[T]):
 
         size = 1  # until the duration of an item is known
         if self._wall_s > 0.0:
-            size = min(MAX_BATCH, int(self._batch_s * self._runs / self._wall_s))
+            # The finished items, `_runs` in number, took `_wall_s` together.
+            items_in_batch_s = int(self._batch_s * self._runs / self._wall_s)
+            size = min(MAX_BATCH, items_in_batch_s)
         if self._remaining is not None:
-            # Towards the end the batches become smaller, so that no worker is idle for long.
-            fair_size = self._remaining // (2 * self._workers * _BATCHES_PER_WORKER)
-            size = min(size, max(fair_size, size // _SMALLEST_FRACTION))
+            # Towards the end the batches become smaller, so that no worker is idle for long:
+            # all batches in flight together contain at most half of the remaining items.
+            batches_in_flight = self._workers * _BATCHES_PER_WORKER
+            fair_size = self._remaining // (2 * batches_in_flight)
+            smallest_size = size // _SMALLEST_FRACTION  # limits the overhead of small batches
+            size = min(size, max(fair_size, smallest_size))
         batch = list(islice(self._new, max(1, size)))
         if self._remaining is not None:
             self._remaining -= len(batch)

@@ -252,27 +252,42 @@ class ExperimentAnalysis(Result):
         return absent
 
     def _count_missing_answers(self) -> Iterator[MissingAnswers]:
-        """Yields the missing answers of each questionnaire and condition."""
+        """Counts the missing answers of each questionnaire, separately for each condition.
+
+        A questionnaire has several items. A completed questionnaire, called form, belongs to
+        one participant and one block of trials. Two numbers are counted: the items without an
+        answer, and the forms in which at least one answer is missing, so that they have no
+        score.
+
+        A block has one condition. A questionnaire that people answer only once, after the whole
+        experiment, belongs to no condition. Its condition is the empty text.
+
+        Yields:
+            The counts for each questionnaire and condition. Excluded participants do not count.
+        """
         protocol = self._experiment.plan.protocol
-        after = {form.name: form.after for form in protocol.questionnaires}
-        groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
-        for row in self._experiment.list_answers():
+        when_answered = {form.name: form.after for form in protocol.questionnaires}
+        answer_groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
+        for row in self._experiment.list_answers():  # one row for each item
             name = row["questionnaire"]
-            if name in after and row[self.unit] not in self._exclude:
-                condition = row["condition"] if after[name] == "block" else ""
-                groups.setdefault((name, condition), []).append(row)
-        for (name, condition), rows in groups.items():
-            values_of_form: dict[tuple[str, int], list[float | None]] = {}
+            if name in when_answered and row[self.unit] not in self._exclude:
+                is_per_block = when_answered[name] == "block"
+                condition = row["condition"] if is_per_block else ""
+                answer_groups.setdefault((name, condition), []).append(row)
+
+        for (name, condition), rows in answer_groups.items():
+            answers_of_form: dict[tuple[str, int], list[float | None]] = {}
             for row in rows:
                 form_key = (row["participant"], row["block"])
-                values_of_form.setdefault(form_key, []).append(row["value"])
+                answers_of_form.setdefault(form_key, []).append(row["value"])
+            incomplete_forms = sum(None in answers for answers in answers_of_form.values())
             yield MissingAnswers(
                 questionnaire=name,
                 condition=condition,
                 asked=len(rows),
                 missing=sum(row["value"] is None for row in rows),
-                forms=len(values_of_form),
-                unscored=sum(None in values for values in values_of_form.values()),
+                forms=len(answers_of_form),
+                unscored=incomplete_forms,
             )
 
     def of(self, measure: str) -> Sequence[Row]:

@@ -176,25 +176,38 @@ class Experiment(Result):
     def _draw_choices(self, staircase: Staircase) -> None:
         """Notes the choices of synthetic participants for all pairs of a staircase.
 
+        A staircase is a perception test with pairs of trials. A quantity has its standard value
+        in one trial of a pair, and a larger value in the other one, the comparison trial. After
+        the second trial, the participant chooses the trial with the larger value. The
+        difference of a pair depends on whether the earlier choices of the block were right.
+
         The choices follow from the plan, so that they can be drawn before any trial is run.
+
+        Args:
+            staircase: Settings of the test. It also contains the model of the participant's
+                perception, which sometimes errs.
         """
-        choices: dict[int, float] = {}
+        choices: dict[
+            int, float
+        ] = {}  # chosen trial, 1 or 2, by the number of the second trial
         with self.open_notes() as notes:
             for step in self.plan.list_steps():
-                if step.form is None or step.form.name != CHOICE:
+                is_choice = step.form is not None and step.form.name == CHOICE
+                if not is_choice:
                     continue
-                second = step.planned
-                right = self.plan.judge_choices(second, choices)
-                difference = staircase.list_differences(right)[-1]
-                comparison = 2 if second.phase == COMPARISON else 1
-                choice = staircase.draw_choice(difference, comparison, second.seed)
-                choices[second.number] = choice
-                who = "-".join(second.group)
+                second_trial = step.planned
+                were_right = self.plan.judge_choices(second_trial, choices)
+                # The last difference is that of this pair, whose choice is not made yet.
+                difference = staircase.list_differences(were_right)[-1]
+                comparison_trial = 2 if second_trial.phase == COMPARISON else 1
+                choice = staircase.draw_choice(difference, comparison_trial, second_trial.seed)
+                choices[second_trial.number] = choice
+                who = "-".join(second_trial.group)
                 note = Note(
                     cell=f"{step.key} {who}",
                     kind=step.kind,
                     who=who,
-                    number=second.number,
+                    number=second_trial.number,
                     unix_s=0.0,
                     text=CHOICE,
                     answers={CHOICE: choice},

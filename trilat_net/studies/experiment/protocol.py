@@ -342,23 +342,36 @@ class ExperimentPlan(Result):
     def list_steps(self) -> Iterator[Step]:
         """Yields everything that participants have to do, in the order of the experiment.
 
-        These are the consents, the trials, and the questionnaires after blocks or at the end.
+        A group of participants does one block of trials for each condition. Its steps are:
+
+        - the consent, before its first trial;
+        - all trials;
+        - in an experiment with a staircase, the choice between the two trials of a pair, after
+          each pair. Practice trials form no pairs;
+        - questionnaires: after every block, or only after the last block of the group.
+
+        Yields:
+            The steps of all groups, one group after the other.
         """
         protocol = self.protocol
-        last_trial = self.trials[-1].trial
+        trials_per_block = self.trials[-1].trial
         for planned in self.trials:
-            if protocol.consent and planned.block == planned.trial == 1:
+            is_first_of_group = planned.block == planned.trial == 1
+            if protocol.consent and is_first_of_group:
                 yield Step("consent", planned)
             yield Step("trial", planned)
-            counted = planned.trial - protocol.practice
-            ends_pair = counted > 0 and counted % 2 == 0
+
+            trial_after_practice = planned.trial - protocol.practice
+            ends_pair = trial_after_practice > 0 and trial_after_practice % 2 == 0
             if protocol.staircase is not None and ends_pair:
                 yield Step("questionnaire", planned, protocol.staircase.form)
-            if planned.trial == last_trial:
-                is_last_block = planned.block == len(protocol.conditions)
-                for form in protocol.questionnaires:
-                    if is_last_block or form.after == "block":
-                        yield Step("questionnaire", planned, find_form(form))
+
+            ends_block = planned.trial == trials_per_block
+            if ends_block:
+                ends_experiment = planned.block == len(protocol.conditions)
+                for questionnaire in protocol.questionnaires:
+                    if ends_experiment or questionnaire.after == "block":
+                        yield Step("questionnaire", planned, find_form(questionnaire))
 
     def judge_choices(self, planned: PlannedTrial, choices: Choices) -> list[bool]:
         """Judges which answers of the participants in a perception test were right.
@@ -376,13 +389,17 @@ class ExperimentPlan(Result):
         Returns:
             For each choice in the block, in the order of the trials, True if it is right.
         """
+        # `number` and `trial` count from 1, so their difference is the index of the first trial.
         block_start = planned.number - planned.trial
-        block_end = block_start + self.trials[-1].trial
+        trials_per_block = self.trials[-1].trial  # all blocks are equally long
+        block_end = block_start + trials_per_block
         judgements: list[bool] = []
-        for second in self.trials[block_start:block_end]:
-            if second.number in choices:
-                right_choice = 2 if second.phase == COMPARISON else 1
-                judgements.append(choices[second.number] == right_choice)
+        for trial in self.trials[block_start:block_end]:
+            is_second_of_judged_pair = trial.number in choices
+            if is_second_of_judged_pair:
+                comparison_is_second = trial.phase == COMPARISON
+                right_choice = 2 if comparison_is_second else 1
+                judgements.append(choices[trial.number] == right_choice)
         return judgements
 
     def find_pair(self, planned: PlannedTrial, choices: Choices) -> tuple[float, bool | None]:
@@ -792,22 +809,39 @@ def list_orders(design: str, conditions: Sequence[str], seed: int) -> list[tuple
 
 
 def _list_trials(protocol: Protocol) -> Iterator[PlannedTrial]:
-    """Yields all trials of an experiment in their order."""
+    """Yields all trials of an experiment in their order.
+
+    Each group of participants does one block of trials per condition. The order of the
+    conditions is the next one of `list_orders`. A block begins with practice trials. The
+    further trials are those of `Protocol.list_phases`: a trial has a phase (of a training or of
+    a staircase, otherwise empty), and a lead, the first user's part of the authority over the
+    slave arm. Catch trials have another condition than their block. Numbers count from 1, and
+    indices from 0.
+
+    Each random quantity has a generator of its own, whose seed contains the seed of the
+    protocol, the group and the block. A last number distinguishes the quantities: none for the
+    first target, 1 for catch trials, and 2 for phases. Therefore a change of one quantity does
+    not change the others.
+
+    Args:
+        protocol: Design of the experiment: conditions, task and participants.
+    """
     orders = list_orders(protocol.design, list(protocol.conditions), protocol.seed)
     groups = list(enumerate(protocol.groups))
     blocks = range(len(protocol.conditions))
     number = 0
-    for (index, group), block in itertools.product(groups, blocks):
-        condition = orders[index % len(orders)][block]
-        random = np.random.default_rng([protocol.seed, index, block, 2])
+    for (group_index, group), block in itertools.product(groups, blocks):
+        condition = orders[group_index % len(orders)][block]
+        phase_random = np.random.default_rng([protocol.seed, group_index, block, 2])
         phases: list[tuple[str, float | None]] = [("", None)] * protocol.practice
-        phases += protocol.list_phases(condition, random)
-        catches = _draw_catches(protocol, condition, index, block)
-        target_random = np.random.default_rng([protocol.seed, index, block])
+        phases += protocol.list_phases(condition, phase_random)
+        catch_trials = _draw_catches(protocol, condition, group_index, block)
+        target_random = np.random.default_rng([protocol.seed, group_index, block])
+        # A task has fewer targets than this. It takes the number modulo that of its targets.
         first_target = int(target_random.integers(1000))
         for trial, (phase, lead) in enumerate(phases):
             number += 1
-            is_catch = trial in catches
+            is_catch = trial in catch_trials
             trial_condition = condition
             if protocol.catch is not None and is_catch:
                 trial_condition = protocol.catch.condition
@@ -815,6 +849,7 @@ def _list_trials(protocol: Protocol) -> Iterator[PlannedTrial]:
             state = seed_sequence.generate_state(1)
             target_step = trial
             if protocol.staircase:
+                # Both trials of a pair have the same target.
                 target_step = (trial - protocol.practice) // 2
             yield PlannedTrial(
                 number=number,
