@@ -708,26 +708,39 @@ def _to_word(text: str) -> str:
 def _make_entry_column(
     source: str, field: str, name: str, values: Sequence[Mapping[str, int]]
 ) -> Column:
-    """Returns the column of one key of a field that is a map.
+    """Makes the column of one entry of a statistics field whose values are maps.
+
+    For example, the field `delay_us` maps each peer to a delay. Its entry of the peer m2
+    becomes the column `delay_m2_us`. A field without a unit counts something: the entry m2 of
+    `accepted` becomes `accepted_m2_count`.
 
     Args:
         source: Name of the file for error messages.
         field: Name of the field of the statistics.
-        name: The key: a peer, or a reason why messages were dropped.
+        name: Key of the entry: a peer, or a reason why messages were dropped.
         values: The maps, one per row.
+
+    Returns:
+        The column. A value is unknown if the map has no such entry, or if the entry is -1 in a
+        field where -1 means that there is no value.
     """
-    unit, text, _ = read_field_docs(LinkStats)[field]
-    stem, _, ending = field.rpartition("_") if unit else (field, "", "count")
+    unit, meaning_of_field, _ = read_field_docs(LinkStats)[field]
+    stem = field
+    ending = "count"
+    if unit:
+        stem, _, ending = field.rpartition("_")  # the ending is the unit, such as "us"
     # `dropped` has no entry for a reason if no message was dropped for that reason.
     absent = 0 if field == "dropped" else None
     numbers = [value.get(name, absent) for value in values]
-    lowest = 0 if field in _NONE_BELOW_0 else -math.inf
-    known = np.array([n is not None and n >= lowest for n in numbers], dtype=np.bool_)
+    lowest_known = 0 if field in _NONE_BELOW_0 else -math.inf
+    known = np.array([n is not None and n >= lowest_known for n in numbers], dtype=np.bool_)
+    # The documentation of a field describes all peers. The column is that of one peer.
+    meaning = meaning_of_field.removeprefix("per peer, ")
     return Column(
         name=f"{stem}_{_to_word(name)}_{ending}",
         values=to_int_array((n or 0 for n in numbers), source, field),
         unit=unit,
-        meaning=f"{name}: {text.removeprefix('per peer, ')}",
+        meaning=f"{name}: {meaning}",
         source=f"{field}.{name}",
         known=None if known.all() else known,
     )

@@ -293,21 +293,28 @@ class LogFile:
     def flush(self) -> None:
         """Writes all stored data to the file.
 
-        If the disk is full, the disk space that was reserved for the end of the file is used
-        for these data.
+        There are three cases:
+
+        1. There was no error so far. Before the data are written, disk space is reserved for
+           them and for the end of the file.
+        2. The disk refuses the data for the first time. The reserved space is released, and the
+           data are written once more. If this succeeds, they are in the file, but the error is
+           raised nevertheless, so that the caller stops and writes only the end of the file.
+        3. The disk refuses the data even then. The file is cut off at the end of the previous
+           flush. Every later call raises the first error.
 
         Raises:
-            OSError: The disk refuses the data, now or in an earlier call. At the first refusal
-                the reserved space is used, and if it is sufficient, the data are in the file
-                nevertheless. Afterwards only the end of the file may be written.
+            OSError: The disk refuses the data, now or in an earlier call. Only the end of the
+                file may be written afterwards.
         """
         if self._broken and self.disk_error:
             raise self.disk_error
         try:
-            if self._pending and not self.disk_error:
+            has_had_error = self.disk_error is not None
+            if self._pending and not has_had_error:
                 self._room.grow(len(self._pending) + self._end_bytes + RESERVE_MARGIN_BYTES)
             self._write_pending()
-            if not self.disk_error:
+            if not has_had_error:
                 self._syncing.sync_new()
         except OSError as error:
             self.disk_error = self.disk_error or error
@@ -412,7 +419,17 @@ class LogFile:
         self.end(error)
 
     def refused(self, error: OSError) -> LogRefused:
-        """Composes the error for the user after the disk refused data. The file must be closed.
+        """Composes the error for the user after the disk refused data.
+
+        The file must be closed before, because the text depends on what became of it:
+
+        - The reserved space was sufficient for the end: the log is finished, under its final
+          name (`path`), with the data up to the error.
+        - Nothing was written: there is no file.
+        - The log is finished, and no write failed, but the file could not be renamed: it keeps
+          its working name.
+        - Otherwise the file has no proper end, and keeps its working name. The user can recover
+          it.
 
         Args:
             error: The error of the operating system.
@@ -432,8 +449,9 @@ class LogFile:
             )
         if not self.size:
             return LogRefused(f"{self.path}: {problem}; nothing was written; {advice}")
-        # On Windows, the file to replace may be open in another program.
-        if self.whole and self.disk_error is None:
+        has_only_renaming_failed = self.whole and self.disk_error is None
+        if has_only_renaming_failed:
+            # On Windows, the file to replace may be open in another program.
             return LogRefused(
                 f"{self.path}: {problem}; the finished log is {self.working}: give it a name"
             )

@@ -352,28 +352,38 @@ class Log(Result, Mapping[str, SiteLog]):
         """Numbers of received and missing messages of each topic, as a line of text per topic.
 
         The recorder writes them at the end of a file. The dictionary is empty for a file that
-        was not finished. For several files, the messages of all files are counted together.
+        was not finished. If the log consists of several files, no file states the counts of all
+        messages. Therefore the records, statistics and events of all files are counted again.
+        The counts that belong to no topic, such as those of dropped messages, cannot be counted
+        again. They are the sums of the files, which `merge` has computed.
         """
         written = self._contents.metadata.get(ACCOUNTS, {})
-        if len(self.sources) == 1:
+        has_one_file = len(self.sources) == 1
+        if has_one_file:
             return written
+
         accounts = SessionAccounts(self.session["session"], self.scenario)
-        for name in self.sites:
-            record_topic = self._topic(name, topics.STATE)
-            link_topic = self._topic(name, topics.LINK)
+        for site in self.sites:
+            record_topic = self._topic(site, topics.STATE)
+            link_topic = self._topic(site, topics.LINK)
             accounts.open_channel(record_topic)
             accounts.open_channel(link_topic)
-            accounts.open_channel(self._topic(name, topics.EVENT))
-            for tick in self[name].tick.tolist():
+            accounts.open_channel(self._topic(site, topics.EVENT))
+            # The sequence number of records and of statistics in a log is their tick.
+            for tick in self[site].tick.tolist():
                 accounts.receive(record_topic, tick)
-            for stats in self.link_stats(name):
+            for stats in self.link_stats(site):
                 accounts.receive(link_topic, stats.tick)
         for event in self.events:
-            if event.member in self.sites and event.n >= 0:
+            has_number = event.n >= 0  # events of the oldest logs have none
+            if event.member in self.sites and has_number:
                 accounts.receive_event(self._topic(event.member, topics.EVENT), event.n, event)
-        for name, ticks in self._stated_ticks.items():
-            accounts.add_expected_ticks(name, ticks)
-        return {**accounts.format_accounts(), **written}
+        # The sites state in their "end" events how many ticks they executed. Further records up
+        # to there are missing.
+        for site, ticks in self._stated_ticks.items():
+            accounts.add_expected_ticks(site, ticks)
+        other_counts = written
+        return {**accounts.format_accounts(), **other_counts}
 
     def account(self, site: str) -> str:
         """Returns how many records of a site were received and how many are missing.

@@ -246,25 +246,33 @@ def _signed_bytes(chain: Mapping[str, str]) -> bytes:
 
 
 def _read_chain(path: Path, progress: Progress | None) -> tuple[Integrity, dict[str, str]]:
-    """Reads a log, and compares it with its digests.
+    """Reads a whole log, and compares it with the digests that it states at its end.
+
+    Digests are checksums of the contents (`running_digest`), which are computed again while the
+    log is read. A log whose digests agree (`DigestState.INTACT`), but whose end mark is
+    missing, counts as unfinished (`DigestState.OPEN`), so that it is not signed.
 
     Args:
         path: The log.
         progress: Function that is called after every record of the log.
 
     Returns:
-        The result of the comparison, and the digests that the log states.
+        The result of the comparison, and the stated digests by name. They are empty if the log
+        states none.
 
     Raises:
         LogError: The log cannot be read.
     """
     with reading(path) as stream:
         reader = McapReader(stream, str(path), progress, kept=False)
+        # The reader computes the digests while its messages are iterated. The messages
+        # themselves are not needed: a deque of length 0 discards them.
         deque(reader.messages(), maxlen=0)
     integrity = reader.judge_digest()
     if integrity.state is DigestState.INTACT and not reader.complete:
         integrity = Integrity(DigestState.OPEN, "the end of the file is missing")
-    return integrity, reader.metadata.get(DIGESTS, {})
+    stated_digests = reader.metadata.get(DIGESTS, {})
+    return integrity, stated_digests
 
 
 def _load_key(path: Path, kind: Any, expected: str) -> Any:

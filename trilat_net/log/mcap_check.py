@@ -63,10 +63,11 @@ class FileCheck:
         # Statistics, end of the data and footer as (offset, record), by opcode.
         self._end_records: dict[int, Any] = {}
         self._undefined_channels: set[int] = set()
-        # Offset of the message index of each channel, for the last chunk. None after a chunk
-        # that cannot be read.
+        # Offset of the message index of each channel, for the last chunk. The indexes follow
+        # the chunk, and are added when they are read. None after a chunk that cannot be read.
         self._message_indexes: dict[int, int] | None = None
-        # Log times and offsets of each channel's messages in the last chunk, alternately.
+        # Log times and offsets of each channel's messages in the last chunk, alternately, as a
+        # message index contains them. An offset is that of the record in the unpacked chunk.
         self._entries: dict[int, array[int]] = {}
         # An unreadable record may have defined a channel, so that undefined channels are not
         # reported after it.
@@ -125,39 +126,47 @@ class FileCheck:
     def _check_other(
         self, frame: mcap_records.RecordFrame, content: bytes, record: Any
     ) -> None:
-        """Checks metadata or an attachment, or stores a record at the end of the file.
+        """Notes metadata, an attachment, an index entry or another record of the file's end.
 
-        The records at the end are compared with the data when the whole file has been read.
+        Metadata and attachments must appear in the index at the end of the file. The entry that
+        they must have there is noted as expected. The entries of the index that are read later
+        are noted as stated. When the whole file has been read, `_compare_index` compares both.
+        An entry of a metadata record or an attachment is (size of the record, name). An entry
+        of a chunk is (size of the record, first and last log time, offsets of the message
+        indexes by channel), see `_check_chunk`. All other records are noted for `_compare_end`.
+
+        Args:
+            frame: Kind and place of the record.
+            content: Content of the record.
+            record: The decoded content.
 
         Raises:
             UnreadableRecord: The checksum of an attachment differs.
         """
         match frame.opcode:
             case Opcode.METADATA:
-                self._expected_index[Opcode.METADATA_INDEX, frame.offset] = (
-                    frame.size,
-                    record.name,
-                )
+                indexed_as = Opcode.METADATA_INDEX, frame.offset
+                self._expected_index[indexed_as] = frame.size, record.name
             case Opcode.ATTACHMENT:
                 if not mcap_records.has_right_crc(content):
                     raise mcap_records.UnreadableRecord(
                         "the CRC of an attachment does not match its content"
                     )
-                self.counts["crcs"] += content[-4:] != bytes(4)
-                self._expected_index[Opcode.ATTACHMENT_INDEX, frame.offset] = (
-                    frame.size,
-                    record.name,
-                )
+                # The last 4 bytes are the checksum. A checksum of 0 means that there is none.
+                has_crc = content[-4:] != bytes(4)
+                self.counts["crcs"] += has_crc
+                indexed_as = Opcode.ATTACHMENT_INDEX, frame.offset
+                self._expected_index[indexed_as] = frame.size, record.name
             case Opcode.METADATA_INDEX | Opcode.ATTACHMENT_INDEX:
                 self._stated_index[frame.opcode, record.offset] = record.length, record.name
             case Opcode.CHUNK_INDEX:
-                entry = (
+                chunk_entry = (
                     record.chunk_length,
                     record.message_start_time,
                     record.message_end_time,
                     record.message_index_offsets,
                 )
-                self._stated_index[frame.opcode, record.chunk_start_offset] = entry
+                self._stated_index[frame.opcode, record.chunk_start_offset] = chunk_entry
             case _:
                 self._end_records[frame.opcode] = frame.offset, record
 
@@ -223,6 +232,12 @@ class FileCheck:
     ) -> None:
         """Checks the records of a chunk, and notes the entries that the index should contain.
 
+        Two indexes refer to a chunk. A message index of each channel follows the chunk, and is
+        compared with the messages by `_check_message_index`. The entry of the chunk in the
+        index of the file states, besides its size and times, where these message indexes are.
+        They are read only after this method. Therefore the expected entry contains a dictionary
+        that `_check_message_index` fills.
+
         Args:
             frame: Place of the chunk.
             content: Content of the chunk.
@@ -231,18 +246,22 @@ class FileCheck:
         Raises:
             UnreadableRecord: The chunk cannot be unpacked, or contains an invalid record.
         """
+        # If the chunk cannot be read (exception), its message indexes are not checked.
         self._message_indexes = None
         head = self._scanner.head(frame)
         self.counts["chunks"] += 1
         data = data or mcap_records.unpack_chunk(content)
-        self.counts["crcs"] += bool(head.crc)
+        has_crc = bool(head.crc)  # 0 means that there is no checksum
+        self.counts["crcs"] += has_crc
         self._entries.clear()
         for opcode, begin, end in mcap_records.iterate_records(data):
             if opcode == mcap_records.OP_MESSAGE:
                 channel, log_ns = self._check_message(frame, data, begin, end)
+                # `begin` is the offset of the content, behind the head of the record.
+                record_offset = begin - mcap_records.RECORD_HEAD_BYTES
                 entries = self._entries.setdefault(channel, array("Q"))
                 entries.append(log_ns)
-                entries.append(begin - mcap_records.RECORD_HEAD_BYTES)
+                entries.append(record_offset)
             elif opcode in mcap_records.DEFINITIONS:
                 self._define(frame, opcode, data[begin:end])
             else:
@@ -250,10 +269,8 @@ class FileCheck:
                 self._add("records", frame.offset, text)
 
         self._message_indexes = {}
-        # The offsets of the message indexes are added to the dictionary when those records
-        # follow.
-        entry = frame.size, head.start_ns, head.end_ns, self._message_indexes
-        self._expected_index[Opcode.CHUNK_INDEX, frame.offset] = entry
+        expected_entry = frame.size, head.start_ns, head.end_ns, self._message_indexes
+        self._expected_index[Opcode.CHUNK_INDEX, frame.offset] = expected_entry
 
     def _check_message_index(self, frame: mcap_records.RecordFrame, content: bytes) -> None:
         """Compares the index of one channel's messages with the messages of the last chunk.

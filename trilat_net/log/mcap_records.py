@@ -497,11 +497,17 @@ class RecordScanner:
         Returns:
             True if the summary has this checksum.
         """
-        begin = footer.summary_start
-        last = self.size - FOOTER_BYTES
-        if not 0 <= begin <= last:
+        summary_start = footer.summary_start
+        footer_start = self.size - FOOTER_BYTES
+        if not 0 <= summary_start <= footer_start:
             return False
-        return self.crc(begin or last, self.size - len(MAGIC) - 4) == footer.summary_crc
+        # The checksum covers the summary and the footer up to the checksum itself, which is the
+        # last field of the footer. A start of 0 means that there is no summary. Then only the
+        # footer is covered.
+        crc_bytes = 4
+        covered_start = summary_start or footer_start
+        covered_end = self.size - len(MAGIC) - crc_bytes
+        return self.crc(covered_start, covered_end) == footer.summary_crc
 
 
 def has_right_crc(attachment: bytes) -> bool:

@@ -341,7 +341,10 @@ class _FileCopy:
         library = f"{survey.library or 'unknown'}, recovered by trilat-net {version}"
         self._out = McapWriter(file, library, survey.profile)
         self._accounts = open_session_accounts(survey.metadata, survey.attachments)
+        # Check of messages by their content. None without a readable scenario, which the check
+        # needs, and for files of other programs.
         self._content = _create_content_check(survey, self._accounts)
+        # Offset of the record that ends the data. Until it is read, all records are data.
         self._data_end = reader.size + 1
         self.is_session_log = survey.is_session_log
         # True until a message, metadata or an attachment is copied.
@@ -536,7 +539,18 @@ class _FileCopy:
             )
 
     def _copy_chunk(self, frame: mcap_records.RecordFrame, data: bytes) -> None:
-        """Copies the records of an unpacked chunk, if a checksum or its content proves them.
+        """Copies the records of an unpacked chunk, if there is evidence that they are right.
+
+        A chunk is a block of records, mostly with a checksum. There are four cases:
+
+        - The chunk has a checksum, which is valid: its records are copied. If the log contains
+          its scenario, the first messages must also belong to the run of the log.
+        - There is no checksum, but the scenario can be read: each message is checked by its
+          content (`content_check`).
+        - There is no checksum, and the log of a session has lost its scenario: nothing shows
+          that the messages are right, and none is copied.
+        - There is no checksum, and the file is from another program, which need not write
+          checksums: its records are copied.
 
         Args:
             frame: Place of the chunk.
@@ -544,7 +558,7 @@ class _FileCopy:
 
         Raises:
             UnreadableRecord: The chunk is not in its original place, is from another run, or
-                cannot be proved.
+                cannot be checked.
         """
         problem = self._survey.misplaced.get(frame.offset)
         if problem:
@@ -554,9 +568,11 @@ class _FileCopy:
             (opcode, data[begin:end])
             for opcode, begin, end in mcap_records.iterate_records(data)
         ]
-        if not head.crc and self._content is None and self.is_session_log:
+        has_checksum = bool(head.crc)
+        has_scenario = self._content is not None
+        if not has_checksum and not has_scenario and self.is_session_log:
             raise UnreadableRecord(f"a chunk {_UNPROVEN}")
-        if not head.crc and self._content is not None:
+        if not has_checksum and has_scenario:
             self._copy_unproven(records, (head.start_ns, head.end_ns))
             return
         if self._content is not None:
@@ -567,18 +583,27 @@ class _FileCopy:
     def _copy_single_message(self, content: bytes) -> None:
         """Copies a message that is not in a chunk, so that no checksum covers it.
 
+        In the log of a session, the content of the message must show that it is the next one of
+        its channel (`content_check`), which requires the scenario. Other programs may write
+        files without chunks, whose messages are copied unchecked.
+
+        Args:
+            content: Content of the message record.
+
         Raises:
-            UnreadableRecord: The content does not prove the message, or the file has chunks, so
-                that a message outside of them is the result of damage.
+            UnreadableRecord: The content contradicts the session or cannot be checked, or the
+                file of another program has chunks, so that a message outside of them is the
+                result of damage.
         """
         if self._content is not None:
-            self._copy_unproven([(mcap_records.OP_MESSAGE, content)], (0, _LAST_NS))
-        elif self.is_session_log:
+            any_time_ns = (0, _LAST_NS)  # no chunk limits the time of the message
+            self._copy_unproven([(mcap_records.OP_MESSAGE, content)], any_time_ns)
+            return
+        if self.is_session_log:
             raise UnreadableRecord(f"a message {_UNPROVEN}")
-        elif self._survey.is_chunked:
+        if self._survey.is_chunked:
             raise UnreadableRecord("a message lies outside of the chunks")
-        else:
-            self._copy_chunk_record(mcap_records.OP_MESSAGE, content)
+        self._copy_chunk_record(mcap_records.OP_MESSAGE, content)
 
     def _copy_chunk_record(self, opcode: int, content: bytes) -> None:
         """Copies a message, or notes a definition. Other records of a chunk are ignored.
@@ -635,7 +660,12 @@ class _FileCopy:
             self._copy_chunk_record(opcode, content)
 
     def _check_unproven(self, opcode: int, content: bytes, span_ns: tuple[int, int]) -> None:
-        """Checks that the content of a record proves the record.
+        """Checks a record that no checksum covers, by what its content states.
+
+        In the log of a session, a message states its sender, its number and its time, which
+        must agree with its channel, with the previous messages and with the scenario
+        (`content_check`). Messages of other programs state nothing of this kind. Of them, only
+        the arrival time is compared with the time range of the chunk.
 
         Args:
             opcode: Kind of the record.
@@ -643,7 +673,7 @@ class _FileCopy:
             span_ns: First and last arrival time of the chunk, in Unix time, in ns.
 
         Raises:
-            UnreadableRecord: The record is not proved.
+            UnreadableRecord: The content contradicts its place in the file.
         """
         if opcode in mcap_records.DEFINITIONS:
             self._check_unproven_definition(opcode, content)
@@ -660,30 +690,42 @@ class _FileCopy:
             raise UnreadableRecord(
                 f"a message belongs to channel {number}, which no record defines"
             )
+        _, topic = channel
+        first_ns, last_ns = span_ns
         if self._content is not None:
             self._content.check(
-                topic=channel[1],
+                topic=topic,
                 sequence=sequence,
                 log_ns=log_ns,
                 publish_ns=publish_ns,
                 payload=payload,
                 span_ns=span_ns,
             )
-        elif not span_ns[0] <= log_ns <= span_ns[1]:
+        elif not first_ns <= log_ns <= last_ns:
             raise UnreadableRecord(
                 "the log time of a message lies outside the time range of its chunk"
             )
 
     def _check_unproven_definition(self, opcode: int, content: bytes) -> None:
-        """Checks a schema or channel that no checksum covers, and notes it.
+        """Checks a schema or channel that no checksum covers, and adds it to the definitions.
+
+        The topic of a channel may show for the first time that the file is the log of a
+        session. If its scenario is missing, the messages of the session cannot be checked, and
+        no further messages without a checksum are copied.
+
+        Args:
+            opcode: Kind of the definition: schema or channel.
+            content: Content of the definition.
 
         Raises:
-            UnreadableRecord: A channel cannot belong to this session.
+            UnreadableRecord: A channel belongs to no member of this session, or to a session
+                whose scenario is missing.
         """
         entry = mcap_records.parse_record(opcode, content)
         if opcode == Opcode.CHANNEL:
             is_session_topic = entry.topic.startswith(f"/{topics.ROOT}/")
-            if is_session_topic and self._content is None:
+            has_scenario = self._content is not None
+            if is_session_topic and not has_scenario:
                 self.is_session_log = True
                 raise UnreadableRecord(_NO_SCENARIO)
             if not self._is_plausible(entry.topic):
@@ -711,11 +753,13 @@ class _FileCopy:
         return self._content.owns_channel(topic)
 
     def _find_channel(self, number: int, payload: bytes) -> tuple[int, str] | None:
-        """Finds the channel of the new file for a message of the source.
+        """Finds the channel of the new file for a message of the source, or registers it.
 
         In the log of a session, the first message of a channel decides, because a message names
         its sender and its kind. The definition of the channel is less reliable, because no
-        checksum covers it in a file that was not finished.
+        checksum covers it in a file that was not finished. If the two contradict each other,
+        the channel is defined anew from the message, and its topic is noted as a loss. The
+        further messages of the channel then go to the same channel.
 
         Args:
             number: Channel number in the source.
@@ -732,8 +776,11 @@ class _FileCopy:
 
         self._identified.add(number)
         topic = self._content.identify(payload) if self._content is not None else ""
-        if not topic or (known is not None and known[1] == topic):
+        is_unidentified = not topic
+        does_definition_agree = known is not None and known[1] == topic
+        if is_unidentified or does_definition_agree:
             return known or self._open_channel(number)
+
         self._misnamed.append(topic)
         channel = self._new_topics.get(topic) or self._open_session_channel(topic)
         self._new_channels[number] = channel
@@ -817,13 +864,17 @@ class _FileCopy:
         """Copies the messages that can be read from the last chunk, if it is incomplete.
 
         The rest of the chunk is added to the losses, or the whole record if it is not a chunk.
-        An incomplete index is no loss.
+        An incomplete index is no loss, because the index of the new file is computed again.
 
         Args:
-            torn: The part from which the end of the file is missing.
+            torn: The part from which the end of the file is missing: the last record, which is
+                incomplete. Its length is 0 if the file ends between two records.
         """
+        # The first byte of a record states its kind.
         opcode = int.from_bytes(self._scanner.read(torn.offset, 1), "little")
-        if not torn.length or opcode in _REGENERATED or torn.offset > self._data_end:
+        is_between_records = not torn.length
+        is_part_of_index = opcode in _REGENERATED or torn.offset > self._data_end
+        if is_between_records or is_part_of_index:
             return
         if opcode != Opcode.CHUNK:
             self._result.add_loss(str(torn), torn.length)
@@ -841,20 +892,28 @@ class _FileCopy:
         )
 
     def _salvage(self, offset: int) -> str:
-        """Copies the records of an incomplete chunk, block by block.
+        """Copies the records of an incomplete chunk that can still be unpacked.
+
+        The chunk was compressed in blocks, which can be unpacked one after another up to the
+        place where the file ends. The checksum of the chunk covers the missing part as well, so
+        that it is of no use. Therefore each message must be checked by its content. In the log
+        of a session this requires the scenario.
 
         Args:
-            offset: Offset of the chunk.
+            offset: Offset of the chunk in the source file.
 
         Returns:
-            The problem that ended the copy. Empty if all blocks were copied.
+            The problem that ended the copy, as a text for the user. Empty if all blocks were
+            copied.
         """
-        if self._content is None and self.is_session_log:
+        can_check_messages = self._content is not None or not self.is_session_log
+        if not can_check_messages:
             return _NO_SCENARIO
         try:
-            torn = TornChunk.read(self._scanner, offset)
-            for records in torn.iterate_blocks():
-                self._copy_unproven(records, (torn.head.start_ns, torn.head.end_ns))
+            torn_chunk = TornChunk.read(self._scanner, offset)
+            for records in torn_chunk.iterate_blocks():
+                span_ns = (torn_chunk.head.start_ns, torn_chunk.head.end_ns)
+                self._copy_unproven(records, span_ns)
         except UnreadableRecord as error:
             return str(error)
         return ""
@@ -952,16 +1011,28 @@ class _FileCopy:
         return False
 
     def _judge_source_chain(self) -> DigestState:
-        """Returns the result of comparing the source with its digests.
+        """Compares the source with the digests that it states, to reveal later changes.
 
-        If a definition is damaged among the data, but intact in the index, the digests differ,
-        although no message was changed. This does not count as a change.
+        A log states two digests (checksums): one of its messages, and one of the definitions of
+        its schemas and channels and of its metadata. Both are compared.
+
+        A definition is stored twice: among the data, and in the summary at the end of the file.
+        If it was damaged among the data, but is intact in the summary, the second digest
+        differs, although no message was changed. The recovery then uses the intact definition,
+        so that the source counts as damaged (OPEN) and not as changed by somebody.
+
+        Returns:
+            The result, see `DigestState`. OPEN also if the file lacks its first bytes, which
+            mark it as an MCAP file.
         """
-        if not self._scanner.begins:
+        has_first_mark = self._scanner.begins
+        if not has_first_mark:
             return DigestState.OPEN
         state = self._reader.judge_digest().state
-        is_repaired = self._survey.is_redefined and self._reader.agrees_on_messages
-        if state is DigestState.CHANGED and is_repaired:
+        is_only_definition_damaged = (
+            self._survey.is_redefined and self._reader.agrees_on_messages
+        )
+        if state is DigestState.CHANGED and is_only_definition_damaged:
             return DigestState.OPEN
         return state
 

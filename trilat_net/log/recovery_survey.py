@@ -169,6 +169,9 @@ class RecoverySurvey:
         """Reads a record that describes the file.
 
         It is a header, metadata, an attachment, the statistics or an entry of the chunk index.
+        A damaged file may contain several sessions and scenarios, of which `_choose_session`
+        chooses later. Therefore all of them are collected. Of other attachments with the same
+        name, the first one counts.
 
         Args:
             frame: Place of the record.
@@ -190,8 +193,9 @@ class RecoverySurvey:
                 self.count = record.message_count
             case Opcode.CHUNK_INDEX:
                 self._chunk_indexes[record.chunk_start_offset] = record
-            case _:
+            case _:  # an attachment, the only other kind in `_DESCRIBING`
                 if record.name == SCENARIO and mcap_records.has_right_crc(content):
+                    # The last 4 bytes are the checksum. A checksum of 0 covers nothing.
                     is_covered = content[-4:] != bytes(4)
                     self._scenarios.append((record.data, is_covered))
                 self.attachments.setdefault(record.name, record.data)
@@ -199,47 +203,63 @@ class RecoverySurvey:
     def _choose_session(self) -> None:
         """Chooses the session and the scenario that belong together.
 
-        The metadata of a session contain the SHA-256 of its scenario. If no session names a
-        scenario of the file, a scenario counts that a checksum covers. A checksum of 0 covers
-        nothing: a page of zeros in the file may have replaced the original one.
+        The metadata of a session contain the SHA-256 of its scenario. The first session whose
+        scenario is in the file is chosen, together with that scenario.
+
+        If there is no such pair, the first session and the first scenario that a checksum
+        covers are chosen. A checksum of 0 covers nothing: a page of zeros in the file may have
+        replaced the original one.
         """
         self.attachments.pop(SCENARIO, None)
-        covered = [text for text, is_covered in self._scenarios if is_covered]
-        if covered:
-            self.attachments[SCENARIO] = covered[0]
-
-        digests = {hashlib.sha256(text).hexdigest(): text for text, _ in self._scenarios}
+        scenarios_by_digest = {
+            hashlib.sha256(text).hexdigest(): text for text, _ in self._scenarios
+        }
         for session, _ in self._sessions:
-            if session.get("scenario_sha256") in digests:
+            digest = session.get("scenario_sha256", "")
+            if digest in scenarios_by_digest:
                 self.metadata[SESSION] = session
-                self.attachments[SCENARIO] = digests[session["scenario_sha256"]]
+                self.attachments[SCENARIO] = scenarios_by_digest[digest]
                 return
+
+        covered_scenarios = [text for text, is_covered in self._scenarios if is_covered]
+        if covered_scenarios:
+            self.attachments[SCENARIO] = covered_scenarios[0]
         if self._sessions:
-            self.metadata[SESSION], _ = self._sessions[0]
+            first_session, _ = self._sessions[0]
+            self.metadata[SESSION] = first_session
 
     def _judge_messages(self) -> None:
-        """Compares the messages of the first chunks with the session that the file names.
+        """Removes the session that the file names, if the messages belong to another session.
 
-        If the messages belong to another session, the stated session is removed. Only chunks
-        with a checksum are evidence against the stated session. Any chunk may show that the
-        file is the log of a session at all.
+        The messages of the first chunks are decoded. They show to which session they belong, by
+        its epoch (start time) and by the boots of their senders, the numbers that identify the
+        starts of the processes. Only chunks with a checksum are evidence against the named
+        session. Any chunk may show that the file is the log of a session at all.
+
+        If the epochs differ, the session is another one with, as a rule, another name. If only
+        the boots differ, as in simulated time, where all epochs are 0, it may have the same
+        name.
         """
-        origins = MessageOrigins(set(), set())
+        covered_origins = MessageOrigins(set(), set())
         for frame, head in self._chunks[:_SAMPLED_CHUNKS]:
             with suppress(UnreadableRecord):
                 data = mcap_records.unpack_chunk(self._scanner.content(frame))
-                stated = find_origins(data)
-                self.is_session_log |= bool(stated.boots) or _names_session(data)
-                if head.crc:
-                    origins.epochs_ns.update(stated.epochs_ns)
-                    origins.boots.update(stated.boots)
+                origins = find_origins(data)
+                self.is_session_log |= bool(origins.boots) or _names_session(data)
+                has_checksum = bool(head.crc)
+                if has_checksum:
+                    covered_origins.epochs_ns.update(origins.epochs_ns)
+                    covered_origins.boots.update(origins.boots)
 
-        session = self.metadata.get(SESSION, {})
-        epochs = set(map(str, origins.epochs_ns))
-        if session and epochs and session.get("epoch_unix_ns", "") not in epochs:
-            self._reject_session(session, is_renamed=True)
-        elif session and has_foreign_boots(session, origins.boots):
-            self._reject_session(session, is_renamed=False)
+        named_session = self.metadata.get(SESSION, {})
+        if not named_session:
+            return
+        epochs = set(map(str, covered_origins.epochs_ns))  # metadata contain texts
+        has_other_epoch = bool(epochs) and named_session.get("epoch_unix_ns", "") not in epochs
+        if has_other_epoch:
+            self._reject_session(named_session, is_renamed=True)
+        elif has_foreign_boots(named_session, covered_origins.boots):
+            self._reject_session(named_session, is_renamed=False)
 
     def _reject_session(self, session: dict[str, str], *, is_renamed: bool) -> None:
         """Removes a session that belongs to another log.

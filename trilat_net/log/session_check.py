@@ -543,34 +543,45 @@ class SessionCheck:
                 )
 
     def _begin_channel(self, channel: ChannelInfo) -> ChannelCheck | None:
-        """Returns the check of a channel's messages, and checks the channel's description.
+        """Begins the check of a channel in the present file, when its first message is read.
 
-        None for channels that are not a member's, such as those for viewers.
+        The description of the channel (its schema, encoding and metadata) is checked at once,
+        and problems are added to the finding "schema". There are three kinds of channels:
+        channels for viewers, channels of the session's members, and channels of other programs.
+        Messages are compared with the session only for the members' channels.
 
         Args:
             channel: Description of the channel in the present file.
+
+        Returns:
+            The check of the messages, which is continued from the previous file of the log.
+            None if the channel is not one of a member of this session.
         """
         topic = channel.topic
+        shown_topic = topic[:80]  # a damaged file may contain a topic of any length
         finding = self._findings["schema"]
-        if topic.startswith(VIZ_ROOT):
+        is_for_viewers = topic.startswith(VIZ_ROOT)
+        if is_for_viewers:
             self._check_view_channel(channel)
             return None
 
         key = topics.parse_key(topic.removeprefix("/"))
-        if (
-            key is None
-            or key.channel not in CHANNEL_TYPES
-            or key.session != self._about["session"]
-            or key.boot
-        ):
+        # A key with a boot announces the presence of a process, and carries no messages.
+        is_of_member = (
+            key is not None
+            and key.channel in CHANNEL_TYPES
+            and key.session == self._about["session"]
+            and not key.boot
+        )
+        if key is None or not is_of_member:
             if not channel.schema:
-                finding.add(self._file, None, f"{topic[:80]}: has no schema")
+                finding.add(self._file, None, f"{shown_topic}: has no schema")
             return None
 
         if topic not in self.channels:
             if self._scenario and key.member not in (*self._scenario.sites, topics.RECORDER):
                 finding.add(
-                    self._file, None, f"{topic[:80]}: the scenario has no member of this name"
+                    self._file, None, f"{shown_topic}: the scenario has no member of this name"
                 )
             self._counted.open_channel(topic)
             self.channels[topic] = ChannelCheck(
@@ -680,10 +691,16 @@ class SessionCheck:
         return all(map(channel_filter.accepts, keys)) and not is_single_part
 
     def _check_accounts(self) -> Finding:
-        """Returns the finding on the message counts that the recorder wrote into the file.
+        """Compares the accounts, the recorder's counts of messages, with the messages.
 
-        They are compared with the messages of the file. The comparison is not possible if the
-        counts include messages of parts that were not read, or if several recorders wrote.
+        At the end of a file, the recorder states for each channel how many messages it received
+        and how many are missing. The comparison is not possible if these counts include
+        messages of parts that were not read, or if several recorders wrote the log. The
+        recorder's own statistics have no numbers, so that their counts cannot be compared.
+        Since version `_ACCOUNTS_SINCE` of the schema, every channel must have an account.
+
+        Returns:
+            The finding, with a problem for each channel whose account is wrong or missing.
         """
         finding = self._findings["accounts"]
         if not self._accounts:
@@ -700,19 +717,26 @@ class SessionCheck:
             if check.kind != topics.STATS:
                 missing = sum(account.missing for account in self._counted.list_starts(topic))
                 counted = {"received": check.received, "missing": missing}
-                for name, count in stated.items():
-                    if count != counted[name]:
-                        account = f"{check.name}: the account states {count} {name}"
-                        finding.add("", None, f"{account}, but the file has {counted[name]}")
-            if not stated and self._version >= _ACCOUNTS_SINCE:
+                for name, stated_count in stated.items():
+                    if stated_count != counted[name]:
+                        text = f"{check.name}: the account states {stated_count} {name}"
+                        # The problem concerns the whole log: no file, no offset.
+                        finding.add("", None, f"{text}, but the file has {counted[name]}")
+            must_have_account = self._version >= _ACCOUNTS_SINCE
+            if not stated and must_have_account:
                 finding.add("", None, f"{check.name}: has no account")
         return finding.conclude("agree with the messages")
 
     def _check_rates(self) -> Finding:
-        """Returns the finding on the rates at which the sites sent records.
+        """Compares the rates at which the sites sent records with the rates of the scenario.
 
-        The rate is computed from the numbers and sending times of the first and the last
-        record. Short recordings are not judged.
+        The number of a record is its tick. The mean rate is therefore the difference between
+        the numbers of the first and the last record, divided by the time between them. It may
+        deviate by the fraction `_RATE_TOLERANCE`. Records over less than `_RATE_SPAN_NS` are
+        not judged.
+
+        Returns:
+            The finding, with a problem for each site whose rate is wrong.
         """
         finding = self._findings["rates"]
         texts = []
@@ -720,13 +744,17 @@ class SessionCheck:
             is_site_record = check.kind == topics.STATE and bool(check.rate_hz)
             if not is_site_record or check.first is None or check.last is None:
                 continue
-            span_ns = check.last[1] - check.first[1]
+            first_tick, first_sent_ns = check.first
+            last_tick, last_sent_ns = check.last
+            span_ns = last_sent_ns - first_sent_ns
             if span_ns < _RATE_SPAN_NS:
                 continue
-            rate_hz = (check.last[0] - check.first[0]) * NS_PER_S / span_ns
+            rate_hz = (last_tick - first_tick) * NS_PER_S / span_ns
             texts.append(f"{check.member} {rate_hz:.1f} Hz")
-            if abs(rate_hz / check.rate_hz - 1) > _RATE_TOLERANCE:
+            relative_error = rate_hz / check.rate_hz - 1
+            if abs(relative_error) > _RATE_TOLERANCE:
                 sent = f"{check.member} sent {rate_hz:.1f} records a second"
+                # The problem concerns the whole log: no file, no offset.
                 finding.add("", None, f"{sent}, but the scenario says {check.rate_hz}")
         return finding.conclude(", ".join(texts) or "the log is too short to measure them")
 
@@ -758,21 +786,34 @@ def judge_integrity(log: Log) -> Integrity:
 def _describe_unexplained_gap(log: Log, site: str) -> str:
     """Describes missing or additional records of a site that the log does not explain.
 
-    The recorder states which messages it missed, in the counts at the end of the file and in
-    its statistics. Any other gap shows that records were removed, or that two logs were
-    joined.
+    The recorder states how many records it received and missed, in the account of the site at
+    the end of the file and in its statistics during the recording. Other gaps show that records
+    were removed, or that two logs were joined. Two tests are made:
+
+    1. The account must agree with the records. This is not tested if there is no account (the
+       file was not finished), if the file is only a part of a log (the account includes other
+       parts), or if the log consists of several files (see below).
+    2. The ticks must be consecutive, except for ticks that the site did not execute, and for as
+       many records as the recorder states to have missed. This is not tested if the digests,
+       checksums of all messages, show that nothing was changed.
+
+    Args:
+        log: The log.
+        site: Name of the site.
 
     Returns:
         The description. Empty if the records agree with the statements of the recorder, or if
-        a part of the file cannot be read.
+        a part of the file cannot be read, so that records may be missing for this reason.
     """
     if log.damaged:
         return ""
     ticks = np.unique(log[site].tick)
     # The counts of several files were computed from their records, and prove nothing.
-    stated = parse_counts(log.account(site)) if len(log.sources) == 1 else {}
+    has_one_file = len(log.sources) == 1
+    stated = parse_counts(log.account(site)) if has_one_file else {}
     counted = {"received": len(ticks), "missing": log.missing(site)}
-    if not log.part and stated not in ({}, counted):
+    has_account = stated != {}
+    if not log.part and has_account and stated != counted:
         stated_text = " and ".join(f"{stated.get(name, 0)} {name}" for name in counted)
         counted_text = " and ".join(f"{count} {name}" for name, count in counted.items())
         return (
@@ -780,12 +821,18 @@ def _describe_unexplained_gap(log: Log, site: str) -> str:
             f"{stated_text}, but the file has {counted_text}"
         )
 
-    gaps = int(ticks[-1] - ticks[0]) + 1 - len(ticks) if len(ticks) else 0
-    gaps -= min(gaps, log.absent_ticks(site))
-    if not gaps or log.chain.state is DigestState.INTACT:
+    # Number of ticks between the first and the last record that have no record.
+    ticks_without_record = int(ticks[-1] - ticks[0]) + 1 - len(ticks) if len(ticks) else 0
+    not_executed = min(ticks_without_record, log.absent_ticks(site))
+    missing = ticks_without_record - not_executed
+    if not missing or log.chain.state is DigestState.INTACT:
         return ""
-    reported = [stats.missing.get(f"{site}/state", 0) for stats in log.recorder_stats()]
-    if gaps <= max([stated.get("missing", 0), *reported]):
+    missing_in_account = stated.get("missing", 0)
+    missing_in_statistics = [
+        stats.missing.get(f"{site}/state", 0) for stats in log.recorder_stats()
+    ]
+    largest_stated = max([missing_in_account, *missing_in_statistics])
+    if missing <= largest_stated:
         return ""
-    missing = count_nouns(gaps, f"record of {site} is", f"records of {site} are")
-    return f"{missing} missing in between, and nothing in the log explains it"
+    missing_text = count_nouns(missing, f"record of {site} is", f"records of {site} are")
+    return f"{missing_text} missing in between, and nothing in the log explains it"

@@ -260,9 +260,25 @@ class SiteMessages:
     def _pack_shared_motion(
         self, record: State, stamp_ns: int, is_wanted: IsWanted
     ) -> NamedMessages:
-        """Encodes the pose of the end effector, its reference, and the wrench.
+        """Encodes the motion of the end effector, its reference, and the wrench on it.
 
-        This applies if the sites share the position or pose of the end effector.
+        This applies if the sites share the position or pose of the end effector instead of the
+        joint positions. The task scale enlarges or reduces the motion that the sites share:
+
+            shared motion = scale * motion of this arm.
+
+        A record contains shared quantities. Speeds and positions of this arm are therefore
+        divided by the scale. Forces of this arm are multiplied by it, so that the power, force
+        times speed, remains the same. Angles are not scaled.
+
+        Args:
+            record: The record of one tick of the site.
+            stamp_ns: Time of the record, in Unix time, in ns.
+            is_wanted: Function that returns True if a program has subscribed to the topic with
+                a name.
+
+        Yields:
+            The name of each wanted topic in trilat-net, and the message.
         """
         motions = [
             ("tip", record.x, record.xd),
@@ -275,12 +291,15 @@ class SiteMessages:
                 yield pose_topic, pose_data
             twist_topic = f"{subject}_twist"
             if is_wanted(twist_topic):
+                # The first three numbers are linear. The others, if there are any, are angular.
                 linear_rate = rate[:POSITION]
                 linear = [speed / self._scale for speed in linear_rate]
                 angular = _fill_rotation(rate)
                 yield twist_topic, self._pack_vectors(stamp_ns, linear, angular)
         if is_wanted("tip_wrench"):
-            # A record contains the wrench that Eq. (8) subtracts, the negative of this wrench.
+            # The message contains the wrench that acts on the arm. In the model of the arm,
+            # Eq. (8) of the paper, the exogenous wrench is subtracted. Therefore a record
+            # contains its negative.
             subtracted_force = record.wrench[:POSITION]
             subtracted_torque = _fill_rotation(record.wrench)
             force = [-self._scale * component for component in subtracted_force]
@@ -342,19 +361,35 @@ class SiteMessages:
         return self._arm.end_effector_orientation(record.q)
 
     def _pack_arrays(self, record: State, is_wanted: IsWanted) -> NamedMessages:
-        """Encodes the wanted arrays of a record."""
+        """Encodes the numbers of a record that have no standard ROS type, as labelled arrays.
+
+        These are the error e = q - q_des, and the arrays that viewers receive at a reduced rate
+        ("slow"): the exogenous torque, the estimated parameters, the numbers that the control
+        law sends, and the mode. In `pack_slow_arrays`, the slow arrays are encoded together,
+        and only the wanted ones are yielded.
+
+        Args:
+            record: The record of one tick of the site.
+            is_wanted: Function that returns True if a program has subscribed to the topic with
+                a name.
+
+        Yields:
+            The name of each wanted topic in trilat-net, and the message.
+        """
         channels = self._channels
-        topics = [_name_array_topic(name) for name in channels.record_arrays]
-        if not any(is_wanted(topic) for topic in topics):
+        array_topics = [_name_array_topic(name) for name in channels.record_arrays]
+        if not any(is_wanted(topic) for topic in array_topics):
             return
+        # Each curve has one value per record. For a single record, the first values of all
+        # curves are the numbers of that record. `error_row` and `slow_row` are slices of them.
         curves = stack_signals([record])
-        row = [curve[0] for curve in curves]
+        numbers = [curve[0] for curve in curves]
         if is_wanted("error"):
-            errors = row[channels.error_row]
+            errors = numbers[channels.error_row]
             error_array = channels.arrays["error"]
             yield "error", error_array.pack(*errors)
-        slow_values = row[channels.slow_row]
-        for name, data in channels.pack_slow_arrays(slow_values):
+        slow_numbers = numbers[channels.slow_row]
+        for name, data in channels.pack_slow_arrays(slow_numbers):
             topic = _name_array_topic(name)
             if is_wanted(topic):
                 yield topic, data

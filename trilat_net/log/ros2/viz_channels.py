@@ -159,6 +159,8 @@ class _SiteBuckets:
         references = [f"{name}_ref" for name in site_channels.joints]
         joint_names = [*site_channels.joints, *references]
         self._joint_state_packer = JointStatePacker(joint_names)
+        self._joint_count = joint_count
+        # Velocities or efforts of the references, which have none.
         self._not_measured = [math.nan] * joint_count
         joint_channel = site_channels.joint_states(joint_names)
         channels = {"joint_states": joint_channel, **site_channels.channels}
@@ -192,13 +194,27 @@ class _SiteBuckets:
         self._late_records: list[Record] = []
 
     def _write_fast(self, stamp_ns: int, row: SignalRow, log_ns: int) -> None:
-        """Writes the joints, their error and, for an arm with a URDF, its frames."""
-        n = len(self._not_measured)
+        """Writes the fast messages at one time: the joints, their error, and the arm's frames.
+
+        Each joint appears twice in the message `joint_states`: as itself, and as a second joint
+        "NAME_ref" with the angle of its reference, which has neither velocity nor effort.
+        Frames, the poses of the links, are written only for an arm that is described by a URDF
+        file. The file itself is written before the first frames.
+
+        Args:
+            stamp_ns: Time of the values, in Unix time, in ns.
+            row: Values of all curves at this time, see `ros2_messages.stack_signals`. For n
+                joints it begins with the positions, the references, the velocities and the
+                efforts (torques), n numbers each.
+            log_ns: Arrival time that the log states for the messages, in Unix time, in ns.
+        """
+        n = self._joint_count
+        positions_and_references = row[: 2 * n]
         velocity = row[2 * n : 3 * n]
         effort = row[3 * n : 4 * n]
         joint_states = self._joint_state_packer.pack(
             stamp_ns,
-            position=row[: 2 * n],
+            position=positions_and_references,
             velocity=[*velocity, *self._not_measured],
             effort=[*effort, *self._not_measured],
         )
@@ -231,20 +247,26 @@ class _SiteBuckets:
         """Adds a record of the site, and writes the messages that are complete now.
 
         Records are collected in buckets, intervals of equal length. A bucket becomes two
-        messages with the minimum and the maximum of each curve, as soon as a record after it
-        arrives.
+        messages with the minimum and the maximum of each curve. To space the messages evenly,
+        a bucket has two halves: when the first record of another bucket arrives, the first
+        message of the previous bucket is written. When a record of the second half arrives, the
+        second message of that previous bucket is written.
 
         Args:
             record: The record.
             log_ns: Arrival time, in Unix time, in ns.
         """
         tick = record.tick
-        if tick < self._first_tick:
+        is_bucket_written = tick < self._first_tick
+        if is_bucket_written:
             self._add_late_record(record, log_ns)
             return
-        if tick >= self._half_end_tick:
-            half = tick // self._half_ticks
+
+        begins_another_half = tick >= self._half_end_tick
+        if begins_another_half:
+            half = tick // self._half_ticks  # counted from tick 0
             bucket = half // 2
+            # Write the second message of the previous bucket, if it is still waiting.
             self._fast_output.flush(log_ns)
             if bucket != self._bucket:
                 self._close_bucket(bucket, log_ns)
@@ -288,24 +310,38 @@ class _SiteBuckets:
         self._slow_output.flush(log_ns)
 
     def _close_bucket(self, next_bucket: int, log_ns: int) -> None:
-        """Writes the first message of the open bucket, and opens the bucket `next_bucket`.
+        """Reduces the records of the open bucket to two messages, and opens another bucket.
 
-        The slow bucket is closed as well, if the next bucket is in another slow one.
+        The first message is written now, and the second one half a bucket later
+        (`_BucketOutput`). Records of older buckets that arrived late are written before.
+
+        The slow curves, such as the estimate, are reduced a second time: a slow bucket consists
+        of `_slow_ratio` fast buckets, and contains their extremes. It also becomes two
+        messages, the first one at its end and the second one half a slow bucket later.
+
+        Args:
+            next_bucket: Number of the bucket that is opened, counted from tick 0.
+            log_ns: Arrival time that the log states for the messages, in Unix time, in ns.
         """
         self._flush_late_records(log_ns)
         if self._records:
-            rows = self._decimate(self._records)
-            self._fast_output.add(rows, log_ns)
-            self._slow_rows += self._select_slow_columns(rows)
+            extremes = self._decimate(self._records)
+            self._fast_output.add(extremes, log_ns)
+            self._slow_rows += self._select_slow_columns(extremes)
             self._records = []
+
+        # Number of the half of a slow bucket in which a fast bucket begins. Two successive
+        # halves, beginning with an even one, form a slow bucket.
         slow_half = 2 * self._bucket // self._slow_ratio
         next_slow_half = 2 * next_bucket // self._slow_ratio
         if next_slow_half != slow_half:
+            # Half a slow bucket has passed: write the second message of the previous one.
             self._slow_output.flush(log_ns)
         is_slow_bucket_over = next_slow_half // 2 != slow_half // 2
         if is_slow_bucket_over and self._slow_rows:
-            stamps_ns, rows_of_curves = zip(*self._slow_rows, strict=True)
-            curves = zip(*rows_of_curves, strict=True)
+            # Transpose the values from a row per time to a curve per quantity.
+            stamps_ns, value_rows = zip(*self._slow_rows, strict=True)
+            curves = zip(*value_rows, strict=True)
             slow_extremes = _stamp_extremes(stamps_ns, curves)
             self._slow_output.add(slow_extremes, log_ns)
             self._slow_rows = []
@@ -327,22 +363,31 @@ class _SiteBuckets:
         return [(stamp_ns, row[slow_row]) for stamp_ns, row in rows]
 
     def _decimate(self, records: list[Record]) -> list[StampedRow]:
-        """Reduces the records of a bucket to the extremes of each curve. Sorts them by time.
+        """Reduces the records of a bucket to the minimum and the maximum of each curve.
+
+        A bucket is a time interval. Its two rows get the times at the beginning and in the
+        middle of the interval, so that the rows of successive buckets are evenly spaced. The
+        extremes of different curves occur at different times, so that no exact time exists.
+
+        Args:
+            records: The records of the bucket, at least one. They are sorted by time in place.
 
         Returns:
-            Two rows, or one row for a single record.
+            Two rows with their times, or one row for a single record.
         """
         # Records nearly always arrive in order, so that sorting costs little.
         records.sort(key=_get_tick)
         stamps_ns: list[int] = []
-        middle_index = len(records) // 2
-        middle_record = records[middle_index]
-        for record in (records[0], middle_record):
+        first_record = records[0]
+        middle_record = records[len(records) // 2]
+        for record in (first_record, middle_record):
             t_ns = record.tick * NS_PER_S // self._rate_hz
             stamp_ns = max(0, self._epoch_unix_ns + t_ns)
             stamps_ns.append(stamp_ns)
+        # A single record is both the first and the middle one, and needs only one time.
+        row_count = min(2, len(records))
         curves = ros2_messages.stack_signals(records)
-        return _stamp_extremes(stamps_ns[: len(records)], curves)
+        return _stamp_extremes(stamps_ns[:row_count], curves)
 
 
 def parse_viz_rate(text: str) -> float:
