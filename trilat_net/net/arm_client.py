@@ -401,32 +401,39 @@ class ArmClient(OutsideClient):
         self._sender.send(ArmMeasurement, **numbers, **stamp)
 
     def torque(self) -> tuple[float, ...] | None:
-        """Returns the torque to apply now in N m per joint, or None if the arm must brake.
+        """Returns the torque to apply now, or None if the arm must brake.
 
-        The arm must brake
+        The torque is that of the newest record, the result of one tick (period of the control
+        loop) of the site. The arm must brake
 
-        - before the first tick (period of the control loop) and after the run,
+        - before the first tick and after the run,
         - if the newest record is older than `FRESH_NS`,
         - `BRAKE_NS` after a fault or after the release of the dead-man switch. Until then the
           torque brings the arm to rest.
+
+        Returns:
+            The torque in N m per joint. None if the arm must brake.
         """
         record = self.record
         if record is None or not self.fresh:
             return None
 
-        # With n coordinates, `mem` contains: n coordinates of the position that the arm holds,
-        # the time at which the fault or stop began, n further numbers, and the reason of a
-        # stop. In records without these numbers, the slices are empty.
+        # With n coordinates, `mem`, the memory of the site in a record, contains: n coordinates
+        # of the position that the arm holds, the time at which the fault or stop began, n
+        # further numbers, and the reason of a stop. Each slice below is a list with one number,
+        # or empty in records without these numbers.
         n = len(record.q_des)
-        begun_ns = record.mem[n : n + 1]
-        stop_reason = record.mem[2 * n + 1 : 2 * n + 2]
+        begun_index = n
+        reason_index = 2 * n + 1
+        begun_ns = record.mem[begun_index : begun_index + 1]
+        stop_reason = record.mem[reason_index : reason_index + 1]
         is_switch_released = record.mode == "stopped" and stop_reason == [LifeReason.RELEASED]
         must_brake_soon = record.mode == "fault" or is_switch_released
-        if not must_brake_soon:
-            return tuple(record.tau)
-
-        is_coming_to_rest = begun_ns and record.t_ns - begun_ns[0] < BRAKE_NS
-        return tuple(record.tau) if is_coming_to_rest else None
+        if must_brake_soon:
+            is_coming_to_rest = bool(begun_ns) and record.t_ns - begun_ns[0] < BRAKE_NS
+            if not is_coming_to_rest:
+                return None
+        return tuple(record.tau)
 
 
 def make_hand_sender(

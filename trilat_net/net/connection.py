@@ -205,18 +205,26 @@ class Connection:
         return encrypted
 
     def open(self) -> ZenohBus:
-        """Opens the connection, and returns the bus through which messages are sent.
+        """Opens the network connection of this process, as the attributes describe it.
+
+        If the process has keys, the endpoints are replaced by encrypted ones (`reach`). The
+        mode determines whether the process connects to the other members, connects to a router,
+        or is a router itself.
+
+        Returns:
+            The bus, through which messages are sent and received.
 
         Raises:
             UnknownHost: A host name cannot be resolved. This is checked first, because Zenoh
                 would try to resolve the name for ever.
             RouterSilent: This process is a client, and no router answers.
-            UsageError: An endpoint cannot be used.
+            UsageError: Zenoh cannot use an endpoint.
         """
-        listen = self.reach(self.listen)
-        connect = self.reach(self.connect or ())
-        check_hosts(find_endpoint_addresses([*listen, *connect]))
-        return ZenohBus(listen, connect, self.mode, self.settings)
+        listen_endpoints = self.reach(self.listen)
+        # None means that the endpoints are not known yet. Then the process only listens.
+        connect_endpoints = self.reach(self.connect or ())
+        check_hosts(find_endpoint_addresses([*listen_endpoints, *connect_endpoints]))
+        return ZenohBus(listen_endpoints, connect_endpoints, self.mode, self.settings)
 
     def require_keys_until(self, left_s: float) -> None:
         """Checks that the keys of the member stay valid until the planned end of a session.

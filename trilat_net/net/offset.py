@@ -293,12 +293,26 @@ class _AdmissibleLines:
     def estimate(self) -> OffsetEstimate:
         """Estimates the offset from all straight lines that the time stamps permit.
 
-        A line describes the offset between the clocks over time. The most probable slope is
-        computed first. The estimated offset is in the middle of the permitted lines with that
-        slope. The limits of the estimate include all permitted lines.
+        A line describes the offset between the clocks over time. Let t be the time in s
+        relative to the present, so that t <= 0 for all limits. The line
+
+            offset(t) = v + slope t
+
+        has the value v at present. It is permitted if it is below every ceiling c at its time
+        t_c, and above every floor f at its time t_f:
+
+            f - slope t_f <= v <= c - slope t_c.
+
+        Ceilings and floors are relaxed, moved apart by `WANDER` per second of their age,
+        because the drift is not exactly constant. The most probable slope is computed first.
+        The estimated offset is in the middle of the permitted values v for that slope. The
+        limits of the estimate include all permitted lines.
+
+        Returns:
+            The estimate for the present time.
         """
         slope = min(max(self._estimate_slope(), self.flattest), self.steepest)
-        # Values at present of the lines with this slope that touch the limits.
+        # Largest and smallest permitted value v for this slope.
         lowest_ceiling = np.min(self._relaxed_ceilings - slope * self._ceiling_times_s)
         highest_floor = np.max(self._relaxed_floors - slope * self._floor_times_s)
         middle = 0.5 * (lowest_ceiling + highest_floor)
@@ -384,6 +398,7 @@ class _SlewSegment:
     def __init__(self, start_ns: int, offset_ns: int, estimate: OffsetEstimate) -> None:
         self.start_ns = start_ns
         self.estimate = estimate
+        # Time at which the smoothed offset has reached (joined) the line of the estimate.
         self._joined_ns = start_ns + SLEW_NS
         self._joined_offset_ns = estimate.extrapolate_ns(self._joined_ns)
         self._approach_rate = (self._joined_offset_ns - offset_ns) / SLEW_NS
@@ -406,15 +421,20 @@ class _SlewSegment:
     def error_bound_ns(self, local_ns: int) -> int:
         """Returns the largest possible error of the smoothed offset at a time, in ns.
 
-        While the offset still approaches the estimate, this is `bound_ns`, the largest error in
-        that phase. Afterwards, it is the error that the estimate permits.
+        The error is the difference between the smoothed offset (the other clock minus the local
+        clock) and the true offset. While the smoothed offset still approaches the estimate,
+        until `SLEW_NS` after the start of the segment, the result is `bound_ns`, the largest
+        error in that phase. Afterwards, it is the largest distance of the smoothed offset from
+        the offsets that the estimate permits at that time.
 
         Args:
             local_ns: The time on the local clock, in ns.
         """
-        if self.start_ns <= local_ns <= self._joined_ns:
+        is_approaching = self.start_ns <= local_ns <= self._joined_ns
+        if is_approaching:
             return self.bound_ns
-        return self.estimate.error_bound_ns(local_ns, self.evaluate_ns(local_ns))
+        smoothed_offset_ns = self.evaluate_ns(local_ns)
+        return self.estimate.error_bound_ns(local_ns, smoothed_offset_ns)
 
 
 class SlewedOffset:

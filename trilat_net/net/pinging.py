@@ -278,22 +278,28 @@ class Pinger:
         self._clock = clock
         self._required = required
         self._query = RepeatedQuery(bus, clock, topics.key(session, "*", topics.PING))
+        # Time on the local clock until which a reply to the latest ping is expected.
         self._reply_expected_until_ns = 0
 
     def poll(self, boots: Collection[int]) -> None:
         """Sends a ping to the other members if it is due, and evaluates the replies to pings.
 
         A ping is a query to which a member replies with the readings of its clock. The method
-        does not wait for replies.
+        does not wait for replies. Until the offsets of all clocks are known, pings are sent
+        with the short period `PING_PACE_NS`. Afterwards, the longer period `PING_REST_NS`
+        suffices to keep the estimates up to date.
 
         Args:
             boots: Members whose replies are evaluated, given by their boots. A boot is a number
                 that identifies one start of a process. If there are none, no ping is sent.
         """
         period_ns = PING_REST_NS if self.knows_clocks(boots) else PING_PACE_NS
-        if boots and self._query.repeat(period_ns):
-            expected_ns = 2 * self.slowest_ns() + _LATE_REPLY_NS
-            self._reply_expected_until_ns = self._clock.monotonic_ns() + expected_ns
+        was_ping_sent = bool(boots) and self._query.repeat(period_ns)
+        if was_ping_sent:
+            # Until this time, `pause_ns` lets the caller poll often: the arrival of a reply is
+            # measured when it is polled, so that late polling makes the measurement worse.
+            longest_reply_ns = 2 * self.slowest_ns() + _LATE_REPLY_NS
+            self._reply_expected_until_ns = self._clock.monotonic_ns() + longest_reply_ns
         while (reply := self._query.poll()) is not None:
             pinged_ns, key, payload = reply
             now_ns = self._clock.monotonic_ns()

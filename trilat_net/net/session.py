@@ -96,7 +96,7 @@ class SessionJoin:
         self.refusal = ""
         # The newest request of this site to join a running session: its event and its epoch.
         self._coming: tuple[Event, Epoch] | None = None
-        self._admitted_by: set[str] = set()
+        self._admitted_by: set[str] = set()  # running sites that have granted that request
         self._admitted_boots: dict[str, int] = {}  # boots of others that joined meanwhile
 
         # What this member receives from the others.
@@ -129,10 +129,14 @@ class SessionJoin:
         running sites that have not admitted it. Empty if the reason is not known.
         """
         running = {info.member for info in self.membership.list_running()}
-        missing = sorted(running - self._admitted_by)
-        if self.refusal or self._coming is None or not missing:
+        silent_sites = sorted(running - self._admitted_by)
+        if self.refusal:
             return self.refusal
-        return f"{', '.join(missing)} did not admit {self._info.member} to the running session"
+        has_requested = self._coming is not None
+        if not has_requested or not silent_sites:
+            return ""
+        names = ", ".join(silent_sites)
+        return f"{names} did not admit {self._info.member} to the running session"
 
     @property
     def announced_first_tick(self) -> int:
@@ -154,10 +158,14 @@ class SessionJoin:
     def poll(self) -> Epoch | None:
         """Receives messages, replies to them, and takes the next step towards the start.
 
-        If the session runs already and this member may join late, it joins the session.
-        Otherwise the leader, the first site of the scenario, proposes and confirms the epoch,
-        the common start time. The other members agree to the proposal, and wait for the
-        confirmation.
+        If the session runs already and this member may join late, it joins the session. A
+        recorder always may, because it only receives. Otherwise the leader, the first site of
+        the scenario, proposes and confirms the epoch, the common start time. The other members
+        agree to the proposal, and wait for the confirmation.
+
+        A member that has agreed to a proposal may find other members running because they have
+        received the confirmation earlier. It waits for the confirmation as well, until the
+        proposed epoch has passed. Only then does it join late.
 
         Returns:
             The epoch once it is fixed. None until then.
@@ -168,6 +176,7 @@ class SessionJoin:
         membership = self.membership
         now_ns = self._clock.monotonic_ns()
         self._publisher.answer_queries()
+        # The leader knows whether it has confirmed a proposal. The others may miss the event.
         may_have_started = self._agreed_proposal is not None and not membership.is_leader
         membership.poll(may_have_started=may_have_started)
         self.pinger.poll(self._list_other_clocks(membership.boots(), membership.clocks()))
@@ -177,7 +186,8 @@ class SessionJoin:
             return epoch
         self._reply_ready()
         running = membership.list_running()
-        may_join_running = self._late.may_join_late or not self._sites
+        is_recorder = not self._sites
+        may_join_running = self._late.may_join_late or is_recorder
         if running and may_join_running:
             # Until the proposed epoch has passed, its confirmation may still arrive.
             may_start_normally = self._agreed_proposal is not None and now_ns < self._epoch_ns
@@ -186,14 +196,21 @@ class SessionJoin:
         elif membership.is_leader:
             epoch = self._lead()
         if not running:
+            # The time that `_join_late` waits for further sites begins anew.
             self._found_running_ns = None
         return epoch
 
     def _join_late(self, running: Sequence[Info], now_ns: int) -> Epoch | None:
-        """Joins a session that is running already.
+        """Takes the next step to join a session that is running already.
 
-        All sites of the session that are present must be known first, and so must their clocks.
-        A recorder may then record at once. A site must be admitted by the running sites.
+        These steps must be complete, one after another:
+
+        1. All sites of the session that are present are known, or `LATE_GATHER_NS` have passed.
+        2. A site (not a recorder) knows the clocks of all running sites on other machines.
+        3. One running site is selected, whose epoch (time of tick 0) is used. Its clock is
+           known, so that the epoch can be converted to the local clock.
+        4. A site requests admission, and all running sites grant it. A recorder needs no
+           admission and may record at once.
 
         Args:
             running: Identities of the running sites.
@@ -207,25 +224,27 @@ class SessionJoin:
         waited_ns = now_ns - self._found_running_ns
         if self._awaits_sites(running) and waited_ns < LATE_GATHER_NS:
             return None
+        is_recorder = not self._sites
         local_clock = self._info.clock
         foreign_boots = {info.boot for info in running if info.clock != local_clock}
-        if self._sites and not self.pinger.knows_clocks(foreign_boots):
+        if not is_recorder and not self.pinger.knows_clocks(foreign_boots):
             return None
         source = self._select_epoch_source(running)
         if source is None:
             return None
 
         # The site whose epoch is used may run on another clock. Convert with the present
-        # offset: that at the epoch is not known, as the clocks have drifted since.
+        # offset: that at the epoch is not known, as the clocks have drifted since. The offset
+        # is the other clock minus the local clock: local time = other time - offset.
         offset_ns = 0
         if source.clock != local_clock:
             offset_ns = self.pinger.estimate(source.boot).extrapolate_ns(now_ns)
         epoch = Epoch(source.epoch_mono_ns - offset_ns, source.epoch_unix_ns, source.boots)
-        is_recorder = not self._sites
         if is_recorder:
             return epoch
 
-        # The site follows the schedule on which the ticks are now, not on which they started.
+        # The running sites have adjusted their schedule since the start. `grid_ns` is the time
+        # of tick 0 according to the present schedule, which this site follows.
         schedule_start_ns = (source.grid_ns or source.epoch_mono_ns) - offset_ns
         local_epoch = epoch._replace(mono_ns=schedule_start_ns)
         return self._request_admission(local_epoch, running, now_ns)
@@ -319,18 +338,29 @@ class SessionJoin:
         return None
 
     def _make_late_epoch(self, coming: Event, epoch: Epoch, running: Sequence[Info]) -> Epoch:
-        """Returns the epoch of a running session, with this site among the members.
+        """Returns the description of a running session, with this site among the members.
 
         Args:
-            coming: Request of this site that all running sites have granted.
-            epoch: The epoch that the request stated.
+            coming: Request of this site (event `coming`) that all running sites have granted.
+                It states the first tick of this site.
+            epoch: Start of the session on the clock of this site.
             running: Identities of the running sites.
+
+        Returns:
+            The given epoch, to which these are added: the boot of each member, which identifies
+            the start of its process; the time of tick 0 on the clock of each running site and
+            of this site, in ns; the first tick of this site; and its request.
         """
         info = self._info
+        # Later entries replace earlier ones: the members at the start of the session, those
+        # that were admitted while this site waited, and this site.
         boots = {**running[0].boots, **self._admitted_boots, info.member: info.boot}
-        epochs = {site.member: site.epoch_mono_ns for site in running}
-        epochs[info.member] = epoch.mono_ns
-        return epoch._replace(boots=boots, epochs=epochs, first=coming.ticks, coming=coming)
+        epoch_times_ns = {site.member: site.epoch_mono_ns for site in running}
+        epoch_times_ns[info.member] = epoch.mono_ns
+        first_tick = coming.ticks
+        return epoch._replace(
+            boots=boots, epochs=epoch_times_ns, first=first_tick, coming=coming
+        )
 
     def _list_other_clocks(
         self, boots: Mapping[str, int], clocks: Mapping[str, str]
@@ -381,50 +411,78 @@ class SessionJoin:
     def _receive_admission(self, event: Event) -> None:
         """Stores whether a running site admits this site, refuses it, or admits another site.
 
+        A site that wants to join the running session publishes the request `coming`. Each
+        running site replies with the event `admit` or `refused`. The event states which site it
+        is about, the boot of that site (the number that identifies the start of its process),
+        and the number of the request, because a request may be repeated.
+
+        Other sites may be admitted while this site waits. Their boots are noted in any case,
+        because they become members of the session.
+
         Args:
             event: An event of a running site. Events of other kinds are ignored.
         """
-        if event.kind == "admit" and event.about in event.boots:
-            self._admitted_boots[event.about] = event.boots[event.about]
+        joining_site = event.about
+        if event.kind == "admit" and joining_site in event.boots:
+            self._admitted_boots[joining_site] = event.boots[joining_site]
+
         info = self._info
-        is_about_local = (
-            event.about == info.member and event.boots.get(info.member) == info.boot
+        is_about_this_start = (
+            joining_site == info.member and event.boots.get(info.member) == info.boot
         )
-        if self._coming is None or not is_about_local:
+        has_requested = self._coming is not None
+        if not has_requested or not is_about_this_start:
             return
+        is_reply_to_newest_request = event.attempt == self._attempt
         if event.kind == "refused":
             self.refusal = event.text
-        elif event.kind == "admit" and event.attempt == self._attempt:
+        elif event.kind == "admit" and is_reply_to_newest_request:
             self._admitted_by.add(event.member)
 
     def _receive_announcement(self, event: Event) -> None:
         """Receives the proposal of an epoch, and agrees if it includes this member.
 
-        Proposals of sites other than the leader are ignored, and so are proposals to a recorder
-        that does not know the scenario yet.
+        The proposal lists the members of the session with their boots, the numbers that
+        identify the starts of their processes. This member is included if its name and its boot
+        are listed. If another boot is listed under its name, another process acts as the same
+        member.
+
+        Proposals of sites other than the leader are ignored. A recorder does not know the
+        leader. It learns the scenario from the identities of the sites, and ignores proposals
+        until one of the listed sites has sent it.
+
+        The member agrees (`_reply_ready`) at once if it has measured the clocks of the others,
+        or later when it has.
+
+        Args:
+            event: Event `epoch`, the proposal.
 
         Raises:
-            SessionError: The proposal includes another start of this site.
+            SessionError: The proposal includes another process that acts as this site.
         """
-        if self.membership.is_leader or (self._sites and event.member != self._sites[0]):
+        is_recorder = not self._sites
+        is_from_leader = is_recorder or event.member == self._sites[0]
+        if self.membership.is_leader or not is_from_leader:
             return
-        knows_scenario = bool(self._sites)
+        knows_scenario = not is_recorder
         for name, info in self.membership.others.items():
-            if info.scenario and event.boots.get(name) == info.boot:
+            is_listed = event.boots.get(name) == info.boot
+            if info.scenario and is_listed:
                 knows_scenario = True
         if not knows_scenario:
             return
 
         local = self._info
-        if event.boots.get(local.member) == local.boot:
-            if not self._must_wait_for_other_leader(event):
-                self._waiting_proposal = event
-                self._reply_ready()
+        is_included = event.boots.get(local.member) == local.boot
+        is_other_process_included = not is_included and local.member in event.boots
         # A proposal with another recorder is no error: of two recorders, one joins late.
-        elif local.member in event.boots and self._sites:
+        if is_other_process_included and not is_recorder:
             raise SessionError(
                 f"session {self._session!r} continues with another process of {local.member}"
             )
+        if is_included and not self._must_wait_for_other_leader(event):
+            self._waiting_proposal = event
+            self._reply_ready()
 
     def _must_wait_for_other_leader(self, event: Event) -> bool:
         """Returns True if this member has agreed to a proposal that may still be confirmed.
@@ -483,13 +541,17 @@ class SessionJoin:
         confirmed once all members have agreed. It is withdrawn if a member is too late, is gone
         or has joined meanwhile. The next call then proposes another one.
 
+        The decision must be made early enough that the confirmation reaches all members before
+        the epoch: `DECIDE_NS` and the slowest round trip before.
+
         Returns:
             The epoch once it is confirmed. None until then.
         """
         now_ns = self._clock.monotonic_ns()
         membership = self.membership
-        agreed = self._agreed_proposal
-        if agreed is None:
+        # For the leader, this is the proposal that it has published itself.
+        proposal = self._agreed_proposal
+        if proposal is None:
             other_clocks = self._list_other_clocks(membership.boots(), membership.clocks())
             if not membership.list_missing() and self.pinger.knows_clocks(other_clocks):
                 self._announce(now_ns)
@@ -497,20 +559,25 @@ class SessionJoin:
 
         decide_ns = self._epoch_ns - DECIDE_NS - self.pinger.slowest_ns()
         is_too_late = now_ns >= decide_ns
-        have_members_changed = agreed.boots != membership.boots()
-        ready_members = self._ready_epochs.keys() | {self._info.member}
+        have_members_changed = proposal.boots != membership.boots()
         if is_too_late or have_members_changed or membership.list_missing():
             self._agreed_proposal = None
-        elif ready_members >= set(agreed.boots):
-            start = self._publisher.publish(
-                "start",
-                "all are ready",
-                attempt=agreed.attempt,
-                boots=agreed.boots,
-                epochs={**self._ready_epochs, self._info.member: self._epoch_ns},
-            )
-            return self._make_epoch(start)
-        return None
+            return None
+
+        # The leader itself is always ready.
+        ready_members = self._ready_epochs.keys() | {self._info.member}
+        proposed_members = set(proposal.boots)
+        are_all_ready = ready_members >= proposed_members
+        if not are_all_ready:
+            return None
+        start = self._publisher.publish(
+            "start",
+            "all are ready",
+            attempt=proposal.attempt,
+            boots=proposal.boots,
+            epochs={**self._ready_epochs, self._info.member: self._epoch_ns},
+        )
+        return self._make_epoch(start)
 
     def _announce(self, now_ns: int) -> None:
         """Proposes an epoch to the members that are present, as the leader.

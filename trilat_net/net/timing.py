@@ -593,7 +593,14 @@ class SiteTiming:
     def update_clocks(self, k: int, now_ns: int) -> list[ClockNotice]:
         """Updates the clock offset of one peer, and adjusts the schedule to the leader's.
 
-        The leader is the first site of the scenario. All sites follow its schedule.
+        The leader is the first site of the scenario. All sites follow its schedule. If it runs
+        on another machine, the error of the local schedule is computed with the smoothed offset
+        of the leader's clock: the time on the leader's clock when tick k is due at this site,
+        minus the nominal time k / rate of this tick, both since the epoch, the start of the
+        session. The error is positive if the tick is late compared with the leader's schedule.
+
+        An estimate of an offset takes a considerable part of a period. Therefore each call
+        estimates that of at most one peer.
 
         Args:
             k: Number of the next tick (period of the control loop). The adjusted schedule
@@ -610,9 +617,11 @@ class SiteTiming:
             notices += self._find_faults(index, k, now_ns)
             is_leader = monitor.peer.name == self._leader_name
             if is_leader and not monitor.peer.is_own:
-                # Time since the epoch on the leader's clock when the tick is due here.
-                leader_ns = due_ns + monitor.offset.evaluate_ns(due_ns) - monitor.peer.epoch_ns
-                error_ns = leader_ns - k * NS_PER_S // self._rate_hz
+                # The offset is the leader's clock minus the local clock.
+                due_on_leader_clock_ns = due_ns + monitor.offset.evaluate_ns(due_ns)
+                since_epoch_ns = due_on_leader_clock_ns - monitor.peer.epoch_ns
+                nominal_ns = k * NS_PER_S // self._rate_hz
+                error_ns = since_epoch_ns - nominal_ns
                 self.schedule.adjust_rate(k, error_ns, monitor.offset.estimate.drift)
         return notices
 
