@@ -205,7 +205,7 @@ class ArmGains(Result):
         the edge is lowest, and which of the two limits bounds the stiffness.
         """
         edge = self.edge
-        # Only the text about the moving states is needed, so the value of the root is arbitrary.
+        # Only the text about the moving states is needed: the value of the root is arbitrary.
         moving_states = tuple(edge["moves"])
         motion = CharacteristicRoot(s=0j, multiplicity=1, states=moving_states).description
         yield (
@@ -720,8 +720,7 @@ class _GainSearch:
         Returns:
             Pairs of a delay, in s, and the value of k, in 1/s^2.
         """
-        loop_delay_ticks_4 = 4.0 * self.age_s * self.rate_hz
-        longest_ticks = max(loop_delay_ticks_4, 8.0)
+        longest_ticks = max(4.0 * self.age_s * self.rate_hz, 8.0)
         geometric_ticks = np.geomspace(1.0, longest_ticks, _CURVE_POINTS)
         delays_ticks = np.round(geometric_ticks)
         delays_s = np.unique(delays_ticks) / self.rate_hz

@@ -433,38 +433,54 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
     def _begin(self, scenario: Scenario) -> None:
         """Prepares the simulated run of a new episode, up to its first step.
 
+        The run is not started. Each step of the environment appends the action of the policy to
+        `self._actions`, and lets the run execute the ticks (control periods) of the step. A
+        simulated operator, `self._player`, holds the arm of the user's site. It shares the list
+        and moves the arm by the last action.
+
         Args:
             scenario: Scenario of the episode.
         """
         self.scenario = scenario
-        self._k = 0
+        self._k = 0  # ticks of the user's site so far
         self._actions = list[Array]()
         hand_site = self._build_hand_site(scenario)
         self._player = ActedHand(hand_site, self._actions)
-        self._plants = make_plant_players(scenario)
+        self._plants = make_plant_players(scenario)  # users' programs that move arms, by site
         hands = {self._user: self._player}
         ticks = [scenario.ticks(name) for name in scenario.names]
+        # The environment reads the state of the last tick only, so one record is kept.
         self._run = FusedRun(scenario, keep=1, hands=hands, plants=self._plants)
-        self._run.plan(ticks)
+        self._run.plan(ticks)  # allocates memory for all ticks of the episode
         self._ticks = scenario.ticks(self._user)
         self._tick_rate_hz = scenario.sites[self._user].rate_hz
 
     def _build_scene(self) -> Scene:
-        """Returns the true state of the episode at the current step."""
+        """Describes the present state of the episode, for the task and for observations.
+
+        The joint angles, end effectors and bodies are the true state of the simulation. The
+        view is what the user's operator, the policy, sees: it contains the states of other
+        sites with their delay.
+
+        Returns:
+            The state. The limit `draws` of attempts to draw a position depends on the arm of
+            the site that does the task (`self._leads`), which is not always the user's arm.
+        """
         names = self.scenario.names
         arms = self.scenario.arms
-        q = {}
+        q_rad = {}
         positions_m = {}
         for name, row in zip(names, self._run.q, strict=True):
             arm = arms[name]
             angles_rad = row[: arm.counts.joints]  # rows are as long as that of the longest arm
-            q[name] = angles_rad
+            q_rad[name] = angles_rad
             position_m = arm.end_effector(angles_rad.tolist())
             positions_m[name] = np.array(position_m)
 
         bodies = {}
         for site, plant in self._plants.items():
             body_names = self.scenario.bodies_m(site)
+            # A pose has seven numbers: the position in m, and a unit quaternion.
             poses = np.reshape(plant.state.bodies, (-1, 7))
             bodies[site] = dict(zip(body_names, poses, strict=True))
 
@@ -473,14 +489,15 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         view = self._player.view(self._k, user_arrays)
         leading_arm = arms[self._leads]
         is_chain = leading_arm.chain is not None
+        most_draws = MOST_DRAWS[is_chain]
         return Scene(
             t_s=self._k / self._tick_rate_hz,
-            q=q,
+            q=q_rad,
             end_effector_m=positions_m,
             view=view,
             bodies=bodies,
-            can_reach=partial(self._can_reach, q),
-            draws=MOST_DRAWS[is_chain],
+            can_reach=partial(self._can_reach, q_rad),
+            draws=most_draws,
         )
 
     def _can_reach(self, q: Mapping[str, Array], site: str, position_m: Array) -> bool:

@@ -575,26 +575,29 @@ def _fit_impedance(force: Complex, motions: Complex, segments: NDArray[np.int64]
     Returns:
         The rows of M, B and K for this axis, shape (3 n,).
     """
-    mean_motion = motions[segments].mean(axis=0)
-    mean_force = force[segments].mean(axis=0)
+    mean_motion = motions[segments].mean(axis=0)  # shape (F, 3 n)
+    mean_force = force[segments].mean(axis=0)  # in N, shape (F,)
     smallest_deviation = 1e-6 * np.abs(mean_force).max()  # avoids a division by zero
 
     def compute_weighted_residuals(impedance: Array) -> Array:
         """Computes how far the measured force is from the force of the hand model.
 
-        At each frequency, the difference is averaged over the segments of the run and divided
-        by its standard deviation.
+        At each frequency, the difference is averaged over the segments of the run, and divided
+        by its standard deviation over the segments. The forces and motions, and their means,
+        are those of the enclosing function.
 
         Args:
-            impedance: Rows of M, B and K for this axis, shape (3 n,), for n axes.
+            impedance: Rows of the mass M, damping B and stiffness K for the axis of the force,
+                one after the other, shape (3 n,). n is the number of axes of the motion.
 
         Returns:
-            The real parts and then the imaginary parts, shape (2 F,), for F frequencies.
+            The real parts and then the imaginary parts, shape (2 F,), for F frequencies. They
+            have no unit.
         """
-        residuals = force - motions @ impedance
-        measured_deviation = residuals.std(axis=0)
-        deviation = np.maximum(measured_deviation, smallest_deviation)
-        mean_residual = mean_force - mean_motion @ impedance
+        residuals = force - motions @ impedance  # in N, shape (segments, F)
+        deviation_over_segments = residuals.std(axis=0)
+        deviation = np.maximum(deviation_over_segments, smallest_deviation)
+        mean_residual = mean_force - mean_motion @ impedance  # in N, shape (F,)
         return _stack_real_and_imaginary(mean_residual / deviation)
 
     design = _stack_real_and_imaginary(mean_motion)

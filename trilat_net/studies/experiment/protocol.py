@@ -389,7 +389,7 @@ class ExperimentPlan(Result):
         Returns:
             For each choice in the block, in the order of the trials, True if it is right.
         """
-        # `number` and `trial` count from 1, so their difference is the index of the first trial.
+        # Both numbers count from 1, so that the difference is the index of the first trial.
         block_start = planned.number - planned.trial
         trials_per_block = self.trials[-1].trial  # all blocks are equally long
         block_end = block_start + trials_per_block

@@ -167,50 +167,85 @@ class SyntheticParticipant:
         return self._interpolate_movement(now.t_s)
 
     def _see_slave(self, now: HandView, slave: PeerView) -> Array:
-        """Returns the position of the slave's end effector that the participant sees, in m.
+        """Looks at the slave arm, and remembers where it is and when it last moved.
 
-        The time at which the slave last moved is remembered.
+        A step of the slave counts as a motion if it is longer than the share `MOVED_SHARE`
+        of the diameter of the target. Before the first look, the participant's own hand rests
+        where it is.
+
+        Args:
+            now: What the participant sees and feels at its site, with the pose of the hand.
+            slave: What the participant sees of the slave arm, delayed by the network.
+
+        Returns:
+            The position of the slave's end effector in m, shape (axes,), with two or three
+            axes.
         """
         position_m = place_slave(self._arm, slave.q)
         slave_m = position_m[: self._axes]
-        if self._slave_m is None:
+        if self._slave_m is None:  # the first look
             self._start_m = now.pose
             self._end_m = now.pose
             self._slave_m = slave_m
         step_m = slave_m - self._slave_m
         distance_m = float(np.linalg.norm(step_m))
         self._slave_m = slave_m
-        if distance_m > MOVED_SHARE * self._goal.width_m:
+        has_moved = distance_m > MOVED_SHARE * self._goal.width_m
+        if has_moved:
             self._moved_s = now.t_s
         return slave_m
 
     def _find_next_start_s(self, slave: PeerView) -> float:
-        """Returns the earliest time of the next movement, in s.
+        """Returns the earliest time at which the participant starts the next movement, in s.
 
-        The hand and the slave must have come to rest. Then the participant reacts. Before a
-        correction, the participant also waits for the delayed view of the slave.
+        The hand and the slave must have come to rest. Then the participant reacts. If the
+        movement corrects an earlier one, the participant also waits until the delayed view
+        shows the end of the slave's motion.
+
+        Args:
+            slave: What the participant sees of the slave arm, with the age of this view.
+
+        Returns:
+            The time since the start of the trial.
         """
-        hand_rest_s = self._begins_s + self._duration_s
-        rest_s = max(hand_rest_s, self._moved_s)
+        hand_rests_from_s = self._begins_s + self._duration_s  # -infinity before any movement
+        slave_moved_last_s = self._moved_s
+        rest_s = max(hand_rests_from_s, slave_moved_last_s)
+
         view_delay_s = 0.0
-        is_correction = not math.isinf(self._begins_s)
+        is_correction = not math.isinf(self._begins_s)  # the hand has moved before
         if is_correction:
             view_delay_s = slave.age_s
         wait_s = self._model.reaction_s + view_delay_s
-        return max(rest_s, 0.0) + wait_s
+        return max(rest_s, 0.0) + wait_s  # a rest counts from the start of the trial
 
     def _find_press_step(self, slave: PeerView, t_s: float) -> Array:
-        """Returns the step towards the required force, in m. It is 0 away from the wall."""
+        """Decides how far the hand moves to press the slave arm against a wall.
+
+        The direction is that from the start of the trial to the target in the wall. The length
+        is proportional to the share of the required force that is still missing: with no force
+        it would be the width of the target, and with the required force it is 0. With too large
+        a force the hand moves back.
+
+        Args:
+            slave: What the participant sees of the slave arm.
+            t_s: Present time in the trial, in s.
+
+        Returns:
+            The step of the hand in m, shape (axes,). It is 0 if there is no force at all,
+            because the slave has not reached the wall yet.
+        """
         goal = self._goal
         force_n = self._find_force_n(slave.q, slave.tau_x)
-        way_m = goal.find_target_m(t_s) - goal.start_m
-        towards_m = way_m[: self._axes]
-        distance_m = np.linalg.norm(towards_m)
-        step_m: Array = towards_m * (goal.width_m / distance_m)
-        if not force_n:
-            return 0.0 * step_m
+        start_to_target_m = goal.find_target_m(t_s) - goal.start_m
+        towards_target_m = start_to_target_m[: self._axes]
+        distance_m = np.linalg.norm(towards_target_m)
+        full_step_m: Array = towards_target_m * (goal.width_m / distance_m)
+        touches_wall = bool(force_n)
+        if not touches_wall:
+            return 0.0 * full_step_m
         missing_share = 1.0 - force_n / goal.force_n
-        return step_m * missing_share
+        return full_step_m * missing_share
 
     def _start_movement(self, t_s: float, step_m: Array) -> None:
         """Starts a movement by a step, with noise in proportion to the step's length.
@@ -251,31 +286,43 @@ class SyntheticParticipant:
         position_m: Array = self._start_m + way_m * share
         return position_m
 
-    def _follow(self, now: HandView, distance_m: Array, age_s: float) -> Array:
-        """Moves the hand towards a moving target, at a rate that falls with the delay.
+    def _follow(self, now: HandView, error_m: Array, age_s: float) -> Array:
+        """Moves the hand so that the slave follows a moving target, despite the delay.
 
-        The rate is at most 0.7 / (reaction time + 2 age of the slave's sample), in 1/s.
+        This is the crossover model of a person (McRuer and Jex): the hand moves with a velocity
+        that is proportional to the error,
+
+            velocity = rate * error.
+
+        The rate is `crossover_rad_s`, but at most `DELAY_MARGIN` / (reaction time + 2 age of
+        the slave's sample), since a person corrects more slowly over a delay. In one call, the
+        hand corrects the share rate * (time since the last call) of the error, at most all of
+        it. The error is seen with noise in proportion to its size.
+
+        The time of the call and the position of the hand are stored for the next call.
 
         Args:
-            now: What the participant sees.
-            distance_m: Distance of the slave from the target, in m.
+            now: What the participant sees and feels at its site, with the present time.
+            error_m: Vector from the slave to the target, in m, shape (axes,).
             age_s: Age of the slave's sample, in s.
 
         Returns:
-            The target position of the hand, in m.
+            The target position of the hand, in m, shape (axes,).
         """
-        # The age is the delay of one direction; a correction is seen after both directions.
         model = self._model
+        # The age is the delay of one direction; a correction is seen after both directions.
         loop_delay_s = model.reaction_s + 2.0 * age_s
-        rate = min(model.crossover_rad_s, DELAY_MARGIN / loop_delay_s)
-        length_m = float(np.linalg.norm(distance_m))
-        deviation_m = model.noise * length_m
+        rate_per_s = min(model.crossover_rad_s, DELAY_MARGIN / loop_delay_s)
+        error_size_m = float(np.linalg.norm(error_m))
+        deviation_m = model.noise * error_size_m
         scatter_m = deviation_m * self._random.standard_normal(self._axes)
+
         share = 0.0
-        if not math.isinf(self._begins_s):
-            elapsed_s = now.t_s - max(self._begins_s, 0.0)
-            share = rate * elapsed_s
+        has_moved_before = not math.isinf(self._begins_s)
+        if has_moved_before:
+            elapsed_s = now.t_s - max(self._begins_s, 0.0)  # since the last call
+            share = rate_per_s * elapsed_s
         self._begins_s = now.t_s
-        correction_m = min(share, 1.0) * (distance_m + scatter_m)
+        correction_m = min(share, 1.0) * (error_m + scatter_m)
         self._end_m = self._end_m + correction_m
         return self._end_m

@@ -330,13 +330,20 @@ def search_margins(
         RunFailed: A worker process died.
     """
     searches = []
-    # Each grid point has two neighbouring cells, one for each end of the range.
+    # The cells of a sweep are numbered with the last axis first. This axis has two values, the
+    # ends of the range, so each grid point of the other axes has two neighbouring cells.
     for number in range(0, plan.cells, 2):
-        end = plan.cell(number)
-        cell = end._replace(values=end.values[:-1], overrides=end.overrides[:-1])
+        cell_at_low_end = plan.cell(number)
+        grid_point = cell_at_low_end._replace(
+            values=cell_at_low_end.values[:-1],  # without the value of the searched key
+            overrides=cell_at_low_end.overrides[:-1],
+        )
         # If nothing is random, all seeds give the same result.
-        seeds = plan.seeds if plan.scenario(*end.overrides).random else plan.seeds[:1]
-        searches += [MarginItem(plan, cell, seed, within) for seed in seeds]
+        is_random = plan.scenario(*cell_at_low_end.overrides).random
+        seeds = plan.seeds if is_random else plan.seeds[:1]
+        searches += [MarginItem(plan, grid_point, seed, within) for seed in seeds]
+
+    # The workers need the files of control laws that users wrote.
     laws = list_imported_code([plan.base])
     with open_worker_pool(jobs, on, most=len(searches), laws=laws) as pool:
         return pool.map(search_margin_task, searches, progress)

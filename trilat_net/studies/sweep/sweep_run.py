@@ -134,34 +134,45 @@ def open_sweep_folder(path: Path, expected: SweepPlan | None = None) -> SweepFol
 
 
 def _format_fact(key: str, facts: Mapping[str, Any]) -> str:
-    """Returns the value of a key of a plan as a text for error messages.
+    """Describes one property of a sweep, so that a message can name how two sweeps differ.
+
+    Examples: "wall (sha256 0123456789ab)" for the scenario, "1..20" for the seeds, "60 s" for
+    the longest time, "numpy 2.1, numba 0.60" for the versions.
 
     Args:
-        key: The key. Its value has a default if the plan does not store it.
+        key: Key of the property in the plan, one of `_DIFFERENCES`. A plan without the key has
+            its default: the first judge, or an empty list.
         facts: The plan as plain values.
     """
-    value = facts.get(key, JUDGES[0] if key == "judge" else [])
+    default = JUDGES[0] if key == "judge" else []
+    value = facts.get(key, default)
+
+    # The text of a scenario is too long for a message. Its name and hash identify it.
     if key in ("text", "scenario_sha256"):
         digest = str(value)
         if key == "text":
             digest = hashlib.sha256(digest.encode()).hexdigest()
-        return f"{facts.get('name')} (sha256 {digest[:12]})"
+        scenario_name = facts.get("name")
+        return f"{scenario_name} (sha256 {digest[:12]})"
 
-    if isinstance(value, dict):
+    is_version_table = isinstance(value, dict)
+    if is_version_table:
         versions = [
             f"{name.removeprefix('version_')} {version}" for name, version in value.items()
         ]
         return ", ".join(versions)
 
-    if key == "seeds" and isinstance(value, list) and value:
-        first = value[0]
-        last = value[-1]
-        is_range = value == list(range(first, last + 1))
-        if is_range:
-            return f"{first}..{last}"
     if isinstance(value, list):
+        if key == "seeds" and value:
+            first_seed = value[0]
+            last_seed = value[-1]
+            is_range = value == list(range(first_seed, last_seed + 1))
+            if is_range:
+                return f"{first_seed}..{last_seed}"
         return ", ".join(map(str, value)) or "none"
-    return f"{value:g} s" if isinstance(value, float) else str(value)
+
+    is_duration = isinstance(value, float)
+    return f"{value:g} s" if is_duration else str(value)
 
 
 def _read_facts(path: Path) -> dict[str, Any]:
@@ -473,22 +484,33 @@ def _run_cells(
     """
     first_seed, *other_seeds = plan.seeds
 
-    def run_pending(runs: Iterable[tuple[int, int]], count: int) -> None:
+    def execute_missing_runs(runs: Iterable[tuple[int, int]], run_count: int) -> None:
         """Executes runs of the sweep, except runs that the journal contains already.
+
+        The plan, the journal, the workers and the progress function are those of `_run_cells`.
+        The journal sends the runs to the workers, and stores the results.
 
         Args:
             runs: Pairs of the number of a cell, a combination of parameters, and a seed.
-            count: Number of all runs, for the progress.
+            run_count: Number of all runs of the sweep so far, with those in the journal, for
+                the progress.
         """
-        tasks = (
+        missing_runs = (
             CellItem(plan, plan.cell(number), seed)
             for number, seed in runs
             if (number, seed) not in journal.done
         )
-        journal.run_pending(pool, run_cell, tasks, len(journal.done), count, progress)
+        journal.run_pending(
+            pool=pool,
+            run=run_cell,
+            tasks=missing_runs,
+            done=len(journal.done),
+            total=run_count,
+            show=progress,
+        )
 
     first_runs = ((number, first_seed) for number in range(plan.cells))
-    run_pending(first_runs, plan.cells)
+    execute_missing_runs(first_runs, plan.cells)
 
     random_cells = list[int]()
     if other_seeds:
@@ -496,7 +518,8 @@ def _run_cells(
             number for number in range(plan.cells) if journal.done[number, first_seed].random
         ]
     repetitions = ((number, seed) for number in random_cells for seed in other_seeds)
-    run_pending(repetitions, plan.cells + len(random_cells) * len(other_seeds))
+    run_count = plan.cells + len(random_cells) * len(other_seeds)
+    execute_missing_runs(repetitions, run_count)
 
 
 def describe_sweep_speed(speed: FinishedSweep) -> str:
