@@ -330,7 +330,7 @@ def search_margins(
         RunFailed: A worker process died.
     """
     searches = []
-    # The cells of a sweep are numbered with the last axis first. This axis has two values, the
+    # The last axis changes fastest from cell to cell. It is the searched key with two values, the
     # ends of the range, so each grid point of the other axes has two neighbouring cells.
     for number in range(0, plan.cells, 2):
         cell_at_low_end = plan.cell(number)

@@ -520,44 +520,73 @@ def _find_scalar_gains(spec: SiteSpec) -> tuple[float, float] | None:
     return law.K[0], law.d[0]
 
 
-def _sample_unit_circle(delay_ticks: float) -> tuple[Array, Array, Array]:
-    """Returns points z = exp(i phi) of the unit circle at which a criterion is evaluated.
+_CIRCLE_POINTS = 400
+"""Number of points in each of the two parts of the sampled half circle."""
 
-    The angles phi = w h go from almost 0 to almost pi, where w is the frequency and h the
-    period of a tick. They are denser over the first turn of the delay, up to
-    phi = 2 pi / `delay_ticks`.
+
+def _sample_unit_circle(delay_ticks: float) -> tuple[Array, Array, Array]:
+    """Returns the frequencies at which the stability criteria of P+d are evaluated.
+
+    The loop is sampled with the tick period h. At its limit of stability, a root lies at
+    z = exp(i phi) on the unit circle, where phi = w h for the frequency w. For the integration
+    scheme "second_order", the equation of such a root contains two functions of t = tan(phi/2)
+    (docs/errata.md, 13):
+
+    - the discrete frequency v = 2 t, in units of 1/h. For small phi it equals phi;
+    - the lag 2 t^3 / (1 + 3 t^2), by which the scheme reduces the damping.
+
+    The criteria take an extreme value over all phi, so the angles need no order. The first one
+    stands for the limit phi -> 0. Others lie densely within the first turn of the delay, where
+    phi * `delay_ticks` goes from 0 to 2 pi, and the rest between 0 and pi.
+
+    Args:
+        delay_ticks: Delay of the loop, in ticks.
 
     Returns:
-        The angles phi, the values 2 tan(phi / 2), and the lag of the integration scheme, by
-        which the scheme reduces the damping.
+        The angles phi in rad, the discrete frequencies v, and the lags, of equal shape.
     """
-    full_turn = min(2.0 * np.pi / delay_ticks, 3.0)
-    first_turn = np.linspace(0.0, full_turn, 400)[1:]
-    half_circle = np.linspace(0.0, np.pi, 400)[1:-1]
-    first_angle = 1e-7 / delay_ticks
-    phi = np.concatenate([[first_angle], first_turn, half_circle])
+    almost_zero = 1e-7 / delay_ticks
+    first_turn_end = min(2.0 * np.pi / delay_ticks, 3.0)  # below pi, where t is infinite
+    first_turn = np.linspace(0.0, first_turn_end, _CIRCLE_POINTS)[1:]
+    half_circle = np.linspace(0.0, np.pi, _CIRCLE_POINTS)[1:-1]
+    phi = np.concatenate([[almost_zero], first_turn, half_circle])
     t = np.tan(0.5 * phi)
     denominator = 1.0 + 3.0 * t**2
     lag = 2.0 * t**3 / denominator
-    return phi, 2.0 * t, lag
+    discrete_frequency = 2.0 * t
+    return phi, discrete_frequency, lag
 
 
 def _compute_required_ratio(least_eigenvalue: float, delay_ticks: int) -> float:
-    """Returns the least stable d / (K T) of equal sites with reversible dominance factors.
+    """Returns how much damping equal sites with the law P+d need, relative to K T.
+
+    K is the stiffness, d the damping, and T = n h the delay, where h is the tick period. Let a
+    be a number between the least eigenvalue of the matrix of dominance factors (how strongly
+    the sites follow each other) and the largest one, 1. A root on the unit circle at the angle
+    phi, with the discrete frequency v and the lag of `_sample_unit_circle`, requires
+    (docs/errata.md, 13):
+
+        d / (K T) = (lag (1 - a cos(n phi)) - a sin(n phi)) / (v n)
+
+    If d / (K T) exceeds the largest value of the right side, there is no such root, and the
+    loop is stable. The right side is linear in a, so only the two extreme values of a matter.
 
     Args:
-        least_eigenvalue: Least eigenvalue of the matrix of dominance factors. The largest
-            eigenvalue of this matrix is 1.
-        delay_ticks: Delay T, in ticks.
+        least_eigenvalue: Least eigenvalue of the matrix of dominance factors, which must be
+            reversible.
+        delay_ticks: Delay n, in ticks.
+
+    Returns:
+        The largest value of the right side, without a unit.
     """
-    phi, w, lag = _sample_unit_circle(delay_ticks)
+    phi, discrete_frequency, lag = _sample_unit_circle(delay_ticks)
     cosine = np.cos(delay_ticks * phi)
     sine = np.sin(delay_ticks * phi)
     ratios = []
     for eigenvalue in (least_eigenvalue, 1.0):
         lag_part = lag * (1.0 - eigenvalue * cosine)
-        damping = lag_part - eigenvalue * sine
-        ratio = damping / (w * delay_ticks)
+        numerator = lag_part - eigenvalue * sine
+        ratio = numerator / (discrete_frequency * delay_ticks)
         ratios.append(ratio)
     return float(np.max(ratios))
 
@@ -565,28 +594,41 @@ def _compute_required_ratio(least_eigenvalue: float, delay_ticks: int) -> float:
 def _compute_pair_excess(
     K: list[float], d: list[float], mean_delay_ticks: float, rate_hz: float
 ) -> float:
-    """Returns the least of 2 sqrt(d1 d2) - (T1 + T2) sqrt(K1 K2) over all frequencies.
+    """Returns by how much two sites with the law P+d exceed the damping that they need.
 
-    The lag of the integration scheme reduces each damping, depending on the frequency.
+    In continuous time, the loop is stable if 2 sqrt(d1 d2) > (T1 + T2) sqrt(K1 K2), with
+    stiffnesses K, dampings d and delays T. In the sampled loop, two quantities depend on the
+    frequency (docs/errata.md, 13). With the angle phi, the discrete frequency v in 1/s and the
+    lag of `_sample_unit_circle`, and with the mean delay of n ticks, they are:
+
+        effective damping of a site = d - K lag / v, at least 0
+        effective mean delay = abs(sin(n phi) + lag cos(n phi)) / v
+
+    The difference of the two sides of the condition is computed with them, and the least value
+    over all frequencies counts. For phi -> 0, the effective quantities are d and
+    (T1 + T2) / 2.
 
     Args:
         K: Stiffnesses of the two sites, in N m/rad.
         d: Dampings of the two sites, in N m s/rad.
-        mean_delay_ticks: Half of T1 + T2, in ticks.
+        mean_delay_ticks: The mean delay n, half of T1 + T2, in ticks.
         rate_hz: Tick rate of both sites.
+
+    Returns:
+        The least difference, in N m s/rad. Positive if the loop is stable.
     """
-    phi, w, lag = _sample_unit_circle(mean_delay_ticks)
-    w_rad_s = w * rate_hz
+    phi, discrete_frequency, lag = _sample_unit_circle(mean_delay_ticks)
+    frequency_per_s = discrete_frequency * rate_hz
     K_1, K_2 = K
     d_1, d_2 = d
-    damping_1 = np.maximum(d_1 - K_1 * lag / w_rad_s, 0.0)
-    damping_2 = np.maximum(d_2 - K_2 * lag / w_rad_s, 0.0)
+    damping_1 = np.maximum(d_1 - K_1 * lag / frequency_per_s, 0.0)
+    damping_2 = np.maximum(d_2 - K_2 * lag / frequency_per_s, 0.0)
     delay_angle = mean_delay_ticks * phi
-    delayed = np.sin(delay_angle) + lag * np.cos(delay_angle)
-    delay_s = np.abs(delayed) / w_rad_s
-    stiffness = math.sqrt(K_1 * K_2)
-    excess = np.sqrt(damping_1 * damping_2) - stiffness * delay_s
-    return float(2.0 * np.min(excess))
+    coupling = np.sin(delay_angle) + lag * np.cos(delay_angle)
+    mean_delay_s = np.abs(coupling) / frequency_per_s
+    mean_stiffness = math.sqrt(K_1 * K_2)
+    half_excess = np.sqrt(damping_1 * damping_2) - mean_stiffness * mean_delay_s
+    return float(2.0 * np.min(half_excess))  # doubled, because the delay is the mean of two
 
 
 def _bound_least_inertia(arm: ArmModel) -> float:
@@ -607,13 +649,22 @@ def _bound_least_inertia(arm: ArmModel) -> float:
 def _evaluate_sampling_criterion(scenario: Scenario) -> StabilityCriterion | None:
     """Evaluates the condition on the tick period of the adaptive law.
 
-    The adaptive law estimates the parameters of its arm with the adaptation gain Gamma. Without
-    delay and under the integration scheme `digital`, the arms come to rest if
-    Gamma g^2 h < Kp, approximately, where g is gravity, h the period of a tick and Kp the
-    damping gain of the law.
+    The adaptive law estimates the parameters of its arm while it runs, with the adaptation gain
+    Gamma. If gravity is estimated too fast for the tick rate, the arm keeps swinging. The arms
+    come to rest if, for each site, approximately
+
+        Gamma g^2 h < Kp,
+
+    where g is the gravitational acceleration, h the period of a tick and Kp the damping gain of
+    the law. This is a rule for arms of about 1 m: a squared length of 1 m^2 is left out. It
+    holds for the integration scheme `digital`, and for delays of at most one tick.
+
+    Only the gains of the parameters in the gravity torque matter, of which the largest counts.
 
     Returns:
-        The condition. None if it does not cover the scenario.
+        The condition for the site with the smallest excess. The excess is Kp - Gamma g^2 h, and
+        is positive if the condition is met. None if a site has another law, or if the condition
+        does not cover the scenario for another reason.
     """
     delays_s = _list_delays_s(scenario)
     if scenario.scheme != "digital" or delays_s is None:
@@ -622,11 +673,12 @@ def _evaluate_sampling_criterion(scenario: Scenario) -> StabilityCriterion | Non
     site_excess = []
     for spec in scenario.sites.values():
         law: Any = spec.control
-        h_s = 1.0 / spec.rate_hz
-        if law.kind is not Adaptive or max(delays_s) > h_s:
+        tick_s = 1.0 / spec.rate_hz
+        has_adaptive_law = law.kind is Adaptive
+        if not has_adaptive_law or max(delays_s) > tick_s:
             return None
-        largest_gain = max(law.Gamma[_GRAVITY])
-        required_kp = largest_gain * spec.arm.g_m_s2**2 * h_s
+        largest_gravity_gain = max(law.Gamma[_GRAVITY])
+        required_kp = largest_gravity_gain * spec.arm.g_m_s2**2 * tick_s
         site_excess.append(min(law.Kp) - required_kp)
     return StabilityCriterion(
         symbol=r"$\Gamma g^2 h = K_p$",
@@ -826,35 +878,40 @@ def trace_closed_form(load: PanelLoader, x: PlaneAxis, y: PlaneAxis) -> MapLine 
 def trace_linear_analysis(
     columns: Sequence[GrowthColumn], y: PlaneAxis
 ) -> tuple[MapLine | None, list[str]]:
-    """Finds the line on which small motions of the linearised loop neither grow nor decay.
+    """Finds the line of the linear analysis, on one side of which the loop is stable.
 
-    There the real part of the loop's rightmost characteristic root is zero.
+    On this line of a map panel, small motions of the linearised control loop neither grow nor
+    decay: the real part of the rightmost characteristic root is zero. The line is described by
+    the decay rate of the motions at the grid points, in 1/s, which is the negative of the
+    growth rate. It is positive on the stable side, see `MapLine.excess`.
 
     Args:
-        columns: Linear analysis of each column of the panel, in the order of x.
+        columns: Linear analysis of each column of the panel (grid points with the same x), in
+            the order of x. It contains growth rates, and precise positions of the limit.
         y: Vertical axis.
 
     Returns:
         The line, or None if it does not cross the panel; and remarks of the analysis for the
         reader of the map, without duplicates.
     """
-    excess_columns = []
+    decay_columns = []
     all_remarks = list[str]()
     for column in columns:
         # A growth rate of -infinity means that nothing moves: the grid point is on no side.
         decay_per_s = [np.nan if np.isinf(rate) else -rate for rate in column.growth_per_s]
-        excess = _place_zeros(y.values, decay_per_s, column.edges)
-        excess_columns.append(excess)
+        # The drawn line must pass through the precise positions of the limit.
+        placed_decay_per_s = _place_zeros(y.values, decay_per_s, column.edges)
+        decay_columns.append(placed_decay_per_s)
         all_remarks.extend(column.remarks)
-    remarks = list(dict.fromkeys(all_remarks))
+    distinct_remarks = list(dict.fromkeys(all_remarks))  # in their order
     line = MapLine(
         label=LINEAR_ANALYSIS,
         text=LINEAR_ANALYSIS,
         about=_ABOUT_ROOTS,
-        excess=np.array(excess_columns).T,
-        rank=1,
+        excess=np.array(decay_columns).T,
+        rank=1,  # line style; 0 is that of the closed form
     )
-    return line if line.crosses_map else None, remarks
+    return line if line.crosses_map else None, distinct_remarks
 
 
 def _find_sign_changes(values: Sequence[float]) -> list[int]:
@@ -876,13 +933,22 @@ def _place_zeros(
 ) -> Array:
     """Changes a quantity along a column so that its linear interpolation is zero at the edges.
 
-    The quantity may be nonlinear between two grid points, so that the zero of its linear
-    interpolation would differ from its true zero, the edge. Therefore the value above each edge
-    is scaled so that the interpolated zero lies on the edge. All other values stay, because
-    they determine the course of a steep line between two columns.
+    The lines of a map are drawn where the linear interpolation between grid points is zero. The
+    quantity may be nonlinear between two grid points, so that this zero would differ from the
+    true zero, the edge. Therefore the value above each edge is changed. Let v be the value
+    below the edge, u the value above it, and f the position of the edge in the interval, from 0
+    to 1. The linear interpolation is zero there if
+
+        v + f (u - v) = 0,   that is,   u = v (1 - 1/f).
+
+    u keeps its sign, which is opposite to that of v. The values are changed from the bottom to
+    the top, so that v is the value that may have been changed for an edge below it.
+
+    All other values stay. They decide where the line passes between this column and the next
+    one, if it is so steep that it crosses neither column nearby.
 
     Args:
-        values: Values of the axis along the column, shape (y,).
+        values: Values of the axis along the column, in rising order, shape (y,).
         excess: The quantity at these values, shape (y,).
         edges: Position of each edge, by the index n of the interval from value n to n + 1. An
             edge that is missing is placed at the zero of the linear interpolation.
@@ -900,6 +966,7 @@ def _place_zeros(
         else:
             change = excess[n] - excess[n + 1]
             fraction = excess[n] / change
+        # An edge exactly at a grid point would make a value 0 or infinite.
         fraction = max(fraction, _ROUNDING)
         fraction = min(fraction, 1.0 - _ROUNDING)
         scale = 1.0 - 1.0 / fraction
