@@ -452,7 +452,7 @@ class SiteVerifier:
         two records before, if possible. Otherwise only the sender of the record is checked.
 
         The record is counted in the result as identical, as different, or as unjudged. After a
-        control law has failed, all further records of the site are unjudged.
+        control law has failed, no further tick of the site is executed.
 
         Args:
             row: Row of the record.

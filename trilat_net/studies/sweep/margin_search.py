@@ -330,8 +330,8 @@ def search_margins(
         RunFailed: A worker process died.
     """
     searches = []
-    # The last axis changes fastest from cell to cell. It is the searched key with two values, the
-    # ends of the range, so each grid point of the other axes has two neighbouring cells.
+    # The last axis changes fastest from cell to cell. It is the searched key with two values,
+    # the ends of the range, so each grid point of the other axes has two neighbouring cells.
     for number in range(0, plan.cells, 2):
         cell_at_low_end = plan.cell(number)
         grid_point = cell_at_low_end._replace(

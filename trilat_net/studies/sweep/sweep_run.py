@@ -144,7 +144,7 @@ def _format_fact(key: str, facts: Mapping[str, Any]) -> str:
             its default: the first judge, or an empty list.
         facts: The plan as plain values.
     """
-    default = JUDGES[0] if key == "judge" else []
+    default: Any = JUDGES[0] if key == "judge" else []
     value = facts.get(key, default)
 
     # The text of a scenario is too long for a message. Its name and hash identify it.
