@@ -253,7 +253,11 @@ def test_a_mass_of_zero_leaves_a_link_out() -> None:
     [
         ({"fingr": {"mass_kg": 1.0}}, "links.fingr", "did you mean 'finger'"),
         ({"base": {"mass_kg": 1.0}}, "links.base", "moved by no joint"),
-        ({"finger": {}}, "links.finger", "is empty: give at least one of mass_kg, com_m, inertia_kg_m2"),
+        (
+            {"finger": {}},
+            "links.finger",
+            "is empty: give at least one of mass_kg, com_m, inertia_kg_m2",
+        ),
         ({"finger": 3}, "links.finger", "must be a table"),
         (3, "links", "must be a table"),
         ({"finger": {"mass": 1.0}}, "links.finger.mass", "did you mean 'mass_kg'"),

@@ -137,7 +137,11 @@ def test_a_trace_may_be_left_but_no_other_begun() -> None:
             "timeline[0].to.loss",
             "must be below",
         ),
-        ({**LINK, "to": {"outages_s": [[1, 2]]}}, "timeline[0].to.outages_s", "cannot be changed"),
+        (
+            {**LINK, "to": {"outages_s": [[1, 2]]}},
+            "timeline[0].to.outages_s",
+            "cannot be changed",
+        ),
         ({**LINK, "to": 5}, "timeline[0].to", "must be a table"),
         ({**ROW, "to": {"m1": 0.9, "m2": 0.2}}, "timeline[0].to", "sum to 1.1"),
         ({**ROW, "to": {"s": 0.5, "m1": 0.5}}, "timeline[0].to", "does not follow itself"),

@@ -3,11 +3,19 @@
 Walls that are held over a tick: what they give, the damping that takes it, and the premise by its name.
 """
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 import trilat_net
-from trilat_net.analysis.certificate.premises import Premise, check_premises, gather_facts
+from trilat_net.analysis.certificate.premises import (
+    AbsentSpan,
+    Premise,
+    check_premises,
+    find_absent_spans,
+    gather_facts,
+)
 from trilat_net.analysis.torque_sources import find_wall_energies
 from trilat_net.core.vectors import Array
 from trilat_net.log.log_reader import Log
@@ -234,3 +242,33 @@ def test_damping_by_the_sampled_speed_gives_energy() -> None:
             * np.sin(np.pi * t / ticks) ** 2
         )
         assert most_given(slow, ticks, 2.0, 1.0) <= 1.0
+
+
+class PartOfSite(SimpleNamespace):
+    """As much of a site's log as presence depends on."""
+
+    def __len__(self) -> int:
+        return len(self.t_s)
+
+
+class LogOfSites(SimpleNamespace):
+    """As much of a log as presence depends on."""
+
+    def __getitem__(self, site: str) -> PartOfSite:
+        return self.parts[site]
+
+
+def test_absence_of_one_site_does_not_hide_that_another_left() -> None:
+    """Site a was away from 1 s to 2 s; site b left at 3 s of 5 s."""
+    log = LogOfSites(
+        sites=("a", "b"),
+        parts={
+            "a": PartOfSite(rate_hz=10, last_tick=49, t_s=np.arange(50) / 10.0),
+            "b": PartOfSite(rate_hz=10, last_tick=29, t_s=np.arange(30) / 10.0),
+        },
+        absences={"a": [(10, 19)]},
+        events=[SimpleNamespace(about="b", kind="left")],
+        scenario=SimpleNamespace(duration_s=5.0),
+    )
+    spans = find_absent_spans(log)  # type: ignore[arg-type]
+    assert spans == [AbsentSpan("a", 1.0, 2.0), AbsentSpan("b", 3.0, 5.0)]

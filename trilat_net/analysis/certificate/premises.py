@@ -685,19 +685,19 @@ def find_absent_spans(log: Log) -> list[AbsentSpan]:
     Returns:
         The spans, sorted by their start. Empty if no site was absent.
     """
-    end_s = recorded_end_s(log)
+    run_end_s = recorded_end_s(log)
     absent = []
     for site in log.sites:
         part = log[site]
         for first, last in log.absences.get(site, ()):
-            start_s = first / part.rate_hz
-            end_s = (last + 1) / part.rate_hz
-            absent.append(AbsentSpan(site, start_s, end_s))
+            absence_start_s = first / part.rate_hz
+            absence_end_s = (last + 1) / part.rate_hz
+            absent.append(AbsentSpan(site, absence_start_s, absence_end_s))
         last_s = (part.last_tick + 1) / part.rate_hz
         kinds = {event.kind for event in log.events if event.about == site}
         has_left = bool(kinds & {"left", "lost"})
-        if last_s < end_s - LEAST_ABSENCE_S and has_left:
-            absent.append(AbsentSpan(site, last_s, end_s))
+        if last_s < run_end_s - LEAST_ABSENCE_S and has_left:
+            absent.append(AbsentSpan(site, last_s, run_end_s))
     return sorted(absent, key=lambda span: span[1:])
 
 
