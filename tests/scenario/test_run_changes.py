@@ -237,7 +237,7 @@ def test_a_command_does_what_the_script_would_have_done(change: dict[str, Any]) 
     ("written", "words"),
     [
         ({"link": "m1->x", "to": {}}, "no link 'm1->x'"),
-        ({"link": "m1->s", "dominance": "s"}, "either a link (link) or"),
+        ({"link": "m1->s", "dominance": "s"}, "must name either a link"),
         ({"link": "m1->s", "to": {"model": "trace", "trace": "0 5"}}, "trace"),
         ({"link": "m1->s", "to": {"delay_ms": 5}, "ramp_s": 1.0}, "only shares have a ramp"),
         ({"dominance": "s", "to": {"m1": 1}, "ramp_s": -1.0}, "ramp_s"),

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, cast
 
 import numba
+from numba.extending import register_jitable
 import numpy as np
 from numba.core import types
 from numba.core.errors import NumbaError
@@ -63,7 +64,8 @@ def compiled(law: T) -> T:
     is built.
     """
     if not isinstance(law, type):
-        return cast(T, numba.njit(**_CHECKED)(law))
+        # called from a law in plain Python it stays a Python function, which takes any objects
+        return cast(T, register_jitable(**_CHECKED)(law))
     law.is_compiled = True  # type: ignore[attr-defined]
     return cast(T, law)
 
