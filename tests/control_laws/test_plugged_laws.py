@@ -95,6 +95,8 @@ def test_its_torque_changes_no_faster_than_it_may_whatever_happens(law: str) -> 
         "duration_s": 9.0,
         "link.outages_s": [[4.0, 4.5]],
         "limits.tau_rate_limit_nm_s": RATE_NM_S,
+        # laws that take 20 ms badly would be in fault at the speed limit of the shipped arms
+        "limits.qd_limit_rad_s": 100.0,
         **(
             {"arm.g_m_s2": 0.0} if law == "adaptive_kinematics" else {}
         ),  # elbows bent, and none hangs

@@ -113,13 +113,8 @@ def test_triangle_dragged_for_minute_is_obeyed_to_its_end() -> None:
         ({"link": "m1->s", "to": {"model": "trace", "file": "/etc/passwd"}}, "file"),
         ({"dominance": "s", "to": {"m1": 0.9, "m2": 0.2}}, "sum"),
         ({"dominance": "x", "to": {"m1": 1.0}}, "sites are"),
-<<<<<<< HEAD
-        ({"dominance": "m1", "to": {"m2": 0.5, "s": 0.5}}, "send the change to m1"),
-        ({"to": {}}, "either a link (link) or"),
-=======
         ({"dominance": "m1", "to": {"m2": 0.5, "s": 0.5}}, "ask m1"),
         ({"to": {}}, "must name either a link"),
->>>>>>> 11609ad4 (Orders that name two targets: tests name the text without its brackets)
     ],
 )
 def test_what_cannot_be_is_refused_with_the_reason(order: Mapping[str, Any], says: str) -> None:
