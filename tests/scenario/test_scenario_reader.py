@@ -183,20 +183,20 @@ def test_an_override_reaches_into_lists_by_number() -> None:
         (
             "sites.s.environment.1.stiffness_n_m",
             "sites.s.environment.1",
-            "it has 1, counted from 0",
+            "the list has 1 entry, counted from 0",
         ),
         (
             "sites.s.environment.-1.stiffness_n_m",
             "sites.s.environment.-1",
-            "it has 1, counted from 0",
+            "the list has 1 entry, counted from 0",
         ),
         (
             "sites.s.environment.wall.stiffness_n_m",
             "sites.s.environment.wall",
-            "it has 1, counted from 0",
+            "the list has 1 entry, counted from 0",
         ),
         ("sites.m.environment.0.stiffness_n_m", "sites.m.environment.0", "the list is empty"),
-        ("sites.s.q0_rad.2", "sites.s.q0_rad.2", "it has 2, counted from 0"),
+        ("sites.s.q0_rad.2", "sites.s.q0_rad.2", "the list has 2 entries, counted from 0"),
         ("sites.s.q0_rad.0.x", "sites.s.q0_rad.0", "is a value, not a table"),
         (
             "sites.s.environment.0.stiffnes_n_m",
