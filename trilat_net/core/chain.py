@@ -593,38 +593,53 @@ def inverse_dynamics(
 
 @leaf
 def _add_products(factor: float, x: Spatial, y: Spatial, first: int, gradient: Array) -> None:
-    """Adds factor times the gradient of x' I(pi) y with respect to pi.
+    """Adds one term x' I y of the product Y' r to the gradient of a link's parameters.
+
+    I is the spatial inertia of the link. It is linear in the ten inertial parameters
+
+        pi = (m, m c, Ixx, Ixy, Iyy, Ixz, Iyz, Izz),
+
+    the mass m, the vector m c with the centre of mass c, and the moments of inertia J. With the
+    linear parts x_lin and y_lin and the angular parts x_ang and y_ang, the term is
+
+        x' I y = m x_lin' y_lin
+               + (m c)' (cross(y_lin, x_ang) + cross(x_lin, y_ang))
+               + x_ang' J y_ang
+
+    The factors of the parameters in this sum are the derivatives with respect to them. J is
+    symmetric. Therefore Ixy, Ixz and Iyz stand in two elements each, and have two products.
 
     Args:
-        factor: The factor.
-        x: a spatial velocity.
-        y: a spatial velocity.
-        first: Index of the link's first parameter.
-        gradient: Changed in its ten entries from `first`.
+        factor: Factor of the term.
+        x: A spatial velocity: its linear part in m/s, then its angular part in rad/s.
+        y: A spatial velocity or acceleration, also with its linear part first.
+        first: Index of the link's first parameter, its mass, in `gradient`.
+        gradient: Gradient for all links, shape (10 n,). `factor` times the ten derivatives is
+            added to the entries from `first`, in the order of pi.
     """
     x_lin, x_ang = x
     y_lin, y_ang = y
     x_1, x_2, x_3 = x_ang
     y_1, y_2, y_3 = y_ang
-    by_m = dot(x_lin, y_lin)
-    y_part = cross(y_lin, x_ang)
-    x_part = cross(x_lin, y_ang)
-    by_mc = add(y_part, x_part)
-    by_Ixx = x_1 * y_1
-    by_Ixy = x_1 * y_2 + x_2 * y_1
-    by_Iyy = x_2 * y_2
-    by_Ixz = x_1 * y_3 + x_3 * y_1
-    by_Iyz = x_2 * y_3 + x_3 * y_2
-    by_Izz = x_3 * y_3
-    gradient[first] += factor * by_m
-    for j in range(3):
-        gradient[first + 1 + j] += factor * by_mc[j]
-    gradient[first + 4] += factor * by_Ixx
-    gradient[first + 5] += factor * by_Ixy
-    gradient[first + 6] += factor * by_Iyy
-    gradient[first + 7] += factor * by_Ixz
-    gradient[first + 8] += factor * by_Iyz
-    gradient[first + 9] += factor * by_Izz
+    d_m = dot(x_lin, y_lin)
+    y_lin_x_x_ang = cross(y_lin, x_ang)
+    x_lin_x_y_ang = cross(x_lin, y_ang)
+    d_mc = add(y_lin_x_x_ang, x_lin_x_y_ang)
+    d_Ixx = x_1 * y_1
+    d_Ixy = x_1 * y_2 + x_2 * y_1
+    d_Iyy = x_2 * y_2
+    d_Ixz = x_1 * y_3 + x_3 * y_1
+    d_Iyz = x_2 * y_3 + x_3 * y_2
+    d_Izz = x_3 * y_3
+    gradient[first] += factor * d_m
+    for axis in range(3):
+        gradient[first + 1 + axis] += factor * d_mc[axis]
+    gradient[first + 4] += factor * d_Ixx
+    gradient[first + 5] += factor * d_Ixy
+    gradient[first + 6] += factor * d_Iyy
+    gradient[first + 7] += factor * d_Ixz
+    gradient[first + 8] += factor * d_Iyz
+    gradient[first + 9] += factor * d_Izz
 
 
 @leaf

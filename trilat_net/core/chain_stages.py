@@ -328,17 +328,30 @@ def _put_acceleration(
 
 @leaf
 def _use_stage(s: Row, joints: int, weight: float, ahead_s: float) -> None:
-    """Adds a stage's rates to the sums, and writes q and qd of the next stage.
+    """Completes a stage of the Runge-Kutta method, and prepares the next stage.
+
+    The method integrates the joint positions q and velocities qd over a period h. A stage is
+    one of its four evaluations of the derivatives (qd, qdd), where qdd is the acceleration:
+
+        q(t + h) = q(t) + h/6 (qd_1 + 2 qd_2 + 2 qd_3 + qd_4)        and the same for qd, qdd
+        q_{n+1}  = q(t) + ahead_s qd_n                               and the same for qd, qdd
+
+    The first line is the result, of which this function adds up the sum in brackets. The second
+    line is the state at which stage n + 1 evaluates the derivatives.
 
     Args:
-        s: The site's row.
-        joints: The number of joints.
-        weight: Weight of the stage in the sums, 1 or 2.
+        s: State of the site (the process that runs the arm). `q` and `qd` are the state at the
+            beginning of the period. `stage_q`, `stage_qd` and `stage_qdd` belong to this stage;
+            the first two are replaced by the state of the next stage. The sums `sum_qd` and
+            `sum_qdd` are updated.
+        joints: Number of joints.
+        weight: Weight of this stage in the sums: 1 or 2, in sixths.
         ahead_s: Time of the next stage after the beginning of the period, s.
     """
     for i in range(joints):
         s.sum_qd[i] += weight * s.stage_qd[i]
         s.sum_qdd[i] += weight * s.stage_qdd[i]
+        # The order matters: the next `stage_q` needs the `stage_qd` of this stage.
         s.stage_q[i] = s.q[i] + ahead_s * s.stage_qd[i]
         s.stage_qd[i] = s.qd[i] + ahead_s * s.stage_qdd[i]
 
