@@ -117,38 +117,52 @@ def _delay_us(
 def _due_ns(
     sample: int, stamp_ns: int, fresh: bool, link: LinkRow, model: Row, points: Points
 ) -> int:
-    """Returns the due time of a sample, ns since the epoch, or LOST.
+    """Computes when a link delivers a sample, or that the link loses it.
 
-    Loss and delay are drawn for every sample, also for lost ones, so that their memories
-    advance by index.
+    This function must be called once for each sample, in the order of the indices. The models
+    of bursts of loss and of correlated delays have a state, which it advances. Therefore loss
+    and delay are drawn even for a sample that is lost for another reason.
 
     Args:
-        sample: Index of the sample.
-        stamp_ns: Stamp of the sample, ns since the epoch.
-        fresh: True for the first sample of the model.
-        link: Row of the link.
-        model: Model in force.
-        points: The site's traces and outages.
+        sample: Index of the sample, the state that the sender sent in the tick (period of its
+            control loop) of this number.
+        stamp_ns: Time at which the sample was sent, ns since the epoch, the common start of the
+            session.
+        fresh: True for the first sample of the model, with which the model's state starts.
+        link: State of the link, with the seed `key` of its random numbers; changed. `copies`
+            counts the duplicated samples, and `due_before` is the latest due time so far, ns.
+        model: Model of delay and loss in force, a row of LINK_MODEL_DTYPE.
+        points: Delay traces and outages of all links of the receiver.
+
+    Returns:
+        The due time, at which the link delivers the sample, ns since the epoch. LOST if the
+        link loses the sample.
     """
     lost = _draw_loss(sample, fresh, link, model)
     delay_us = _delay_us(
         sample=sample, stamp_ns=stamp_ns, fresh=fresh, link=link, model=model, points=points
     )
-    if lost or delay_us < 0 or _in_outage(stamp_ns, link, points):
+    lost_by_trace = delay_us < 0
+    if lost or lost_by_trace or _in_outage(stamp_ns, link, points):
         return LOST
 
     if model.duplicate > 0.0:
         u, _ = uniforms(link.key, sample, DUPLICATE, 0)
-        if u < model.duplicate:
+        is_duplicated = u < model.duplicate
+        if is_duplicated:
             link.copies += 1
-            # The receiver uses the earlier one. Models with memory or by time give the copy the
-            # same delay.
-            if model.kind < _AR1:
+            # The receiver uses whichever of the two arrives first. The kinds before AR1 are
+            # distributions, from which the copy gets a delay of its own. With all other kinds,
+            # the copy has the delay of the sample and changes nothing.
+            draws_delay_of_copy = model.kind < _AR1
+            if draws_delay_of_copy:
                 copy_us = clamp_delay_us(draw_delay_us(link.key, sample, COPY, model))
                 delay_us = min(delay_us, copy_us)
 
+    # The play-out buffer of the receiver keeps each sample for at least `playout_us`.
     due_ns: int = stamp_ns + max(delay_us, model.playout_us) * 1000
     if model.in_order == 1:
+        # A sample waits for all older samples.
         due_ns = max(due_ns, link.due_before)
     link.due_before = max(due_ns, link.due_before)
     return due_ns

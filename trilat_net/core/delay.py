@@ -291,16 +291,26 @@ def next_ar1_value(
 
 @leaf
 def sine_delay_us(stamp_ns: int, model: Row) -> float:
-    """Returns the delay of a sample on a link whose delay is a sine of time, us, not rounded.
+    """Computes the delay of a sample on a link whose delay is a sine function of time.
+
+        delay(t) = mean + amplitude sin(2 pi t / period + phase)
 
     Args:
-        stamp_ns: Stamp of the sample, the time at which it was sent, ns since the epoch.
-        model: Model of the delay, a row of LINK_MODEL_DTYPE.
+        stamp_ns: Stamp of the sample, the time t at which it was sent, ns since the epoch, the
+            common start of the session.
+        model: Model of the delay, a row of LINK_MODEL_DTYPE. The mean is `location`, the
+            amplitude `scale` and the period `extra`, all in us. The phase is `weight`, in rad.
+
+    Returns:
+        The delay, us, not rounded.
     """
-    location: float = model.location
-    scale: float = model.scale
-    turns = stamp_ns * 1e-3 / model.extra
-    return location + scale * math.sin(2.0 * math.pi * turns + model.weight)
+    mean_us: float = model.location
+    amplitude_us: float = model.scale
+    period_us = model.extra
+    phase_rad = model.weight
+    stamp_us = stamp_ns * 1e-3
+    turns = stamp_us / period_us
+    return mean_us + amplitude_us * math.sin(2.0 * math.pi * turns + phase_rad)
 
 
 @leaf
