@@ -270,17 +270,26 @@ def _compile_law(torque: Callable[..., Any], form: _Form) -> Any:
 
 
 def _read_numbers(law: Any) -> dict[str, np.ndarray[Any, Any]]:
-    """Returns the attributes of a law that are numbers: the remembered ones, then the others.
+    """Collects the numbers of a law, which the compiled law stores in a row of an array.
 
-    Numbers that `torque` writes, and lists, become floats; other integers remain integers. The
-    names of the attributes that `torque` uses are read from its byte code.
+    These are the attributes of the instance, and the attributes of its class whose names occur
+    in the method `torque`. Each of them needs a fixed type:
+
+    - Integers that do not change, such as counts and indices, remain integers. Booleans that
+      do not change become integers.
+    - All other numbers become floats, also integers that may change: the numbers that the law
+      remembers from tick to tick, attributes that `torque` assigns, and lists, whose elements
+      it can assign. A tick is a period of the control loop.
 
     Args:
         law: An instance of the law's class.
 
     Returns:
-        Numbers by name, as arrays. Attributes that are not numbers are left out.
+        Numbers by name, as arrays: first those that the law remembers, in their order, then the
+        others in alphabetical order. Attributes that are not numbers are left out.
     """
+    # The byte code of `torque` names the attributes that it reads and assigns. It does not tell
+    # whether they belong to the law, so names of attributes of other objects are included.
     code = list(dis.get_instructions(type(law).torque))
     written = {step.argval for step in code if step.opname == "STORE_ATTR"}
     access = ("LOAD_ATTR", "LOAD_METHOD", "STORE_ATTR")
@@ -298,10 +307,11 @@ def _read_numbers(law: Any) -> dict[str, np.ndarray[Any, Any]]:
         except ValueError:  # a list of rows with different lengths
             continue
         kind = numbers.dtype.kind
-        if kind not in "fiub" or not numbers.size:
+        is_numeric = kind in "fiub"  # float, integer, unsigned integer or boolean
+        if not is_numeric or not numbers.size:
             continue
-        is_changed = name in remembered or name in written or isinstance(value, list)
-        dtype = np.float64 if is_changed or kind == "f" else np.int64
+        may_change = name in remembered or name in written or isinstance(value, list)
+        dtype = np.float64 if may_change or kind == "f" else np.int64
         numbers_by_name[name] = numbers.astype(dtype)
     return numbers_by_name
 

@@ -498,19 +498,25 @@ class _Leaf(CPUDispatcher):
         return super().get_call_template(plain_arguments, plain_keywords)
 
     def add_overload(self, result: Any) -> None:
-        """Registers a compiled form of the function, for the types of its arguments.
+        """Stores a compiled form of the function, so that it need not be compiled again.
 
-        Machine code is registered for calls from Python. LLVM code, which only other compiled
-        functions can call, is not. Numba calls this method.
+        There are two forms. A leaf that Python calls is machine code. An inner leaf, which was
+        compiled because another leaf calls it, is LLVM code, which cannot be executed. Both are
+        entered into `overloads`, the table in which compiled callers look up a function by the
+        types of its arguments. Numba's own method also enters the machine code into the table
+        of functions that Python can call; an inner leaf must not get there. Numba calls this
+        method.
 
         Args:
             result: Numba's description of the compiled form.
         """
-        if getattr(result.library, "is_inner", False):
-            argument_types = tuple(result.signature.args)
-            self.overloads[argument_types] = result
-        else:
+        # A library of Numba's own class, and not of `_LeafLibrary`, lacks the attribute.
+        is_inner = getattr(result.library, "is_inner", False)
+        if not is_inner:
             super().add_overload(result)
+            return
+        argument_types = tuple(result.signature.args)
+        self.overloads[argument_types] = result
 
     def compile(self, signature: Any) -> Any:
         """Loads or compiles the function for given types of arguments.
