@@ -69,17 +69,21 @@ _DIVERGED = int(Mode.DIVERGED)
 
 
 def max_over_joints(buckets: Array) -> Array:
-    """Returns the peaks of the position error e and the joint speed qd over all joints.
+    """Computes the largest position error and joint speed of an arm in each interval of time.
 
     Args:
-        buckets: Peaks of each joint of a site in K intervals of time, shape (K, 3 n), see
-            `run_until`.
+        buckets: Statistics of an arm with n joints in K intervals of time, which are called
+            buckets, shape (K, 3 n). `run_until` writes them. Each row consists of three groups
+            of n columns, one column per joint: the largest position error |e| in rad, the
+            largest joint speed |qd| in rad/s, and the last joint angle q in rad.
 
     Returns:
-        The largest |e|, rad, and the largest |qd|, rad/s, per interval, shape (K, 2).
+        The largest |e| in rad and the largest |qd| in rad/s over all joints, shape (K, 2).
     """
     joints = buckets.shape[1] // 3
-    peaks: Array = buckets[:, : 2 * joints].reshape(-1, 2, joints).max(axis=2)
+    errors_and_speeds = buckets[:, : 2 * joints]
+    by_quantity_and_joint = errors_and_speeds.reshape(-1, 2, joints)
+    peaks: Array = by_quantity_and_joint.max(axis=2)
     return peaks
 
 
@@ -119,36 +123,51 @@ class ReplayedInputs(NamedTuple):
 def _accept_record(
     k: int, rate_hz: int, peer: SiteRow, sample: int, sent: RecentRecords, link: LinkArrays
 ) -> None:
-    """Accepts the record of a peer's tick as an arrival at tick k.
+    """Reads the sample of a peer from its record, and stores it as an arrival at the receiver.
 
-    The columns of the record are those of `TickRecord.shared`.
+    A site is the process that runs one arm. The receiver is a site, and the peer another site,
+    whose samples (states) it receives. A record contains the results of one tick, a period of
+    the control loop. With n joints, m coordinates that the sites share and P parameters, its
+    floating-point numbers are
+
+        q (n), qd (n), q_des (m), qd_des (m), tau (n), tau_x (n), theta_hat (P),
+        x (m), xd (m), wrench (m),                                  only in task space
+        the numbers that the control law of the peer sends
+
+    Sites that share joint angles send q, qd and tau_x. Sites in task space send the pose x, its
+    velocity xd and the external wrench on the end effector instead.
 
     Args:
-        k: Tick of the receiver.
+        k: Present tick of the receiver.
         rate_hz: Tick rate of the receiver, Hz.
-        peer: Row of the peer.
-        sample: Tick of the peer.
-        sent: Last records of the peer.
-        link: Arrays of the link from the peer.
+        peer: State of the peer.
+        sample: Tick in which the peer sent the sample.
+        sent: Latest records of the peer, a ring buffer: the record of tick i is at i modulo the
+            length.
+        link: Arrays of the link from the peer; the sample is stored in them.
     """
     n = peer.joints
     m = peer.shared
     first_sent = _first_sent(peer)
-    q = 0
-    qd = n
-    tau_x = 3 * n + 2 * m
+    q_column = 0
+    qd_column = n
+    tau_x_column = 3 * n + 2 * m
     if peer.task:
-        q = first_sent - 3 * m
-        qd = first_sent - 2 * m
-        tau_x = first_sent - m
-    row = sent.rows[sample & (sent.t_ns.shape[0] - 1)]
+        # x, xd and the wrench are the last vectors before the numbers that the law sends.
+        q_column = first_sent - 3 * m
+        qd_column = first_sent - 2 * m
+        tau_x_column = first_sent - m
+    # The length of the ring is a power of two, so a modulo is a mask of the lower bits.
+    ring_mask = sent.t_ns.shape[0] - 1
+    row = sent.rows[sample & ring_mask]
+    # Each slice starts at its vector and may be longer: `accept_sample` ignores the rest.
     accept_sample(
         k=k,
         rate_hz=rate_hz,
         tick=sample,
-        q=row[q:],
-        qd=row[qd:],
-        tau_x=row[tau_x:],
+        q=row[q_column:],
+        qd=row[qd_column:],
+        tau_x=row[tau_x_column:],
         sent=row[first_sent:],
         link=link,
     )
