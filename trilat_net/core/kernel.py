@@ -174,21 +174,29 @@ def _put_known_gravity(s: SiteRow, chain: RowArray | None, torque: Array) -> Non
 
 @leaf
 def _guard_torque(k: int, t_ns: int, s: SiteRow, chain: RowArray | None) -> None:
-    """Ends stage 6: replaces or changes the torque of an arm at rest, and limits all torques.
+    """Turns the torque of the control law into the torque that the motors get.
 
-    Under the rule `glide` a torque that is not finite leads to FAULT here. The torque of an arm
-    that rests, or that has just left its rest, differs from that of its law.
+    This is the last part of stage 6 of a tick, after the law has written the torque `tau`. The
+    rate of every torque is limited. Under the rule `glide`, by which an arm comes to rest while
+    a peer (another arm) is silent, these cases change the torque before:
+
+    - The torque is not finite: the mode becomes FAULT, in which the arm comes to rest.
+    - The arm comes to rest or is at rest: damping and an integral term are added, see
+      `resting`. If the law cannot hold the arm, the gravity torque replaces that of the law.
+    - The arm has just left its rest: the torque blends from that at rest to that of the law.
 
     Args:
-        k: The tick.
+        k: Number of the tick, a period of the control loop.
         t_ns: Nominal time of the tick, ns since the epoch, the common start of the session.
-        s: Row of the site.
-        chain: Rows of the chain, or None.
+        s: State of the site (the process that runs the arm); changed.
+        chain: Data of the joints, one row per joint. None for the planar two-link arm.
     """
     resting = False
     if s.on_stale == _GLIDE:
+        # A site with the reason NOT_FINITE is in FAULT already, and does not enter it again.
         if s.reason != _NOT_FINITE and s.mode != _DIVERGED and not is_torque_finite(s):
             latch_mode(t_ns, s, _FAULT, _NOT_FINITE)
+        # The mode may have just become FAULT, in which the arm rests.
         resting = rests(s)
         if resting:
             if not rests_by_law(s):
@@ -198,6 +206,7 @@ def _guard_torque(k: int, t_ns: int, s: SiteRow, chain: RowArray | None) -> None
             return_to_law(t_ns, s)
     limit_torque_rate(s)
     if resting:
+        # The integral term must not grow while a limit cuts off the torque.
         advance_rest(s)
 
 
@@ -482,18 +491,28 @@ def sense_stages(
 ) -> None:
     """Computes the part of a tick that precedes the control law (stages 1 to 5).
 
-    The stages are: store the samples that arrived; bring samples into use; compute the
-    reference, the errors, and the estimate. Then the external torque is computed.
+    A tick is one period of the control loop. A sample is the state that a peer, another arm's
+    process, sends in one of its ticks. The stages are:
+
+    - 1 accept: store the samples that arrived, until their simulated delay has passed.
+    - 2 release: put into use the newest sample of each peer whose delay has passed.
+    - 3 reference: compute the position that the arm shall follow.
+    - 4 errors: compute the tracking errors.
+    - 5 estimate: update the estimate of the arm's dynamic parameters.
+
+    At last, the torque of operators and environments on the arm is computed.
 
     Args:
-        k: The tick.
+        k: Number of the tick.
         t_ns: Nominal time of the tick, ns since the epoch, the common start of the session.
-        count: Number of arrivals in the buffers.
-        arrays: Arrays of the site; written.
-        buffers: Arrivals of the tick.
+        count: Number of samples that arrived since the previous tick.
+        arrays: Arrays of the site (the process that runs the arm), see `SiteArrays`; written.
+        buffers: Contains the samples that arrived.
     """
     rate_hz = arrays.site[0].rate_hz
-    # Missed ticks release their samples too: each page of a calendar must be read once.
+    # Samples wait in a ring buffer with one page per tick. The pages of the ticks that the site
+    # has missed (because it was too slow) are emptied first. Otherwise a later tick with the
+    # same page would use their samples.
     for missed in range(k - arrays.site[0].skipped, k):
         for j in range(arrays.links.shape[0]):
             release_sample(missed, rate_hz, link_arrays(arrays, j))
@@ -502,6 +521,7 @@ def sense_stages(
     # 2 release
     for j in range(arrays.links.shape[0]):
         release_sample(k, rate_hz, link_arrays(arrays, j))
+    # 3 reference, 4 errors, 5 estimate
     reference_stages(
         k=k,
         t_ns=t_ns,
