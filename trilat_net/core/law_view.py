@@ -77,6 +77,8 @@ _PER_JOINT = ("q", "qd", "tau_x", "tau_before", "q_before", "tau", "gravity", "b
 _PER_COORDINATE = ("q_des", "qd_des", "felt")
 _IN_ROW = {"gravity": "G"}
 """Fields of the site's row whose names differ from those of a law's input."""
+_FIRST_PEER_VECTOR = PeerView._fields.index("q")
+"""Index of the first vector in `PeerView`: q, qd and tau_x come last, after single numbers."""
 
 
 def _name_vectors(vectors: Sequence[SentVector], numbers: list[float]) -> SimpleNamespace:
@@ -197,22 +199,38 @@ class PlainLaw:
         restore_law(self._law, self._setup.name, memory)
 
     def _read(self, k: int) -> LawInput:
-        """Returns the input of tick `k`, after `update_law_view` has written the rows.
+        """Collects the input of the control law for one tick, a period of the control loop.
 
-        All numbers are copied to lists, which plain Python reads faster than arrays.
+        `update_law_view` must have written the arrays before. All numbers are copied from them
+        to lists, which plain Python reads faster than arrays.
+
+        The input also contains the vectors that the law sends to the laws of its peers (other
+        arms), with the numbers of the previous tick. The law overwrites them, and
+        `_collect_sent` reads the new numbers. In the array they have the order of a record:
+        first the vectors that go to all peers, then for each peer those that go to it alone.
+
+        Args:
+            k: Number of the tick.
+
+        Returns:
+            The input.
         """
         setup = self._setup
+        # One column per field of `PeerView`, in their order, with one entry per peer.
         columns: list[Any] = [column.tolist() for column in self._peer_columns]
-        # The last three columns are the vectors q, qd and tau_x.
-        columns[4:] = [map(LawVector, rows) for rows in columns[4:]]
+        vector_columns = columns[_FIRST_PEER_VECTOR:]
+        columns[_FIRST_PEER_VECTOR:] = [map(LawVector, rows) for rows in vector_columns]
         peers = tuple(map(PeerView, *columns))
+
         received = [] if self._received is None else self._received.tolist()
         from_peers = [_name_vectors(self._receives, numbers) for numbers in received]
+
         sent = self._sent.tolist()
         to_peers = []
         for j in range(len(peers)):
-            first = self._to_all_size + j * self._peer_size
-            to_peers.append(_name_vectors(self._sends_to_peer, sent[first:]))
+            first_to_peer = self._to_all_size + j * self._peer_size
+            to_peers.append(_name_vectors(self._sends_to_peer, sent[first_to_peer:]))
+
         vectors = {}
         for name, view in self._views.items():
             vectors[name] = LawVector(view.tolist())

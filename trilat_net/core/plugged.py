@@ -51,32 +51,40 @@ def _call_compiled(_context: Any, address: Any, arguments: Any) -> Any:
     """
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        """Generates the LLVM code, in the calling convention of Numba.
+        """Generates the LLVM code of the call `function(*arguments)` by the function's address.
+
+        The address is a value at run time. Therefore the compiled caller does not depend on the
+        function, and is not compiled again for another one. Numba calls `generate` while it
+        compiles the caller. Arguments, result and exceptions are passed as in all functions
+        that Numba compiles.
 
         Args:
             context: Numba's description of the target processor.
             builder: Appends LLVM instructions to the caller.
-            signature: The signature of the intrinsic.
-            values: The LLVM values of the address and of the tuple.
+            signature: Types of the two arguments of the intrinsic: an integer, and a tuple with
+                one type per argument of the function.
+            values: LLVM values of the same two arguments: the address of the function, and the
+                tuple of its arguments.
 
         Returns:
-            The LLVM value of None, the result of the call.
+            The LLVM value of None, which is the result of the call in Python.
         """
         convention = context.call_conv
         address_value, tuple_value = values
         argument_types = tuple(signature.args[1])
-        # Convert the integer to a pointer to a function.
+        # Convert the address, an integer, to a pointer to a function that returns None.
         function_type = convention.get_function_type(types.none, argument_types)
         pointer = builder.inttoptr(address_value, function_type.as_pointer())
         unpack: Any = cgutils.unpack_tuple
         argument_values = unpack(builder, tuple_value)
-        # A function returns a status, which states whether an exception was raised.
+        # A compiled function returns a status, which states whether it raised an exception. If
+        # so, the caller returns at once with the same status.
         status, _ = convention.call_function(
             builder, pointer, types.none, argument_types, argument_values
         )
         with builder.if_then(status.is_error, likely=False):
             convention.return_status_propagate(builder, status)
-        return context.get_dummy_value()
+        return context.get_dummy_value()  # Numba represents None by an arbitrary value
 
     # A Numba type that is called with types of arguments is a signature: this one returns None.
     return types.none(address, arguments), generate
