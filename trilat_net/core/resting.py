@@ -142,11 +142,11 @@ def enter_rest(t_ns: int, mode: int, reason: int, site: SiteRow) -> None:
         return
     site.return_from_ns = t_ns
     for i in range(site.joints):
-        _write_reference(site, i, site.q[i], site.qd[i])
+        _write_rest_reference(site, i, site.q[i], site.qd[i])
 
 
 @leaf
-def _read_reference(site: SiteRow, i: int) -> tuple[float, float]:
+def _read_rest_reference(site: SiteRow, i: int) -> tuple[float, float]:
     """Returns the rest reference of joint i, rad, and its rate, rad/s."""
     if site.task:
         return site.q_rest[i], site.qd_rest[i]
@@ -154,14 +154,19 @@ def _read_reference(site: SiteRow, i: int) -> tuple[float, float]:
 
 
 @leaf
-def _write_reference(site: SiteRow, i: int, q: float, qd: float) -> None:
-    """Writes the rest reference of joint i into the fields that the record's `mem` contains.
+def _write_rest_reference(site: SiteRow, i: int, q: float, qd: float) -> None:
+    """Stores the rest reference of a joint, the motion that brings the joint to rest.
+
+    In joint space, the sites share joint angles. The fields `q_held` and `qd_held` have one
+    number per joint, and no other use while the arm rests. In task space, the sites share poses
+    of the end effector. Then these fields have one number per coordinate of the pose, and the
+    joints need `q_rest` and `qd_rest`. `_read_rest_reference` reads the same fields.
 
     Args:
-        site: Row of the site.
-        i: The joint.
-        q: The reference, rad.
-        qd: Its rate, rad/s.
+        site: State of the site (the process that runs the arm); changed.
+        i: Index of the joint.
+        q: Position of the reference, rad.
+        qd: Velocity of the reference, rad/s.
     """
     if site.task:
         site.q_rest[i] = q
@@ -181,7 +186,7 @@ def _find_remaining_s(elapsed_s: float, site: SiteRow) -> float:
     """
     remaining_s = LEAST_STOP_S - elapsed_s
     for i in range(site.joints):
-        _, rate = _read_reference(site, i)
+        _, rate = _read_rest_reference(site, i)
         remaining_s = max(remaining_s, abs(rate) / site.deceleration[i])
     return remaining_s
 
@@ -211,7 +216,7 @@ def advance_rest_reference(t_ns: int, ticks: int, site: SiteRow) -> None:
     fast = is_fast(site)
     for i in range(site.joints):
         qd = site.qd[i]
-        q_ref, rate_before = _read_reference(site, i)
+        q_ref, rate_before = _read_rest_reference(site, i)
         rate = factor * rate_before
         if rate * qd <= 0.0:
             rate = 0.0
@@ -228,7 +233,7 @@ def advance_rest_reference(t_ns: int, ticks: int, site: SiteRow) -> None:
             distance = q_before - q_ref
             if (joint_step - step) * distance >= 0.0:
                 step = joint_step
-        _write_reference(site, i, q_ref + step, rate)
+        _write_rest_reference(site, i, q_ref + step, rate)
 
 
 @leaf
@@ -247,7 +252,7 @@ def _brakes(t_ns: int, site: SiteRow) -> bool:
     elapsed_ns = t_ns - site.return_from_ns
     brakes = elapsed_ns < LEAST_STOP_S * NS_PER_S or is_fast(site)
     for i in range(site.joints):
-        _, reference_velocity = _read_reference(site, i)
+        _, reference_velocity = _read_rest_reference(site, i)
         brakes = brakes or reference_velocity != 0.0
     return brakes
 
@@ -256,12 +261,18 @@ def _brakes(t_ns: int, site: SiteRow) -> bool:
 def put_rest_reference(site: SiteRow, q: Array, qd: Array) -> None:
     """Computes the reference of an arm at rest, in the coordinates of its control law.
 
-    In joint space, it is the motion that brings the joints to rest. In task space, the
-    coordinates describe the pose of the end effector. Their reference is then the present pose
-    and its velocity, because the joints have a reference of their own that brings them to rest.
+    In joint space, the coordinates are the joint angles. The reference is the motion that
+    brings the joints to rest. The forces on other arms, which some laws reflect, are cleared,
+    so that they do not move the resting arm.
+
+    In task space, the coordinates describe the pose of the end effector. Their reference is the
+    present pose and its velocity, so that the law sees no error. `add_rest_torque` brings the
+    joints to rest instead, by a reference of their own.
 
     Args:
-        site: State of the site (the process that runs the arm).
+        site: State of the site (the process that runs the arm). `task` is 1 in task space, and
+            0 in joint space. In joint space, `felt` is cleared, the weighted torque on the
+            other arms in N m.
         q: Receives the reference, one number per coordinate, rad or m.
         qd: Receives the velocity of the reference, rad/s or m/s.
     """
@@ -270,14 +281,14 @@ def put_rest_reference(site: SiteRow, q: Array, qd: Array) -> None:
             q[i] = site.x[i]
             qd[i] = site.xd[i]
         else:
-            q[i], qd[i] = _read_reference(site, i)
+            q[i], qd[i] = _read_rest_reference(site, i)
             site.felt[i] = 0.0
 
 
 @leaf
 def _find_slip(site: SiteRow, i: int) -> float:
     """Returns s = qd - qd_ref + Lambda (q - q_ref) of joint i, rad/s."""
-    q_ref, qd_ref = _read_reference(site, i)
+    q_ref, qd_ref = _read_rest_reference(site, i)
     Lambda = REST_RATE_1_S
     if site.law == _ADAPTIVE and not site.task:
         Lambda = site.Lambda[i]
@@ -344,15 +355,28 @@ def add_rest_torque(k: int, t_ns: int, site: SiteRow) -> None:
 def advance_rest(site: SiteRow) -> None:
     """Updates the integral term w of the torque that holds an arm at rest.
 
-    The term w carries a constant load. In a period h of the control loop it changes by -h k B
-    s, where B is the damping of the arm at rest, k B the integral gain, and s the filtered
-    deviation of the joint from its reference. If the torque is already limited in the direction
-    of the change, w stays unchanged (anti-windup).
+    The term w carries a constant load, for example unknown gravity. In each period h of the
+    control loop, it changes by
+
+        -h k B s,    s = qd - qd_ref + Lambda (q - q_ref)
+
+    where q and qd are the position and velocity of a joint, q_ref and qd_ref those of the
+    reference that brings it to rest, Lambda a rate in 1/s, and k B the integral gain.
+
+    If a limit has cut off a part of the torque, w does not change in the direction of this
+    part. Otherwise it would grow without effect (windup).
+
+    Args:
+        site: State of the site (the process that runs the arm). For each joint, `tau_held` is w
+            in N m, which is changed, and `integral` is k B in N m/rad. `u` is the torque before
+            its limits and `tau` after them, N m.
     """
     for i in range(site.joints):
-        step = -site.integral[i] * _find_slip(site, i) / site.rate_hz
-        excess = site.u[i] - site.tau[i]
-        if isfinite(step) and excess * step <= 0.0:
+        slip = _find_slip(site, i)
+        step = -site.integral[i] * slip / site.rate_hz
+        cut_off = site.u[i] - site.tau[i]
+        # A step is not finite if the motion is not; it must not get into w.
+        if isfinite(step) and cut_off * step <= 0.0:
             site.tau_held[i] += step
 
 
