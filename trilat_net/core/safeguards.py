@@ -59,25 +59,39 @@ def limit_reference(k: int, site: SiteRow) -> None:
 
 @leaf
 def _limit_turn(site: SiteRow) -> None:
-    """Limits the angular velocity of the reference about each axis.
+    """Limits how fast the orientation of the reference turns, about each axis of the base.
 
-    The axis of the turn since the previous tick is kept: the turn is shortened as a whole.
+    The reference is the pose that the arm follows. It may turn from its orientation in the
+    previous tick (period of the control loop) by at most the limit times the period, about each
+    axis. If it turns too far, the whole rotation vector of the turn is multiplied by the same
+    factor, so that the direction of its axis is kept. The reference then turns at the velocity
+    of the shortened turn.
+
+    Args:
+        site: State of the site (the process that runs the arm). Its coordinates 0 to 2 are a
+            position, and 3 to 5 a rotation vector in rad. `q_followed` is the reference in the
+            previous tick. `q_des` and `qd_des`, the new reference and its velocity, are
+            limited. `qd_des_limit` contains the limits of the velocity, rad/s.
     """
     vector_before = three(site.q_followed[3:])
-    before = rotation_matrix(vector_before)
-    desired = rotation_matrix(three(site.q_des[3:]))
-    turn = relative_rotation(desired, before)
+    orientation_before = rotation_matrix(vector_before)
+    desired_orientation = rotation_matrix(three(site.q_des[3:]))
+    turn = relative_rotation(desired_orientation, orientation_before)
+    # The largest factor with which the turn is within the limits of all three axes.
     factor = 1.0
-    for i in range(3):
-        size = abs(turn[i])
-        largest_turn = site.qd_des_limit[3 + i] / site.rate_hz
-        if size * factor > largest_turn:
-            factor = largest_turn / size
+    for axis in range(3):
+        angle = abs(turn[axis])
+        largest_angle = site.qd_des_limit[3 + axis] / site.rate_hz
+        if angle * factor > largest_angle:
+            factor = largest_angle / angle
     if factor < 1.0:
         limited_turn = scale(factor, turn)
         velocity = scale(factor * site.rate_hz, turn)
+        # The orientation before, followed by the limited turn.
         put_three(site.q_des[3:], compose_rotations(limited_turn, vector_before))
         put_three(site.qd_des[3:], velocity)
+    # The velocity of a turn that was not shortened comes from the peers, and may be above the
+    # limit although the turn is not. That of a shortened turn only loses rounding errors here.
     for i in range(3, 6):
         limit = site.qd_des_limit[i]
         rate = site.qd_des[i]

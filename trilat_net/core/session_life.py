@@ -149,24 +149,40 @@ def _alignment_s(site: SiteRow) -> float:
 
 @leaf
 def _start_alignment(t_ns: int, site: SiteRow, reason: int, q: Array, qd: Array) -> None:
-    """Starts an alignment, unless the peers are farther away than the limit.
+    """Starts an alignment, by which the reference of an arm returns smoothly to its peers.
+
+    The reference is the position that the arm follows, and the peers are the other arms. During
+    the alignment, in the mode RETURN, the reference is that of the peers plus an offset. The
+    offset starts as the difference between a given reference and that of the peers, and falls
+    to zero, see `_find_offset`. Therefore the reference does not jump.
+
+    If a coordinate of the offset, or its angle, is above the limit, the mode does not change,
+    and only the reason `ALIGN_LIMIT` is stored.
+
+    An orientation is a rotation vector in the coordinates from 3 on. With the rotation matrices
+    R_q of the given reference and R_p of that of the peers, its offset is the turn R_q R_p',
+    which leads from the peers to the given reference. The angular velocity of the turn is the
+    given one minus that of the peers, which the turn rotates.
 
     Args:
         t_ns: Time, ns since the epoch, the common start of the session.
-        site: Row of the site, with the peers' reference in q_des and qd_des.
-        reason: Reason of the change of mode.
-        q: Reference from which the site aligns.
-        qd: Rate of this reference.
+        site: State of the site, the process that runs the arm; changed. `q_des` and `qd_des`
+            are the reference of the peers and its velocity. If the alignment starts, `q_held`
+            receives the offset, `qd_held` its rate, `return_from_ns` its start, and `tau_held`
+            the last torque, from which the torque blends to that of the law (`return_to_law`).
+        reason: Reason of the change of mode, a `LifeReason`.
+        q: Reference from which the alignment starts, rad or m.
+        qd: Velocity of this reference, rad/s or m/s.
     """
     turn = (0.0, 0.0, 0.0)
-    rate = (0.0, 0.0, 0.0)
+    turn_rate = (0.0, 0.0, 0.0)
     if has_orientation(site):
         site_rotation = rotation_matrix(three(q[3:]))
         peers_rotation = rotation_matrix(three(site.q_des[3:]))
         turn = relative_rotation(site_rotation, peers_rotation)
-        peers_rate = rotate_by_vector(turn, three(site.qd_des[3:]))
-        velocity = subtract(three(qd[3:]), peers_rate)
-        rate = rotation_vector_rate(turn, velocity)
+        peers_velocity = rotate_by_vector(turn, three(site.qd_des[3:]))
+        turn_velocity = subtract(three(qd[3:]), peers_velocity)
+        turn_rate = rotation_vector_rate(turn, turn_velocity)
 
     near = length(turn) <= site.align_limit
     for i in range(count_linear_coordinates(site)):
@@ -181,7 +197,7 @@ def _start_alignment(t_ns: int, site: SiteRow, reason: int, q: Array, qd: Array)
         site.qd_held[i] = qd[i] - site.qd_des[i]
     if has_orientation(site):
         put_three(site.q_held[3:], turn)
-        put_three(site.qd_held[3:], rate)
+        put_three(site.qd_held[3:], turn_rate)
     put(site.tau_held, site.tau_before)
     site.mode = _ALIGN
     site.reason = reason
@@ -208,17 +224,28 @@ def _leave_rest(t_ns: int, site: SiteRow, reason: int) -> None:
 
 @leaf
 def _extrapolate_reference(site: SiteRow) -> None:
-    """Extrapolates the reference of the previous tick by one period with its rate.
+    """Estimates where the reference of a moving arm would be now, if nothing had changed.
 
-    A site that drops or restores a peer aligns from there, because it has not rested before.
+    The reference is the position that the arm follows, computed from the positions of its
+    peers, the other arms. It jumps if a peer is dropped because it is lost, or restored when it
+    comes back. An alignment then leads smoothly to the new reference. It starts from the
+    reference of the previous tick (period of the control loop), moved on by one period at its
+    velocity. An arm at rest needs no such estimate, because it has a reference of its own.
+
+    An orientation, a rotation vector in the coordinates from 3 on, turns at its angular
+    velocity.
+
+    Args:
+        site: State of the site, the process that runs the arm. `q_followed` and `qd_followed`
+            are the reference of the previous tick and its velocity; `q_followed` is moved on.
     """
-    h_s = 1.0 / site.rate_hz
+    period_s = 1.0 / site.rate_hz
     for i in range(count_linear_coordinates(site)):
-        site.q_followed[i] += h_s * site.qd_followed[i]
+        site.q_followed[i] += period_s * site.qd_followed[i]
     if has_orientation(site):
-        turn = scale(h_s, three(site.qd_followed[3:]))
-        reference = compose_rotations(turn, three(site.q_followed[3:]))
-        put_three(site.q_followed[3:], reference)
+        turn = scale(period_s, three(site.qd_followed[3:]))
+        orientation = compose_rotations(turn, three(site.q_followed[3:]))
+        put_three(site.q_followed[3:], orientation)
 
 
 @leaf
@@ -374,12 +401,17 @@ def _update_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
 
 @leaf
 def update_session_life(t_ns: int, site: SiteRow, links: RowArray) -> None:
-    """Changes the mode of a site by the rules of this module, and computes its reference.
+    """Changes the mode of a site if needed, and computes its reference for the mode.
 
     A site is the process that runs the arm, and the reference is the position that the arm
-    follows. Before the call, `q_des` and `qd_des` contain the weighted mean of the other arms'
-    positions and its derivative. After the call, they contain the new reference. The reference
-    of the previous control period is in `q_followed` and `qd_followed`.
+    follows. The modes and their changes are explained at the top of this module. The mode
+    changes by an order of a person or of the site itself, by a fault of the arm, or because
+    peers (other arms) fall silent or are heard again.
+
+    Before the call, `q_des` and `qd_des` contain the weighted mean of the other arms' positions
+    and its derivative. After the call, they contain the reference: this mean in the mode RUN,
+    the mean plus an offset in RETURN, and the reference that brings the arm to rest otherwise.
+    The reference of the previous control period is in `q_followed` and `qd_followed`.
 
     Args:
         t_ns: Time, ns since the start of the session.
@@ -387,15 +419,19 @@ def update_session_life(t_ns: int, site: SiteRow, links: RowArray) -> None:
         links: States of the links from the other sites, one row per link.
     """
     if site.mode == _DIVERGED:
-        return
-    if t_ns == tick_ns(site.first, site.rate_hz):
+        return  # this mode is final
+    is_first_tick = t_ns == tick_ns(site.first, site.rate_hz)
+    if is_first_tick:
         enter_rest(t_ns, _WAITING, _START, site)
-    ticks = 1 + site.skipped
+    # Read the missed ticks before `_apply_order` clears them.
+    ticks_since_last_call = 1 + site.skipped
     if site.order != 0 or site.skipped != 0:
         _apply_order(t_ns, site)
+    # An arm that leaves its rest in this tick starts from its rest reference at this time.
     if rests(site):
-        advance_rest_reference(t_ns, ticks, site)
+        advance_rest_reference(t_ns, ticks_since_last_call, site)
     _update_mode(t_ns, site, links)
+    # The mode is now final for this tick.
     if site.mode == _ALIGN:
         _add_offset(t_ns, site)
     elif rests(site):
@@ -438,19 +474,27 @@ def _find_offset(t_ns: int, duration_s: float, site: SiteRow, i: int) -> tuple[f
 
 @leaf
 def _add_offset(t_ns: int, site: SiteRow) -> None:
-    """Adds the offset of an alignment and its rate to the peers' reference.
+    """Computes the reference of an arm that returns smoothly to its peers, the other arms.
 
-    Linear coordinates are added. An orientation is composed with the turn of the offset.
+    This return is called alignment. The reference, which the arm follows, is the reference of
+    the peers plus an offset, which falls to zero. The offset and its rate are added to position
+    and velocity. `_start_alignment` has stored their start values.
+
+    For an orientation, the offset is a turn, which follows the rotation of the peers: the
+    rotation matrix of the reference is T R, with T of the turn and R of the peers. The angular
+    velocity is that of the turn plus that of the peers, which the turn rotates.
 
     Args:
         t_ns: Time, ns since the epoch, the common start of the session.
-        site: Row of the site, with the peers' reference.
+        site: State of the site, the process that runs the arm. In a pose, the coordinates 0 to
+            2 are a position, and 3 to 5 a rotation vector in rad. `q_des` and `qd_des` are the
+            reference of the peers and its velocity, and receive the sums.
     """
     duration_s = _alignment_s(site)
     for i in range(count_linear_coordinates(site)):
-        offset, rate = _find_offset(t_ns, duration_s, site, i)
+        offset, offset_rate = _find_offset(t_ns, duration_s, site, i)
         site.q_des[i] += offset
-        site.qd_des[i] += rate
+        site.qd_des[i] += offset_rate
     if has_orientation(site):
         x, x_rate = _find_offset(t_ns, duration_s, site, 3)
         y, y_rate = _find_offset(t_ns, duration_s, site, 4)
@@ -459,6 +503,6 @@ def _add_offset(t_ns: int, site: SiteRow) -> None:
         turn_rate = (x_rate, y_rate, z_rate)
         peers_velocity = rotate_by_vector(turn, three(site.qd_des[3:]))
         turn_velocity = angular_velocity(turn, turn_rate)
-        reference = compose_rotations(turn, three(site.q_des[3:]))
-        put_three(site.q_des[3:], reference)
+        orientation = compose_rotations(turn, three(site.q_des[3:]))
+        put_three(site.q_des[3:], orientation)
         put_three(site.qd_des[3:], add(turn_velocity, peers_velocity))
