@@ -319,36 +319,47 @@ class CalendarSizer:
     def make_room(self, arrays: SiteArrays, k: int, peer: int, tick: int) -> SiteArrays:
         """Makes sure that a sample fits into the ring buffer of its link.
 
-        A sample is the state that a peer (another arm's process) sends. It waits in the buffer
-        until its simulated delay has passed. If its number is out of range, the buffer is not
-        enlarged, and the sample is refused later.
+        A sample is the state that a peer (another arm's process) sends in one of its ticks, the
+        periods of its control loop. The sample waits in the buffer until its simulated delay
+        has passed. The buffer has one entry, called page, for each tick of the receiver from
+        the present one on. The sample fits if the last tick in which it may come into use has a
+        page. This tick is at most `ahead` + `longest_wait` ticks away: the sample was sent
+        `ahead` ticks after the present one (negative for an earlier sample), and then waits for
+        at most `longest_wait` ticks.
+
+        If the clock of the peer is too far ahead, the buffer is not enlarged, and the sample is
+        refused later. Otherwise `newest` is updated: it is the newest sample of the peer that
+        fits into the buffer as it is now. Samples up to this one need no call of this method.
 
         Args:
             arrays: Arrays of the site, the process that receives the sample.
-            k: Present control period of the site.
+            k: Present tick of the site.
             peer: Index of the peer.
-            tick: Number of the peer's control period in which it sent the sample.
+            tick: Tick of the peer in which it sent the sample.
 
         Returns:
-            The same arrays if the sample fits or is to be refused. Otherwise arrays with larger
-            buffers.
+            The same arrays if the sample fits, is to be refused, or if the buffers have their
+            largest size. Otherwise arrays with larger buffers.
         """
         rate_hz = self._rate_hz
         peer_hz = self._peer_hz[peer]
-        wait = span_ticks(self._delay_us[peer] * 1000, rate_hz) + _SLACK
-        ahead = tick * rate_hz // peer_hz - k
+        longest_wait = span_ticks(self._delay_us[peer] * 1000, rate_hz) + _SLACK
+        sent_at_tick = tick * rate_hz // peer_hz  # in ticks of this site
+        ahead = sent_at_tick - k
         if ahead > span_ticks(AHEAD_LIMIT_NS, rate_hz):
             return arrays  # the sample will be refused
 
-        needed = ahead + wait
+        needed = ahead + longest_wait
         pages = arrays.calendars.shape[1]
-        if needed > pages < self.most_pages:
-            pages = min(1 << needed.bit_length(), self.most_pages)
+        if needed > pages and pages < self.most_pages:
+            # The number of pages is a power of two, so that a modulo is a mask of bits.
+            next_power_of_two = 1 << needed.bit_length()
+            pages = min(next_power_of_two, self.most_pages)
             # Samples of missed ticks still wait in the pages of those ticks.
-            first = k - int(arrays.site["skipped"][0])
-            arrays = widen_calendars(arrays, first, pages)
-        newest_tick = k + pages - wait
-        self.newest[peer] = newest_tick * peer_hz // rate_hz
+            first_waiting_tick = k - int(arrays.site["skipped"][0])
+            arrays = widen_calendars(arrays, first_waiting_tick, pages)
+        newest_fitting_tick = k + pages - longest_wait
+        self.newest[peer] = newest_fitting_tick * peer_hz // rate_hz
         return arrays
 
 
@@ -409,18 +420,27 @@ A run may have any number of changes: those that have begun are folded, see `fol
 
 
 def apply_change(arrays: SiteArrays, change: CoreChange, t_ns: int) -> None:
-    """Applies a change to a running site, for example a new delay model of a link.
+    """Applies a change from outside to a running site, the process that runs one arm.
 
-    A change that starts later is added to the table of planned changes.
+    There are four kinds of changes:
+
+    - The message that the site missed ticks, the periods of its control loop. Their number is
+      stored until the next tick.
+    - An order, for example to stop the arm. The next tick carries it out. If several orders
+      come before this tick, the one with the highest number counts, see `LifeOrder`.
+    - A new model of the delay and loss of a link. It is added to the table of the link's
+      models, and applies from its start time on.
+    - A ramp of the dominance factors, the weights with which the arm follows the other arms.
+      It is added to the table of ramps, from which old ramps are removed before.
 
     Args:
-        arrays: Arrays of the site, the process that runs one arm; changed.
+        arrays: Arrays of the site; changed.
         change: The change.
         t_ns: Present time in ns since the start of the session. The site computes no more
             control periods before this time.
 
     Raises:
-        ValueError: There are too many planned changes.
+        ValueError: A table has no free row for the change.
     """
     s: Row = arrays.site[0]
     if change.order is LifeOrder.OVERRUN:
@@ -434,6 +454,7 @@ def apply_change(arrays: SiteArrays, change: CoreChange, t_ns: int) -> None:
             raise ValueError(f"a run can have at most {MAX_CHANGES} changes to a link")
         add_model(arrays, change.peer, change.model)
     if change.ramp is not None:
+        # Remove the ramps that are over, to have room for the new one.
         s.ramps = fold_ramps(t_ns, int(s.ramps), arrays.ramps)
         if s.ramps >= len(arrays.ramps):
             raise ValueError(
