@@ -331,18 +331,27 @@ class Layout(NamedTuple):
     def rest_columns(self, peers: int) -> slice:
         """Finds the reference that brings the joints to rest, in the field `mem` of a record.
 
-        Only a site (the process of an arm) in task space stores the reference there: the
-        positions and then the velocities of the joints. In joint space, the reference is stored
-        elsewhere.
+        `mem` contains numbers from which a run can be continued. For a site (the process that
+        runs one arm) with n joints, m coordinates that the sites share, and P peers (the other
+        sites), it starts with the numbers that `Site` stores under the rule `glide`:
+
+            q_held (m), return_from_ns (1), qd_held (m), reason (1), used_ns (P), tau_held (n),
+            q_rest (n), qd_rest (n)                                       only in task space
+
+        `q_rest` and `qd_rest` are the positions and velocities of the reference, for each
+        joint. In joint space, `q_held` and `qd_held` contain them while the arm rests.
 
         Args:
-            peers: Number of the other sites from which this site receives data.
+            peers: Number P of the other sites from which this site receives data.
 
         Returns:
-            The slice of the field. Empty in joint space.
+            The slice of `q_rest` and `qd_rest`. Empty in joint space.
         """
-        first = 2 * (self.shared + 1) + peers + self.joints
-        return slice(first, first + 2 * self.joints * self.task)
+        held_and_start = self.shared + 1  # q_held and return_from_ns
+        rate_and_reason = self.shared + 1  # qd_held and reason
+        first = held_and_start + rate_and_reason + peers + self.joints
+        length = 2 * self.joints * self.task  # zero in joint space, where `task` is False
+        return slice(first, first + length)
 
     def list_lost_peers(self, mem: Sequence[float], peers: Sequence[str]) -> list[str]:
         """Returns the names of the peers without which a site goes on, from its record.

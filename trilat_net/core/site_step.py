@@ -164,26 +164,44 @@ class Site:
         return grip, target, target_ahead
 
     def _plug_law(self, setup: SiteSetup) -> None:
-        """Creates the user's law of a setup, if any, and compiles the stages around it.
+        """Creates the control law that a user wrote, and compiles the other stages of a tick.
 
-        A user's law runs between two compiled halves of the tick, in which all other stages
-        are.
+        A tick is a period of the control loop. A user's law is called between two compiled
+        functions: `_sense` computes the stages of a tick before the torque, and `_act` those
+        after it. Without such a law, nothing is compiled here.
+
+        `_user_law` is the user's object. `_law` calls it with the arrays of this site, and may
+        be a compiled form of it. Both are None without such a law.
+
+        Args:
+            setup: Setup of the site, which may contain a factory of the law.
         """
         self._user_law = None
         if setup.law_factory is not None:
             self._user_law = setup.law_factory(setup.law_context())
         self._law = None
         self.law_failure: LawFailed | None = None
-        if self._user_law is not None:
-            a = self._arrays
-            b = self._buffers
-            self._law = plug_law(self._user_law, setup, a, self._sent)
-            # Compile now, and not within the time that the law has for a tick.
-            self._law.bind()
-            self._sense = bind_leaf(sense_stages, 0, 0, 0, a, b)
-            self._act = bind_leaf(
-                act_stages, 0, 0, a.site, a.actors, a.table, a.chain, b.record
-            )
+        if self._user_law is None:
+            return
+
+        arrays = self._arrays
+        buffers = self._buffers
+        self._law = plug_law(self._user_law, setup, arrays, self._sent)
+        # Compile now, and not within the time that the law has for a tick. The arguments serve
+        # for their types: the zeros stand for the tick, its time in ns, and the count of
+        # arrivals.
+        self._law.bind()
+        self._sense = bind_leaf(sense_stages, 0, 0, 0, arrays, buffers)
+        self._act = bind_leaf(
+            act_stages,
+            0,
+            0,
+            arrays.site,
+            arrays.actors,
+            arrays.table,
+            arrays.chain,
+            buffers.record,
+        )
 
     def apply_change(self, command: CoreChange, t_ns: int) -> None:
         """Applies a change to the running site, for example a new delay model of a link.
@@ -536,6 +554,16 @@ class Site:
 
         After a further call of `restore_links`, `step` continues the run.
 
+        The field `mem` of a record contains the numbers of the site and its law that no other
+        field contains. For m coordinates that the sites share, these are
+
+        - the reference that is held (m numbers) and the time from which it is held, ns,
+        - under the rule `glide`, by which an arm comes to rest while a peer (another arm) is
+          silent, the further numbers that `_restore_life` reads,
+        - the numbers that the user's law remembers, if there is one.
+
+        `mem` is empty if nothing is to be remembered.
+
         Args:
             before: Record of the control period before `last`. If `last` is the first record,
                 any record can be given.
@@ -550,6 +578,7 @@ class Site:
         s.q_des = last.q_des
         s.qd_des = last.qd_des
         s.tau = last.tau
+        # `resume_stages` extrapolates the torque during the period of `last` from both torques.
         s.tau_before = before.tau
         if last.mem:
             s.q_held = last.mem[:shared]
@@ -557,20 +586,31 @@ class Site:
         law_memory = last.mem[shared + 1 :]
         if self._glides and law_memory:
             law_memory = self._restore_life(law_memory)
-        self._sent[:] = last.ch or 0.0
+        self._sent[:] = last.ch or 0.0  # `ch` is empty if the law sends no numbers
         self._apply_hand(last.hand)
         if self._law is not None:
             self._law.restore(law_memory)
             self._law_memory = list(law_memory)
+        # Compute what is in no record: errors, external torques, and the motion after `last`.
         resume_stages(last.tick, self._arrays)
 
     def _restore_life(self, memory: list[float]) -> list[float]:
-        """Restores the memory of `session_life` from the field `mem` of a record.
+        """Restores the memory of the rule `glide` from the field `mem` of a record.
 
-        The numbers are read in the order in which `_held_memory` writes them.
+        By this rule, an arm comes to rest while a peer (another arm) is silent, see
+        `session_life`. The numbers are read in the order in which `_held_memory` writes them:
+
+        - `qd_held`: the rate of the held reference, one number per shared coordinate,
+        - `reason`: why the mode changed last, a `LifeReason`,
+        - `used_ns`: the time at which the last sample of a peer came into use, per peer, ns,
+        - `tau_held`: the torque that carries a constant load at rest, per joint, N m,
+        - only in task space `q_rest` and `qd_rest`: the reference that brings the joints to
+          rest, two numbers per joint,
+        - only if the site continues without lost peers `gone`: the state of each peer.
 
         Args:
-            memory: Numbers of the record, after those of the held reference.
+            memory: Numbers of the record, after the held reference and the time from which it
+                is held.
 
         Returns:
             The remaining numbers, which belong to the user's law.
@@ -581,20 +621,24 @@ class Site:
         joints = self.layout.joints
         s.qd_held = memory[:shared]
         s.reason = int(memory[shared])
-        rest = memory[shared + 1 :]
-        self._links["used_ns"] = rest[:peers]
-        s.tau_held = rest[peers : peers + joints]
-        rest = rest[peers + joints :]
+        remaining = memory[shared + 1 :]
+
+        used_ns, remaining = remaining[:peers], remaining[peers:]
+        tau_held, remaining = remaining[:joints], remaining[joints:]
+        self._links["used_ns"] = used_ns
+        s.tau_held = tau_held
         if self.layout.task:
-            s.q_rest = rest[:joints]
-            s.qd_rest = rest[joints : 2 * joints]
-            rest = rest[2 * joints :]
+            q_rest, remaining = remaining[:joints], remaining[joints:]
+            qd_rest, remaining = remaining[:joints], remaining[joints:]
+            s.q_rest = q_rest
+            s.qd_rest = qd_rest
         if self._degrades:
-            self._links["gone"] = rest[:peers]
-            rest = rest[peers:]
+            gone, remaining = remaining[:peers], remaining[peers:]
+            self._links["gone"] = gone
+        # Orders and missed ticks are inputs of the tick that applies them: none is waiting.
         s.order = 0
         s.skipped = 0
-        return rest
+        return remaining
 
     def restore_links(
         self, k: int, in_use: Sequence[Arrival | None], waiting: Sequence[Arrival]
@@ -640,33 +684,49 @@ class Site:
         accept_stage(k, len(waiting), self._arrays, self._buffers)
 
     def _restore_received(self, peer: int, sample: Arrival | None) -> None:
-        """Restores the numbers that a peer's law sent with the sample in use.
+        """Restores the numbers that the control law of a peer sent with the sample in use.
+
+        Control laws that users wrote can send numbers to each other, besides the motion of the
+        arms. They travel in the field `ch` of a sample, the state that a peer (another arm's
+        process) sends. The law of this site reads them in an order of its own. The array
+        `columns` contains for each number that it reads the index in `ch`, or -1 if the law of
+        the peer does not send this number. Such a number is 0.
 
         Args:
             peer: Index of the peer.
-            sample: The sample in use, or None before the first.
+            sample: The sample in use. None before the first sample.
         """
         channel = self._arrays.channel
         if channel is None:
-            return
+            return  # the law of this site is built in, and reads no such numbers
         if sample is None or not len(sample.ch):
             channel.received[peer] = 0.0
             return
-        # Column -1, of a number that is not sent, reads the 0 that is appended.
-        sent = np.append(sample.ch, 0.0)
-        channel.received[peer] = sent[channel.columns[peer]]
+        # The index -1 selects the last number, the appended zero.
+        sent_and_zero = np.append(sample.ch, 0.0)
+        channel.received[peer] = sent_and_zero[channel.columns[peer]]
 
     def _pack(self, k: int, arrivals: Sequence[Arrival]) -> int:
-        """Writes the arrivals of a tick into the buffers, and makes room in the calendars.
+        """Writes the samples that arrived before a tick into the input buffers of the tick.
 
-        A calendar keeps each sample until its delay has passed.
+        A tick is a period of the control loop. A sample is the state that a peer (another arm's
+        process) sends. The buffers have three parts:
+
+        - `arrivals`: peer, tick and motion of each sample,
+        - `forces`: the external torques of the senders, if this site uses them,
+        - `sent`: the numbers that the laws of the senders sent, if the law of this site reads
+          such numbers.
+
+        Later the tick moves the samples to the calendars, the ring buffers in which they wait
+        until their simulated delay has passed. If a sample does not fit there, the calendars
+        are replaced by larger ones.
 
         Args:
-            k: The tick.
+            k: Number of the tick.
             arrivals: Samples that arrived since the previous tick.
 
         Returns:
-            The number of bytes written into the buffer of arrivals.
+            The number of bytes written into `arrivals`.
 
         Raises:
             ValueError: There are more than MAX_ARRIVALS arrivals.
@@ -675,14 +735,17 @@ class Site:
             raise ValueError(
                 f"a tick can process at most {MAX_ARRIVALS} arrivals, but has {len(arrivals)}"
             )
-        offset = 0
-        newest = self._sizer.newest
+        packed_bytes = 0
+        # For each peer the newest sample that is known to fit; `make_room` updates the list.
+        newest_fitting = self._sizer.newest
         for peer, tick, q, qd, *_ in arrivals:
-            if tick > newest[peer]:
+            if tick > newest_fitting[peer]:
                 self._arrays = self._sizer.make_room(self._arrays, k, peer, tick)
+                # The arguments of the compiled tick contain the calendars.
                 self._tick_arrays = (*self._arrays, *self._buffers)
-            self._pack_arrival(self._arrival_bytes, offset, peer, tick, *q, *qd)
-            offset += self._arrival_size
+            self._pack_arrival(self._arrival_bytes, packed_bytes, peer, tick, *q, *qd)
+            packed_bytes += self._arrival_size
+        # A sample without forces or numbers has an empty vector, which counts as zeros.
         if self._keeps_forces:
             for n, arrival in enumerate(arrivals):
                 self._buffers.forces[n] = arrival.tau_x or 0.0
@@ -690,4 +753,4 @@ class Site:
             for n, arrival in enumerate(arrivals):
                 count = self._received_counts[arrival.peer]
                 self._buffers.sent[n, :count] = arrival.ch or 0.0
-        return offset
+        return packed_bytes
