@@ -482,14 +482,29 @@ _ACTIVITIES = {
 def describe_mode(
     site: str, output: TickRecord, *, glides: bool = False, law_failure: Exception | None = None
 ) -> str:
-    """Returns the sentence with which a site reports a change of its mode in the log.
+    """Writes the sentence with which a site reports a change of its mode in the log.
+
+    A site is the process that runs one arm, and its peers are the other sites. The sentence
+    states what the arm does, from which time on, and why, for example "s holds its reference
+    from t = 1.250 s: a peer is stale". A peer is stale if nothing has come from it for too
+    long.
+
+    No reason is given for what happens as soon as the peers are heard: that the arm returns to
+    them (RETURN) and follows them (RUN). An exception is a return because a peer was dropped or
+    restored.
 
     Args:
         site: Name of the site.
-        output: Record of the first tick in the mode.
+        output: Record of the first tick (period of the control loop) in the mode.
         glides: True: the site is under the rule `glide`, by which an arm comes to rest while a
-            peer is silent. The sentence then gives the reason for the mode.
-        law_failure: Error with which the user's control law failed, or None.
+            peer is silent. Its record contains the reason for the mode. Without this rule, the
+            mode can only change because of a stale peer.
+        law_failure: Error with which the user's control law failed last, or None. It is given
+            as the reason if the mode is due to this failure. It is only used under the rule
+            `glide`.
+
+    Returns:
+        The sentence.
     """
     if glides:
         reason = find_life_reason(output)
@@ -497,11 +512,14 @@ def describe_mode(
     else:
         reason = None
         text = "a peer is stale"
+    # The error of the law says more than the reason that a number is not finite.
     if law_failure is not None and find_life_reason(output) is LifeReason.NOT_FINITE:
         text = str(law_failure)
+
     is_regrouped = reason in (LifeReason.DROPPED, LifeReason.RESTORED)
-    is_aligning = output.mode is Mode.RETURN and not is_regrouped
-    if is_aligning or output.mode is Mode.RUN:
+    is_usual_return = output.mode is Mode.RETURN and not is_regrouped
+    needs_no_reason = is_usual_return or output.mode is Mode.RUN
+    if needs_no_reason:
         text = ""
     event = f"{site} {_ACTIVITIES[output.mode]} from t = {output.t_ns * 1e-9:.3f} s"
     return f"{event}: {text}" if text else event

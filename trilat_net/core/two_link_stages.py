@@ -210,30 +210,38 @@ def update_external_torque(
 ) -> None:
     """Computes the torque that operators and environments exert on the planar arm now.
 
-    The state of the site receives the whole torque, the part that stays constant until the next
-    period of the control loop, and the largest force of a wall.
+    It is the sum of up to three parts:
+
+    - The torque of the sampled operators and environments. They are evaluated once per period
+      of the control loop, and their torque is held until the next period.
+    - The torque of all others, which act continuously. It is computed again while the arm moves
+      during the period.
+    - If the arm is real or simulated elsewhere (`external`), the torque that was measured.
 
     Args:
         t_s: Time since the start of the session, s.
-        s: State of the site (the process that runs the arm); written.
+        s: State of the site (the process that runs the arm); written. `on_arm` receives the
+            whole torque and `held` the first part, N m. `wall_n` receives the largest force of
+            a wall, N. `sensed` is the measured torque, N m.
         actors: Operators and environments, one row for each.
         table: Numbers of all operators and environments, for example recorded torques.
     """
     q = pair(s.q)
     qd = pair(s.qd)
     lengths = pair(s.lengths)
-    held = torque_on_arm(
+    held_0, held_1, held_wall_n = torque_on_arm(
         t_s=t_s, q=q, qd=qd, lengths=lengths, actors=actors, table=table, sampled=1
     )
-    now = torque_on_arm(
+    continuous_0, continuous_1, continuous_wall_n = torque_on_arm(
         t_s=t_s, q=q, qd=qd, lengths=lengths, actors=actors, table=table, sampled=0
     )
-    put(s.held, (held[0], held[1]))
-    s.wall_n = max(held[2], now[2])
-    total_0 = now[0] + held[0]
-    total_1 = now[1] + held[1]
+    put(s.held, (held_0, held_1))
+    s.wall_n = max(held_wall_n, continuous_wall_n)
+    total_0 = continuous_0 + held_0
+    total_1 = continuous_1 + held_1
     put(s.on_arm, (total_0, total_1))
-    if s.external != 0:
+    is_measured = s.external != 0
+    if is_measured:
         for i in range(2):
             s.on_arm[i] += s.sensed[i]
 
