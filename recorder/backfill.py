@@ -216,30 +216,46 @@ class GapRepair:
     def _receive_reply(
         self, open_request: _OpenRequest, now_ns: int
     ) -> Iterator[RepairedMessage]:
-        """Yields the messages of the reply, if it has arrived, or closes a request without one.
+        """Yields the messages of the reply, if it has arrived, or closes an expired request.
 
-        A reply adjusts the timeout to four times the round trip. Invalid replies are counted.
+        The timeout and the size of the next requests adapt to the connection:
+
+        - After a valid reply, the timeout is four times the time that the reply took, within
+          the limits `ANSWER_NS`. The number of requested messages is doubled.
+        - If no valid reply arrives within the timeout, the request is closed, so that it can be
+          repeated. The timeout is doubled and the number of requested messages is halved,
+          because small replies get through a bad connection more easily.
+
+        An invalid reply is counted as dropped, and otherwise has no effect: the request stays
+        open until a valid reply arrives or the timeout ends.
 
         Args:
             open_request: The open request.
             now_ns: Present time on the monotonic clock, in ns.
+
+        Yields:
+            The new messages of a valid reply. Nothing if no valid reply has arrived.
         """
         request = open_request.request
-        round_trip_ns = now_ns - open_request.sent_ns
+        shortest_timeout_ns, longest_timeout_ns = ANSWER_NS
+        elapsed_ns = now_ns - open_request.sent_ns
         while (reply := open_request.replies.poll()) is not None:
+            _key, payload = reply
             try:
-                backfill = self._decode(reply[1], request)
+                backfill = self._decode(payload, request)
             except WireError as error:
                 self._dropped[error.reason] += 1
                 continue
-            self._timeout_ns = min(max(ANSWER_NS[0], 4 * round_trip_ns), ANSWER_NS[1])
+            timeout_ns = max(shortest_timeout_ns, 4 * elapsed_ns)
+            self._timeout_ns = min(timeout_ns, longest_timeout_ns)
             self._request_size = min(2 * self._request_size, BACKFILL_MESSAGES)
             self._open = None
             yield from self._accept_reply(backfill, request, now_ns)
             return
 
-        if round_trip_ns >= self._timeout_ns:
-            self._timeout_ns = min(2 * self._timeout_ns, ANSWER_NS[1])
+        is_expired = elapsed_ns >= self._timeout_ns
+        if is_expired:
+            self._timeout_ns = min(2 * self._timeout_ns, longest_timeout_ns)
             self._request_size = max(1, self._request_size // 2)
             self._open = None
 

@@ -533,42 +533,71 @@ class Recording:
         return all(left)
 
     def _has_left(self, site: str, now_ns: int) -> bool:
-        """Returns True if all messages of a site are stored, or if the site is gone for good.
+        """Finds out whether the recorder need not wait for any more messages of a site.
 
-        How long the recorder waits for a site that is gone depends on whether its end and all
-        its messages are known.
+        This is the case if all messages of the site are stored, or if the site has been absent
+        from the network for so long that it is regarded as gone for good.
+
+        Args:
+            site: Name of the site, the process that runs one arm.
+            now_ns: Present time on the monotonic clock, in ns.
+
+        Returns:
+            True if all messages are stored, or the site is gone for good.
         """
         if site in self._stored_sites:
             return True
-        since_ns = self._update_gone_since_ns(site, now_ns)
-        if since_ns is None:
+        absent_since_ns = self._update_gone_since_ns(site, now_ns)
+        if absent_since_ns is None:  # the site is present
             return False
 
-        wait_ns = SETTLE_NS
-        if self._sites[site].final_ticks is None:
-            wait_ns = max(SETTLE_NS, min(AWAY_NS, self._end_ns - since_ns))
-        elif not self._sites[site].is_complete:
+        reception = self._sites[site]
+        has_ended = reception.final_ticks is not None
+        if not has_ended:
+            # The connection may have been cut, so that the site may return. There is no reason
+            # to wait beyond `_end_ns`, because every site should have left by then.
+            until_session_end_ns = self._end_ns - absent_since_ns
+            wait_ns = max(SETTLE_NS, min(AWAY_NS, until_session_end_ns))
+        elif not reception.is_complete:
+            # After its end, a site waits until the recorder has its messages. If its connection
+            # is only interrupted, it can still send the missing ones.
             wait_ns = RECONNECT_NS
-        return now_ns - since_ns > wait_ns
+        else:
+            # Nothing is known to be missing, but messages may still be in transit.
+            wait_ns = SETTLE_NS
+        return now_ns - absent_since_ns > wait_ns
 
     def is_up_to_date(self, ending_ns: int, now_ns: int) -> bool:
-        """Returns True if the recorder has every message that the sites have sent so far.
+        """Finds out whether the recorder has every message that the sites have sent so far.
 
-        The recorder calls this method after it was told to end during a running session. It
-        waits for `SETTLE_NS`, because messages may still be in transit. After this time, every
-        site that still runs must have no missing message.
+        The recorder calls this method repeatedly after it was told to end while the session
+        still runs. A site is a process that runs one arm. There are three cases for each site:
+
+        - The site has left: no more messages of it are expected (`_has_left`).
+        - The site runs and sends messages. Its messages are numbered, so that gaps show which
+          ones are missing. If there are no gaps `SETTLE_NS` after the recorder was told to end,
+          the messages that were in transit at that time have arrived.
+        - Otherwise, the site has ended or is silent, but has not left. It may have sent
+          messages of which the recorder knows nothing, or the last check of its messages is
+          still pending. The recorder then waits until the site runs again or has left.
 
         Args:
             ending_ns: Time at which the recorder was told to end, on the monotonic clock, in
                 ns.
             now_ns: Present time on the monotonic clock, in ns.
+
+        Returns:
+            True if every site has left, or runs and has no missing message.
         """
+        may_be_in_transit = now_ns - ending_ns <= SETTLE_NS
         for name, site in self._sites.items():
             if self._has_left(name, now_ns):
                 continue
             silence_ns = now_ns - (site.last_received_ns or 0)
             is_running = site.final_ticks is None and silence_ns < HEARD_NS
-            if not is_running or site.lacks_messages or now_ns - ending_ns <= SETTLE_NS:
+            if not is_running:
+                return False
+            if site.lacks_messages or may_be_in_transit:
                 return False
         return True
 

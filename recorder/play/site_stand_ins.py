@@ -337,21 +337,41 @@ class SiteStandIns:
         return played_topics.index(topic) if topic in played_topics else -1
 
     def _find_start(self, site: str) -> tuple[int, int]:
-        """Returns the index of the start of a site that is being played, and its boot.
+        """Finds out which start of a site is being played at present.
 
-        The first start has the index 0. The newest played event of the site determines both.
+        A site may have been started several times while the session was recorded. Each start
+        numbers its events from 0, and states in them its boot, the random number that
+        identifies the start. The history of the played messages adds `NUMBERS_OF_A_START` to
+        the number of an event for each earlier start. Hence the number of the newest played
+        event, divided by `NUMBERS_OF_A_START` and rounded down, is the index of its start.
+
+        The boot of the first start is known in advance. That of a later start is read from the
+        newest event when it is needed first, and is then stored in `_boots`.
+
+        Args:
+            site: Name of the site.
+
+        Returns:
+            The index of the start, which is 0 for the first one, and its boot. If the newest
+            event is no longer stored or cannot be decoded, they are those that were found
+            before.
         """
         channel = self._find_channel(site, topics.EVENT)
-        newest = self._history.next_numbers.get(channel, 0) - 1
-        start = max(newest, 0) // NUMBERS_OF_A_START
+        # It is -1 if no event of the site was played yet.
+        newest_event = self._history.next_numbers.get(channel, 0) - 1
+        start_index = max(newest_event, 0) // NUMBERS_OF_A_START
         first_start = (0, self._infos[site].boot)
-        if start == 0:
+        if start_index == 0:
             return first_start
-        if self._boots.get(site, first_start)[0] != start:
-            _, payloads = self._history.find_messages(channel, newest, newest)
+
+        stored_index, _ = self._boots.get(site, first_start)
+        is_boot_known = stored_index == start_index
+        if not is_boot_known:
+            # At most one event is requested, so that the list has at most one entry.
+            _, payloads = self._history.find_messages(channel, newest_event, newest_event)
             for payload in payloads:
-                with suppress(WireError):
-                    self._boots[site] = (start, decode(payload, Event).boot)
+                with suppress(WireError):  # an event of a damaged log may be unreadable
+                    self._boots[site] = (start_index, decode(payload, Event).boot)
         return self._boots.get(site, first_start)
 
     def _reply_backfill(self, site: str, query: Query) -> None:
