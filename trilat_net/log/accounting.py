@@ -875,22 +875,28 @@ class SessionAccounts:
     def format_accounts(self) -> dict[str, str]:
         """Formats the numbers of received and missing messages, as they are stored in a log.
 
-        Members that are not sites, such as recorders, are left out if no message is expected of
-        them.
+        A line is, for example, "expected 1000, received 998, missing 2, ...". If the log is a
+        later part of a recording, the messages are counted from the first one in this part. The
+        line then begins with the number of that message, such as "from 5000 on: ".
 
         Returns:
-            A line of text for each topic, see `Account.describe`.
+            A line of text for each topic, such as "/trilat/paper/m1/state", whose last two
+            parts are the member and the channel. A member that is not a site, such as a
+            recorder, has no line if no message is expected of it.
         """
         texts = {}
         for topic, account in self._accounts.items():
-            member = topic.split("/")[-2]
-            if not account.expected and member not in self._rates_hz:
+            member, _channel = topic.split("/")[-2:]
+            is_site = member in self._rates_hz
+            if not account.expected and not is_site:
                 continue
-            # The last account is that of the topic itself.
-            earlier_starts = list(self._starts.get(topic, {}).values())[:-1]
-            base = self._bases.get(topic, 0)
-            prefix = f"from {base} on: " if base else ""
-            texts[topic] = prefix + account.describe(*earlier_starts)
+            # Whenever a member is started again, it numbers its events from 0 again, and they
+            # get a new account. `account` is the last one, that of the newest start.
+            accounts_of_starts = list(self._starts.get(topic, {}).values())
+            earlier_accounts = accounts_of_starts[:-1]
+            first_number = self._bases.get(topic, 0)
+            prefix = f"from {first_number} on: " if first_number else ""
+            texts[topic] = prefix + account.describe(*earlier_accounts)
         return texts
 
     def list_starts(self, topic: str) -> list[Account]:

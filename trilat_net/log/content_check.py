@@ -67,13 +67,19 @@ class MessageOrigins(NamedTuple):
 def find_origins(data: bytes, most: int = _SAMPLED_MESSAGES) -> MessageOrigins:
     """Finds out from which sessions and senders the first messages of a chunk come.
 
-    A damaged file may contain a chunk of another file. The start time of its session reveals
-    that. An event that announces the start of a session contains the start time. Records and
-    statistics contain their sending time after the start, and are stored with the Unix time of
-    sending. The difference is the start time. Sessions in virtual time start at 0.
+    A damaged file may contain a chunk, a block of messages, of another file. Two facts reveal
+    that: the start time (epoch) of the session, and the boots of the senders, random numbers
+    that identify the starts of their processes. A message shows the epoch in one of two ways:
+
+    - An event that announces the start of a session states the epoch.
+    - A record (result of one period of a control loop) or statistics message states its sending
+      time after the epoch, and is stored with its sending time in Unix time. The difference is
+      the epoch.
+
+    Sessions in virtual time start at 0.
 
     Args:
-        data: The unpacked chunk, a block of messages.
+        data: The unpacked chunk.
         most: Largest number of messages to decode.
 
     Returns:
@@ -88,21 +94,26 @@ def find_origins(data: bytes, most: int = _SAMPLED_MESSAGES) -> MessageOrigins:
         if decoded >= most:
             break
         decoded += 1
-        publish_ns = MESSAGE_HEAD.unpack_from(data, begin)[3]
+        _channel, _sequence, _log_ns, publish_ns = MESSAGE_HEAD.unpack_from(data, begin)
         payload = data[begin + MESSAGE_HEAD.size : end]
-        # The type of the message is unknown: a payload can be decoded as its own type only.
+        # The type of the message is unknown, so that all types are tried. A payload can be
+        # decoded as its own type only. Any other type raises a WireError.
         kinds: tuple[Any, ...] = (messages.State, messages.LinkStats, messages.Event)
         for kind in kinds:
             with suppress(WireError):
                 message: AnyMessage = decode(payload, kind, messages.READABLE)
-                identity = identify_message(message, 1)
-                sent_ns = identity.sent_ns
+                # The rate affects only the number of the message, which is not used here.
+                any_rate_hz = 1
+                identity = identify_message(message, any_rate_hz)
                 boots.add((identity.sender, message.boot))
+                sent_since_epoch_ns = identity.sent_ns
                 if isinstance(message, messages.Event):
-                    if message.epoch_unix_ns:
+                    states_epoch = bool(message.epoch_unix_ns)
+                    if states_epoch:
                         epochs_ns.add(message.epoch_unix_ns)
-                elif sent_ns is not None and publish_ns:
-                    epochs_ns.add(publish_ns - sent_ns)
+                elif sent_since_epoch_ns is not None and publish_ns:
+                    # A `publish_ns` of 0 is unknown.
+                    epochs_ns.add(publish_ns - sent_since_epoch_ns)
     return MessageOrigins(epochs_ns, boots)
 
 

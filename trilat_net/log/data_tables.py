@@ -492,31 +492,42 @@ def _make_hand_columns(site: SiteLog, arm: ArmModel, mode: str) -> Iterator[Colu
 def _make_bodies_columns(site: SiteLog, bodies: Iterable[str]) -> Iterator[Column]:
     """Yields the columns of the poses of the bodies in the site's simulated environment.
 
+    Each record contains a pose of seven numbers for each body: the position (x, y, z) in m, and
+    the orientation as a unit quaternion (w, x, y, z). A quaternion and its negative are the
+    same orientation. The signs are chosen so that the curves of the four numbers do not jump.
+
     Args:
-        site: Records of the site.
+        site: Records of the site, the process that runs one arm.
         bodies: Names of the bodies, in the order of the records.
+
+    Yields:
+        Seven columns for each body, such as "cup_x_m" and "cup_qw", with a row per record.
     """
     pose_length = POSITION + len(QUATERNION_AXES)
-    for number, body in enumerate(bodies):
-        first = pose_length * number
-        for n, axis in enumerate("xyz", first):
+    for body_index, body in enumerate(bodies):
+        position_start = pose_length * body_index
+        for index, axis in enumerate("xyz", position_start):
             text = f"{axis} of the place of {body}, a body of its plant"
             yield _make_number_column(
-                site=site, field="bodies", n=n, stem=f"{body}_{axis}", unit="m", text=text
+                site=site, field="bodies", n=index, stem=f"{body}_{axis}", unit="m", text=text
             )
-        first += POSITION
-        quaternions = align_signs(site.bodies[:, first : first + len(QUATERNION_AXES)])
-        axes = zip(QUATERNION_AXES, quaternions.T, strict=True)
-        for n, (name, values) in enumerate(axes, first):
+
+        quaternion_start = position_start + POSITION
+        quaternion_end = quaternion_start + len(QUATERNION_AXES)
+        quaternions = align_signs(site.bodies[:, quaternion_start:quaternion_end])
+        components = zip(QUATERNION_AXES, quaternions.T, strict=True)
+        for index, (name, values) in enumerate(components, quaternion_start):
+            component = name[1]  # "w" of "qw"
             text = (
-                f"orientation of {body}, a body of its plant, {name[1]} of {_STEADY_QUATERNION}"
+                f"orientation of {body}, a body of its plant, {component} of "
+                f"{_STEADY_QUATERNION}"
             )
             yield Column(
                 name=f"{body}_{name}",
                 values=np.ascontiguousarray(values),
                 unit="",
                 meaning=text,
-                source=f"bodies[{n}]",
+                source=f"bodies[{index}]",
             )
 
 

@@ -455,40 +455,57 @@ class Log(Result, Mapping[str, SiteLog]):
         return {site: self._find_absences(site, starts) for site, starts in self.starts.items()}
 
     def _find_absences(self, site: str, starts: list[tuple[int, int]]) -> list[tuple[int, int]]:
-        """Finds the ranges of ticks that a site did not execute, see `absences`.
+        """Finds the ranges of ticks that a site did not execute, as its process was not running.
+
+        A tick is one period of the control loop. The process may be started again while the
+        session runs. It then joins at a later tick. The absence before a start ends just before
+        its first tick. It begins after the last tick that the earlier process is known to have
+        executed, from one of three sources:
+
+        - a record (the message with the results of one tick),
+        - the "end" event of the earlier process, which states its number of ticks,
+        - events of the kind `LAST`, in which the other sites state how many ticks they had
+          received before this start.
 
         Args:
-            site: Name of the site.
-            starts: Its starts, as (first tick, boot), in ascending order.
+            site: Name of the site, the process that runs one arm.
+            starts: Its starts in ascending order: the first tick, and the boot, the random
+                number that identifies the start.
 
         Returns:
-            The ranges, as (first tick, last tick), in ascending order.
+            The absences, as (first tick, last tick), in ascending order.
         """
         end_events = [event for event in self.events if event.kind == "end"]
-        end_ticks = [event.ticks - 1 for event in end_events if event.member == site]
-        executed_ticks = [*self[site].tick.tolist(), *end_ticks]
+        # The ticks are counted from 0, so that the last one is one less than their number.
+        last_ticks = [event.ticks - 1 for event in end_events if event.member == site]
+        executed_ticks = [*self[site].tick.tolist(), *last_ticks]
         executed = np.array(executed_ticks, dtype=np.int64)
-        under_way = count_under_way(topics.STATE, self[site].rate_hz)
+        most_in_transit = count_under_way(topics.STATE, self[site].rate_hz)
         absences: list[tuple[int, int]] = []
-        for first, boot in starts:
-            begin = int(executed[executed < first].max(initial=-1)) + 1
+        for start_tick, boot in starts:
+            last_executed = int(executed[executed < start_tick].max(initial=-1))
+            absence_begin = last_executed + 1
 
-            # Other sites report how many ticks they received before this start.
-            received = 0
+            reported_ticks = 0
             for event in self.events:
                 if event.kind == LAST and event.boots.get(site) == boot:
-                    received = max(received, event.ticks)
-            received = min(first, received)
-            # A few ticks more than recorded are no missing records: the site was lost while
-            # their records were still in transit to the recorder.
-            if received - begin > under_way:
-                begin = received
+                    reported_ticks = max(reported_ticks, event.ticks)
+            reported_ticks = min(start_tick, reported_ticks)
+            # Some ticks may be reported but not recorded, because their records were still in
+            # transit to the recorder when the process was killed. Such ticks count as not
+            # executed. More ticks than that were executed, and their records are missing.
+            unrecorded_ticks = reported_ticks - absence_begin
+            if unrecorded_ticks > most_in_transit:
+                absence_begin = reported_ticks
 
-            if absences and begin == absences[-1][0]:
-                # The start in between executed no tick, so that the two ranges are one.
-                absences.pop()
-            if begin < first:
-                absences.append((begin, first - 1))
+            if absences:
+                previous_begin, _ = absences[-1]
+                if absence_begin == previous_begin:
+                    # Nothing was executed since the previous absence began, although the site
+                    # was started in between. The new absence replaces the previous one.
+                    absences.pop()
+            if absence_begin < start_tick:
+                absences.append((absence_begin, start_tick - 1))
         return absences
 
     def absent_ticks(self, site: str) -> int:
