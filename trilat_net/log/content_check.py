@@ -112,7 +112,7 @@ def find_origins(data: bytes, most: int = _SAMPLED_MESSAGES) -> MessageOrigins:
                     if states_epoch:
                         epochs_ns.add(message.epoch_unix_ns)
                 elif sent_since_epoch_ns is not None and publish_ns:
-                    # A `publish_ns` of 0 is unknown.
+                    # A stored time of 0 proves nothing.
                     epochs_ns.add(publish_ns - sent_since_epoch_ns)
     return MessageOrigins(epochs_ns, boots)
 

@@ -455,7 +455,7 @@ class Log(Result, Mapping[str, SiteLog]):
         return {site: self._find_absences(site, starts) for site, starts in self.starts.items()}
 
     def _find_absences(self, site: str, starts: list[tuple[int, int]]) -> list[tuple[int, int]]:
-        """Finds the ranges of ticks that a site did not execute, as its process was not running.
+        """Finds the ranges of ticks that a site did not execute because it was not running.
 
         A tick is one period of the control loop. The process may be started again while the
         session runs. It then joins at a later tick. The absence before a start ends just before

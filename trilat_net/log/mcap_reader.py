@@ -214,20 +214,34 @@ class McapReader:
     def messages(self) -> Iterator[McapMessage]:
         """Yields every message in the order of the file.
 
+        There are two ways of reading:
+
+        - Normally (`watch` is None), only the kinds of records in `_READ` are read, and the
+          file must begin with the mark of MCAP. The scanner stops after too many damaged parts.
+        - For the check and the recovery of damaged files, the caller has set `watch`, a
+          function that receives every record. Records of all kinds are read, and the file may
+          begin with anything. The scanner goes on to the end of the file, but no more records
+          are unpacked after too many damaged parts (`_gave_up`).
+
+        A part that cannot be read is added to `damaged`, and the reading continues behind it.
+
         Raises:
             LogError: The file is no MCAP file, or unpacks to far too much for its size.
         """
         scanner = self.scanner
-        if not scanner.begins and self.watch is None:
+        is_watched = self.watch is not None
+        if not scanner.begins and not is_watched:
             reason = "is empty" if not self.size else "does not begin with the mark of MCAP"
             raise LogError(f"{self._source}: is not an MCAP file: the file {reason}")
         for frame in scanner.frames():
             self.offset = frame.offset
-            if frame.opcode in _READ or self.watch is not None:
+            if frame.opcode in _READ or is_watched:
                 try:
                     yield from self._read_records(self._open(frame), frame)
                 except mcap_records.UnreadableRecord as error:
-                    damaged = scanner.damaged if self.watch is None else self._more_damage
+                    # The scanner stops if its own list is too long. For `watch` it must go on,
+                    # so that the damage is added to another list.
+                    damaged = self._more_damage if is_watched else scanner.damaged
                     damaged.append(mcap_records.Damage(frame.offset, frame.size, str(error)))
             if self._progress is not None:
                 self._progress(frame.end, self.size)
@@ -258,10 +272,22 @@ class McapReader:
         return data
 
     def _unpack(self, frame: mcap_records.RecordFrame, content: bytes) -> bytes:
-        """Returns the messages and definitions in a record of the file, in unpacked form.
+        """Processes a record of the file, and returns the messages and definitions in it.
 
-        The header, metadata and attachments are stored. They contain no such records, and the
-        result is empty.
+        What happens depends on the kind of the record:
+
+        - A chunk, a compressed block of messages and definitions, is counted and unpacked.
+        - A message or definition outside of chunks is returned in the same form as in a chunk.
+        - Metadata, attachments and the header are stored in the attributes of the reader. They
+          contain no messages. They are added to the digest here, the checksum that is compared
+          with the one in the file. `_read_records` adds what this method returns.
+
+        Args:
+            frame: Kind and place of the record.
+            content: Content of the record.
+
+        Returns:
+            The messages and definitions, with the head of each. Empty if there are none.
 
         Raises:
             UnreadableRecord: The record cannot be decoded, or its checksum is wrong.
@@ -279,6 +305,7 @@ class McapReader:
                 entry = mcap_records.parse_record(frame.opcode, content)
                 self.metadata[entry.name] = entry.metadata
                 if entry.name == DIGESTS:
+                    # The digests of the file cannot cover themselves.
                     return b""
             case Opcode.ATTACHMENT:
                 attachment = mcap_records.parse_record(frame.opcode, content)

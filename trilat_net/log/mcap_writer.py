@@ -341,38 +341,52 @@ class McapWriter:
         return facts
 
     def _close_chunk(self) -> None:
-        """Writes the open chunk and the indexes of its messages.
+        """Writes the open chunk, the block of the newest messages, and the indexes to it.
 
-        The chunk consists of a head and the compressed messages. An index for each channel
-        follows, with the times and offsets of its messages. The entry of the chunk in the
-        summary states where these indexes are.
+        The format is defined by the specification of MCAP. Three kinds of records are written:
+
+        1. Chunk: a head with the time range, the size and the checksum (CRC) of the messages,
+           and the compressed messages.
+        2. Message index, one for each channel with messages in the chunk: the log time of each
+           message, and its offset in the unpacked chunk.
+        3. Chunk index: where the chunk and its message indexes are. It is only added to the
+           summary, which `finish` writes at the end of the file.
+
+        The messages are also added to the running digest, a checksum of all messages.
         """
-        self._chain.add_records(self._open_chunk, self.messages - self._chain.messages)
-        data = self._compressor.compress(self._open_chunk)
+        # The digest has counted the messages of the closed chunks.
+        new_messages = self.messages - self._chain.messages
+        self._chain.add_records(self._open_chunk, new_messages)
+        packed = self._compressor.compress(self._open_chunk)
+        # Index entries of the channels that have messages in the chunk. Log times and offsets
+        # alternate: every second number, from the first one on, is a time.
         used = {channel: entries for channel, entries in self._entries.items() if entries}
-        # Log times and offsets alternate in the entries.
         start_ns = min(min(entries[::2]) for entries in used.values())
         end_ns = max(max(entries[::2]) for entries in used.values())
         unpacked_bytes = len(self._open_chunk)
         crc = zlib.crc32(self._open_chunk)
         head = _CHUNK.pack(start_ns, end_ns, unpacked_bytes, crc) + pack_text(_COMPRESSION)
-        record = pack_record(Opcode.CHUNK, head + _pack_long_bytes(data))
-        chunk_offset = self._write(record)
+        chunk_record = pack_record(Opcode.CHUNK, head + _pack_long_bytes(packed))
+        chunk_offset = self._write(chunk_record)
 
-        index_start = self.position
+        indexes_start = self.position
         index_offsets = b""
         for channel, entries in used.items():
-            body = struct.pack(f"<HI{len(entries)}Q", channel, 8 * len(entries), *entries)
+            # The channel (16 bits), the size of the entries in bytes (32 bits), and the
+            # entries, each of which consists of 64-bit numbers with 8 bytes.
+            entries_bytes = 8 * len(entries)
+            body = struct.pack(f"<HI{len(entries)}Q", channel, entries_bytes, *entries)
             index_offset = self._write(pack_record(Opcode.MESSAGE_INDEX, body))
             index_offsets += struct.pack("<HQ", channel, index_offset)
             self._entries[channel] = []
+        indexes_bytes = self.position - indexes_start
 
-        # The fields of a chunk index in their order, see the specification of MCAP.
-        index = struct.pack("<QQQQ", start_ns, end_ns, chunk_offset, len(record))
-        index += _pack_bytes(index_offsets)
-        index += struct.pack("<Q", self.position - index_start) + pack_text(_COMPRESSION)
-        index += struct.pack("<QQ", len(data), unpacked_bytes)
-        self._add_to_summary(Opcode.CHUNK_INDEX, index)
+        # The fields of a chunk index, in the order of the specification.
+        chunk_index = struct.pack("<QQQQ", start_ns, end_ns, chunk_offset, len(chunk_record))
+        chunk_index += _pack_bytes(index_offsets)
+        chunk_index += struct.pack("<Q", indexes_bytes) + pack_text(_COMPRESSION)
+        chunk_index += struct.pack("<QQ", len(packed), unpacked_bytes)
+        self._add_to_summary(Opcode.CHUNK_INDEX, chunk_index)
 
         first_ns, last_ns = self._span_ns or (start_ns, end_ns)
         self._span_ns = min(first_ns, start_ns), max(last_ns, end_ns)
