@@ -840,7 +840,11 @@ class _FileCopy:
     def _register_copy(
         self, number: int | None, new_number: int, topic: str
     ) -> tuple[int, str]:
-        """Notes a channel that was registered in the new file.
+        """Notes a channel of the new file, so that the messages of the source find it.
+
+        A message is assigned to its channel in one of two ways: by the channel number that is
+        stored with it in the source, or, if that is wrong, by the topic that its content
+        reveals. Only messages of the session's members reveal their topic.
 
         Args:
             number: Channel number in the source. None if the source does not define the
@@ -849,7 +853,7 @@ class _FileCopy:
             topic: Topic of the channel.
 
         Returns:
-            The channel number in the new file, and the topic.
+            The channel number in the new file, and the topic, as the caller returns them.
         """
         channel = new_number, topic
         if number is not None:
@@ -857,6 +861,7 @@ class _FileCopy:
         if self._content is not None and self._content.owns_channel(topic):
             self._new_topics.setdefault(topic, channel)
         if self._accounts is not None:
+            # Missing messages are then noticed even if no message of the channel is left.
             self._accounts.open_channel(topic)
         return channel
 
@@ -961,29 +966,45 @@ class _FileCopy:
         self._result.lost.insert(0, f"{loss}; {_UNOPENED}{advice}")
 
     def _finish(self) -> None:
-        """Completes the result, and writes the accounts, the recovery's facts and the end."""
+        """Finishes the new file, and the result of the recovery, after all messages are copied.
+
+        The following is written at the end of the new file:
+
+        - the accounts: how many messages of each channel are in the new file, and how many are
+          missing (only if the source is the log of a session with a readable scenario),
+        - the facts of the recovery: the name of the source, the losses, and whether the source
+          agreed with its digests, the checksums of its contents,
+        - digests of the new file, by which later changes are noticed (only with accounts),
+        - the index and the end mark of the format MCAP.
+        """
         result = self._result
         accounts = self._accounts
+        source_metadata = self._survey.metadata
         result.finished = self._scanner.finished
         result.messages = self._out.messages
         result.duration_s = self._out.duration_s
-        if SESSION in self._survey.metadata:
+        if SESSION in source_metadata:
             result.chain = self._judge_source_chain()
         if accounts is not None:
             result.missing = list(accounts.describe_missing())
-            # The end of a finished part may be in a later part of the log.
-            if not (result.finished and PART in self._survey.metadata):
+            # If a log is divided into parts, the sites may end in a later part.
+            is_finished_part = result.finished and PART in source_metadata
+            if not is_finished_part:
                 result.missing += accounts.describe_unfinished_sites()
             result.coverage = accounts.coverage()
-            source_accounts = self._survey.metadata.get(ACCOUNTS, {})
+            source_accounts = source_metadata.get(ACCOUNTS, {})
             if self._contradicts_accounts(accounts, source_accounts):
+                # Records were removed or added, even if the digests of the source agree.
                 result.chain = DigestState.CHANGED
-            counts = {
+            # The names of other counts, such as those of dropped messages, are not topics. They
+            # cannot be computed from the messages, and are copied from the source.
+            other_counts = {
                 name: text for name, text in source_accounts.items() if not name.startswith("/")
             }
-            self._out.add_metadata(ACCOUNTS, {**accounts.format_accounts(), **counts})
+            self._out.add_metadata(ACCOUNTS, {**accounts.format_accounts(), **other_counts})
         self._out.add_metadata(RECOVERED, result.facts())
         if accounts is not None:
+            # Only logs of sessions contain digests. Files of other programs remain as they are.
             self._out.close_digest()
         self._out.finish()
 

@@ -262,31 +262,43 @@ class RecoverySurvey:
             self._reject_session(named_session, is_renamed=False)
 
     def _reject_session(self, session: dict[str, str], *, is_renamed: bool) -> None:
-        """Removes a session that belongs to another log.
+        """Removes a session from the survey that belongs to another log than the messages.
 
-        The scenario is removed as well, and so are the channels of that session that no
-        checksum covers.
+        This happens if a damaged disk has overwritten a page of the file with a page of another
+        file. A page is a block of `PAGE_BYTES`, which is always overwritten as a whole. The
+        foreign page contains the metadata of its session, and may contain definitions of its
+        channels. These definitions are removed as well, and so is the scenario, the description
+        of the experiment. A definition that a checksum covers is genuine and is kept.
 
         Args:
-            session: Metadata of the session.
-            is_renamed: True if the session of the messages has another name. If it may have the
-                same name, only those channels are removed that are in the same page of the file
-                as the session, because whole pages of a file are overwritten.
+            session: Metadata of the foreign session.
+            is_renamed: True if the session of the messages has another name. All definitions of
+                channels with the name of the foreign session are then foreign. If the names may
+                be equal, only those in the same page as the foreign metadata are removed.
         """
         self.is_foreign_session = True
-        pages = {offset // PAGE_BYTES for entry, offset in self._sessions if entry == session}
+        foreign_pages = {
+            offset // PAGE_BYTES for metadata, offset in self._sessions if metadata == session
+        }
         del self.metadata[SESSION]
         self.attachments.pop(SCENARIO, None)
+        # The topic of each channel of the session begins with this prefix. The definition of a
+        # channel contains the topic, encoded in UTF-8.
         topic_prefix = f"/{topics.ROOT}/{session.get('session', '')}/".encode()
 
-        def is_kept(entry: Definition) -> bool:
-            offset = self._uncovered_offsets.get(entry)
+        def is_genuine(definition: Definition) -> bool:
+            """Returns True if a definition may belong to the session of the messages."""
+            offset = self._uncovered_offsets.get(definition)
             if offset is None:  # a checksum covers the definition
                 return True
-            is_suspect = is_renamed or offset // PAGE_BYTES in pages
-            return topic_prefix not in entry[1] or not is_suspect
+            _opcode, content = definition
+            has_foreign_name = topic_prefix in content
+            is_name_unambiguous = is_renamed
+            is_in_foreign_page = offset // PAGE_BYTES in foreign_pages
+            is_foreign = has_foreign_name and (is_name_unambiguous or is_in_foreign_page)
+            return not is_foreign
 
-        self.definitions = list(filter(is_kept, self.definitions))
+        self.definitions = list(filter(is_genuine, self.definitions))
 
     def _find_misplaced_chunks(self) -> dict[int, str]:
         """Finds the chunks that are not in their original places.

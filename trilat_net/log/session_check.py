@@ -465,23 +465,37 @@ class SessionCheck:
             self._findings["chain"].add(file, None, self._chain_text)
 
     def _begin_file(self, reader: McapReader) -> None:
-        """Reads the metadata of a file's session.
+        """Prepares the check of a file, once its metadata and its scenario were read.
 
-        Nothing happens if the file is not a log of trilat-net.
+        The files of a log must belong to one session, which is checked by its metadata. It is
+        counted how many files there are and how many of them are parts, because a recorder can
+        divide a log into several files. The scenario, the description of the experiment, is
+        checked too. For the first file, the counts of the messages are prepared.
+
+        Nothing happens if no file so far, including this one, is a log of trilat-net. `ours`
+        remains False in this case.
+
+        Args:
+            reader: Reader of the file.
 
         Raises:
-            LogError: The file belongs to another session than the previous files.
+            LogError: The file belongs to another session than the previous files, or to none.
         """
         about = reader.metadata.get(SESSION, {})
-        if not {"session", "driver"} <= about.keys() or SCENARIO not in reader.attachments:
+        has_metadata = {"session", "driver"} <= about.keys()
+        is_session_log = has_metadata and SCENARIO in reader.attachments
+        if not is_session_log:
             if self.ours:
                 raise LogError(
                     f"{self._file}: is not a part of the same log as the previous files; check "
                     "this file separately"
                 )
             return
-        same = ("session", "epoch_unix_ns", "scenario_sha256")
-        if self.ours and any(about.get(key) != self._about.get(key) for key in same):
+        identifying_keys = ("session", "epoch_unix_ns", "scenario_sha256")
+        is_other_session = any(
+            about.get(key) != self._about.get(key) for key in identifying_keys
+        )
+        if self.ours and is_other_session:
             raise LogError(
                 f"{self._file}: belongs to another session than the previous files; check this "
                 "file separately"
@@ -492,8 +506,12 @@ class SessionCheck:
         self._about = about
         self._version = _parse_number(about, "schema_version")
         self._files += 1
-        self._parts += PART in reader.metadata
-        self._first_part |= reader.metadata.get(PART, {}).get("index", "") in ("", "1")
+        if PART in reader.metadata:
+            self._parts += 1
+        # Number of the part, as text. It is empty if the log is not divided.
+        part_index = reader.metadata.get(PART, {}).get("index", "")
+        contains_beginning = part_index in ("", "1")
+        self._first_part |= contains_beginning
         self._check_scenario(reader.attachments[SCENARIO])
         if is_first_file:
             self._open_accounts(about["session"])

@@ -137,9 +137,13 @@ class TornChunk(NamedTuple):
 def find_doubtful_page(scanner: RecordScanner, begin: int, end: int) -> int:
     """Finds the first page in a part of a file that was probably not written correctly.
 
-    A page is a block of bytes that the operating system writes as a whole. It is doubtful if it
-    contains only zeros, or if an equal page exists elsewhere in the file before the end of the
-    part.
+    A page is a block of `PAGE_BYTES` that the operating system writes as a whole. If a computer
+    loses power, some pages of a file may be missing or in the wrong place. A page of the part
+    is therefore doubtful in two cases:
+
+    - It contains only zeros: it was never written.
+    - It is equal to another page, in the part or before it. Compressed data never repeat a
+      whole page by chance, so that a page was written to the wrong place.
 
     Args:
         scanner: Scanner of the file.
@@ -151,19 +155,25 @@ def find_doubtful_page(scanner: RecordScanner, begin: int, end: int) -> int:
     """
     # The first boundary of a page in the part: -(-a // b) rounds a / b up.
     first_page = -(-begin // PAGE_BYTES) * PAGE_BYTES
+    first_doubtful = end
+    # Offset of each whole page of the part, by its content. The last page may be incomplete. It
+    # is left out, because it cannot be equal to a whole page.
     offsets: dict[bytes, int] = {}
     for offset in range(first_page, end, PAGE_BYTES):
         page = scanner.read(offset, min(PAGE_BYTES, end - offset))
-        if not any(page) or page in offsets:
-            end = offset
+        is_unwritten = not any(page)
+        if is_unwritten or page in offsets:
+            first_doubtful = offset
             break
         if len(page) == PAGE_BYTES:
             offsets[page] = offset
 
-    first_doubtful = end
+    # A page of the part that is equal to a page before the part is doubtful as well.
     for offset in range(0, min(first_page, scanner.size), PAGE_BYTES):
-        page = scanner.read(offset, PAGE_BYTES)
-        first_doubtful = min(first_doubtful, offsets.get(page, first_doubtful))
+        page_before_part = scanner.read(offset, PAGE_BYTES)
+        equal_page = offsets.get(page_before_part)
+        if equal_page is not None:
+            first_doubtful = min(first_doubtful, equal_page)
     return first_doubtful
 
 

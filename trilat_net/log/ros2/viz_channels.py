@@ -300,12 +300,21 @@ class _SiteBuckets:
 
         The method is called at the end of the log.
 
+        The records of a site are collected in time intervals of equal length, the fast buckets.
+        The extremes of `_slow_ratio` successive fast buckets are collected in a slow bucket.
+        Each bucket becomes two messages: the first one is written when the bucket is closed,
+        and the second one half a bucket later. It is kept until then by an object of its own,
+        one for fast and one for slow buckets.
+
         Args:
             log_ns: Arrival time that the log states for the messages, in Unix time, in ns.
         """
-        # Two slow buckets further on, both the fast and the slow bucket are closed.
+        # A bucket is closed when a later one is opened. A fast bucket that belongs to a later
+        # slow bucket closes both kinds. The next slow bucket would suffice, and one more leaves
+        # a margin.
         bucket_after_log = self._bucket + 2 * self._slow_ratio
         self._close_bucket(bucket_after_log, log_ns)
+        # Write the second messages of these buckets at once.
         self._fast_output.flush(log_ns)
         self._slow_output.flush(log_ns)
 
@@ -418,21 +427,28 @@ def parse_viz_rate(text: str) -> float:
 
 
 def _stamp_extremes(stamps_ns: Sequence[int], curves: Iterable[SignalRow]) -> list[StampedRow]:
-    """Returns the extremes of curves, with the first and the middle time as their times.
+    """Reduces the curves of a time interval to two rows: the extremes of each curve.
+
+    A row contains one value of each curve at one time. The first row contains the extreme of
+    each curve (minimum or maximum) that occurs first, and the second row the other extreme.
+
+    The extremes of different curves occur at different times, so that no exact time of a row
+    exists. The rows get the times at the beginning and in the middle of the interval instead,
+    so that the rows of successive intervals are evenly spaced.
 
     Args:
-        stamps_ns: Times of the values, in Unix ns.
-        curves: Values of each curve, in the order of the times.
+        stamps_ns: Times of the values in the interval, in Unix time, in ns. At least one.
+        curves: For each curve its values in the interval, in the order of time.
 
     Returns:
-        Two rows, or one row for a single time.
+        The two rows, each with its time. Only one row if there is a single time.
     """
     middle_index = len(stamps_ns) // 2
-    stamps = (stamps_ns[0], stamps_ns[middle_index])
+    row_stamps_ns = (stamps_ns[0], stamps_ns[middle_index])
     rows = decimate_min_max(curves)
     # For a single time, the minimum and the maximum are equal, and one row is enough.
     row_count = min(2, len(stamps_ns))
-    stamped_rows = zip(stamps[:row_count], rows[:row_count], strict=True)
+    stamped_rows = zip(row_stamps_ns[:row_count], rows[:row_count], strict=True)
     return list(stamped_rows)
 
 
