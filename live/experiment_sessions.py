@@ -110,37 +110,47 @@ class ExperimentSessions:
     def _request_step(self, step: Step, rest_s: float = 0.0) -> bool:
         """Waits until every user has completed a step, and notes consents and answers.
 
+        A step is a consent, a questionnaire, or the readiness for a trial. The users complete
+        it on their web pages, which the stage controls. A note is an entry of the experiment's
+        journal, which survives a restart of this program. It records the consent or the answers
+        of one user.
+
         Args:
             step: The step.
             rest_s: Rest before the step, in s.
 
         Returns:
-            False if the experiment was ended before.
+            True if every user has completed the step. False if the experiment was ended before.
         """
-        users = dict(zip(self.stage.users, step.planned.group, strict=True))
-        cells = {site: f"{step.key} {who}" for site, who in users.items()}
-        done = [site for site, cell in cells.items() if (cell, 0) in self._notes.done]
-        request = self.stage.request_step(step, rest_s, done)
-        note_count = len(self._notes.done)
+        pseudonyms = dict(zip(self.stage.users, step.planned.group, strict=True))  # by site
+        note_keys = {site: f"{step.key} {who}" for site, who in pseudonyms.items()}
+        # The journal identifies an entry by its key and a seed, which is 0 for all notes.
+        sites_done_earlier = [
+            site for site, key in note_keys.items() if (key, 0) in self._notes.done
+        ]
+        request = self.stage.request_step(step, rest_s, sites_done_earlier)
+        note_count_before = len(self._notes.done)
         form_name = step.form.name if step.form else ""
 
-        while not request.replies.keys() >= users.keys():
+        while not request.replies.keys() >= pseudonyms.keys():
             if self.ends():
                 return False
             self.clock.sleep_until(self.clock.monotonic_ns() + POLL_NS)
             # A user who is ready for a trial leaves no note.
             if step.kind == "trial":
                 continue
+            # Every poll offers all replies. The journal ignores those that it contains already.
             for site, (answers, _) in list(request.replies.items()):
                 self._add_note(
-                    cell=cells[site],
+                    cell=note_keys[site],
                     kind=step.kind,
-                    who=users[site],
+                    who=pseudonyms[site],
                     number=step.planned.number,
                     text=form_name,
                     answers=answers,
                 )
-        if len(self._notes.done) > note_count:
+        has_new_notes = len(self._notes.done) > note_count_before
+        if has_new_notes:
             self.experiment.write_tables()
         return True
 
@@ -179,34 +189,45 @@ class ExperimentSessions:
     def _run_trial(self, step: Step) -> bool:
         """Repeats a trial until one attempt counts.
 
-        If the program was ended during this trial, a finished log of that attempt is counted,
-        and another attempt is noted as aborted.
+        An attempt is one session of the trial, with a folder of its own. If an earlier start of
+        this program was ended during the trial, it may have left a finished log, which is
+        counted now, or an unfinished attempt, which is noted as aborted.
+
+        Args:
+            step: The step of the trial.
 
         Returns:
-            False if the experiment was ended before an attempt counted.
+            True if an attempt counts. False if the experiment was ended before.
         """
         plan = self.experiment.plan
         planned = step.planned
         scenario = plan.find_scenario(planned, self.experiment.list_choices())
         trial = ExperimentTrial(plan.protocol, scenario, planned, plan.digest)
-        path = make_subfolder(self.experiment.folder / LOGS) / planned.file
+        log_path = make_subfolder(self.experiment.folder / LOGS) / planned.file
         # The log exists if the program was killed before it had counted the trial.
-        if path.exists() and not self._count_trial(trial, path):
-            return True
+        if log_path.exists():
+            reason_against = self._count_trial(trial, log_path)
+            if not reason_against:
+                return True
 
-        for last_attempt in self._list_attempts(planned)[-1:]:
-            if any(last_attempt.glob("*.mcap*")):
+        earlier_attempts = self._list_attempts(planned)
+        if earlier_attempts:
+            last_attempt = earlier_attempts[-1]
+            has_begun_log = any(last_attempt.glob("*.mcap*"))
+            if has_begun_log:
                 self._record_aborted(planned, "the program was ended")
             else:
                 # The session of the attempt had not begun.
                 shutil.rmtree(last_attempt, ignore_errors=True)
 
         rest_s = plan.rest_before_s(planned)
-        while not self._run_attempt(step, trial, path, rest_s):
+        while True:
+            counts = self._run_attempt(step, trial, log_path, rest_s)
+            if counts:
+                return True
             if self.ends():
                 return False
-            rest_s = 0.0
-        return True
+            rest_s = 0.0  # the users have rested before the first attempt
 
     def _list_attempts(self, planned: PlannedTrial) -> list[Path]:
         """Returns the folders of the attempts at a trial, the oldest first."""
@@ -371,8 +392,10 @@ def run_with_people(
             ) -> SessionResult:
                 """Runs the session of one trial, and shows it on the experiment's web pages.
 
-                A trial is one execution of the experiment's task. If the user interrupts the
-                session, for example with Ctrl-C, the whole experiment ends too.
+                A trial is one execution of the experiment's task. The function uses the server
+                `page` of the web pages, the network connection `idle` that the pages observe
+                between the sessions, and the signal handler `interrupt` of the experiment. If a
+                signal ends the session, for example Ctrl-C, the whole experiment ends too.
 
                 Args:
                     watch: The trial and its present state.
@@ -382,14 +405,16 @@ def run_with_people(
                 Returns:
                     The result of the session, which contains the path of its log.
                 """
-                attend = partial(_show_session, page, idle, watch)
+                # `run_demo` passes the remaining arguments: the session and its addresses.
+                show_session_on_pages = partial(_show_session, page, idle, watch)
                 result = run_demo(
                     scenario=watch.trial.scenario,
                     folder=folder,
                     console=Console(quiet=True),
-                    attend=attend,
+                    attend=show_session_on_pages,
                     begins=begins,
                 )
+                # Both are the number of the signal that arrived, or 0. The first one is kept.
                 interrupt.number = interrupt.number or result.interrupted
                 return result
 

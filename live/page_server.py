@@ -417,14 +417,29 @@ class PageServer:
                 self._next_session = None
 
     def _switch_session(self, bus: Bus, session: str) -> None:
-        """Observes another session. All pages receive its state from the beginning."""
+        """Observes another session, and makes all pages receive its state from the beginning.
+
+        A page remembers how many points of the plots and how many events it has received, so
+        that it is sent only new ones. These numbers restart at 0 for the new session, and each
+        page is sent the constants of the new session again ("greeted").
+
+        Args:
+            bus: Network connection that reaches the session.
+            session: Name of the session.
+        """
         self._bus = bus
         self.view = SessionView(bus, self._clock, session)
         self._frames = SessionFrames(self.view)
+        # The counts of refused messages continue over all sessions.
         self._desk = OrderDesk(bus, self._clock, session, self.refused)
+
+        # The newest frame, which is a message with the present state of the session. The second
+        # attribute holds the newest frames for the users of sites, by the name of the site.
         self._frame: dict[str, Any] | None = None
         self._frames_as_site: dict[str, dict[str, Any]] = {}
+        # Latest replies of the sites to orders of the pages.
         self._notices: list[dict[str, Any]] = []
+
         for page in self._pages:
             page.hands = PageHands(bus, self._clock, session, f"page {page.number}")
             page.points = 0
@@ -706,24 +721,53 @@ class PageServer:
             self._count_failure("message", error)
 
     def _handle_message(self, page: Page, message: PageMessage) -> None:
-        """Carries out the request of a page's message, if the page may request it."""
-        view = self.view
+        """Carries out the request of a page's message, if the page may request it.
+
+        A request that the page may not make is counted as refused, with the reason. The rights
+        depend on the role of the page's user, for example a watcher. Most requests are carried
+        out only for a page that takes part in the control of the session.
+
+        Args:
+            page: The page.
+            message: The decoded message.
+        """
         if not page.role.may(message):
             self.refused["not of its role"] += 1
+        # Requests of every page, whether it takes part or not.
         elif isinstance(message, Seen):
-            page.drawn = min(message.n, page.sent)
-            while page.unseen and page.unseen[0] <= page.drawn:
-                page.unseen.popleft()
-            page.wake.set()
-        elif isinstance(message, StopArms):  # every role may stop the arms
-            self._desk.stop(view.sites, page.role.noun)
+            self._note_drawn_frame(page, message.n)
+        elif isinstance(message, StopArms):
+            self._desk.stop(self.view.sites, page.role.noun)
         elif isinstance(message, TakePart):
             self._request_part(page, message.want)
         elif isinstance(message, AnswerPage):
             self._answer_request(page, message)
         elif not page.takes_part:
             self.refused["does not take part"] += 1
-        elif isinstance(message, SetLink | SetShares):
+        else:
+            self._control_session(page, message)
+
+    def _note_drawn_frame(self, page: Page, frame_number: int) -> None:
+        """Notes that a page has drawn a frame, so that further frames can be sent to it.
+
+        Args:
+            page: The page.
+            frame_number: Number of the frame, as the page states it.
+        """
+        page.drawn = min(frame_number, page.sent)  # a page may state any number
+        while page.unseen and page.unseen[0] <= page.drawn:
+            page.unseen.popleft()
+        page.wake.set()
+
+    def _control_session(self, page: Page, message: PageMessage) -> None:
+        """Carries out a request that only a page that takes part in the session may make.
+
+        Args:
+            page: The page, which takes part.
+            message: The decoded message, which the role of the page's user permits.
+        """
+        view = self.view
+        if isinstance(message, SetLink | SetShares):
             self._desk.queue_change(message, view.sites, view.links, page.role.noun)
         elif isinstance(message, ReleaseArms):
             self._desk.release(message, view.sites, page.role.noun)
@@ -850,16 +894,28 @@ class PageServer:
         return self._frame_number - page.sent >= WAITING_FRAME_STEP
 
     def _describe_greeting(self, page: Page) -> dict[str, Any]:
-        """Returns the first message to a page, with the constants of the session."""
+        """Returns the first message to a page, with the constants of the session.
+
+        The message has the single key "hello". Its value contains the constants, the role of
+        the page's user ("role"), the site whose user's view the page shows ("as", empty for the
+        view of all sites), the number of the present frame ("n"), whether the page may end the
+        session ("ends"), and the step of the experiment if there is one.
+        """
         role = page.role
         frames = self._frames
-        constants = frames.describe_session_as_user() if role.site else frames.describe()
+        # The user of a site must not see constants that reveal the condition of an experiment.
+        is_view_of_one_site = bool(role.site)
+        if is_view_of_one_site:
+            constants = frames.describe_session_as_user()
+        else:
+            constants = frames.describe()
+        may_end_session = self._ends and role.kind == "experimenter"
         fields = {
             **constants,
             "role": role.kind,
             "as": role.site,
             "n": self._frame_number,
-            "ends": self._ends and role.kind == "experimenter",
+            "ends": may_end_session,
             **self._describe_stage(page),
         }
         return {"hello": fields}
@@ -877,21 +933,42 @@ class PageServer:
         return {"stage": self._stage.describe(role.kind, role.site, page.number, t_s)}
 
     def _describe_frame(self, page: Page) -> dict[str, Any]:
-        """Returns the newest frame for a page."""
+        """Returns the newest frame for a page: the state of the session and of the page itself.
+
+        Args:
+            page: The page.
+
+        Returns:
+            The frame as plain values for JSON. It consists of the time, the arms and the links
+            as the page's user sees them, of the fields that are explained below, and of the
+            step of the experiment if there is one.
+        """
         site = page.role.site
+        # The user of a site sees the other arms delayed. Other roles see all arms at present.
         state = self._describe_as_site(site) if site else self._describe_all(page)
+        # The default role is that of an experimenter who sees all sites.
+        is_full_experimenter = page.role == Role()
         return {
+            # Number of the frame, which the page sends back once it has drawn the frame.
             "n": self._frame_number,
             **state,
-            "results": list(self.files.results) if page.role == Role() else [],
+            # Files of the ended session that can be loaded, and new replies of sites to orders.
+            "results": list(self.files.results) if is_full_experimenter else [],
             "notices": self._list_notices(page),
+            # Whether the page shows how old the poses of the other arms are.
             "ages": self._shows_ages,
+            # Number of open pages.
             "pages": len(self._pages),
+            # Whether this page may give orders, whether it waits for the permission of other
+            # pages to do so, and the numbers of the pages that wait for its own permission.
             "takes_part": page.takes_part,
             "asks": page.asks is not None,
             "asked": self._list_requests(page),
+            # Names of the sites whose arms this page holds.
             "holds": self._list_held_sites(page),
+            # Number of refused messages and requests of all pages.
             "refused": sum(self.refused.values()),
+            # "t" is the time of the arms in the frame, in s.
             **self._describe_stage(page, state["t"]),
         }
 

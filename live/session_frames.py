@@ -237,18 +237,26 @@ class ArmFrames:
         return state, extremes
 
     def _place_reference(self, records: AlignedRecords) -> Array:
-        """Returns the points of the reference pose in the last record, in m.
+        """Computes where the reference is that the arm follows, so that a page can draw it.
 
-        If the sites exchange poses of the end effector, the reference is one point. Otherwise
-        it is a point for each joint.
+        The reference `q_des` is what the control law makes the arm follow. It consists of joint
+        positions, or of a pose of the end effector if the sites exchange such poses. A pose
+        begins with the position x, y, z, multiplied by the scale of the site's task.
+
+        Args:
+            records: Records since the previous frame. The reference of the last one is placed.
+
+        Returns:
+            Points in m. For joint positions, the points between the links of an arm in the
+            reference pose. For a pose of the end effector, one point, shape (1, 3).
         """
         points_m: Array
         if self._model.shares_pose:
-            shared_position = records.q_des[-1, :3]
-            points_m = shared_position[np.newaxis] / self._spec.task.scale
+            scaled_position = records.q_des[-1, :3]
+            points_m = scaled_position[np.newaxis] / self._spec.task.scale
         else:
-            last_index = len(records.known) - 1
-            last_reference = records.q_des[last_index:]
+            last_row = len(records.known) - 1  # `known` has one entry per record
+            last_reference = records.q_des[last_row:]  # shape (1, n), in rad or m
             points_m = joint_positions_m(self._model, last_reference)[0]
         return points_m
 
@@ -550,28 +558,50 @@ class SessionFrames:
         return age_ms
 
     def _describe_peer(self, site: str, peer: str, tick: int) -> Json:
-        """Returns the pose of a peer at a tick, for the user of a site.
+        """Returns the pose in which the user of a site sees the arm of a peer.
 
-        If the record of that tick is missing, the pose is that of the previous frame.
+        The pose is stored for the next frame: if the record of a tick is missing, the user sees
+        the pose of the previous frame again. Users of different sites see different poses,
+        because their delays differ. Therefore a pose is stored per site and peer.
+
+        Args:
+            site: Name of the user's site.
+            peer: Name of the site whose arm is described.
+            tick: Tick of the peer (period of its control loop) that the user sees.
+
+        Returns:
+            The pose as `ArmFrames.describe_pose` returns it, its tick, and the poses of the
+            bodies that the arm can touch. Before the first record, the pose at the start.
         """
         arm = self._arms[peer]
         pose = self._peer_poses.get((site, peer)) or arm.describe_start()
-        view = self._view.sites[peer]
-        if tick != pose["tick"] and view.window.has_record(tick):
-            record = view.window.rows(tick, tick)
-            joint_pose = arm.describe_pose(record.q[0])
-            body_poses = view.bodies.get(tick, [])
-            bodies = self._turns[site, peer].align(body_poses)
+        peer_view = self._view.sites[peer]
+        if tick != pose["tick"] and peer_view.window.has_record(tick):
+            records_of_tick = peer_view.window.rows(tick, tick)  # exactly one record
+            joint_pose = arm.describe_pose(records_of_tick.q[0])
+            body_poses = peer_view.bodies.get(tick, [])
+            # Chooses the signs of the bodies' quaternions, so that the picture does not jump.
+            aligned_bodies = self._turns[site, peer].align(body_poses)
             pose = {
                 **joint_pose,
                 "tick": tick,
-                "bodies": _round(bodies),
+                "bodies": _round(aligned_bodies),
             }
         self._peer_poses[site, peer] = pose
         return pose
 
     def _describe_site(self, name: str, site: SiteView) -> tuple[Json, list[float]]:
-        """Returns the present state of a site, and the extremes since the previous frame."""
+        """Describes the present state of one site and its arm, as a part of a frame.
+
+        Args:
+            name: Name of the site.
+            site: What is known about the site. It must have published a record.
+
+        Returns:
+            The state as plain values for JSON: that of `ArmFrames.describe_now`, and the fields
+            that are explained below. In addition, the four largest values since the previous
+            frame, as `ArmFrames.describe_now` returns them.
+        """
         record = site.record
         stats = site.stats
         assert record is not None
@@ -582,28 +612,41 @@ class SessionFrames:
         if not has_ended:
             alarm = site.find_alarm(self._view.session, name)
             silence_s = round(self._view.silence_s(site), 1)
+        # Chooses the signs of the bodies' quaternions, so that the picture does not jump. The
+        # empty name stands for a page that sees all arms.
         bodies = self._turns["", name].align(record.bodies)
         # A view that joined late does not know how many earlier records are missing.
-        missing = 0
-        if site.first_tick == 0:
+        missing_count = 0
+        has_seen_all = site.first_tick == 0
+        if has_seen_all:
             state_account = site.reception.accounts["state"]
-            missing = state_account.missing
-        holder = site.holder if state.get("source") else ""
+            missing_count = state_account.missing
+        # The source is the number of the program that holds the arm at present, 0 if none does.
+        is_held = bool(state.get("source"))
         fields = {
             **state,
+            # Whether records have arrived since the previous frame.
             "new": has_new_records,
+            # Time in s and tick of the newest record.
             "t": record.t_ns / NS_PER_S,
             "tick": record.tick,
+            # For each peer, the tick of the sample that the control law used.
             "used": record.used,
+            # What the site does, for example "fault".
             "mode": record.mode,
+            # Poses of the bodies that the arm can touch: seven numbers per body.
             "bodies": _round(bodies),
             "alarm": None if alarm is None else _describe_alarm(alarm),
             "ended": site.ended or has_ended,
+            # Time without a message of the site, in s.
             "silent_s": silence_s,
-            "holder": holder,
+            # Person or program that holds the arm. Empty if nobody does.
+            "holder": site.holder if is_held else "",
+            # Largest lateness of a tick in us, and number of ticks that were a period late.
             "late_us": stats.late_max_us if stats else 0,
             "overruns": stats.overruns if stats else 0,
-            "missing": missing,
+            # Number of records that have not arrived.
+            "missing": missing_count,
         }
         return fields, extremes
 

@@ -156,6 +156,10 @@ class SiteView:
     def find_alarm(self, session: str, name: str) -> LifeAlarm | None:
         """Finds out whether the arm of the site needs attention, because of a stop or a fault.
 
+        Only a site under the rule `glide` has alarms: by this rule an arm comes to rest while a
+        peer is silent. The alarm follows from the newest record of the site, and in it from the
+        mode of the site and from `mem`, the numbers that it keeps from tick to tick.
+
         Args:
             session: Name of the session.
             name: Name of the site.
@@ -167,20 +171,24 @@ class SiteView:
         record = self.record
         if record is None or not self.glides or self.ended:
             return None
-        lost: Sequence[str] = ()
+        lost_peers: Sequence[str] = ()  # peers without which the site continues
         if self.layout is not None:
-            lost = self.layout.list_lost_peers(record.mem, self.peers)
+            lost_peers = self.layout.list_lost_peers(record.mem, self.peers)
+        shared_coordinates = len(record.q_des)  # by which `mem` is divided
+        # The function of the module `ticks`, which derives an alarm from a record alone.
         alarm = find_alarm(
             session=session,
             site=name,
             mode=record.mode,
             mem=record.mem,
-            shared=len(record.q_des),
-            lost=lost,
+            shared=shared_coordinates,
+            lost=lost_peers,
         )
         if alarm is None:
             return None
-        if alarm.order == "enable" and self.stopped_by:
+        # The order "enable" ends a stop that was ordered. Only an event says by whom.
+        was_stopped_by_order = alarm.order == "enable"
+        if was_stopped_by_order and self.stopped_by:
             reason = f"ordered by {self.stopped_by}"
             return alarm._replace(reason=reason)
         return alarm
@@ -346,8 +354,10 @@ class SessionView:
     ) -> Mapping[str, int]:
         """Finds out at which tick the user of a site sees each of the other arms.
 
-        This is the tick of the sample that the site uses for its control law. If the scenario
-        delays the user's picture further, it is the tick of an earlier sample.
+        A tick is a period of a control loop, and a sample is the state that a peer publishes in
+        a tick. The user sees a peer at the tick of the sample that the site uses for its
+        control law. The scenario may delay the picture that the user sees further. Then it is
+        the tick of an earlier sample.
 
         Args:
             site: Name of the user's site.
@@ -355,7 +365,7 @@ class SessionView:
             used: For each peer of the site, the tick of the sample that it uses at `tick`.
 
         Returns:
-            The tick for each peer.
+            The tick for each peer, by its name.
         """
         assert self.scenario is not None
         if site not in self._pictures:
@@ -363,8 +373,10 @@ class SessionView:
         picture_ticks = self._pictures[site].advance_to(tick, used)
         peer_ticks: dict[str, int] = {}
         for peer, picture_tick in picture_ticks.items():
-            newest_tick = self.sites[peer].window.newest
-            peer_ticks[peer] = min(picture_tick, newest_tick)
+            # This observer may not have received the peer's record of that tick yet, although
+            # the site has received the sample.
+            newest_received_tick = self.sites[peer].window.newest
+            peer_ticks[peer] = min(picture_tick, newest_received_tick)
         return peer_ticks
 
     def _connect_to_sites(self) -> None:
@@ -401,7 +413,13 @@ class SessionView:
             )
 
     def _receive(self, inbound: InboundMessage) -> None:
-        """Decodes a message, and stores its contents if it comes from a site.
+        """Decodes a message of a site, and stores each record, statistic or event in it.
+
+        Messages of other members are ignored. The first record or statistics of a site shows
+        whether this observer has joined late, so that earlier ones are not requested.
+
+        Args:
+            inbound: The message, with its key in the network and the time of its arrival.
 
         Raises:
             WireError: The message cannot be decoded.
@@ -421,16 +439,20 @@ class SessionView:
             try:
                 message = site.reception.read(channel, payload)
             except WireError:
-                # A site that has been started again announces its new boot with an event.
-                if channel != topics.EVENT:
+                # Messages of an unknown boot (start of the process) cannot be read. A site that
+                # has been started again announces its new boot with an event.
+                may_announce_boot = channel == topics.EVENT
+                if not may_announce_boot or not self._accept_new_boot(parts.member, payload):
                     raise
-                if not self._accept_new_boot(parts.member, payload):
-                    raise
+                # From now on, messages of the new boot can be read.
                 message = site.reception.read(channel, payload)
-            is_first = site.record is None and site.stats is None
-            if is_first and channel != topics.EVENT:
+            has_stored_none = site.record is None and site.stats is None
+            is_first = has_stored_none and channel != topics.EVENT
+            if is_first:
                 self._skip_records_before(site, message.content)
-            if site.reception.accept(channel, message, inbound.mono_ns):
+            # A message that has arrived before, for example on request, is not stored again.
+            is_new = site.reception.accept(channel, message, inbound.mono_ns)
+            if is_new:
                 self._store(parts.member, site, channel, message.content)
 
     def _accept_new_boot(self, name: str, payload: bytes) -> bool:

@@ -112,21 +112,28 @@ class SessionWatch:
         """Receives the messages that have arrived, and checks the stability of the session.
 
         The check uses V, the energy function of the stability proof. V must not rise by more
-        than people and walls supply. The line `title` above the table then contains the newest
-        V.
+        than people and walls supply. A text with the newest V, or with the reason why there is
+        none, is stored for the line `title` above the table.
+
+        Raises:
+            ScenarioError: The session has no site whose user's view could be shown.
         """
         view = self.view
         view.poll()
         if self._as_site and view.scenario is not None:
+            # Called only for the error that it raises if there is no such site.
             find_site(view.scenario, self._as_site)
-        course = view.advance_energy()
+
+        course = view.advance_energy()  # energies at the new ticks, None without new ticks
         if course is not None:
             self._energy_text = (
                 f"V = {course.V[-1]:.4g} J at {course.t_s[-1]:.1f} s, "
                 f"people and walls gave {course.supplied[-1]:.4g} J"
             )
-        elif view.energy is not None and view.energy.reason:
-            self._energy_text = f"no V: {view.energy.reason}"
+            return
+        energy = view.energy
+        if energy is not None and energy.reason:
+            self._energy_text = f"no V: {energy.reason}"
 
     @property
     def title(self) -> str:
@@ -169,6 +176,8 @@ class SessionWatch:
 
         If only the view of one user is shown, the user's own site has a complete row. The row
         of another site contains the time and the joint angles of the pose that this user sees.
+        This pose is older than the newest one, because the network delays it, and because the
+        scenario may delay the picture further.
 
         Returns:
             The rows. Each row is a dictionary of texts, by the heads of the columns. Empty
@@ -177,10 +186,11 @@ class SessionWatch:
         view = self.view
         scenario = view.scenario
         as_site = self._as_site
-        all_rows: dict[str, SiteRow] = {}
+        rows_by_site: dict[str, SiteRow] = {}
         for name, site in view.sites.items():
-            if scenario is not None and as_site in ("", name):
-                all_rows[name] = describe_site(
+            is_shown_completely = as_site in ("", name)  # "" shows all sites
+            if scenario is not None and is_shown_completely:
+                rows_by_site[name] = describe_site(
                     scenario,
                     name,
                     site.record,
@@ -188,17 +198,22 @@ class SessionWatch:
                     ended=site.ended or view.ended,
                     silent_s=view.silence_s(site),
                 )
-        record = view.sites[as_site].record if as_site in all_rows else None
-        if record is None:
-            return list(all_rows.values())
-        for peer, tick in view.find_peer_ticks(as_site, record.tick, record.used).items():
+
+        user_record = view.sites[as_site].record if as_site in rows_by_site else None
+        if user_record is None:
+            return list(rows_by_site.values())
+
+        # The ticks of the peers whose poses the user of `as_site` sees at present.
+        visible_ticks = view.find_peer_ticks(as_site, user_record.tick, user_record.used)
+        for peer, tick in visible_ticks.items():
             window = view.sites[peer].window
             row = dict.fromkeys(HEADS, "") | {"site": peer}
             if window.has_record(tick):
+                joint_positions = window.rows(tick, tick).q[0]
                 row["time"] = f"{tick / window.rate_hz:.3f} s"
-                row["angles"] = describe_angles(window.rows(tick, tick).q[0].tolist())
-            all_rows[peer] = row
-        return list(all_rows.values())
+                row["angles"] = describe_angles(joint_positions.tolist())
+            rows_by_site[peer] = row
+        return list(rows_by_site.values())
 
 
 @contextmanager
@@ -226,15 +241,22 @@ def show_in_terminal(
             display.say("S or space: stop every arm")
 
         def update_display() -> None:
-            """Updates the display. Stops every arm if the user has pressed S or space."""
+            """Updates the display. Stops every arm if the user has pressed S or space.
+
+            `watch` composes the texts about the session, `desk` sends orders to the sites and
+            collects their replies, and `display` prints on the terminal. `read_keys` returns
+            the pressed keys, and is None if this process must not read the keyboard.
+            """
             watch.update()
-            if read_keys is not None and STOP_KEYS.intersection(read_keys()):
+            wants_stop = read_keys is not None and STOP_KEYS.intersection(read_keys())
+            if wants_stop:
                 display.say(
                     "stopping every arm" if watch.view.running else "the session has not begun"
                 )
                 desk.stop(watch.view.sites, "a watcher at a terminal")
             desk.poll()
             while desk.replies:
+                # A reply also has the site, the channel of the order and the acceptance.
                 *_, text = desk.replies.pop(0)
                 display.say(text)
             if display.due:
