@@ -593,29 +593,37 @@ class _StarterProcess:
         Each new process is a copy of this starter process, made by `os.fork`. Therefore the
         method returns in every copy and, at the end, in the starter.
 
+        A request is a tuple of four values: the name of the process; the command and its
+        arguments; the number of the signal to send, or 0 to start the process; and the file for
+        the output of the process.
+
         Returns:
             The command and its arguments, if the method returns in a copy, which must now
             execute the command. None, if it returns in the starter, after the requesting
             process has disappeared and all copies have ended.
         """
         arguments: list[str]
+        longest_wait_s = POLL_NS / 10 / NS_PER_S  # then the ends of processes are reported
         while True:
             self._report_ends()
             try:
-                if not self._pipe.poll(POLL_NS / 10 / NS_PER_S):
+                has_request = self._pipe.poll(longest_wait_s)
+                if not has_request:
                     continue
-                name, arguments, number, output = self._pipe.recv()
+                name, arguments, signal_number, output = self._pipe.recv()
             except (EOFError, OSError):
+                # The requesting process has disappeared.
                 self._end_all()
                 return None
-            is_start_request = number == 0
+
+            is_start_request = signal_number == 0
             if is_start_request:
                 is_copy = self._fork(name)
                 if is_copy:
                     _become_process(arguments, output)
                     return arguments
             elif name in self._running:
-                os.kill(self._running[name], number)
+                os.kill(self._running[name], signal_number)
 
     def _fork(self, name: str) -> bool:
         """Copies this process.

@@ -243,16 +243,25 @@ class DeviceHand:
     def describe(self) -> str:
         """Returns a line for the user about the states of the device and the round trip times.
 
-        The line contains the numbers of states, of jumps and of unreadable states, and the
-        median and the 99th percentile of the round trip time if any was measured.
+        A state is a message of the device with its position. It is dropped if it cannot be
+        read, or if it is a jump: farther from the previous position than the speed limit of the
+        scenario allows. A round trip begins when a position of the device is sent to the arm.
+        It ends when the device renders the force with which the arm reacts to this position.
+
+        Returns:
+            The numbers of received states, of jumps and of unreadable states. If a round trip
+            was measured, also the median and the 99th percentile of the round trip time in ms.
         """
         states = count_nouns(self.states, "state")
         jumps = count_nouns(self.jumps, "jump")
         counts = f"{states} of the device, dropped {jumps}, {self.unreadable} unreadable"
         if not self.trips_ns:
             return counts
-        p50, p99 = np.percentile(self.trips_ns, [50, 99]) / 1e6
-        return f"{counts}; from its place to the force of it p50 {p50:.1f} ms, p99 {p99:.1f} ms"
+        median_ms, p99_ms = np.percentile(self.trips_ns, [50, 99]) / 1e6
+        return (
+            f"{counts}; from its place to the force of it "
+            f"p50 {median_ms:.1f} ms, p99 {p99_ms:.1f} ms"
+        )
 
     def run(self, stopped: Callable[[], bool], say: Callable[[str], None]) -> None:
         """Moves the arm with the device until the session ends.

@@ -511,24 +511,36 @@ class Rehearsal(LoopStats):
     def run(self, clock: Clock) -> list[int]:
         """Executes all ticks (periods of the control loop) of the scenario in real time.
 
+        The loop runs without other sites: there are no links to receive samples from, and the
+        records are not sent anywhere.
+
+        Args:
+            clock: Clock of this process.
+
         Returns:
             The lateness of each tick, the time from its due time to its beginning, in us.
         """
-        inbox = PeerInbox(links=(), rings=(), boots=(), monitors=(), dropped=self.dropped)
-        epoch_ns = clock.monotonic_ns() + NS_PER_S // 10
+        boot = 1  # identifies the start of the process, which matters only in a network
+        inbox_without_peers = PeerInbox(
+            links=(), rings=(), boots=(), monitors=(), dropped=self.dropped
+        )
+        # The first tick is due a tenth of a second from now.
+        first_tick_ns = clock.monotonic_ns() + NS_PER_S // 10
+        timing = SiteTiming(first_tick_ns, self._site.rate_hz, peers=(), leader="")
+        discarded_records = StateBlock(self._site, boot, send=lambda _: None)
 
-        timing = SiteTiming(epoch_ns, self._site.rate_hz, (), "")
-        site_io: Any = self
+        # This object has the methods of a `RunningSite` that the loop calls, without its type.
+        replacement_of_running_site: Any = self
         run_loop(
             site=self._site,
-            boot=1,
+            boot=boot,
             ticks=self._ticks,
             clock=clock,
-            inbox=inbox,
+            inbox=inbox_without_peers,
             timing=timing,
             stats=self,
-            states=StateBlock(self._site, 1, lambda _: None),
-            io=site_io,
+            states=discarded_records,
+            io=replacement_of_running_site,
         )
         return self._late_us
 

@@ -210,20 +210,28 @@ class ExternalArm:
             "arm_lost" to enter the mode "fault", after `SILENCE_LIMIT_NS`. "arm_back" to
             continue. Empty if nothing has changed.
         """
-        reported_before = self._reported_order
-        self._reported_order = ""
+        previous_order = self._reported_order
         if self._silent_ns > SILENCE_LIMIT_NS:
             self._reported_order = "arm_lost"
-            is_done = reported_before == "arm_lost" and mode is Mode.FAULT
-            return "" if is_done else "arm_lost"
+            was_carried_out = previous_order == "arm_lost" and mode is Mode.FAULT
+            return "" if was_carried_out else "arm_lost"
         if self._silent_ns > HELD_SILENCE_NS:
             self._reported_order = "arm_silent"
-            return "" if reported_before else "arm_silent"
-        # After "arm_lost" the site stays in the mode "fault" until a user resets it.
-        return "arm_back" if reported_before == "arm_silent" else ""
+            is_known_already = previous_order != ""
+            return "" if is_known_already else "arm_silent"
+
+        # Measurements arrive. After "arm_lost" the site need not be told: it stays in the mode
+        # "fault" until a user resets it.
+        self._reported_order = ""
+        return "arm_back" if previous_order == "arm_silent" else ""
 
     def _accept(self, payload: bytes) -> None:
         """Checks one measurement, and stores it or counts the reason why it is dropped.
+
+        A measurement names its site, the boot of the driver (a random number that identifies
+        the start of its process), and its own number n, which the driver increases by one. It
+        is dropped if it is of another site or driver, is not newer than the stored one, or is
+        implausible, which means that the arm cannot have moved so far.
 
         Args:
             payload: The encoded measurement.
@@ -242,9 +250,9 @@ class ExternalArm:
             self._dropped["stranger"] += 1
             return
 
-        if message.boot != self._boot:
+        if is_other_process:
             self._boot = message.boot
-            self._n = message.n - 1
+            self._n = message.n - 1  # the numbers of a new process may begin at any number
         if message.n <= self._n:
             self._dropped["old measurement"] += 1
             return
@@ -255,8 +263,11 @@ class ExternalArm:
             return
 
         self._accepted_ns = now_ns
-        if self._is_counting and message.n > self._n + 1:
-            self._dropped["missing measurement"] += message.n - self._n - 1
+        missing = message.n - self._n - 1  # measurements between the last one and this one
+        if self._is_counting and missing > 0:
+            self._dropped["missing measurement"] += missing
+        # Measurements that were lost before the session are not counted. Therefore counting
+        # begins after the first measurement that is accepted in the session.
         self._is_counting = self._is_bound
         self._n = message.n
         self.newest = PlantState(message.q, message.qd, message.tau_x)
@@ -402,7 +413,12 @@ class DeadManSwitch:
         self._was_released = True
 
     def _accept(self, payload: bytes, received_ns: int) -> None:
-        """Checks one report of a program, and updates the state of that program.
+        """Checks one report of a program, and updates whether that program holds the switch.
+
+        Several programs may report about the switch of one arm. If one of them releases it, the
+        switch is released, and the others must release it and press it again before they count
+        as holding it. A report names its site, the boot of the program (a random number that
+        identifies the start of its process), and its own number n, which the program increases.
 
         Args:
             payload: The encoded report.
@@ -417,10 +433,12 @@ class DeadManSwitch:
             self._dropped["stranger"] += 1
             return
 
-        if message.boot not in self._programs and len(self._programs) >= STARTS_KEPT:
+        is_new_program = message.boot not in self._programs
+        if is_new_program and len(self._programs) >= STARTS_KEPT:
             self._forget_program()
         program = self._programs.setdefault(message.boot, _Holder())
-        if message.n <= program.n:
+        is_out_of_order = message.n <= program.n
+        if is_out_of_order:
             self._dropped["old switch message"] += 1
             return
         program.n = message.n
@@ -428,9 +446,11 @@ class DeadManSwitch:
         if message.held:
             program.pressed_ns = received_ns
             return
-        # The switch of this program was released. From now on it can be pressed again.
-        if program.counts and program.pressed_ns is not None:
+        # The program does not hold the switch. If it held it until now, the arm must stop.
+        has_held_switch = program.counts and program.pressed_ns is not None
+        if has_held_switch:
             self._release([program])
+        # From now on, the program counts as holding the switch once it is pressed again.
         program.pressed_ns = None
         program.counts = True
 

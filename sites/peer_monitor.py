@@ -131,7 +131,15 @@ class PeerMonitor:
         *,
         alive: bool,
     ) -> None:
-        """Updates the attributes after the token of a member has appeared or disappeared.
+        """Updates which processes are present after a token has appeared or disappeared.
+
+        A token shows that one process is connected. The process belongs to a recorder or a
+        site. It need not be the one that is a member of the session, because a process that
+        waits to join, or that was replaced, also has a token.
+
+        The method updates `recorders` and the sites whose tokens exist. If the process is a
+        member, or any recorder, it also publishes its appearance or loss, and updates
+        `departed`.
 
         Args:
             member: Name of the member.
@@ -140,24 +148,26 @@ class PeerMonitor:
             t_ns: Present time, in ns since the epoch (the common start of the session).
             alive: True if the token has appeared.
         """
-        is_member = str(self.boots.get(member)) == boot
+        member_boot = self.boots.get(member)
+        is_member_process = str(member_boot) == boot
         is_recorder = member == topics.RECORDER
         is_site = member in self._events
         if is_recorder:
             _set_membership(self.recorders, boot, alive)
-            # A recorder joins late, or replaces a recorder that died.
-            if alive and not is_member:
+            # A recorder that is not a member joins late, or replaces a recorder that died.
+            if alive and not is_member_process:
                 publisher.publish("back", "a recorder has joined", about=member, t_ns=t_ns)
         elif is_site:
             _set_membership(self._alive, (member, boot), alive)
 
         # The departure of a member that has published its end was reported already.
-        if self.boots.get(member) in self._ended:
+        if member_boot in self._ended:
             return
-        if is_member and alive:
+        if is_member_process and alive:
             self.departed.pop(member, None)
-        elif not alive and (is_member or is_recorder):
+        elif not alive and (is_member_process or is_recorder):
             publisher.publish("lost", f"{member} is gone", about=member, t_ns=t_ns)
+            # Only if the scenario lets sites come back, the session goes on without this one.
             if self._admits and is_site:
                 sentence = f"{member} has been gone since t = {t_ns * 1e-9:.1f} s"
                 self.departed[member] = (t_ns, sentence)
@@ -228,22 +238,28 @@ class PeerMonitor:
     def _decide_on_join(self, publisher: EventPublisher, event: Event, t_ns: int) -> None:
         """Admits a new process of a site, or refuses it while the previous one still runs.
 
+        A boot is the number that identifies the start of a process. The previous process still
+        runs if its token exists in the network and it has not published its end.
+
         Args:
             publisher: Publishes the events of this site.
-            event: Event with which the new process requests to join.
+            event: Event with which the new process requests to join. It names the boot of the
+                process and its first tick (`ticks`).
             t_ns: Present time, in ns since the epoch (the common start of the session).
         """
         member = event.member
-        previous_boot = self.boots.get(member)
-        # The request was admitted already, with the same first tick.
-        is_repeated = self._first_ticks.get(event.boot) == event.ticks
+        previous_boot = self.boots.get(member)  # None if the site was not a member before
+        admitted_first_tick = self._first_ticks.get(event.boot)
+        was_admitted_already = admitted_first_tick == event.ticks
         is_consistent = event.boots.get(member) == event.boot
-        if not is_consistent or is_repeated:
+        if not is_consistent or was_admitted_already:
             return
 
-        is_replaced = previous_boot not in (event.boot, *self._ended)
-        is_previous_alive = (member, str(previous_boot)) in self._alive
-        if is_replaced and is_previous_alive:
+        is_other_process = previous_boot != event.boot
+        has_published_end = previous_boot in self._ended
+        has_token = (member, str(previous_boot)) in self._alive
+        if is_other_process and not has_published_end and has_token:
+            # A refusal is published only once, although the request is repeated.
             if event.boot not in self._refused:
                 self._refused.add(event.boot)
                 text = f"{member} is present already; a new start must wait until it is gone"

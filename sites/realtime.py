@@ -88,25 +88,32 @@ def _set_affinity(cpu: int | None) -> str:
     return "cpu " + ",".join(str(n) for n in sorted(os.sched_getaffinity(0)))
 
 
-def _call_libc(obtained: str, function: str, *arguments: int) -> str:
-    """Calls a function of the C library that returns 0 on success.
+def _call_libc(setting: str, function: str, *arguments: int) -> str:
+    """Makes a real-time setting by a call of a function of the C library.
+
+    The function must return 0 on success.
 
     Args:
-        obtained: Text to return on success.
+        setting: Description of the setting for the user, such as "locked" for memory.
         function: Name of the function.
         *arguments: Arguments of the function.
 
+    Returns:
+        The argument `setting`, because `prepare` reports for each step what was obtained.
+
     Raises:
-        AttributeError: The platform is not Linux.
+        AttributeError: The platform is not Linux. `prepare` reports this error, which a missing
+            function also raises, as "not on this platform".
         OSError: The call has failed.
     """
     if not sys.platform.startswith("linux"):
         raise AttributeError
     libc = ctypes.CDLL(None, use_errno=True)
-    if getattr(libc, function)(*arguments) != 0:
-        number = ctypes.get_errno()
-        raise OSError(number, os.strerror(number))
-    return obtained
+    has_failed = getattr(libc, function)(*arguments) != 0
+    if has_failed:
+        error_number = ctypes.get_errno()
+        raise OSError(error_number, os.strerror(error_number))
+    return setting
 
 
 def _set_scheduling() -> str:

@@ -187,8 +187,10 @@ class RetransmitBuffer:
     def skip(self, first: int, next_tick: int) -> None:
         """Adds an empty message for each message that the skipped ticks would have published.
 
-        Messages are numbered by the tick. Without the empty messages, later messages would be
-        stored under wrong numbers.
+        The number of a message follows from its tick: a record (channel `STATE`) has the number
+        of its tick, and statistics (channel `LINK`), which are published several times a
+        second, are numbered from 0. Without the empty messages, later messages would be stored
+        under wrong numbers.
 
         Args:
             first: First skipped tick, a period of the control loop.
@@ -196,10 +198,13 @@ class RetransmitBuffer:
         """
         skipped_ticks = next_tick - first
         self.channels[topics.STATE].skip(skipped_ticks)
-        next_number, published = skipped_numbers(
+
+        next_statistics_number, published_statistics = skipped_numbers(
             topics.LINK, next_tick, skipped_ticks, self._site.rate_hz
         )
-        self.channels[topics.LINK].skip(max(0, next_number - published))
+        # As the numbers begin at 0, this is how many statistics the skipped ticks lack.
+        unpublished_statistics = max(0, next_statistics_number - published_statistics)
+        self.channels[topics.LINK].skip(unpublished_statistics)
 
     def answer_query(self) -> bool:
         """Answers the oldest waiting query of a recorder.

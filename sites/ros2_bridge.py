@@ -713,32 +713,39 @@ def describe_target(
 ) -> tuple[str, str, Callable[[bytes], Sequence[float]], Callable[..., int]]:
     """Determines the topic that commands the arm of a site, and how its messages are used.
 
-    The type of the topic depends on whether the scenario's operator moves the end effector,
-    moves the joints, or applies forces.
+    Another program commands the arm on a ROS 2 topic, in the role of the site's operator. The
+    type of the topic depends on whether the scenario's operator moves the end effector, moves
+    the joints, or applies forces.
 
     Args:
         scenario: Scenario of the session.
-        site: Name of the site, which must have a live operator.
-        hand: Connection to the site, in the role of the operator.
-        frame: Frame of the positions and forces in the messages.
+        site: Name of the site (process that runs the arm), which must have a live operator.
+        hand: Connection to the site, in the role of the operator. Its method `turn` sends joint
+            angles, `push` a force, and `move` a position of the end effector.
+        frame: Name of the coordinate frame of the positions and forces in the messages.
 
     Returns:
-        Four values: the name of the topic, its type, a function that converts a message to a
-        target, and a function that sends the target to the site.
+        topic: Name of the topic.
+        type: Name of the ROS type of its messages.
+        read: Function that converts an encoded message to a target: joint angles, a force or a
+            position. Raises ValueError if it cannot.
+        send: Function that sends the target to the site.
     """
-    live = scenario.sites[site].find_live_hand(is_open=True)
-    assert live is not None
+    operator = scenario.sites[site].find_live_hand(is_open=True)
+    assert operator is not None
     initial_q = scenario.sites[site].q0_rad
     end_effector = scenario.arms[site].end_effector(initial_q)
     axes = len(end_effector)  # 2 for an arm in a plane, 3 in space
-    if live.mode == "joint":
-        read = partial(read_joint_target, list_joint_names(scenario, site))
-        return "target_joint", cdr.JOINT_STATE, read, hand.turn
-    if live.mode == "force":
-        read = partial(read_vector_target, frame, axes, 6)
-        return "target_wrench", cdr.WRENCH, read, hand.push
-    read = partial(read_vector_target, frame, axes, 7)
-    return "target_pose", cdr.POSE, read, hand.move
+    if operator.mode == "joint":
+        read_joints = partial(read_joint_target, list_joint_names(scenario, site))
+        return "target_joint", cdr.JOINT_STATE, read_joints, hand.turn
+    if operator.mode == "force":
+        wrench_length = 6  # force and moment
+        read_force = partial(read_vector_target, frame, axes, wrench_length)
+        return "target_wrench", cdr.WRENCH, read_force, hand.push
+    pose_length = 7  # position and quaternion
+    read_position = partial(read_vector_target, frame, axes, pose_length)
+    return "target_pose", cdr.POSE, read_position, hand.move
 
 
 def list_joint_names(scenario: Scenario, site: str) -> list[tuple[str, ...]]:
@@ -1007,16 +1014,23 @@ def open_robot(
 def refuse_other_robots(table: TopicTable, scenario: Scenario) -> None:
     """Checks that each robot in the settings belongs to a site with an external arm.
 
+    An external arm is a real arm, or a simulation in another program. Only for its site the
+    settings of a robot have a meaning. Settings that equal the defaults are tolerated for the
+    other sites of the scenario, because they change nothing.
+
     Args:
         table: The user's settings of topics and robots.
         scenario: Scenario of the session.
 
     Raises:
-        UsageError: A robot belongs to another site.
+        UsageError: A site without an external arm has settings of a robot, or the scenario has
+            no such site.
     """
     for site, robot in table.robots.items():
-        has_settings = robot != RobotTable() or site not in scenario.names
-        if site not in scenario.outside and has_settings:
+        has_external_arm = site in scenario.outside
+        is_unknown = site not in scenario.names
+        differs_from_defaults = robot != RobotTable()
+        if not has_external_arm and (differs_from_defaults or is_unknown):
             outside = ", ".join(scenario.outside) or "none"
             raise UsageError(
                 f"--names: sites.{site}: no site of this name has an external arm; sites with "

@@ -585,31 +585,38 @@ class RunningSession:
             def find() -> dict[str, State]:
                 """Returns one record of each site, by the name of the site.
 
+                A record is the stored result of one tick, a period of a site's control loop.
                 Without `as_site`, it is the newest record that has arrived. With `as_site`, it
                 is the record of the pose that the user of that site sees. The dictionary is
                 empty until the first record has arrived.
+
+                The records that arrive from `inbox` are kept in `latest_records`, because the
+                user may see an older pose than the newest. `picture_delay` computes which tick
+                of each peer the user sees, as the scenario may delay the user's picture.
                 """
                 nonlocal picture_delay
                 for record in read_records(inbox):
                     if record.site not in latest_records:
                         latest_records[record.site] = deque(maxlen=STATES_KEPT)
                     latest_records[record.site].append(record)
-                newest = {site: records[-1] for site, records in latest_records.items()}
+                newest_records = {site: records[-1] for site, records in latest_records.items()}
                 if not as_site:
-                    return newest
-                if as_site not in newest:
+                    return newest_records
+                if as_site not in newest_records:
                     return {}
 
                 if picture_delay is None:
+                    # The site runs, because a record of it has arrived, and sends its scenario.
                     info = self._find_running(bus, as_site)
                     scenario = parse_embedded(info.scenario, self.name)
                     picture_delay = PictureDelay(scenario, as_site)
-                local_record = newest[as_site]
-                visible_records = {as_site: local_record}
-                visible_ticks = picture_delay.advance_to(local_record.tick, local_record.used)
-                for peer, tick in visible_ticks.items():
+                user_record = newest_records[as_site]
+                visible_records = {as_site: user_record}
+                # The field `used` states which sample of each peer the control law used.
+                visible_ticks = picture_delay.advance_to(user_record.tick, user_record.used)
+                for peer, visible_tick in visible_ticks.items():
                     for record in reversed(latest_records.get(peer, deque())):
-                        if record.tick == tick:
+                        if record.tick == visible_tick:
                             visible_records[peer] = record
                             break
                 return visible_records

@@ -126,20 +126,26 @@ class SessionPing:
     def is_over(self, timeout_ns: int, begun_ns: int) -> bool:
         """Returns True once the pings to every member are complete, or have been given up.
 
+        The measurement lasts at least `GATHERING_NS` after the first reply of a member, because
+        further members may reply in this time. It is given up `PATIENCE_NS` after all pings
+        should have been sent.
+
         Args:
             timeout_ns: Longest wait for the first reply, in ns.
             begun_ns: Time at which the measurement was started, on the clock of this process,
                 in ns.
         """
         now_ns = self._clock.monotonic_ns()
-        if self._first_ns is None:
+        if self._first_ns is None:  # no member has replied
             return now_ns - begun_ns > timeout_ns
 
-        elapsed_ns = now_ns - self._first_ns
-        pings_ns = self._trips_per_member * PING_PACE_NS
-        limit_ns = GATHERING_NS + pings_ns + PATIENCE_NS
-        is_complete = self.pinger.knows_clocks(self._boots) or elapsed_ns > limit_ns
-        return elapsed_ns > GATHERING_NS and is_complete
+        since_first_reply_ns = now_ns - self._first_ns
+        sending_ns = self._trips_per_member * PING_PACE_NS  # needed to send all pings
+        give_up_after_ns = GATHERING_NS + sending_ns + PATIENCE_NS
+        is_complete = self.pinger.knows_clocks(self._boots)
+        is_given_up = since_first_reply_ns > give_up_after_ns
+        has_gathered_members = since_first_reply_ns > GATHERING_NS
+        return has_gathered_members and (is_complete or is_given_up)
 
     def report(self) -> PingReport:
         """Returns the delays and clock offsets that have been measured up to the present time.
