@@ -126,20 +126,28 @@ class PeerInbox:
     def admit(self, index: int, boot: int, first: int) -> None:
         """Accepts samples of a restarted peer, and no more samples of its previous process.
 
+        A sample is accepted only if it has the boot that is stored for its peer. The ticks
+        between the last sample of the previous process and the first tick of the new process
+        have no samples, and do not count as missing.
+
         Args:
             index: Index of the peer among all peers of this site.
             boot: Number that identifies the new process of the peer.
             first: First tick (period of the control loop) of the new process.
         """
         self._boots[index] = boot
+        # The new process may start in any pose. Therefore its first sample is not compared with
+        # the newest sample of the previous process.
         self._newest[index] = None
-        self._last[index] = max(self._last[index], first - 1)
-        self._skipped_until[index] = self._last[index]
+        last_tick_without_sample = max(self._last[index], first - 1)
+        self._last[index] = last_tick_without_sample
+        self._skipped_until[index] = last_tick_without_sample
 
     def find_last_tick_of(self, index: int, boot: int) -> int | None:
         """Returns the last tick whose sample has arrived from a peer before its restart.
 
-        A tick is one period of the peer's control loop.
+        A tick is one period of the peer's control loop. A boot is the number that identifies a
+        process. This method is called before `admit`, which stores the boot of the new process.
 
         Args:
             index: Index of the peer among all peers of this site.
@@ -149,10 +157,13 @@ class PeerInbox:
             The last tick received from the previous process. None if no sample of that process
             has arrived, or if the samples of `boot` are accepted already.
         """
-        is_accepted_already = boot == self._boots[index]
+        accepted_boot = self._boots[index]
+        is_accepted_already = boot == accepted_boot
         last_tick = self._last[index]
-        has_received = last_tick > self._skipped_until[index]
-        if is_accepted_already or not has_received:
+        # Before the first sample of a process, `_last` is the tick before its first tick.
+        tick_before_process = self._skipped_until[index]
+        has_received_sample = last_tick > tick_before_process
+        if is_accepted_already or not has_received_sample:
             return None
         return last_tick
 
@@ -280,10 +291,14 @@ MIN_HELD_DELAY_US = 100_000
 def may_hold_samples(scenario: Scenario, name: str) -> bool:
     """Returns True if a site may send the samples of several ticks together, and thus late.
 
-    The run is not changed by this if every link from the site delays its samples by at least
-    `MIN_HELD_DELAY_US`, because no peer uses a sample before that time. The user may shorten
-    the delay of a link during the run. Therefore the site must receive the events of its peers,
-    and must send each sample at once after an event has reported a change.
+    A sample is the state that a site sends to its peers in each tick, a period of its control
+    loop. The receiver of a link delays each sample as the scenario prescribes, counted from the
+    tick of the sample and not from its arrival. If every link from the site prescribes at least
+    `MIN_HELD_DELAY_US`, no peer uses a sample before that time. Sending it a few milliseconds
+    late then has no effect on the run.
+
+    The result holds for the delays of the scenario. If the user shortens a delay during the
+    run, the site stops holding samples, see `RunningSite._watch_members`.
 
     Args:
         scenario: The scenario, which describes the arms, their links and the run.
@@ -291,12 +306,16 @@ def may_hold_samples(scenario: Scenario, name: str) -> bool:
     """
     for receiver in scenario.names:
         for link in scenario.setup(receiver).links:
-            if link.peer != name:
+            sender = link.peer
+            if sender != name:
                 continue
+            # The models replace each other in the course of the run.
             for model in link.models:
                 is_constant = model.kind == DelayKind.CONSTANT
-                constant_us = model.location if is_constant else 0.0
-                smallest_delay_us = max(model.playout_us, constant_us)
+                # A random delay may be as short as 0.
+                smallest_network_us = model.location if is_constant else 0.0
+                # The play-out buffer holds each sample until it has at least a given age.
+                smallest_delay_us = max(model.playout_us, smallest_network_us)
                 if smallest_delay_us < MIN_HELD_DELAY_US:
                     return False
     return True
@@ -376,13 +395,18 @@ class StateBlock:
     def send_samples(self, k: int, send: Callable[[TickRecord], tuple[Any, ...]]) -> None:
         """Sends the waiting samples to the peers, unless they are held until a later tick.
 
+        If the samples may be held (`holds_samples`), they are sent together in every wake tick.
+        Wake ticks occur `WAKES_PER_S` times a second, in different ticks for sites of different
+        `turn`, so that not all sites of a machine wake their peers at the same time.
+
         Args:
             k: Number of the present tick (period of the control loop).
             send: Function that sends the sample of a record. It returns the sending time and
                 the confirmations of received samples ("echoes") that the sample contained. Both
                 become part of the record.
         """
-        is_wake_tick = (k + 1 - self._turn) % self._ticks_per_wake == 0
+        ticks_after_this_one = k + 1
+        is_wake_tick = (ticks_after_this_one - self._turn) % self._ticks_per_wake == 0
         if not self.holds_samples or is_wake_tick:
             self._send_waiting_samples(send)
 

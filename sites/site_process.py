@@ -337,36 +337,43 @@ class RunningSite:
         """Returns the schedule of the site's ticks, and the timing of its links.
 
         Sites on one machine have the same clock. They wake up one after another in each period,
-        in the order of the scenario, so that they do not compete for the processors.
+        in the order of the scenario, so that they do not compete for the processors. The names
+        of the sites on this machine are also stored, for the real-time settings.
+
+        Args:
+            pinger: Offsets of the other members' clocks, as estimated by pings.
         """
         parts = self._parts
         epoch = self._epoch
         scenario = parts.scenario
-        peers = []
-        local_names = {parts.name}
+        peer_clocks = []
+        local_names = {parts.name}  # sites on this machine
         for name in parts.site.peers:
+            # The pings are stored by boot, the number of a process start. A peer that is not
+            # present has no pings, and is assumed to have the same epoch on the same clock.
             boot = epoch.boots.get(name, NO_BOOT)
-            peer = PeerClock(
+            peer_clock = PeerClock(
                 name=name,
                 epoch_ns=epoch.epochs.get(name, epoch.mono_ns),
                 index_at_peer=scenario.peers(name).index(parts.name),
                 estimate=pinger.estimate(boot),
                 estimator=pinger.estimator(boot),
             )
-            peers.append(peer)
+            peer_clocks.append(peer_clock)
             is_present = name in epoch.boots
-            if peer.is_own and is_present:
+            is_on_this_machine = peer_clock.is_own
+            if is_on_this_machine and is_present:
                 local_names.add(name)
 
         self._local_sites = [name for name in scenario.names if name in local_names]
         turn = self._local_sites.index(parts.name)
-        rate_hz = max(scenario.sites[name].rate_hz for name in self._local_sites)
+        highest_rate_hz = max(scenario.sites[name].rate_hz for name in self._local_sites)
         return SiteTiming(
             epoch_ns=epoch.mono_ns,
             rate_hz=parts.site.rate_hz,
-            peers=peers,
-            leader=scenario.names[0],
-            turn_ns=find_turn_ns(turn, len(self._local_sites), rate_hz),
+            peers=peer_clocks,
+            leader=scenario.names[0],  # all sites follow the tick schedule of this one
+            turn_ns=find_turn_ns(turn, len(self._local_sites), highest_rate_hz),
         )
 
     def run(self) -> None:
@@ -519,23 +526,29 @@ class RunningSite:
         times a second.
 
         Args:
-            k: Tick that was executed last.
+            k: Tick (period of the control loop) that was executed last.
             t_ns: Nominal time of that tick, in ns since the epoch (the common start of the
                 session).
         """
         parts = self._parts
-        nominal_ns = tick_ns(k + 1, parts.site.rate_hz)
-        # Start of the session as the present schedule implies it, for sites that join late.
-        grid_ns = self._timing.schedule.due_ns(k + 1) - nominal_ns
-        self._publisher.update(ticks=k + 1, grid_ns=grid_ns)
+        next_tick = k + 1
+        next_nominal_ns = tick_ns(next_tick, parts.site.rate_hz)
+        # Start of the session as the present schedule implies it, for sites that join late. It
+        # changes slowly, because the schedule follows the clock of the leader.
+        grid_ns = self._timing.schedule.due_ns(next_tick) - next_nominal_ns
+        self._publisher.update(ticks=next_tick, grid_ns=grid_ns)
         self._publisher.answer_queries()
-        notices = self._timing.update_clocks(k + 1, parts.clock.monotonic_ns())
+
+        # Other members: their clocks, and who takes part.
+        notices = self._timing.update_clocks(next_tick, parts.clock.monotonic_ns())
         self._publish_clocks(notices, t_ns)
         self._watch_members(t_ns)
         self._rejoin(t_ns)
 
+        # News of this site. Each is a tick and a sentence.
         if parts.hand is not None:  # who has started or ended to move the arm
             for _, text in parts.hand.news:
+                # `say` prints the name of the site itself.
                 _, _, text_without_site = text.partition(": ")
                 parts.say(text_without_site)
             self._publish_news("hand", parts.hand.news)
@@ -544,7 +557,8 @@ class RunningSite:
         self._publish_waiting(k, t_ns)
 
         second = t_ns // NS_PER_S
-        if self._output is not None and second >= self._status_s + STATUS_PERIOD_S:
+        is_status_due = second >= self._status_s + STATUS_PERIOD_S
+        if self._output is not None and is_status_due:
             self._status_s = second
             parts.say(self._describe_status(self._output))
 
@@ -603,6 +617,9 @@ class RunningSite:
     def _watch_members(self, t_ns: int) -> None:
         """Updates who takes part in the session, and checks if a peer is away for too long.
 
+        A member is present while its token exists in the network, which the monitor observes.
+        The monitor also collects the events of new processes of peers that may join.
+
         Args:
             t_ns: Present time, in ns since the epoch (the common start of the session).
         """
@@ -610,21 +627,23 @@ class RunningSite:
         monitor = parts.monitor
         monitor.watch(self._publisher, t_ns)
         if monitor.changed:
-            # From now on every sample is published in its own tick, because a change may
-            # shorten the delay of a link. A change takes effect 100 ms after its request at the
-            # earliest, so that no sample held until now was already needed.
+            # If all links have long delays, the samples of a few ticks are held and published
+            # together. A peer has published a change, which may shorten a delay. Therefore
+            # every sample is published in its own tick from now on. This is early enough: a
+            # change takes effect at least 100 ms after its request, when all samples that are
+            # held at present have been published.
             parts.states.holds_samples = False
 
         # A peer whose samples arrive is present, even if its token was lost.
         if monitor.departed:
-            for meter in self._timing.monitors:
-                if meter.is_receiving(parts.clock.monotonic_ns()):
-                    monitor.mark_present(meter.peer.name, t_ns)
+            for link_monitor in self._timing.monitors:
+                if link_monitor.is_receiving(parts.clock.monotonic_ns()):
+                    monitor.mark_present(link_monitor.peer.name, t_ns)
 
-        for event in monitor.admitted:
-            self._admit_peer(event, t_ns)
+        for join_event in monitor.admitted:
+            self._admit_peer(join_event, t_ns)
         monitor.admitted.clear()
-        self._has_given_up = self._is_peer_away_too_long(t_ns)
+        self._has_given_up = self._is_peer_away_too_long(t_ns)  # ends the loop
 
     def _is_peer_away_too_long(self, t_ns: int) -> bool:
         """Returns True if a peer left longer ago than the user's options tolerate."""
@@ -779,27 +798,29 @@ class RunningSite:
         """
         parts = self._parts
         mode = output.mode
-        rule = parts.setup.on_stale
+        rule = parts.setup.on_stale  # what the arm does while samples of a peer are missing
         if mode is Mode.HOLD:
             second = output.t_ns // NS_PER_S
-            if second <= self._alarm_s:
+            had_alarm_in_this_second = second <= self._alarm_s
+            if had_alarm_in_this_second:
                 return
             self._alarm_s = second
 
         if rule.action is not StaleAction.GLIDE:
             return
 
-        lost: Sequence[str] = ()  # peers without which the arm continues
+        # Some arms go on without a lost peer. They have an alarm as they return to the others.
+        lost_peers: Sequence[str] = ()
         if rule.degrades and mode is Mode.RETURN:
-            lost = parts.site.layout.list_lost_peers(output.mem, parts.site.peers)
+            lost_peers = parts.site.layout.list_lost_peers(output.mem, parts.site.peers)
 
         alarm = find_alarm(
-            parts.options.session,
-            parts.name,
-            MODE_WORDS[mode],
-            output.mem,
-            len(output.q_des),
-            lost,
+            session=parts.options.session,
+            site=parts.name,
+            mode=MODE_WORDS[mode],
+            mem=output.mem,
+            shared=len(output.q_des),
+            lost=lost_peers,
         )
         if alarm is not None:
             parts.say(f"*** {alarm}")
@@ -885,20 +906,23 @@ class RunningSite:
         Returns:
             member: Name of the member that ended the run. Empty if the run was completed, or
                 was ended by a request to all sites.
-            cause: End of a sentence that names the cause. Empty if the run was completed.
+            cause: Text that names the cause, to be appended to the sentence "m1 made 500
+                ticks". Empty if the run was completed.
         """
         parts = self._parts
         monitor = parts.monitor
-        if self._failure is not None:
+        if self._failure is not None:  # of this site
             return parts.name, f": {self._failure}"
-        if monitor.ended_by:
+        if monitor.ended_by:  # another member ended it, or has replaced this site
             return monitor.ended_member, f": {monitor.ended_by}"
-        if parts.changes.stopped:
+        if parts.changes.stopped:  # users requested that all sites end at the same tick
             return "", ", as many as it was asked for"
-        if self._ticks == parts.scenario.ticks(parts.name):
+        scenario_ticks = parts.scenario.ticks(parts.name)
+        if self._ticks == scenario_ticks:
             return "", ""
         if parts.interrupt.is_requested():
-            return parts.name, f", ended by {signal.Signals(parts.interrupt.number).name}"
+            signal_name = signal.Signals(parts.interrupt.number).name
+            return parts.name, f", ended by {signal_name}"
 
         # The site has waited too long for peers that left.
         first_departed = next(iter(monitor.departed), "")

@@ -142,23 +142,30 @@ class KeyProblem(NamedTuple):
 
 @cache
 def _vector_keys(kind: StructType, extra: str) -> Mapping[str, str]:
-    """Returns the keys of a type that are vectors, with the count that gives each its length.
+    """Finds which keys of a table are vectors, and on which count the length of each depends.
+
+    The fields of a structure type are the keys of a table in a scenario. The length of a vector
+    depends on the arm, for example on its number of joints. The annotation of its field says
+    so: a field `Kd: Annotated[tuple[float, ...], Meta(extra={"per": "joints"})]` has one number
+    per joint, and its entry in the result is `"Kd": "joints"`.
 
     Args:
-        kind: The type.
-        extra: "per" for vectors that a single number may stand for. "point" for points in
-            space, which must be written in full.
+        kind: The structure type of the table.
+        extra: Which vectors are searched for, as a key of `Meta.extra`. "per" for vectors that
+            a single number may stand for. "point" for points in space, which must be written in
+            full.
 
     Returns:
-        For each key the name of a field of `VectorCounts`.
+        For each vector, by its key, the name of the field of `VectorCounts` with its length.
     """
-    counts = {}
+    count_names = {}
     for key, hint in get_type_hints(kind, include_extras=True).items():
-        for meta in getattr(hint, "__metadata__", ()):
-            annotations = meta.extra if isinstance(meta, Meta) else None
-            if annotations is not None and extra in annotations:
-                counts[key] = str(annotations[extra])
-    return counts
+        # Only a type of the form `Annotated[type, ...]` has this attribute.
+        for annotation in getattr(hint, "__metadata__", ()):
+            values = annotation.extra if isinstance(annotation, Meta) else None
+            if values is not None and extra in values:
+                count_names[key] = str(values[extra])
+    return count_names
 
 
 def expand_vectors(table: TomlTable, kind: StructType, counts: VectorCounts) -> TomlTable:

@@ -171,7 +171,18 @@ class Interrupt:
             outer.number = outer.number or self.number
 
     def _handle(self, number: int, _frame: FrameType | None) -> None:
-        """Records a signal, and raises KeyboardInterrupt inside `raising`."""
+        """Records a signal that requests the end of the program, such as that of Ctrl-C.
+
+        The first signal requests an orderly end. A second Ctrl-C requests the end at once, for
+        a user who does not want to wait. Two signals in quick succession count as one request,
+        because a terminal and a parent process may both deliver the same signal.
+
+        Args:
+            number: Number of the signal.
+
+        Raises:
+            KeyboardInterrupt: The signal has arrived in a `with` block of `raising`.
+        """
         self.number = self.number or number
         # A terminal that closes and its shell send one SIGHUP each: these are not repetitions.
         if number != _HANG_UP:
@@ -180,7 +191,7 @@ class Interrupt:
                 self._requested_s = now_s
             elif now_s - self._requested_s > _SAME_REQUEST_S:
                 self._is_repeated = True
-        if self.raises:
+        if self.raises:  # within a `with` block of `raising`
             raise KeyboardInterrupt
 
     @contextmanager

@@ -572,29 +572,46 @@ def _make_progress_line(clock: Clock) -> Callable[["PlayProgress"], None]:
 def _describe_playback(outcome: "PlaybackSummary", rate: float) -> dict[str, Any]:
     """Returns the outcome of a replay as plain values, with the keys of `trilat replay --json`.
 
+    A replay publishes the messages of a log again, at the times of the recording. Receivers may
+    be slow, and recorders may store the messages.
+
     Args:
         outcome: The outcome.
         rate: Speed relative to the recording. Infinity, which becomes None, for as fast as
             possible.
+
+    Returns:
+        The values by key. Comments in the function explain the keys.
     """
     lateness = outcome.lateness
     late_us = None
     if lateness is not None:
         late_us = {"p50": lateness.p50_us, "p99": lateness.p99_us, "max": lateness.max_us}
+    has_recorders = bool(outcome.recorders)
+    damaged_files = {path.as_posix(): reason for path, reason in outcome.torn.items()}
     return {
+        # Number of published messages by topic, and of all of them.
         "messages": outcome.counts,
         "published": sum(outcome.counts.values()),
+        # Number of passes through the log that were started.
         "rounds": outcome.rounds,
         "rate": None if math.isinf(rate) else rate,
         "took_s": round(outcome.took_s, 6),
+        # How late messages were published. None if they had no deadlines.
         "late_us": late_us,
+        # Time for which the replay waited for slow receivers, in s.
         "held_s": round(outcome.held_s, 3),
+        # How often a receiver was disconnected, because it accepted no message for 5 s.
         "cut": outcome.cut,
+        # Number of messages whose place in the file was too far from their turn.
         "strays": outcome.strays,
+        # Number of recorders after the last message, and whether they stored all messages.
         "recorders": outcome.recorders,
-        "stored": outcome.stored if outcome.recorders else None,
+        "stored": outcome.stored if has_recorders else None,
+        # Number of messages that were sent again to recorders that missed them.
         "told": outcome.refilled,
-        "torn": {path.as_posix(): text for path, text in outcome.torn.items()},
+        # Damaged files of the log, with the reason.
+        "torn": damaged_files,
     }
 
 

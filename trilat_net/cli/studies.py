@@ -262,25 +262,35 @@ def show_progress(
     from ..studies.sweep.sweep_run import format_wall_time
 
     clock = SystemClock()
-    began_ns = -1
-    first = 0
-    printed = 0
+    first_call_ns = -1  # time of the first call of `show_line`, -1 before it
+    done_at_first_call = 0
+    printed_tenths = 0  # tenths of the items that were finished at the last printed line
 
     def show_line(done: int, total: int) -> None:
-        """Prints a line with the remaining time after each tenth of the items."""
-        nonlocal began_ns, first, printed
-        if began_ns < 0:
+        """Prints a line with the remaining time, about once per tenth of the items.
+
+        The remaining time follows from the mean duration of the items since the first call. No
+        line is printed at the first call, where this duration is unknown, nor after the last
+        item.
+
+        Args:
+            done: Number of finished items.
+            total: Number of all items.
+        """
+        nonlocal first_call_ns, done_at_first_call, printed_tenths
+        if first_call_ns < 0:
             # The time before the first item is the start of the processes, which does not
             # count towards the duration of an item.
-            began_ns = clock.monotonic_ns()
-            first = done
-        lines = done * _PROGRESS_LINES // total
-        if done in (total, first) or lines <= printed:
+            first_call_ns = clock.monotonic_ns()
+            done_at_first_call = done
+        finished_tenths = done * _PROGRESS_LINES // total
+        has_no_remaining_time = done in (total, done_at_first_call)
+        if has_no_remaining_time or finished_tenths <= printed_tenths:
             return
-        printed = lines
-        elapsed_s = (clock.monotonic_ns() - began_ns) * 1e-9
-        left_s = elapsed_s / (done - first) * (total - done)
-        print_line(f"  {done} of {total} {items}, about {format_wall_time(left_s)} left")
+        printed_tenths = finished_tenths
+        elapsed_s = (clock.monotonic_ns() - first_call_ns) * 1e-9
+        remaining_s = elapsed_s / (done - done_at_first_call) * (total - done)
+        print_line(f"  {done} of {total} {items}, about {format_wall_time(remaining_s)} left")
 
     yield show_line
 

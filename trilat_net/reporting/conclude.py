@@ -157,12 +157,19 @@ def conclude(
             )
 
         def wait_for_findings() -> Iterator[Finding]:
-            """Yields the result of each check of the log.
+            """Yields the result of each check of the log, once the checks have finished.
 
-            It first waits until the other process, which executes the log again, has finished.
+            The checks run in another process, which executes the log again. `check` is the
+            future of their results. This generator waits for them only when the first result is
+            requested, so that the report can be prepared meanwhile. The results are also stored
+            in the list `findings`, which is empty until then.
+
+            Raises:
+                RunFailed: The other process was terminated.
             """
             try:
-                findings.extend(check.result())
+                results = check.result()
+                findings.extend(results)
             except BrokenProcessPool:
                 raise RunFailed(
                     "the process that reruns the log ended unexpectedly; try again"
