@@ -113,7 +113,7 @@ def test_triangle_dragged_for_minute_is_obeyed_to_its_end() -> None:
         ({"link": "m1->s", "to": {"model": "trace", "file": "/etc/passwd"}}, "file"),
         ({"dominance": "s", "to": {"m1": 0.9, "m2": 0.2}}, "sum"),
         ({"dominance": "x", "to": {"m1": 1.0}}, "sites are"),
-        ({"dominance": "m1", "to": {"m2": 0.5, "s": 0.5}}, "ask m1"),
+        ({"dominance": "m1", "to": {"m2": 0.5, "s": 0.5}}, "send the change to m1"),
         ({"to": {}}, "must name either a link"),
     ],
 )

@@ -21,10 +21,10 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, cast
 
 import numba
-from numba.extending import register_jitable
 import numpy as np
 from numba.core import types
 from numba.core.errors import NumbaError
+from numba.extending import register_jitable
 
 from ..errors import LawFailed, ScenarioError
 from .control import limit_torque
