@@ -1004,7 +1004,7 @@ class _FileCopy:
             self._out.add_metadata(ACCOUNTS, {**accounts.format_accounts(), **other_counts})
         self._out.add_metadata(RECOVERED, result.facts())
         if accounts is not None:
-            # Only logs of sessions contain digests. Files of other programs remain as they are.
+            # Without accounts, the digests of the source were copied, if there are any.
             self._out.close_digest()
         self._out.finish()
 

@@ -293,9 +293,8 @@ class RecoverySurvey:
                 return True
             _opcode, content = definition
             has_foreign_name = topic_prefix in content
-            is_name_unambiguous = is_renamed
             is_in_foreign_page = offset // PAGE_BYTES in foreign_pages
-            is_foreign = has_foreign_name and (is_name_unambiguous or is_in_foreign_page)
+            is_foreign = has_foreign_name and (is_renamed or is_in_foreign_page)
             return not is_foreign
 
         self.definitions = list(filter(is_genuine, self.definitions))

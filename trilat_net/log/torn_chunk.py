@@ -142,8 +142,8 @@ def find_doubtful_page(scanner: RecordScanner, begin: int, end: int) -> int:
     is therefore doubtful in two cases:
 
     - It contains only zeros: it was never written.
-    - It is equal to another page, in the part or before it. Compressed data never repeat a
-      whole page by chance, so that a page was written to the wrong place.
+    - It is equal to another page, in the part or before it. Compressed data hardly ever repeat
+      a whole page by chance. Probably the page was written to the wrong place.
 
     Args:
         scanner: Scanner of the file.

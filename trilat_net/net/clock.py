@@ -127,17 +127,27 @@ class SkewedClock:
     def sleep_until(self, deadline_ns: int) -> None:
         """Sleeps until this clock has reached a time.
 
-        The time is converted to a time of the base clock, which then sleeps.
+        The deadline is converted to a time of the base clock, which then sleeps. When the base
+        clock has advanced by p since the start, this clock reads
+
+            start + offset + p (1 + drift).
+
+        Solving this for p gives the time for which the base clock must run:
+
+            p = (deadline - start - offset) / (1 + drift).
+
+        The drift is stored in ns/s, so that 1 + drift is (NS_PER_S + drift_ppb) / NS_PER_S.
 
         Args:
             deadline_ns: The time on this clock, in ns. If it has passed already, the method
                 returns at once.
         """
-        # Time from the start to the deadline, on this clock and on the other clock.
-        passed_ns = deadline_ns - self._start_ns - self._offset_ns
+        # Time from the start to the deadline, as this clock and as the base clock measure it.
+        skewed_duration_ns = deadline_ns - self._start_ns - self._offset_ns
+        skewed_ns_per_base_s = NS_PER_S + self._drift_ppb
         # -(-a // b) is a / b rounded up, so that the sleep does not end before the deadline.
-        other_passed_ns = -(-passed_ns * NS_PER_S // (NS_PER_S + self._drift_ppb))
-        self._clock.sleep_until(self._start_ns + other_passed_ns)
+        base_duration_ns = -(-skewed_duration_ns * NS_PER_S // skewed_ns_per_base_s)
+        self._clock.sleep_until(self._start_ns + base_duration_ns)
 
     def identity(self) -> str:
         """Returns a text that identifies this clock, with its offset, its drift and its start.

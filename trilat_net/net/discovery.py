@@ -177,13 +177,23 @@ def _query_sites(
     bus: Bus,
     clock: Clock,
     session: str,
-    names: SiteNamesOf,
+    parse_site_names: SiteNamesOf,
     stopped: Callable[[], bool],
     timeout_s: float | None,
 ) -> tuple[str, ...] | None:
     """Queries the members of a session for the names of its sites.
 
-    The arguments are those of `connect_to_session`, with a bus that reaches the first site.
+    A site is a process that runs one arm. Its reply contains the scenario, the description of
+    the experiment, which names all sites of the session.
+
+    Args:
+        bus: Network connection that reaches the first site.
+        clock: Clock of the caller.
+        session: Name of the session.
+        parse_site_names: Function that returns the names of the sites in the text of a
+            scenario. It raises `ScenarioError` if the text is not a scenario.
+        stopped: Function that returns True to give up.
+        timeout_s: Longest wait for a reply, in s. None waits until `stopped` returns True.
 
     Returns:
         The names, from the first reply that contains a scenario. None if `stopped` returned
@@ -195,9 +205,12 @@ def _query_sites(
     for info in find_members(bus, clock, session, stopped=stopped, timeout_s=timeout_s):
         try:
             if info.scenario:
-                return names(info.scenario)
+                return parse_site_names(info.scenario)
         except ScenarioError:  # not a scenario of this program
             continue
+
+    # The search has ended, because the caller has stopped it or because the time is over. The
+    # second case cannot occur without a limit, so that `timeout_s` is a number below.
     if stopped():
         return None
     raise SessionError(

@@ -383,13 +383,29 @@ class SessionJoin:
     def _read_events(self) -> Epoch | None:
         """Receives the events of all members, and acts on those about the start.
 
+        The members agree on the epoch, the common time of tick 0, in three steps:
+
+        1. `epoch`: The leader proposes an epoch. The event states the number of the proposal
+           (`attempt`), and the boots of all members. A boot is a random number that identifies
+           one start of a process.
+        2. `ready`: Each member agrees. It states the epoch on its own clock.
+        3. `start`: The leader confirms the proposal, and states the epochs of all members.
+
+        The events `ready` and `start` repeat the number and the boots of their proposal. They
+        are ignored if this member has agreed to another proposal.
+
+        Other events, by which a site is admitted to a session that is running already, are
+        passed to `_receive_admission`.
+
         Returns:
             The epoch once the leader has confirmed the proposal that this member agreed to.
             None until then.
         """
         for event in read_messages(self._events, Event):
-            if event.boots.get(event.member) != event.boot:
-                continue  # the sender is not a member according to its own event
+            # An event must list its own sender among the members, with the right boot.
+            is_sender_listed = event.boots.get(event.member) == event.boot
+            if not is_sender_listed:
+                continue
             if event.kind == "epoch":
                 self._receive_announcement(event)
                 continue
@@ -398,13 +414,15 @@ class SessionJoin:
             agreed = self._agreed_proposal
             if agreed is None:
                 continue
-            if event.attempt != agreed.attempt or event.boots != agreed.boots:
-                continue  # the event belongs to another proposal
+            is_about_agreed = event.attempt == agreed.attempt and event.boots == agreed.boots
+            if not is_about_agreed:
+                continue
+            is_from_leader = event.boot == agreed.boot
             if event.kind == "ready":
                 self._ready_epochs[event.member] = event.epoch_mono_ns
-            elif event.kind == "start" and event.boot == agreed.boot:
-                includes_all = event.epochs.keys() == agreed.boots.keys()
-                if includes_all:
+            elif event.kind == "start" and is_from_leader:
+                includes_all_members = event.epochs.keys() == agreed.boots.keys()
+                if includes_all_members:
                     return self._make_epoch(event)
         return None
 

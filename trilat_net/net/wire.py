@@ -366,20 +366,45 @@ def make_decoder(
     Returns:
         The function, which raises WireError as `decode` does.
     """
-    limit = _SIZE_LIMITS.get(kind, MAX_BYTES)
+    max_bytes = _SIZE_LIMITS.get(kind, MAX_BYTES)
     parse = _DECODERS[kind].decode
     if kind is PeerSample and layout is not None:
         # Thousands of samples may wait in a ring, so their size is limited more tightly.
-        limit = SAMPLE_BYTES + NUMBER_BYTES * (3 * layout.shared + layout.sent)
-    vector_lengths = _list_vector_lengths(kind, layout or Layout())
-    get_vectors = attrgetter(*vector_lengths) if vector_lengths else None
-    lengths = list(vector_lengths.values()) if layout else None
+        max_bytes = SAMPLE_BYTES + NUMBER_BYTES * (3 * layout.shared + layout.sent)
+    lengths_by_name = _list_vector_lengths(kind, layout or Layout())
+    get_vectors = attrgetter(*lengths_by_name) if lengths_by_name else None
+    required_lengths = list(lengths_by_name.values()) if layout else None
 
     def decode_payload(payload: bytes) -> Any:
-        """Decodes and checks one payload. Raises WireError if the payload is not valid."""
-        if len(payload) > limit:
+        """Decodes the payload of one message, and checks the message.
+
+        These variables of `make_decoder` depend only on the type of the message and on the
+        layout (numbers of joints, peers and parameters) of the sender:
+
+        - `max_bytes`: largest size of a payload.
+        - `parse`: decodes a payload, and checks the types and ranges of the fields.
+        - `versions`: accepted versions of the schema. Messages from the network must have the
+          version of this program. For logs, older versions are accepted as well.
+        - `get_vectors`: returns the fields of a message that are vectors, such as the joint
+          angles. None if the type has no vectors.
+        - `lengths_by_name`: lengths of these vectors, by name.
+        - `required_lengths`: the same lengths as a list. None accepts any lengths.
+
+        Args:
+            payload: The encoded message.
+
+        Returns:
+            The message.
+
+        Raises:
+            WireError: The payload is too large or malformed, has another schema version,
+                contains a number that is not finite, or contains a vector of the wrong length.
+        """
+        if len(payload) > max_bytes:
             size = count_nouns(len(payload), "byte")
-            raise WireError("oversized", f"the message has {size}; at most {limit} are allowed")
+            raise WireError(
+                "oversized", f"the message has {size}; at most {max_bytes} are allowed"
+            )
         try:
             message: Any = parse(payload)
         except (ValueError, RecursionError) as error:
@@ -394,11 +419,15 @@ def make_decoder(
 
         if get_vectors is not None:
             vectors = get_vectors(message)
-            if lengths is not None and [*map(len, vectors)] != lengths:
-                _check_lengths(vectors, vector_lengths)
-            # As in `encode_state`, the terms are checked only if their sum is not finite.
+            # The comparison of lists is fast. If they differ, the call finds the wrong vector,
+            # and raises an error that names it.
+            if required_lengths is not None and [*map(len, vectors)] != required_lengths:
+                _check_lengths(vectors, lengths_by_name)
+            # A sum is finite only if all of its terms are, and one sum is faster than a check
+            # of each term. The sum of finite terms may overflow. Therefore the terms are
+            # checked one by one if the sum is not finite.
             if not _isfinite(sum(map(sum, vectors))):
-                _check_finite(message, vectors, vector_lengths)
+                _check_finite(message, vectors, lengths_by_name)
         return message
 
     return decode_payload
