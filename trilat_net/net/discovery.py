@@ -161,7 +161,7 @@ def connect_to_session(
                     bus=first_bus,
                     clock=clock,
                     session=session,
-                    names=names,
+                    parse_site_names=names,
                     stopped=stopped,
                     timeout_s=timeout_s,
                 )
