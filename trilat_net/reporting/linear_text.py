@@ -129,20 +129,28 @@ def tabulate_roots(analysis: LinearAnalysis) -> TextTable:
     A motion with the root s changes as exp(s t), and grows if the real part of s is positive.
     The table describes the motion of each root.
 
-    The roots are those of the continuous loop. If a root of the sampled loop, as it is computed
-    tick by tick, differs, the table also has the roots of the sampled loop. If the delays
-    differ from tick to tick, the table has only the roots of the sampled loop, because the
-    continuous loop has only mean delays.
+    The roots are those of the continuous loop, whose controllers compute all the time. If a
+    root of the sampled loop, whose controllers compute once per tick, differs, two further
+    columns have the roots of the sampled loop. If the delays differ from tick to tick, the
+    table has only the roots of the sampled loop over a span of ticks, because the continuous
+    loop has only mean delays.
 
     Args:
         analysis: The analysis.
+
+    Returns:
+        The table with a row per root: real part in 1/s, imaginary part in rad/s, frequency in
+        Hz, damping ratio, number of equal roots ("modes"), and what moves.
     """
-    spanned = analysis.decisive.span_s is not None
-    roots = analysis.decisive.roots if spanned else analysis.continuous.roots
-    sampled = [None if spanned else analysis.find_sampled_root(root) for root in roots]
-    differ = any(other is not None for other in sampled)
+    ticks_differ = analysis.decisive.span_s is not None
+    roots = analysis.decisive.roots if ticks_differ else analysis.continuous.roots
+    # For each root, the one of the sampled loop if it is to be shown beside it.
+    sampled_roots = [
+        None if ticks_differ else analysis.find_sampled_root(root) for root in roots
+    ]
+    has_sampled_columns = any(sampled is not None for sampled in sampled_roots)
     rows = []
-    for root, other in zip(roots, sampled, strict=True):
+    for root, sampled in zip(roots, sampled_roots, strict=True):
         # The imaginary part of a real root may be -0.0, which would be printed as "-0".
         row = [
             f"{root.s.real:.4g}",
@@ -151,13 +159,13 @@ def tabulate_roots(analysis: LinearAnalysis) -> TextTable:
             f"{root.damping:.4g}",
             str(root.multiplicity),
         ]
-        if differ and other is None:
+        if has_sampled_columns and sampled is None:
             row += ["same", "same"]
-        elif other is not None:
-            row += [f"{other.s.real:.4g}", f"{other.s.imag:.4g}"]
+        elif sampled is not None:
+            row += [f"{sampled.s.real:.4g}", f"{sampled.s.imag:.4g}"]
         rows.append([*row, root.description])
     heads = ["re 1/s", "im rad/s", "Hz", "damping", "modes"]
-    if differ:
+    if has_sampled_columns:
         heads += ["re as computed", "im as computed"]
     heads.append("what moves")
     return TextTable(heads, rows, align="r" * (len(heads) - 1) + "l")
@@ -186,25 +194,39 @@ def describe_linear_verdict(analysis: LinearAnalysis) -> str:
     """Returns a sentence that says whether small motions of the coupled arms decay.
 
     The sentence states the growth rate and the frequency of the slowest decaying, or fastest
-    growing, motion. They belong to the characteristic root with the largest real part.
+    growing, motion. They belong to the characteristic root with the largest real part. Motions
+    that neither decay nor grow, but keep a constant speed ("drifting"), are only counted. An
+    example is "stable: the slowest motion goes as exp(-1.2 t / s) at 3.4 rad/s, as computed
+    tick by tick".
 
     Args:
-        analysis: Result of the linear stability analysis.
+        analysis: Result of the linear stability analysis. The roots that decide about stability
+            (`decisive`) are those of the sampled loop, whose controllers compute in ticks, if
+            it could be analysed, and otherwise those of the continuous loop.
+
+    Returns:
+        The sentence, which begins with the verdict "stable", "unstable" or "at the edge".
     """
     rightmost = analysis.decisive.rightmost
-    drifting = analysis.decisive.drifting
-    motions = "motions keep their" if drifting > 1 else "motion keeps its"
-    drift = f"{drifting} {motions} speed"
+    drifting_count = analysis.decisive.drifting
+    motions = "motions keep their" if drifting_count > 1 else "motion keeps its"
+    drift = f"{drifting_count} {motions} speed"
     if rightmost is None:
-        return f"{analysis.verdict}: {drift if drifting else 'nothing moves'}"
+        return f"{analysis.verdict}: {drift if drifting_count else 'nothing moves'}"
+
     growth = f"exp({rightmost.s.real:.4g} t / s)"
     if rightmost.s.imag:
         growth += f" at {rightmost.s.imag:.4g} rad/s"
-    if analysis.sampled is not None:
-        basis = analysis.decisive.basis or " tick by tick"
-        growth += f", as computed{basis.removeprefix(',')}"
-    slowest = f"{drift}, and the slowest of the others" if drifting else "the slowest motion"
-    return f"{analysis.verdict}: {slowest} goes as {growth}"
+    is_of_sampled_loop = analysis.sampled is not None
+    if is_of_sampled_loop:
+        # If ticks differ, the basis is a phrase such as ", over the period of 0.05 s".
+        ticks = analysis.decisive.basis.removeprefix(",") or " tick by tick"
+        growth += f", as computed{ticks}"
+
+    motion = "the slowest motion"
+    if drifting_count:
+        motion = f"{drift}, and the slowest of the others"
+    return f"{analysis.verdict}: {motion} goes as {growth}"
 
 
 _MAX_BANDS = 3
@@ -273,23 +295,32 @@ def _describe_conditions(ports: PortAnalysis) -> list[str]:
 def _describe_port_passivity(ports: PortAnalysis) -> list[str]:
     """Returns the lines about the passivity of all ports, of each joint, and of the proof.
 
-    The stability proof assumes operators that are passive in r, the velocity plus Lambda times
-    the error e, instead of the velocity.
+    A port is a joint or axis at which an operator holds an arm. The arms are passive if they
+    never supply energy to the operators. The stability proof assumes operators that are passive
+    in r, the velocity plus Lambda times the error e, instead of the velocity.
+
+    At zero frequency, the admittance Y (velocities per torque) may have a pole: a constant
+    torque makes a velocity grow. For free masses, this is compatible with passivity.
+
+    Args:
+        ports: Results for the ports.
     """
     lines = []
-    if ports.pole.order:
-        kind = "as of free masses" if ports.pole.passive else "which no passive network has"
-        lines.append(f"  at zero frequency Y has a pole of order {ports.pole.order}, {kind}")
-    all_ports = _describe_passivity(ports.velocity, ports.impedance_unit(), ports.kind)
-    lines.append(f"  operators passive in {ports.speed}, coupled or not: {all_ports}")
+    pole = ports.pole
+    if pole.order:
+        meaning = "as of free masses" if pole.passive else "which no passive network has"
+        lines.append(f"  at zero frequency Y has a pole of order {pole.order}, {meaning}")
+    all_ports_text = _describe_passivity(ports.velocity, ports.impedance_unit(), ports.kind)
+    lines.append(f"  operators passive in {ports.speed}, coupled or not: {all_ports_text}")
+    # Each joint alone, without operators at the others.
     for joint, passivity in ports.joints.items():
         unit = ports.impedance_unit(joint)
-        port = _describe_passivity(passivity, unit, ports.kind)
-        lines.append(f"    {ports.name_port(joint)} alone: {port}")
+        joint_text = _describe_passivity(passivity, unit, ports.kind)
+        lines.append(f"    {ports.name_port(joint)} alone: {joint_text}")
     if ports.proof is not None:
         premise = f"r = {ports.speed} + Lambda e, the proof's premise"
-        proof = _describe_proof(ports, ports.proof)
-        lines.append(f"  operators passive in {premise}: {proof}")
+        proof_text = _describe_proof(ports, ports.proof)
+        lines.append(f"  operators passive in {premise}: {proof_text}")
     return lines
 
 
@@ -355,44 +386,72 @@ def _describe_absolute_stability(ports: PortAnalysis) -> str:
 def _describe_two_ports(ports: PortAnalysis) -> list[str]:
     """Returns the lines about Llewellyn's criterion, which decides on stability for two sites.
 
-    Each pair of sites and joint is a two-port. A line describes a failing two-port, or a group
-    of them, and a last line counts those for which the criterion holds.
+    A two-port is one joint of two sites, at which one operator each acts. A third site is free,
+    or its arm is clamped. The criterion fails if some passive operators make the two-port
+    unstable, which is so if Llewellyn's parameter is below 1 in some band of frequencies. A
+    line describes a failing two-port, or a group of them, and a last line counts those for
+    which the criterion holds.
+
+    Args:
+        ports: Results for the joints at which the operators act.
     """
     failing = [two_port for two_port in ports.two_ports if two_port.minima.below]
+
     # For arms with many joints, the failing two-ports of a pair of sites share a line.
+    has_line_per_joint = len(ports.joints) <= _MAX_SEPARATE_JOINTS
     groups: dict[tuple[object, ...], list[TwoPort]] = {}
     for two_port in failing:
-        joint = two_port.joint if len(ports.joints) <= _MAX_SEPARATE_JOINTS else ""
-        groups.setdefault((two_port.sites, two_port.clamped, joint), []).append(two_port)
+        joint = two_port.joint if has_line_per_joint else ""
+        line_key = (two_port.sites, two_port.clamped, joint)
+        groups.setdefault(line_key, []).append(two_port)
     lines = [_describe_failing(ports, group) for group in groups.values()]
-    holding = len(ports.two_ports) - len(failing)
-    if not holding:
+
+    holding_count = len(ports.two_ports) - len(failing)
+    if not holding_count:
         return lines
     subject = "the others"
     if not failing:
         subject = f"every pair and {ports.kind}"
         if any(two_port.clamped for two_port in ports.two_ports):
             subject += ", the third site free or clamped"
-    return [*lines, f"{subject}: holds ({holding} two-ports)"]
+    return [*lines, f"{subject}: holds ({holding_count} two-ports)"]
 
 
 def _describe_failing(ports: PortAnalysis, group: list[TwoPort]) -> str:
-    """Returns a line about failing two-ports of the same sites, with their worst minimum."""
+    """Returns a line that says at which frequencies Llewellyn's criterion fails.
+
+    A two-port is one joint of two sites. It fails at a frequency if Llewellyn's parameter is
+    below 1 there. The line ends with the smallest value of the parameter and its frequency. An
+    example is "m1 and s, joint 1: fails at 2-5 Hz; least 0.8 at 3 Hz".
+
+    Args:
+        ports: Results for all joints, from which the names of joints and axes are taken.
+        group: Failing two-ports of the same two sites. They have the same third site clamped,
+            or none.
+    """
     worst = min(group, key=lambda two_port: two_port.minima.least)
     minima = worst.minima
-    joints = [str(ports.axes.get(two_port.joint, two_port.joint)) for two_port in group]
+
+    # In task space, the numbers of the ports stand for axes with names.
+    port_names = []
+    for two_port in group:
+        port_name = ports.axes.get(two_port.joint, two_port.joint)
+        port_names.append(str(port_name))
     subject = " and ".join(worst.sites)
     if worst.clamped:
         subject += f", {worst.clamped} clamped"
-    subject += f", {ports.kind} {', '.join(joints)}"
+    subject += f", {ports.kind} {', '.join(port_names)}"
+
     if len(group) == 1:
-        failure = _list_bands(minima.below)
+        frequencies = _list_bands(minima.below)
     else:
+        # Several two-ports have too many bands to list. The range that contains them is stated.
         bands = [band for two_port in group for band in two_port.minima.below]
         from_hz = min(band.from_hz for band in bands)
         to_hz = max(band.to_hz for band in bands)
-        failure = f"within {from_hz:.3g}-{to_hz:.3g} Hz"
-    return f"{subject}: fails {failure}; least {minima.least:.3g} at {minima.least_hz:.3g} Hz"
+        frequencies = f"within {from_hz:.3g}-{to_hz:.3g} Hz"
+    least = f"least {minima.least:.3g} at {minima.least_hz:.3g} Hz"
+    return f"{subject}: fails {frequencies}; {least}"
 
 
 def _describe_transparency(ports: PortAnalysis, transparency: Transparency) -> str:

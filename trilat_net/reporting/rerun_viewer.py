@@ -441,27 +441,32 @@ def _select_estimates(topic: str, kind: str, names: Sequence[str]) -> PlotCurves
 
 
 def _select_joint_states(topic: str, field: str, names: Sequence[str]) -> PlotCurves | None:
-    """Returns the curves of a list of joint states.
+    """Returns the curves of the positions, velocities or torques of joints.
 
-    A channel contains the states of the joints, those of the reference (with the suffix
-    "_ref"), or both. If it contains both, the reference is shown only among the positions.
+    The messages of a channel contain the states of the joints, those of the reference that the
+    joints follow, or both. The reference has names with the suffix "_ref", or the topic
+    ".../reference". In the viewer, the curves of a reference always have the suffix, by which
+    they get a paler colour. If a channel contains both, the reference is shown only among the
+    positions.
 
     Args:
         topic: Topic of the channel.
         field: Name of the list: "position", "velocity" or "effort".
-        names: Names of all joints.
+        names: Names of all joints. Without any name, the channel counts as a reference.
 
     Returns:
         The curves. None for the torques of a reference, which do not exist.
     """
-    is_reference = all(name.endswith("_ref") for name in names)
-    is_reference = is_reference or topic.endswith("/reference")
-    if is_reference and field == "effort":
+    suffix = "_ref"
+    has_only_reference_names = all(name.endswith(suffix) for name in names)
+    is_only_reference = has_only_reference_names or topic.endswith("/reference")
+    if is_only_reference and field == "effort":
         return None
-    if is_reference:
-        names = [name.removesuffix("_ref") + "_ref" for name in names]
-    shows_all = is_reference or field == "position"
-    visible = [shows_all or not name.endswith("_ref") for name in names]
+    if is_only_reference:
+        # The names in a channel ".../reference" may lack the suffix.
+        names = [name.removesuffix(suffix) + suffix for name in names]
+    shows_references = is_only_reference or field == "position"
+    visible = [shows_references or not name.endswith(suffix) for name in names]
     return PlotCurves(f"{topic}/{field}", tuple(names), tuple(visible))
 
 

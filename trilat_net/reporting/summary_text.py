@@ -611,24 +611,37 @@ def compose_benchmark(benchmark: Result) -> Iterator[Block]:
 def _judge_transport(transport: dict[str, Any], needs: dict[str, Any]) -> str:
     """Returns a sentence that compares the delay of a transport with the needs of a scenario.
 
+    A transport is the protocol that carries the samples between sites, such as TCP.
+
     Args:
-        transport: Measured delays and losses of the transport.
+        transport: Measured delays and losses of the transport. `p99_ms` is the 99th percentile
+            of the delay, None if no message returned. `hidden` is True if it is at most
+            `held_ms`. `age_ms` is the age at which samples would be used. `spare_ms` is the
+            further age up to which the loop stays stable, None if it is not stable or not
+            known to be. `lost_share` is the fraction of lost messages, and `playout_ms` is the
+            largest delay, rounded up.
         needs: Sizes, rates and time limits of the scenario. `held_ms` is the time for which its
             links hold each sample before it is used, so that shorter delays have no effect.
+            `stable_ms` lists the ages at which the loop is stable, None if they are not known.
     """
     if transport["p99_ms"] is None:
         return "no message returned"
-    parts = [f"p99 {transport['p99_ms']:.3g} ms"]
+
+    delay = f"p99 {transport['p99_ms']:.3g} ms"
     if needs["held_ms"]:
         relation = "hides in" if transport["hidden"] else "exceeds"
-        parts[0] += f" {relation} the {needs['held_ms']:g} ms for which links hold samples"
-    parts.append(f"samples are in use {transport['age_ms']:.4g} ms old")
+        delay += f" {relation} the {needs['held_ms']:g} ms for which links hold samples"
+    parts = [delay, f"samples are in use {transport['age_ms']:.4g} ms old"]
+
+    is_stability_known = needs["stable_ms"] is not None
     if transport["spare_ms"] is not None:
         parts.append(f"{transport['spare_ms']:.4g} ms to spare")
-    elif needs["stable_ms"] is not None:
+    elif is_stability_known:
         parts.append("at which the loop is not stable")
     if transport["lost_share"]:
         parts.append(f"{100 * transport['lost_share']:.3g} % lost")
+
+    # A play-out buffer of the largest delay makes the delay of all samples equal.
     playout = (
         f"a play-out of {transport['playout_ms']} ms would hold every one of these samples"
     )

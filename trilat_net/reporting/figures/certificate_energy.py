@@ -265,24 +265,35 @@ def _draw_work(axes: Axes, balance: EnergyBalance, form: FigureSize) -> None:
 
 
 def _draw_residual(axes: Axes, balance: EnergyBalance, form: FigureSize) -> None:
-    """Draws the residual of the balance, with and without the work that sampling does.
+    """Draws the residual of the energy balance, which shows whether the log fits the model.
 
+    The solid line is the residual: the change of the energy function V that neither dissipation
+    ("taken") nor the work on the arms ("given") explains. Some of it arises because the control
+    law is executed in ticks ("sampling"). The dotted line is what remains without this part.
     The value axis is logarithmic, so that the residual can be compared with the largest energy.
+
+    Args:
+        axes: Panel of the figure, as Matplotlib axes.
+        balance: V and all energies that change it, in J over time.
+        form: Width, type sizes and resolution of the figure.
     """
-    scale = balance.scale or 1.0
-    floor = 1e-9 * scale
+    largest_energy = balance.scale or 1.0
+    floor = 1e-9 * largest_energy  # smaller magnitudes are drawn at this height
+    solid = "-"
+    dotted = (0, (1, 1))
     residuals = (
-        ("V - V(0) + taken - given", balance.residual, "-"),
-        ("with sampling booked", balance.unexplained, (0, (1, 1))),
+        ("V - V(0) + taken - given", balance.residual, solid),
+        ("with sampling booked", balance.unexplained, dotted),
     )
     for label, values, dashes in residuals:
         magnitude = np.maximum(np.abs(values), floor)
         _draw_line(
             balance, axes, magnitude, label=label, color=style.REFERENCE, linestyle=dashes
         )
-    axes.axhline(scale, color=style.FAINT, linewidth=0.9, label="largest energy")
-    # The legend of a narrow figure is higher and needs more room above the lines.
+    axes.axhline(largest_energy, color=style.FAINT, linewidth=0.9, label="largest energy")
+    # The legend is above the lines. In a narrow figure it is higher, and needs 12 decades of
+    # the axis instead of 4.
     room = 1e12 if form.narrow else 1e4
-    axes.set(yscale="log", ylabel="residual (J)", ylim=(floor, room * scale))
+    axes.set(yscale="log", ylabel="residual (J)", ylim=(floor, room * largest_energy))
     columns = 1 if form.narrow else 3
     axes.legend(loc="upper left", ncols=columns, fontsize=_choose_legend_pt(form))

@@ -458,30 +458,47 @@ def draw_parameter_estimates(log: Log, form: FigureSize = REPORT_SIZE) -> Figure
 
 
 def _draw_link_estimates(log: Log, form: FigureSize) -> Figure:
-    """Draws the parameter estimates of arms in space, with a panel per link's parameter."""
+    """Draws the estimates of the inertial parameters of arms in space, over time.
+
+    A link has `LINK_PARAMETERS` parameters, such as its mass, and each has a panel. The panels
+    of a link fill one row, or two rows of a narrow figure. A panel has the estimates of all
+    sites whose arms have that link.
+
+    Args:
+        log: Log of the run.
+        form: Width, type sizes and resolution of the figure.
+    """
     arms = log.scenario.arms
-    longest = max((arms[site] for site in log.sites), key=lambda arm: arm.counts.joints)
+    longest_arm = max((arms[site] for site in log.sites), key=lambda arm: arm.counts.joints)
     columns = LINK_PARAMETERS // 2 if form.narrow else LINK_PARAMETERS
-    rows = len(longest.theta) // columns
-    with style.time_figure(log, form, 0.8 + 0.74 * rows) as plot:
+    rows = len(longest_arm.theta) // columns  # theta are the parameters of all links
+    height_in = 0.8 + 0.74 * rows
+    with style.time_figure(log, form, height_in) as plot:
         grid = style.add_panels(plot.figure, rows, columns, sharex=True)
         panels: list[Axes] = [*grid.flat]
-        for index, (axes, parameter) in enumerate(zip(panels, longest.parameters, strict=True)):
-            name, unit = parameter
+        panel_parameters = zip(panels, longest_arm.parameters, strict=True)
+        for index, (axes, parameter) in enumerate(panel_parameters):
+            name, unit = parameter  # a name such as "upper.m", the mass of the link "upper"
             link, _, symbol = name.rpartition(".")
             sites = [site for site in log.sites if index < len(arms[site].theta)]
             _draw_estimate(plot=plot, sites=sites, index=index, axes=axes, width=0.9)
             plot.mark(axes, log.sites, numbered=False)
+
+            # The panels are small. Therefore titles, ticks and labels are small too.
             title = f"{style.typeset_symbol(symbol)} ({style.typeset_unit(unit)})"
             axes.set_title(title, fontsize=_LINK_PANEL_PT, pad=3.5)
             axes.tick_params(labelsize=5.0, length=1.5, pad=1.0)
             axes.locator_params(axis="y", nbins=2)
             style.flatten_rounding(axes)
-            if index % LINK_PARAMETERS == 0:
-                number = 1 + index // LINK_PARAMETERS
-                style.label_row(axes, f"{number}: {link}", form)
-        plot.finish(list(grid[-1]), _list_estimate_entries(log))
-        for axes in grid[-1]:
+
+            is_first_panel_of_link = index % LINK_PARAMETERS == 0
+            if is_first_panel_of_link:
+                link_number = 1 + index // LINK_PARAMETERS
+                style.label_row(axes, f"{link_number}: {link}", form)
+
+        bottom_panels = grid[-1]
+        plot.finish(list(bottom_panels), _list_estimate_entries(log))
+        for axes in bottom_panels:
             axes.set_xlabel("t (s)", fontsize=_LINK_PANEL_PT, labelpad=1.0)
     return plot.figure
 

@@ -90,6 +90,7 @@ def draw_twins(pushed: PushedTwins, form: FigureSize = REPORT_SIZE) -> Figure:
     shows the differences between the joint velocities of the twins and of the run, in rad/s. It
     has a line for each push, or a line for each joint if there was a single push. The lower
     panel shows the joint speeds of the run. If there are no twins, the figure shows the reason.
+    The title is a sentence on how the pushes develop.
 
     Args:
         pushed: The run and its twins.
@@ -100,24 +101,29 @@ def draw_twins(pushed: PushedTwins, form: FigureSize = REPORT_SIZE) -> Figure:
         return style.empty_figure(growth.text, form)
 
     height_in = 5.4 if form.narrow else 4.4
+    title_width = 62 if form.narrow else 110  # characters per line
     with style.time_figure(pushed.log, form, height_in) as plot:
         panels = style.add_panels(plot.figure, 2, 1, sharex=True, height_ratios=(4.0, 1.0))
-        above, below = panels[:, 0]
+        upper_panel, lower_panel = panels[:, 0]
         lines = list(_list_lines(pushed, growth.twins))
-        rated = growth.worst if pushed.linear is None else growth.pushes[0]
-        _draw_differences(above, pushed, lines, rated)
-        _limit_differences(above, form)
-        _mark_push(above, pushed.at_s, form)
+        # The growth rate is drawn for the push that the title is about. If pushes of several
+        # sizes were tried, the title is about all of them, and the first push is chosen.
+        has_several_sizes = pushed.linear is not None
+        rated_push = growth.pushes[0] if has_several_sizes else growth.worst
+        _draw_differences(upper_panel, pushed, lines, rated_push)
+        _limit_differences(upper_panel, form)
+        _mark_push(upper_panel, pushed.at_s, form)
 
+        # The time axis begins a little before the push, so that its line is visible.
         margin_s = 0.08 * (growth.to_s - pushed.at_s)
         from_s = max(0.0, pushed.at_s - margin_s)
-        _draw_speeds(below, pushed.log, growth.twins, from_s)
+        _draw_speeds(lower_panel, pushed.log, growth.twins, from_s)
 
-        plot.mark(above, pushed.log.sites)
-        entries = [(line.label, line.options) for line in lines]
-        title = textwrap.fill(pushed.headline(), 62 if form.narrow else 110)
-        plot.finish([below], entries, title=style.typeset(title))
-        below.set_xlim(from_s, growth.to_s)
+        plot.mark(upper_panel, pushed.log.sites)
+        legend_entries = [(line.label, line.options) for line in lines]
+        title = textwrap.fill(pushed.headline(), title_width)
+        plot.finish([lower_panel], legend_entries, title=style.typeset(title))
+        lower_panel.set_xlim(from_s, growth.to_s)
     return plot.figure
 
 
@@ -129,32 +135,41 @@ def _draw_log_twins(log: Log, form: FigureSize) -> Figure:
 
 
 def _list_lines(pushed: PushedTwins, twins: Twins) -> Iterator[_DifferenceLine]:
-    """Yields the lines of the upper panel.
+    """Yields the lines of the panel that shows the differences between twins and their run.
 
     - If pushes of several sizes were tried, to find those that act linearly, each size has a
       line, from light to dark.
     - Several pushes have a line each. The push of one joint has the style of that joint.
     - A single push has a line per joint that it moved.
+
+    Args:
+        pushed: The run and its pushed twins.
+        twins: The twins of `pushed`, each with its push and the course of its difference.
     """
     all_joints = list(range(len(twins.joints)))
     joint_styles = _style_joints(pushed.log, twins.joints)
     shades = colormaps["viridis"](np.linspace(0.9, 0.0, len(twins.paths)))
+    has_several_sizes = pushed.linear is not None
     for number, path in enumerate(twins.paths):
-        size, _, target = path.push.name.partition(" at ")
-        if pushed.linear is not None:
+        # The name of a push is for example "1e-06 rad at m1 joint 1", "1e-06 rad at all joints"
+        # or "1e-06 of all estimates". Only a push of joints has a target after "at".
+        size, _, pushed_joints = path.push.name.partition(" at ")
+        if has_several_sizes:
             shade = {"color": tuple(shades[number]), "linewidth": 1.3}
             yield _DifferenceLine(size, path, all_joints, shade)
         elif len(twins.paths) > 1:
-            plain = {
-                "color": _SEVERAL_JOINTS_COLOUR if target else _ESTIMATES_COLOUR,
+            style_without_joint = {
+                "color": _SEVERAL_JOINTS_COLOUR if pushed_joints else _ESTIMATES_COLOUR,
                 "linewidth": 1.0,
                 "linestyle": style.DASHES[number % len(style.DASHES)],
             }
-            options = joint_styles.get(target, plain)
+            options = joint_styles.get(pushed_joints, style_without_joint)
             yield _DifferenceLine(path.push.name, path, all_joints, options)
         else:
             for joint, name in enumerate(twins.joints):
-                if np.isfinite(path.largest[:, joint]).any():
+                # The logarithm of the difference is -inf while the joint has not moved.
+                has_moved = np.isfinite(path.largest[:, joint]).any()
+                if has_moved:
                     yield _DifferenceLine(name, path, [joint], joint_styles[name])
 
 
@@ -182,54 +197,64 @@ def _draw_differences(
         axes: Panel of the figure, as Matplotlib axes.
         pushed: A run and its pushed twins.
         lines: Lines of the differences.
-        rated: Growth of the push whose rate is drawn.
+        rated: Growth of the push whose rate is drawn. At least one line belongs to this push.
     """
     growth = pushed.growth
     drawn_s = growth.to_s - pushed.at_s
-    step = max(1, int(drawn_s * BUCKETS_PER_S / _POINTS))
+    # A twin has `BUCKETS_PER_S` values a second. So many of them become one point of a line
+    # that a line has about `_POINTS` points.
+    intervals_per_point = max(1, int(drawn_s * BUCKETS_PER_S / _POINTS))
     axes.set_yscale("log")
-    rated_traces = []
+    rated_traces = []  # times and values of the lines of the rated push
     for line in lines:
-        t_s, values = _trace_amplitude(line, growth.to_s, step)
+        t_s, values = _trace_amplitude(line, growth.to_s, intervals_per_point)
         axes.plot(t_s, values, **line.options)
-        if line.path.push is rated.push:
+        belongs_to_rated_push = line.path.push is rated.push
+        if belongs_to_rated_push:
             rated_traces.append((t_s, values))
 
-    # All lines of one push belong to one twin. Therefore they have the same times.
-    rated_t_s = rated_traces[0][0]
+    # A push has one line, or one per joint. All of them belong to one twin, and therefore have
+    # the same times.
+    rated_t_s, _ = rated_traces[0]
     envelope = np.fmax.reduce([values for _, values in rated_traces])
     _draw_rate(axes, pushed, rated, rated_t_s, envelope)
 
 
 def _trace_amplitude(line: _DifferenceLine, to_s: float, step: int) -> tuple[Array, Array]:
-    """Returns the points of a line. A point is the largest amplitude around its time.
+    """Computes the points of a line, each as the largest difference around its time.
 
-    The amplitudes are computed as logarithms, because unstable twins grow beyond the range of
-    floating-point numbers.
+    The difference between a twin and its run is known in intervals of 50 ms. A difference that
+    has decayed to rounding errors is pushed again. The intervals from one push to the next are
+    called a leg. The line is interrupted between two legs.
+
+    The computation uses logarithms, because the difference of a run in which disturbances grow
+    exponentially may exceed the range of floating-point numbers.
 
     Args:
         line: The line.
         to_s: End of the line, in s.
-        step: Number of intervals of the twin that a point covers.
+        step: Number of intervals that a point covers.
 
     Returns:
-        Times in s and amplitudes in rad/s, each of shape (K,). A NaN amplitude after the part
-        of each push interrupts the line.
+        Times in s and amplitudes in rad/s, each of shape (K,). Each leg ends with a point of
+        the amplitude NaN, at which the line is interrupted. So is it where the difference is 0.
     """
     path = line.path
-    amplitude = measure_amplitude(path, line.joints)
+    log_amplitude = measure_amplitude(path, line.joints)
     end = int(np.searchsorted(path.t_s, to_s))
-    end = max(end, path.pushed[-1] + 1)
+    end = max(end, path.pushed[-1] + 1)  # the last leg has at least one interval
     t_s = np.zeros(0)
-    logarithms = np.zeros(0)
-    for first, last in pairwise([*path.pushed, end]):
-        starts = np.arange(first, last, step)
-        middles = np.minimum(starts + step // 2, last - 1)
-        peaks = np.maximum.reduceat(amplitude[:last], starts)
+    log_peaks = np.zeros(0)
+    for leg_start, leg_end in pairwise([*path.pushed, end]):
+        # Groups of `step` intervals, each with its first and its middle interval.
+        starts = np.arange(leg_start, leg_end, step)
+        middles = np.minimum(starts + step // 2, leg_end - 1)
+        group_peaks = np.maximum.reduceat(log_amplitude[:leg_end], starts)
         t_s = np.r_[t_s, path.t_s[middles], np.nan]
-        logarithms = np.r_[logarithms, peaks, -np.inf]
-    amplitudes = np.exp(np.minimum(logarithms, MOST_LOG))
-    return t_s, np.where(np.isfinite(logarithms), amplitudes, np.nan)
+        log_peaks = np.r_[log_peaks, group_peaks, -np.inf]
+    # Larger logarithms would overflow.
+    amplitudes = np.exp(np.minimum(log_peaks, MOST_LOG))
+    return t_s, np.where(np.isfinite(log_peaks), amplitudes, np.nan)
 
 
 def _draw_rate(
@@ -280,20 +305,27 @@ def _draw_rate(
 
 
 def _limit_differences(axes: Axes, form: FigureSize) -> None:
-    """Labels and limits the axis of differences.
+    """Labels and limits the logarithmic axis of the differences.
 
-    Differences that are so small that they consist of rounding errors are shaded.
+    Differences below `SMALLEST` consist of rounding errors. If any difference comes near this
+    value, the axis begins a decade below it, and this decade is shaded. The axis spans at least
+    a factor of 30, so that slow growth does not look fast.
+
+    Args:
+        axes: Panel of the figure, as Matplotlib axes, in which the lines are already drawn.
+        form: Width, type sizes and resolution of the figure.
     """
     axes.set_ylabel("difference of velocities (rad/s)")
     low, high = axes.get_ylim()
-    if low < 10.0 * SMALLEST:
+    is_near_rounding = low < 10.0 * SMALLEST
+    if is_near_rounding:
         low = SMALLEST / 10.0
         axes.axhspan(low, SMALLEST, **_ROUNDING)
         axes.annotate(
             "rounding",
             xy=(0.0, SMALLEST),
             xycoords=axes.get_yaxis_transform(),
-            xytext=(3.0, -9.0),
+            xytext=(3.0, -9.0),  # in points: inside the shaded decade, at its left end
             fontsize=form.small_pt,
             **_NOTE,
         )
