@@ -151,3 +151,47 @@ def test_with_unknown_lengths_v_falls_by_the_dissipation() -> None:
 def test_without_learning_lengths_v_falls_by_something_else() -> None:
     V, lost = functional(run(UNKNOWN, gain=0.0, **WRONG))
     assert np.abs(V + lost - V[0]).max() > 1e-3 * V[0]
+
+
+def estimated_over_true(lengths: tuple[float, float], q: tuple[float, float]) -> np.ndarray:
+    """J_hat J^-1 of an arm of two links of 1 m, which relates estimated to true velocities."""
+    pose = np.array([q])
+    estimated = jacobians(np.array([lengths]), pose)[0]
+    true = jacobians(np.array([[1.0, 1.0]]), pose)[0]
+    return np.asarray(estimated @ np.linalg.inv(true))
+
+
+def test_weight_of_errata_10_is_not_symmetric_and_may_be_singular() -> None:
+    """With Lambda = 1 and one delay for all, it is the sum of J_hat J^-1 over the arms plus T I."""
+    one = estimated_over_true((0.2, 3.0), (0.0, 0.2))
+    assert np.linalg.eigvalsh(0.5 * (one + one.T)) == pytest.approx([-5.447, 8.647], abs=1e-3)
+    # Its own eigenvalues are the ratios of the lengths, as a similar matrix shows.
+    assert np.sort(np.linalg.eigvals(one).real) == pytest.approx([0.2, 3.0])
+    mirrored = estimated_over_true((0.2, 3.0), (0.5 * np.pi, -0.2))
+    weight = 0.5 * (one + mirrored)
+    assert np.linalg.det(weight) < 0.0
+    delay_s = -np.linalg.eigvals(weight).real.min()
+    assert delay_s > 0.0
+    assert abs(np.linalg.det(weight + delay_s * np.eye(2))) < 1e-9
+
+
+@pytest.mark.long
+def test_errors_vanish_although_the_weight_of_errata_10_is_indefinite() -> None:
+    """An end effector of finite reach cannot move at one velocity for ever: e and qd go to zero."""
+    log = run(UNKNOWN, gain=LENGTH_GAIN, **{**WRONG, "duration_s": 60.0})
+    apart_m = np.abs(places(log, "m") - places(log, "s")).max(axis=1)
+    assert apart_m[-1] <= 0.01 * apart_m[0]
+    for site in log.sites:
+        elbow = np.abs(np.sin(log[site].q[:, 1]))
+        assert elbow.min() > 0.1
+        assert np.abs(log[site].qd[-1000:]).max() < 1e-2
+        # x_hat(t + s) - x_hat(t) + s Lambda e(t) over s = 0.5 s goes to zero with t.
+        lengths_m = np.array([state.mem[-4:-2] for state in log[site].states])
+        inner, outer = log[site].q[:, 0], log[site].q.sum(axis=1)
+        estimate = lengths_m[:, [0]] * np.stack([np.cos(inner), np.sin(inner)], axis=1)
+        estimate += lengths_m[:, [1]] * np.stack([np.cos(outer), np.sin(outer)], axis=1)
+        peer = "s" if site == "m" else "m"
+        e = places(log, site)[DELAY:] - places(log, peer)[:-DELAY]
+        rest = estimate[DELAY + 500 :] - estimate[DELAY:-500] + 0.5 * 1.5 * e[:-500]
+        size = np.abs(rest).max(axis=1)
+        assert size[-5000:].max() < 0.02 * size[:5000].max()

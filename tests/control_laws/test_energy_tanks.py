@@ -17,7 +17,7 @@ from tests.unit_arm import H50, hand, unit_scenario
 from tests.virtual_runs import sampled, trajectories
 from trilat_net.execution import virtual
 from trilat_net.execution.verify import verify
-from trilat_net.scenario.describe import describe_law_conditions
+from trilat_net.scenario.describe import describe_law_conditions, list_law_proofs
 
 TANKS: dict[str, Any] = {"law": "tanks", "level_J": 0.125, "fill_nm_s_rad_J": 40.0}
 
@@ -132,5 +132,11 @@ def test_compiled_and_per_tick_runs_agree_and_logs_verify(law: str) -> None:
 def test_a_scenario_says_what_its_law_rests_on(law: str) -> None:
     (line, *_) = describe_law_conditions(pair(LAWS[law], clamped=False, duration_s=1.0))
     assert line.startswith(f"condition of {law} at m")
-    assert "holds: " in line
+    assert "holds: motion stays bounded (decay is not proved)" in line
+    assert "stable" not in line
     assert "sufficient" in line
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_passivity_is_no_proof_that_motion_decays(law: str) -> None:
+    assert list_law_proofs(pair(LAWS[law], clamped=False, duration_s=1.0)) == []

@@ -1,7 +1,8 @@
-"""Adaptive synchronisation of qd + Lambda q: agreement without gravity, collapse to q = 0 with it."""
+"""Adaptive synchronisation of qd + Lambda q: agreement without gravity, collapse to q = 0 or hanging with it."""
 
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tests.unit_arm import last_rows, unit_scenario
@@ -24,6 +25,9 @@ GAINS: dict[str, dict[str, Any]] = {
     "sync": {"law": "sync", "K": [3.0, 3e-6]},
     "adaptive": {"law": "adaptive", "Kp": [1.0, 1e-6], "Kd": [3.0, 3e-6]},
 }
+
+
+HANGING_STARTS = ((-1.65, 0.0), (-1.8, 0.1), (-1.45, 0.0))
 
 
 def pendulums(law: str, starts: tuple[float, ...], gravity: float) -> Scenario:
@@ -56,7 +60,29 @@ def test_under_gravity_it_ends_at_zero_wherever_it_starts(starts: tuple[float, .
         -0.5,
     ):
         assert first == pytest.approx([-6.4e-5, 5.9e-5], rel=0.035)
-    assert "under gravity the arms end at q = 0" in describe_law_conditions(scenario)[0]
+    assert "at q = 0 or hanging" in describe_law_conditions(scenario)[0]
+
+
+@pytest.mark.parametrize(
+    "start",
+    [
+        (-1.5, 0.0),
+        *(pytest.param(start, marks=pytest.mark.long) for start in HANGING_STARTS),
+    ],
+)
+def test_under_gravity_arms_that_start_low_end_hanging(start: tuple[float, float]) -> None:
+    """Y_G'r = 0 also holds where cos q1 = cos(q1 + q2) = 0, whatever r is: arms of two links, no users."""
+    names = ("m", "s")
+    scenario = unit_scenario(
+        {name: {"q0_rad": list(start)} for name in names},
+        {"law": "sync", "Lambda": 1.0, "K": 3.0, "Gamma": 1.0, "theta_hat0": 0.0},
+        arm={},
+        duration_s=100.0,
+    )
+    (last,) = last_rows(scenario, 100.0)
+    assert last["q"][:, 0] == pytest.approx(-0.5 * np.pi, abs=5e-3)
+    assert last["q"][:, 1] == pytest.approx(0.0, abs=5e-3)
+    assert abs(last["qd"]).max() < 1e-3
 
 
 @pytest.mark.long

@@ -271,3 +271,47 @@ def test_bound_of_held_torques_is_that_of_worst_mass(count: int, ticks: int) -> 
         )
         most = max(growth(count, ticks, d, float(m)) for m in masses if m > 0.5 * d * TICK_S)
         assert (most > 0.0) is grows
+
+
+def slopes_of_tanh(poses: Any, K: float, P: float) -> Any:
+    """The slopes of P tanh(K e / P) between sites that are held at some poses."""
+    return K / np.cosh(K * (poses[:, None] - poses) / P) ** 2
+
+
+def test_slopes_of_tanh_obey_the_bound_of_p_d() -> None:
+    """Errata 13: positive semidefinite, and by Schur's theorem lambda_min K <= S o kappa <= K."""
+    rng = np.random.default_rng(13)
+    for count in (2, 3, 4, 6):
+        for _ in range(50):
+            alpha = shares(rng, count, reversible=True)
+            D = find_balancing_weights(alpha)
+            assert D is not None
+            S = np.sqrt(D)[:, None] * alpha / np.sqrt(D)
+            poses = rng.normal(0.0, rng.uniform(0.01, 3.0), count)
+            kappa = slopes_of_tanh(poses, 10.0, rng.uniform(0.5, 20.0))
+            assert np.linalg.eigvalsh(kappa).min() > -1e-12
+            product = np.linalg.eigvalsh(S * kappa)
+            assert product.min() >= 10.0 * np.linalg.eigvalsh(S).min() - 1e-12
+            assert product.max() <= 10.0 + 1e-12
+
+
+def sloped(slopes: Any, d: float) -> Network:
+    """Three heavy sites of equal shares, whose pulls have these slopes; T = 100 ms."""
+    wires = tuple(
+        Wire(i, j, 0.5 * slopes[i][j], 0.0, 0.1) for i in range(3) for j in range(3) if i != j
+    )
+    return Network((5.0,) * 3, (d,) * 3, (0.0,) * 3, wires)
+
+
+def test_slopes_up_to_k_alone_are_not_enough() -> None:
+    """Errata 13: d = 0.6 K T is above 0.5 K T; (K, K, 0) grows, and slopes that tanh can have do not."""
+    K = 10.0
+    chain = K * np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 1.0], [0.0, 1.0, 1.0]])
+    least = np.linalg.eigvalsh(0.5 * (chain - K * np.eye(3))).min()
+    assert least == pytest.approx(-0.7071 * K, abs=1e-3)
+    assert np.linalg.eigvalsh(chain).min() < -0.4 * K  # so no tanh has these slopes
+    assert compute_delay_spectrum(sloped(chain, 0.6 * K * 0.1).loop, 1).verdict == "unstable"
+    for poses in ([0.0, 0.0, 0.0], [0.0, 0.3, 0.6], [0.0, 0.1, 1.0]):
+        slopes = slopes_of_tanh(np.array(poses), K, 5.0)
+        spectrum = compute_delay_spectrum(sloped(slopes, 0.6 * K * 0.1).loop, 2)
+        assert spectrum.verdict != "unstable"

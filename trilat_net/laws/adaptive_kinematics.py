@@ -22,8 +22,10 @@ Symbols:
     - Y_k: matrix with Y_k l_hat = J_hat qd.
     - Lambda, Kp, Kd, Gamma, Gamma_l: gains.
 
-The stability proof of the law `adaptive` applies, because the adaptation of l_hat cancels the
-term that wrong lengths add (docs/laws.md). Source of the adaptive Jacobian: Cheah, Liu and
+The functional V of the law `adaptive` does not rise, because the adaptation of l_hat cancels
+the term that wrong lengths add. The end of its proof does not carry over. docs/laws.md proves
+instead that e and qd go to zero, because an end effector of finite reach cannot move at one
+velocity for ever. Source of the adaptive Jacobian: Cheah, Liu and
 Slotine, Int. J. Robotics Research 25 (2006).
 
 Invariant:
@@ -316,8 +318,9 @@ class AdaptiveKinematics(ControlLaw):
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
         """Evaluates whether this control law is known to be stable in a scenario.
 
-        The stability proof requires that all delays are constant, that the elbow of each arm
-        stays bent, and that the true lengths of the links lie between the bounds `least_m` and
+        The proof in docs/laws.md that e and qd go to zero requires that all delays are
+        constant, that the dominance matrix is irreducible, that the elbow of each arm stays
+        bent, and that the true lengths of the links lie between the bounds `least_m` and
         `most_m`.
 
         Args:
@@ -332,9 +335,9 @@ class AdaptiveKinematics(ControlLaw):
                 None, "proved for constant delays, and a delay here varies"
             )
         text = (
-            f"for every constant delay, while abs(sin q2) > {LEAST_SINE:g} and the lengths are "
-            f"between {self.least_m:g} and {self.most_m:g} m (sufficient); the run shows if "
-            "elbows stay bent"
+            "e and qd go to zero for every constant delay and irreducible alpha, while "
+            f"abs(sin q2) > {LEAST_SINE:g} and the lengths are between {self.least_m:g} and "
+            f"{self.most_m:g} m (sufficient); the run shows if elbows stay bent"
         )
         return StabilityCondition(None, text)
 

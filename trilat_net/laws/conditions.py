@@ -31,6 +31,18 @@ motion of all sites needs at its most critical mass.
 """
 
 
+class ArmLoad(NamedTuple):
+    """Spring and damper by which an operator or environment reacts to the motion of an arm.
+
+    Attributes:
+        stiffness_nm_rad: Stiffness per joint, N m/rad.
+        damping_nm_s_rad: Damping per joint, N m s/rad.
+    """
+
+    stiffness_nm_rad: tuple[float, ...]
+    damping_nm_s_rad: tuple[float, ...]
+
+
 class LawSituation(NamedTuple):
     """Facts about a session on which the stability condition of one site's law may depend.
 
@@ -48,6 +60,9 @@ class LawSituation(NamedTuple):
             chain.
         hold_s: Duration for which a torque is held, s: one tick with the scheme `digital`, NaN
             if sites have several rates, otherwise 0 as in continuous time.
+        hands: Per site the operators and environments that react to the motion of its arm. None
+            instead of them if the reaction of one is not a spring and a damper per joint. ()
+            instead of all sites if nothing is known.
     """
 
     site: int
@@ -59,6 +74,7 @@ class LawSituation(NamedTuple):
     rate_hz: int
     gravity_nm: tuple[float, ...] = ()
     hold_s: float = 0.0
+    hands: tuple[tuple[ArmLoad, ...] | None, ...] = ()
 
     @property
     def longest_s(self) -> float:
@@ -86,6 +102,7 @@ class LawSituation(NamedTuple):
             laws=tuple(self.laws[n] for n in sites),
             alpha=self.alpha[part],
             delay_s=self.delay_s[part],
+            hands=tuple(self.hands[n] for n in sites) if self.hands else (),
         )
 
 
@@ -96,10 +113,13 @@ class StabilityCondition(NamedTuple):
         holds: True if the condition is met, False if not, None if it cannot be decided.
         text: Sentence with the condition, its numbers, its premises, and whether it is
             sufficient or sharp.
+        proves_decay: True if all motions die away where the condition holds. False if it only
+            proves that they stay bounded, or that the loop is passive.
     """
 
     holds: bool | None
     text: str
+    proves_decay: bool = False
 
 
 def find_least_reversible(alpha: Array) -> float | None:
@@ -220,7 +240,8 @@ def _judge_two_sites(
             "4 (d1 - K1 h / 2) (d2 - K2 h / 2) >= (T1 + T2 + h)^2 K1 K2, "
             f"T1 + T2 + h = {round_trip_ms}"
         )
-    return StabilityCondition(holds, f"{text} ({scope})")
+    proves_decay = holds and not hold_s
+    return StabilityCondition(holds, f"{text} ({scope})", proves_decay)
 
 
 def _judge_several_sites(
@@ -264,7 +285,9 @@ def _judge_several_sites(
     formula = f"{share:.4g} K T"
     if hold_s:
         formula = f"K h / 2 + {share:.4g} K (T + h / 2)"
-    return StabilityCondition(holds, f"d > {formula} = {bound.max():.4g} ({scope})")
+    text = f"d > {formula} = {bound.max():.4g} ({scope})"
+    proves_decay = holds and not hold_s
+    return StabilityCondition(holds, text, proves_decay)
 
 
 def _find_common_motion_share(count: float) -> float:

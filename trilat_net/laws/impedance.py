@@ -18,6 +18,7 @@ proportion to its share of the lead. Masters send zeros.
 """
 
 from collections.abc import Mapping, Sequence
+from itertools import combinations, product
 from typing import Any, ClassVar
 
 import numpy as np
@@ -27,8 +28,17 @@ from ..core.site_setup import Gains, Law
 from ..core.user_law import LawContext, LawInput
 from ..core.vectors import Array
 from ..fields import NotNegativeJoints, PositiveJoints
-from .conditions import LawSituation, LinearForm, LinearSituation, StabilityCondition
+from .conditions import (
+    ArmLoad,
+    LawSituation,
+    LinearForm,
+    LinearSituation,
+    StabilityCondition,
+)
 from .interface import DAMPING, INERTIA, STIFFNESS, ControlLaw, TuningSite
+
+MOST_HANDS = 4
+"""Largest number of hands at the masters whose selections are tried one by one."""
 
 
 @compiled
@@ -200,12 +210,23 @@ class Impedance(ControlLaw):
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
         """Evaluates whether the loop between the masters and the slave is stable.
 
-        The result states the stiffest wall at the slave for which the small-gain theorem proves
-        stability for any delays (see `find_stiffest_wall`). The condition is not met if there
-        is not exactly one slave, if a site uses another law, or if a damping is zero.
+        Only a slave that touches something sends forces and thereby closes a loop. The loop is
+        then judged by the small-gain theorem: it is stable for constant delays of any length if
+        its gain is below 1 at every frequency. A hand at a master changes the gain. Therefore
+        the gain is computed with each selection of the scenario's hands at the masters, from
+        none to all, because a person may let go.
+
+        The condition is undecided in two cases:
+
+        - A delay varies. The gain at each frequency says nothing about delays that vary.
+        - A hand at a master, or what the slave touches, is not a spring and a damper per joint.
+
+        The condition is not met if there is not exactly one slave, if a site uses another law,
+        or if a damping is zero.
 
         Args:
-            situation: All sites, their laws, and the weights with which they follow each other.
+            situation: All sites, their laws, what acts on their arms, and the weights with
+                which they follow each other.
         """
         laws = situation.laws
         followers = []
@@ -216,18 +237,52 @@ class Impedance(ControlLaw):
         if len(followers) != 1 or not have_this_law:
             text = "one site follows, and all the others have this law with follows = false"
             return StabilityCondition(False, text)
-        slave = followers[0]
-        dominance_factors = situation.alpha[slave]
-        K_e = find_stiffest_wall(laws, dominance_factors, slave)
-        if K_e == 0.0:
+        if any(damping <= 0.0 for law in laws for damping in law.B):
             text = "the small-gain theorem requires B > 0 at every site"
             return StabilityCondition(False, text)
-        stiffness = "of any stiffness" if K_e == np.inf else f"of up to {K_e:.4g} N m/rad"
+
+        slave = followers[0]
+        hands = situation.hands or (None,) * len(laws)
+        slave_loads = hands[slave]
+        if slave_loads == ():
+            text = "the slave touches nothing, so that no loop is closed, whatever the delays"
+            bound = _describe_stiffest_wall(situation, slave)
+            return StabilityCondition(True, f"{text}; {bound}")
+        if np.isnan(situation.longest_s):
+            text = (
+                "known for constant delays, and a delay here varies: a loop gain below 1 at "
+                "every frequency is no bound for delays that vary"
+            )
+            return StabilityCondition(None, text)
+        master_hands = _select_master_hands(hands, slave)
+        if slave_loads is None or master_hands is None:
+            text = (
+                "known for springs and dampers per joint, but a hand at a master or what the "
+                "slave touches is of another kind (a hand at a master may void the bound)"
+            )
+            return StabilityCondition(None, text)
+
+        largest_gain = 0.0
+        for selection in master_hands:
+            for joint in range(len(laws[0].K)):
+                stiffness = sum(load.stiffness_nm_rad[joint] for load in slave_loads)
+                damping = sum(load.damping_nm_s_rad[joint] for load in slave_loads)
+                gain = _compute_loop_gain(
+                    laws=laws,
+                    dominance_factors=situation.alpha[slave],
+                    slave=slave,
+                    joint=joint,
+                    stiffnesses=np.array([stiffness]),
+                    damping=damping,
+                    hands=selection,
+                )
+                largest_gain = max(largest_gain, float(gain.max()))
         text = (
-            "for any delays, varying ones too, in free motion and at a spring "
-            f"{stiffness} at the slave (small gain: sufficient)"
+            f"the loop gain is at most {largest_gain:.3g}, and must be below 1, for constant "
+            "delays of any length, with and without the hands at the masters (small gain: "
+            "sufficient, in continuous time)"
         )
-        return StabilityCondition(True, text)
+        return StabilityCondition(largest_gain < 1.0, text)
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
@@ -244,61 +299,154 @@ class Impedance(ControlLaw):
         return {**gains, "follows": site.role == "slave"}
 
 
-def find_stiffest_wall(laws: Sequence[Any], dominance_factors: Array, slave: int) -> float:
+def find_stiffest_wall(
+    laws: Sequence[Any],
+    dominance_factors: Array,
+    slave: int,
+    hands: Sequence[Sequence[ArmLoad]] = (),
+) -> float:
     """Returns the largest wall stiffness with loop gain below 1 at all frequencies, N m/rad.
 
-    A loop whose gain is below 1 at every frequency is stable for any delays (small-gain
-    theorem). The loop from the slave's force to itself has the gain
+    A loop whose gain is below 1 at every frequency is stable for constant delays of any length
+    (small-gain theorem). The loop from the slave's force to itself has at most the gain
 
-        sum_i a_i^2 K_e (K_s + B_s s)
-              / ((M_s s^2 + B_s s + K_s + K_e) (M_i s^2 + B_i s + K_i))
+        |K_e (K_s + B_s s) / (M_s s^2 + B_s s + K_s + K_e)|
+            sum_i a_i^2 / |M_i s^2 + (B_i + b_i) s + K_i + k_i|
 
     where K_e is the stiffness of the wall, the index s denotes the slave, i runs over the
-    masters and s is the Laplace variable. The gain is evaluated on a grid of frequencies and
-    stiffnesses.
+    masters, k_i and b_i are stiffness and damping of the hand at master i, and s is the Laplace
+    variable. The absolute values are summed, because the delays of the masters may differ. The
+    gain is evaluated on a grid of frequencies and stiffnesses.
+
+    A spring at a master can raise the gain, and so can a mass, even though both are passive.
 
     Args:
         laws: Settings of the law of each site.
         dominance_factors: a_i, those of the slave, shape (N,).
         slave: Index of the slave.
+        hands: Springs and dampers that act on the arm of each site. By default, none act.
 
     Returns:
         The stiffness. It is inf if any stiffness is allowed, and 0 if not even free motion
             decays.
     """
-    s = 1j * np.geomspace(1e-2, 1e4, 4000)
-    stiffnesses = np.geomspace(1e-2, 1e6, 400)
-    K_e = stiffnesses[:, None]
-    gains = []
     for law in laws:
-        gain = np.array([law.M, law.B, law.K])
-        gains.append(gain)
-    for gain in gains:
-        B = gain[1]
-        if (B <= 0.0).any():
+        if any(damping <= 0.0 for damping in law.B):
             return 0.0  # without damping, free motion does not decay
-
+    selection = hands or ((),) * len(laws)
+    stiffnesses = np.geomspace(1e-2, 1e6, 400)
     stiffest = np.inf
-    joints = len(laws[0].K)
-    for joint in range(joints):
-        masters: Any = 0.0  # the sum of a_i^2 over the impedances of the masters
-        for n, gain in enumerate(gains):
-            if n == slave:
-                continue
-            M, B, K = gain[:, joint]
-            impedance = M * s * s + B * s + K
-            squared_factor = dominance_factors[n] ** 2
-            masters = masters + squared_factor / impedance
-
-        M, B, K = gains[slave][:, joint]
-        impedance = M * s * s + B * s + K
-        coupling = K + B * s
-        slave_gain = K_e * coupling / (impedance + K_e)
-        loop_gain = np.abs(slave_gain * masters)
-        largest_gains = loop_gain.max(axis=1)
+    for joint in range(len(laws[0].K)):
+        gain = _compute_loop_gain(
+            laws=laws,
+            dominance_factors=dominance_factors,
+            slave=slave,
+            joint=joint,
+            stiffnesses=stiffnesses,
+            damping=0.0,
+            hands=selection,
+        )
+        largest_gains = gain.max(axis=1)
         unstable = np.flatnonzero(largest_gains >= 1.0)
         if len(unstable):
             last_stable = max(0, unstable[0] - 1)
             stiffness = float(stiffnesses[last_stable])
             stiffest = min(stiffest, stiffness)
     return stiffest
+
+
+def _compute_loop_gain(
+    laws: Sequence[Any],
+    dominance_factors: Array,
+    slave: int,
+    joint: int,
+    stiffnesses: Array,
+    damping: float,
+    hands: Sequence[Sequence[ArmLoad]],
+) -> Array:
+    """Returns the gain of the loop of `find_stiffest_wall` on a grid of frequencies.
+
+    Args:
+        laws: Settings of the law of each site.
+        dominance_factors: Dominance factors of the slave, shape (N,).
+        slave: Index of the slave.
+        joint: Index of the joint.
+        stiffnesses: Stiffnesses of the slave's environment, shape (E,), N m/rad.
+        damping: Damping of the slave's environment, N m s/rad.
+        hands: Springs and dampers that act on the arm of each site.
+
+    Returns:
+        The gains, shape (E, F) for F frequencies.
+    """
+    s = 1j * np.geomspace(1e-2, 1e4, 4000)
+    masters: Any = 0.0
+    for n, law in enumerate(laws):
+        if n == slave:
+            continue
+        impedance = law.M[joint] * s * s + law.B[joint] * s + law.K[joint]
+        for hand in hands[n]:
+            impedance += hand.damping_nm_s_rad[joint] * s + hand.stiffness_nm_rad[joint]
+        squared_factor = dominance_factors[n] ** 2
+        masters = masters + squared_factor / np.abs(impedance)
+
+    law = laws[slave]
+    load = stiffnesses[:, np.newaxis] + damping * s
+    coupling = law.K[joint] + law.B[joint] * s
+    impedance = law.M[joint] * s * s + coupling
+    slave_gain = load * coupling / (impedance + load)
+    gain: Array = np.abs(slave_gain) * masters
+    return gain
+
+
+def _select_master_hands(
+    hands: Sequence[Sequence[ArmLoad] | None], slave: int
+) -> list[tuple[tuple[ArmLoad, ...], ...]] | None:
+    """Returns each selection of the hands at the masters, from none to all of them.
+
+    Args:
+        hands: Springs and dampers that act on the arm of each site.
+        slave: Index of the slave, whose hands are left out.
+
+    Returns:
+        Per selection the hands of each site. None if a hand at a master is of another kind, or
+        if there are more than `MOST_HANDS` of them.
+    """
+    selections_by_site: list[list[tuple[ArmLoad, ...]]] = []
+    count = 0
+    for n, site_hands in enumerate(hands):
+        if n == slave:
+            selections_by_site.append([()])
+            continue
+        if site_hands is None:
+            return None
+        count += len(site_hands)
+        sizes = range(len(site_hands) + 1)
+        selections = [part for size in sizes for part in combinations(site_hands, size)]
+        selections_by_site.append(selections)
+    if count > MOST_HANDS:
+        return None
+    return list(product(*selections_by_site))
+
+
+def _describe_stiffest_wall(situation: LawSituation, slave: int) -> str:
+    """Returns a phrase about the walls that a slave in free motion may touch.
+
+    Args:
+        situation: All sites, their laws and their hands.
+        slave: Index of the slave.
+    """
+    hands = situation.hands or (None,) * len(situation.laws)
+    selections = _select_master_hands(hands, slave)
+    if selections is None:
+        return "no bound is known for walls, because of the hands at the masters"
+    factors = situation.alpha[slave]
+    stiffnesses = [
+        find_stiffest_wall(situation.laws, factors, slave, selection)
+        for selection in selections
+    ]
+    stiffest = min(stiffnesses)
+    limit = "of any stiffness" if stiffest == np.inf else f"of up to {stiffest:.4g} N m/rad"
+    return (
+        f"at a spring {limit} at the slave for constant delays of any length, with and without "
+        "the hands at the masters (small gain: sufficient, in continuous time)"
+    )

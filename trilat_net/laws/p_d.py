@@ -16,6 +16,7 @@ import numpy as np
 from ..core.site_setup import Gains, Law
 from ..core.vectors import Array
 from ..fields import NotNegative, NotNegativeJoints, PositiveCoordinates
+from .conditions import LawSituation, StabilityCondition, judge_position_exchange
 from .interface import DAMPING, STIFFNESS, ControlLaw
 
 
@@ -70,6 +71,21 @@ class PD(ControlLaw):
         """
         known = (theta * self.gravity).tolist()
         return Gains(Law.KNOWN, K=self.K, d=self.d, known=known)
+
+    def condition(self, situation: LawSituation) -> StabilityCondition | None:
+        """Evaluates whether the damping suffices for the delays, whatever the arms weigh.
+
+        Args:
+            situation: All sites, their laws, the delays, and the weights with which they follow
+                each other.
+
+        Returns:
+            The condition of `judge_position_exchange`. None if the law does not compensate
+            gravity exactly, because then no condition is known.
+        """
+        if not self.exchanges_positions():
+            return None
+        return judge_position_exchange(situation, "K", "d")
 
     def exchanges_positions(self) -> bool:
         """Returns True if the law compensates gravity exactly.

@@ -31,8 +31,15 @@ class PF(ControlLaw):
     and environments on the peers' arms as received, with the same weights.
 
     A slave has K > 0 and k_f = 0, a master K = 0 and k_f > 0. The law serves one master and one
-    slave. The loop is stable in free motion. With any passive operator and any
-    wall the master needs d >= k_f (2 K T + d_s)^2 / (4 d_s), where K and d_s are the slave's.
+    slave. The loop is stable in free motion. For any passive operator and any wall, the master
+    needs at least
+
+        d >= k_f (2 K T + d_s)^2 / (4 d_s)
+
+    K and d_s are the slave's gains. This is the edge for a light slave, whose inertia M_s per
+    joint is at most d_s^2 / (4 K). For a heavier slave the edge is higher and has no closed
+    form; the larger one of this value and k_f K (2 M_s + T d_s)^2 / (4 M_s d_s) is sufficient
+    (docs/errata.md, 15).
 
     Attributes:
         K: Stiffness per joint, N m/rad.

@@ -6,8 +6,9 @@ dynamic parameters of the arm, such as masses.
 
 The flaw: an arm can rest only if the learning rests, too. This requires Y_G' r = 0, where Y_G
 is the matrix whose product with the parameters is the gravity torque, and Y_G' its transpose.
-At rest, r is Lambda q. Therefore under gravity all arms end at q = 0, wherever their users want
-to hold them. Laws that compare positions, such as `adaptive`, do not have this flaw, because
+At rest, r is Lambda q. Therefore under gravity each arm ends at q = 0, or where its links have
+no lever arm: it hangs, with cos q1 = 0 and cos(q1 + q2) = 0. Users cannot hold it anywhere
+else. Laws that compare positions, such as `adaptive`, do not have this flaw, because
 their r contains the position error instead of q.
 
 Invariant:
@@ -43,7 +44,7 @@ class Sync(ControlLaw):
     regressor: times the parameters, it gives the torque of the arm's dynamics. Y' is its
     transpose.
 
-    Weakness: under gravity all arms end at q = 0. The law is for planar arms.
+    Weakness: under gravity all arms end at q = 0 or hanging. The law is for planar arms.
 
     Source: Chopra, Spong and Lozano, "Synchronization of bilateral teleoperators with time
     delay", Automatica 44, 2008; the weakness is described by Nuno, Ortega and Basanez,
@@ -165,7 +166,7 @@ class Sync(ControlLaw):
 
         The stability proof requires that all delays are constant. If a delay varies, the
         condition is undecided (`holds` is None). If all are constant, the text also warns that
-        under gravity the arms end at the joint angles q = 0.
+        under gravity the arms end only at poses with Y_G' r = 0.
 
         Args:
             situation: The site, its peers (the other sites) and the delays between them.
@@ -175,7 +176,8 @@ class Sync(ControlLaw):
             return StabilityCondition(None, text)
         text = (
             "r of all sites agree for every constant delay, any Lambda, K and Gamma > 0 "
-            "(sufficient); but under gravity the arms end at q = 0, wherever users move them"
+            "(sufficient); but under gravity the arms end where Y_G' r = 0, at q = 0 or "
+            "hanging (cos q1 = 0 and cos(q1 + q2) = 0), wherever users move them"
         )
         return StabilityCondition(True, text)
 

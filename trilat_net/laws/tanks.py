@@ -215,7 +215,8 @@ class Tanks(EnergyLaw):
             text = f"a tank sends {part_per_tick:.3g} of its energy a tick, more than it has"
             return StabilityCondition(False, text)
         text = (
-            f"tanks are passive for any shares, delays and loss, where {PASSIVE_OUTSIDE}, and "
+            "motion stays bounded (decay is not proved): tanks are passive for any shares, "
+            f"delays and loss, where {PASSIVE_OUTSIDE}, and "
             f"joints accelerate by {self.acceleration_rad_s2:g} rad/s^2 at most"
         )
         return StabilityCondition(True, text)

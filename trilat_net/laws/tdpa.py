@@ -946,8 +946,8 @@ class Tdpa(EnergyLaw):
             The assumptions as a text, with a condition that holds.
         """
         passive_coupling = (
-            "couplings are passive for any delays, jitter, loss and shares, where "
-            f"{PASSIVE_OUTSIDE}"
+            "motion stays bounded (decay is not proved): couplings are passive for any delays, "
+            f"jitter, loss and shares, where {PASSIVE_OUTSIDE}"
         )
         if self.energy == "velocity":
             leak = "up to tau qdd h^2 / 2 per tick, which the accounts by velocity miss"

@@ -924,7 +924,8 @@ class Wave(EnergyLaw):
             share = impedance / total
             shares.append(f"{peer} {share:.4g}")
         text = (
-            f"lines are passive for any delays, jitter and loss, where {PASSIVE_OUTSIDE}; "
+            "motion stays bounded (decay is not proved): lines are passive for any delays, "
+            f"jitter and loss, where {PASSIVE_OUTSIDE}; "
             f"the shares of {site} are b_ij / sum b_ik: {', '.join(shares)}"
         )
         return StabilityCondition(True, text)

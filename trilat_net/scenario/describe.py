@@ -26,14 +26,23 @@ from ..core.dominance import ROW_SUM_TOLERANCE, find_balancing_weights
 from ..core.philox import link_key
 from ..core.vectors import Array
 from ..errors import count_nouns
-from ..laws.conditions import LawSituation, StabilityCondition
+from ..laws.conditions import ArmLoad, LawSituation, StabilityCondition
 from ..laws.interface import LawSettings
 from .arms import TASK_AXES, Arm, read_arm
 from .delay_models import LinkBase
+from .delay_period import find_final_link
+from .operators.kernel_operators import (
+    Chirp,
+    JointSpring,
+    Multisine,
+    Pulse,
+    RecordedTorque,
+    ViscousEnvironment,
+)
 from .rest_bounds import find_rest_bounds
 from .sample_uses import count_silences, draw_used_samples
 from .scenario_reader import load_scenario
-from .scenario_types import Scenario
+from .scenario_types import Scenario, SiteSpec
 from .urdf import UrdfJoint
 
 # Notes on the matrix of dominance factors, the weights with which sites follow their peers.
@@ -100,11 +109,52 @@ def _find_hold_time(scenario: Scenario) -> float:
     return periods_s.pop() if len(periods_s) == 1 else math.nan
 
 
+def _find_hand_impedances(site: SiteSpec, joints: int) -> tuple[ArmLoad, ...] | None:
+    """Returns the operators and environments of a site that react to the motion of its arm.
+
+    Operators whose torque depends on time alone are left out.
+
+    Args:
+        site: Description of the site.
+        joints: Number of joints of its arm.
+
+    Returns:
+        The spring and the damper of each. None if one of them acts on the end effector, or if
+        it is live or a program: its reaction is not the same at every pose, or not known.
+    """
+    impedances = []
+    for source in (*site.hands, *site.environment):
+        if isinstance(source, _TIMED_TORQUES):
+            continue
+        if not isinstance(source, JointSpring | ViscousEnvironment):
+            return None
+        # A sampled torque lags behind the motion, so that it is no spring and damper.
+        if source.sampled:
+            return None
+        stiffness: tuple[float, ...] = (0.0,)
+        if isinstance(source, JointSpring):
+            stiffness = source.stiffness_nm_rad
+        damping = source.damping_nm_s_rad
+        impedance = ArmLoad(
+            stiffness_nm_rad=tuple(np.broadcast_to(stiffness, joints).tolist()),
+            damping_nm_s_rad=tuple(np.broadcast_to(damping, joints).tolist()),
+        )
+        impedances.append(impedance)
+    return tuple(impedances)
+
+
+_TIMED_TORQUES = (Pulse, Chirp, Multisine, RecordedTorque)
+"""Operators whose torque depends on time alone."""
+
+
 def _list_situations(scenario: Scenario) -> Iterator[tuple[str, LawSettings, LawSituation]]:
     """Yields each site, its control law, and the facts on which its stability depends."""
     rates_hz = {name: site.rate_hz for name, site in scenario.sites.items()}
     delay_s = _find_link_delays(scenario.links, rates_hz)
     hold_s = _find_hold_time(scenario)
+    hands = tuple(
+        _find_hand_impedances(site, len(site.q0_rad)) for site in scenario.sites.values()
+    )
     for n, (name, site) in enumerate(scenario.sites.items()):
         situation = LawSituation(
             site=n,
@@ -116,6 +166,7 @@ def _list_situations(scenario: Scenario) -> Iterator[tuple[str, LawSettings, Law
             rate_hz=site.rate_hz,
             gravity_nm=scenario.arms[name].largest_gravity(site.arm.g_m_s2),
             hold_s=hold_s,
+            hands=hands,
         )
         yield name, scenario.controls[n], situation
 
@@ -140,6 +191,31 @@ def describe_law_conditions(scenario: Scenario) -> list[str]:
         f"{condition.text}"
         for (tag, condition), sites in owners.items()
     ]
+
+
+def list_law_proofs(scenario: Scenario) -> list[str]:
+    """Lists the stability conditions of control laws that prove that all motions die away.
+
+    They are evaluated for the delays and dominance factors (the weights with which arms follow
+    each other) at the end of the scenario.
+
+    Args:
+        scenario: Description of the experiment.
+
+    Returns:
+        A phrase per condition. Empty unless the condition of every site holds and proves it.
+    """
+    if any(change.dominance for change in scenario.timeline):
+        return []
+    links = {name: find_final_link(scenario, name) for name in scenario.links}
+    final = msgspec.structs.replace(scenario, links=links, timeline=())
+    proofs = []
+    for _, law, situation in _list_situations(final):
+        condition = law.condition(situation)
+        if condition is None or not condition.proves_decay:
+            return []
+        proofs.append(f"the condition of {law.tag}: {condition.text}")
+    return list(dict.fromkeys(proofs))
 
 
 def _describe_idle_shares(scenario: Scenario) -> list[str]:

@@ -41,6 +41,15 @@ SAMPLING_SHARE = 1e-2
 """Energy that an arm may get beyond what its law books, as a share of the largest energy."""
 
 
+NEGATIVE_ENERGY_MEANING = (
+    "an observed energy below zero, such as -0.85 mJ, means that at this tick one end of a "
+    "connection had taken out that much more energy than it knew to have been put in, its "
+    "reserve included, so that passivity proves nothing about the run, which may be stable all "
+    "the same"
+)
+"""What a negative energy means, in the same words wherever it is explained to the user."""
+
+
 class ObservedFinding(StrEnum):
     """Result of the check that the energies which control laws declare stay above zero.
 

@@ -530,7 +530,7 @@ class _RunMeasures(NamedTuple):
 
 def _measure_run(scenario: Scenario) -> _RunMeasures:
     """Runs a scenario in virtual time, and measures the run."""
-    records_by_site, end = run_whole(scenario)
+    records_by_site, end, _ = run_whole(scenario)
     records = list(records_by_site.values())
     t_s, q, e = _sample_at_common_times(records)
     mean_rad = q.mean(axis=0)

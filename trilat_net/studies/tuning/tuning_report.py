@@ -25,11 +25,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from ...analysis.certificate.observed_energy import NEGATIVE_ENERGY_MEANING
 from ...errors import count_nouns
 from ...files import write_whole
 from ...reporting import style
 from ...reporting.appearance import REPORT_SIZE, SITE_COLOURS
 from ...reporting.result_text import Block, TextTable, format_number
+from ...scenario.laws import BUILT_IN
 from ..intervals import MeanInterval
 from .candidate import CLASS_MEANINGS, CandidateClass, CandidateScore
 from .search_space import SEARCH_SPACES, weigh_joints
@@ -51,6 +53,7 @@ def compose_tuning(tuned: TuningResult) -> Iterator[Block]:
     """
     yield tabulate_laws(tuned)
     yield from (f"  {line}" for line in list_class_meanings())
+    yield from (f"note: {line}" for line in list_energy_notes(tuned))
 
     for search in tuned.found:
         if search.front:
@@ -271,6 +274,28 @@ def describe_procedure(plan: TuningPlan) -> list[str]:
     return lines
 
 
+def list_energy_notes(tuned: TuningResult) -> list[str]:
+    """Returns what a tuning leaves out about laws that keep accounts of energy.
+
+    The classes follow from the motion of the arms. A run whose law had overdrawn its accounts
+    can therefore count as stable here, while its certificate is open.
+
+    Args:
+        tuned: Result of the comparison of control laws.
+    """
+    laws = []
+    for search in tuned.found:
+        law = BUILT_IN.get(search.space.law)
+        if callable(getattr(law, "energies", None)):
+            laws.append(search.space.law)
+    if not laws:
+        return []
+    return [
+        f"{', '.join(laws)} declare energies, which `trilat certify` checks and the classes "
+        f"above do not: {NEGATIVE_ENERGY_MEANING}"
+    ]
+
+
 def list_class_meanings() -> list[str]:
     """Returns a line for each class of behaviour, such as stable, with its meaning.
 
@@ -297,7 +322,7 @@ def build_tuning_page(tuned: TuningResult) -> str:
         _format_list(describe_procedure(tuned.plan)),
         tabulate_laws(tuned).markdown(),
         "Classes, the first that applies:",
-        _format_list(list_class_meanings()),
+        _format_list([*list_class_meanings(), *list_energy_notes(tuned)]),
         "## Search ranges",
         tabulate_search(tuned.plan).markdown(),
         "## Fronts",
