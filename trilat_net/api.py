@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 from .analysis.certificate.stability_certificate import Certificate
 from .analysis.metrics.log_metrics import LogMetrics, compute_log_metrics
-from .analysis.twin_growth import TWINS
 from .errors import UsageError
 from .execution.log_checks import LogCheckReport, run_log_checks
 from .execution.virtual import SimulatedLog, simulate_scenario
@@ -177,7 +176,7 @@ def certify(
     *,
     min_coverage: float = MIN_COVERAGE,
     own_laws: bool = False,
-    twins: int = TWINS,
+    twins: int | None = None,
 ) -> Certificate:
     """Judges if a recorded run is stable; the command is `trilat certify`.
 
@@ -201,7 +200,7 @@ def certify(
     Raises:
         LogError: The log cannot be read.
     """
-    from .theory.linear_analysis import certify_run
+    from .theory.run_certificate import certify_run
 
     return certify_run(_open(log), min_coverage=min_coverage, own_laws=own_laws, twins=twins)
 

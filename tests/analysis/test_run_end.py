@@ -104,7 +104,7 @@ def test_slow_loop_without_delay_sustains_what_faster_one_ends() -> None:
     fast = classify_log_end(
         trilat_net.simulate("paper", {**held, "rate_hz": 200, "duration_s": 60.0})
     )
-    assert slow.stability is not Stability.STABLE
+    assert slow.stability is not Stability.SETTLED
     assert slow.end_speed_rad_s > 0.5
     assert fast.stability is not Stability.NOT_STABLE
     assert fast.end_speed_rad_s < 0.1
@@ -203,8 +203,8 @@ def test_what_grows_while_an_operator_acts_is_open(pushed: bool, stability: Stab
             Stability.OPEN,
             "m and s stand 0.05 rad apart",
         ),  # what pulls at s has no effect
-        (0.05, 0.05, 1.0, Stability.STABLE, ""),
-        (0.01, 0.0, 0.0, Stability.STABLE, ""),
+        (0.05, 0.05, 1.0, Stability.SETTLED, ""),
+        (0.01, 0.0, 0.0, Stability.SETTLED, ""),
     ],
 )
 def test_sites_at_rest_must_agree_unless_a_force_separates_them(
@@ -299,7 +299,7 @@ def test_what_sinks_slowly_has_not_converged(
 
 @pytest.mark.parametrize(
     ("at_s", "stability"),
-    [(15.0, Stability.STABLE), (35.0, Stability.STABLE), (39.0, Stability.OPEN)],
+    [(15.0, Stability.SETTLED), (35.0, Stability.SETTLED), (39.0, Stability.OPEN)],
 )
 def test_a_loop_that_changes_last_must_be_seen_after_that(
     at_s: float, stability: Stability

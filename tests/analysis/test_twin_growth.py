@@ -7,11 +7,11 @@ import pytest
 
 import trilat_net as tn
 from trilat_net.analysis.envelope_trend import EnvelopeTrend
-from trilat_net.analysis.run_end import EndBehaviour, Stability, classify_log_end
 from trilat_net.analysis.twin_growth import (
+    CLEAR_GROWTH,
     PushedTwins,
     TwinGrowth,
-    judge_end_by_twins,
+    estimate_miss_probability,
     judge_twins,
 )
 from trilat_net.execution.twins import Push, TwinPath, Twins
@@ -67,33 +67,69 @@ def test_a_number_beyond_all_numbers_is_null() -> None:
     assert row["rate_per_s"] == pytest.approx(80.0, rel=0.05)
 
 
-def test_a_run_is_not_stable_where_its_twins_grow() -> None:
-    end = classify_log_end(tn.simulate("two_sites"))
-    assert end.stability is Stability.STABLE
-    slow = end._replace(speed=end.speed._replace(trend=EnvelopeTrend.STEADY))
-    judged = {
-        rate: judge_end_by_twins(slow, grown(rate), settles=None, rises=False).stability
-        for rate in (-0.55, 0.0, 0.2)
+def of_joints(*rates_per_s: float, sizes: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)) -> Twins:
+    """Two twins in which every joint has a mode of its own, with its own rate and size."""
+    t_s = np.arange(400) / 20.0 + 0.05
+    log_sizes = np.log(1e-6 * np.array(sizes)) + np.outer(t_s, rates_per_s)
+    last = np.exp(log_sizes) * np.cos(7.0 * t_s)[:, np.newaxis]
+    largest = np.log(np.abs(last))
+    paths = []
+    for name in ("1e-06 rad at all joints", "1e-06 rad at m joint 1"):
+        push = Push(name, "q", np.full((2, 2), 1e-6), again=False)
+        paths.append(TwinPath(push, t_s, largest.copy(), last, np.zeros(len(t_s)), (0,)))
+    return Twins(paths, JOINTS, np.full((len(t_s), 4), 1e-3), True)
+
+
+def test_slow_growth_of_a_joint_is_seen_beside_faster_decay_of_another() -> None:
+    """m joint 1 grows by 0.02 /s from a thousandth of the size of the others, which decay."""
+    sizes = (1e-3, 1.0, 1.0, 1.0)
+    growth = judge_twins(TWO, of_joints(0.02, -0.3, -0.3, -0.3, sizes=sizes), 0.0, math.inf)
+    assert growth.trend is EnvelopeTrend.GROWS
+    assert growth.worst is not None
+    assert growth.worst.joint == "m joint 1"
+    assert growth.worst.rate_per_s == pytest.approx(0.02, abs=2e-3)
+    assert growth.grows is growth.worst.leads
+
+
+def test_joint_that_grows_and_is_fastest_makes_pushes_grow() -> None:
+    growth = judge_twins(TWO, of_joints(0.02, -2.0, -2.0, -2.0), 0.0, math.inf)
+    assert growth.grows
+    still = judge_twins(TWO, of_joints(-0.3, -2.0, -2.0, -2.0), 0.0, math.inf)
+    assert still.trend is EnvelopeTrend.DECAYS
+    assert not still.grows
+
+
+def test_part_of_a_period_is_no_trend() -> None:
+    """The delays of this scenario repeat after 145.2 s: 1.20 s and 1.21 s."""
+    sines = {
+        "links.m->s": {
+            "model": "sine",
+            "delay_ms": 50.0,
+            "amplitude_ms": 20.0,
+            "period_s": 1.2,
+        },
+        "links.s->m": {
+            "model": "sine",
+            "delay_ms": 50.0,
+            "amplitude_ms": 20.0,
+            "period_s": 1.21,
+        },
     }
-    assert judged == {-0.55: Stability.STABLE, 0.0: Stability.OPEN, 0.2: Stability.NOT_STABLE}
+    growth = judge_twins(load_scenario("two_sites", sines), difference(-0.5), 0.0, math.inf)
+    assert growth.delay_period_s == pytest.approx(145.2)
+    assert growth.hides_period
+    assert "145.2 s" in growth.period_text
 
 
-@pytest.mark.parametrize(
-    ("speed_rad_s", "rate_per_s"),
-    [
-        (1e-4, -0.55),
-        *(pytest.param(*one, marks=pytest.mark.long) for one in ((5e-3, -0.55), (1e-4, 0.0))),
-    ],
-)
-def test_a_slow_end_needs_no_trend_where_pushes_die(
-    speed_rad_s: float, rate_per_s: float
-) -> None:
-    """1e-4 rad/s are 1 mrad in 10 s; 5e-3 rad/s may be a drift, and what keeps a push may keep going."""
-    end = classify_log_end(tn.simulate("two_sites"))
-    slow = end._replace(behaviour=EndBehaviour.UNDECIDED, end_speed_rad_s=speed_rad_s)
-    judged = judge_end_by_twins(slow, grown(rate_per_s), settles=None, rises=False).stability
-    settled = speed_rad_s < 1e-3 and rate_per_s < 0.0
-    assert judged is (Stability.STABLE if settled else Stability.OPEN)
+def test_random_directions_miss_a_growing_mode_with_this_probability() -> None:
+    """A mode with less than a hundredth of its usual share in each of n directions."""
+    generator = np.random.default_rng(1)
+    mode = generator.standard_normal(30)
+    directions = generator.uniform(-1.0, 1.0, (200_000, 30))
+    shares = np.abs(directions @ mode) / (np.linalg.norm(mode) / math.sqrt(3.0))
+    missed = float(np.mean(shares < 1.0 / CLEAR_GROWTH))
+    assert estimate_miss_probability(1) == pytest.approx(missed, rel=0.1)
+    assert estimate_miss_probability(3) == pytest.approx(estimate_miss_probability(1) ** 3)
 
 
 @pytest.mark.long

@@ -17,38 +17,31 @@ from concurrent.futures import ProcessPoolExecutor
 from functools import cache
 from multiprocessing import get_context
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 import trilat_net
-from trilat_net.analysis.certificate.premises import Evidence, explain_no_functional
-from trilat_net.analysis.certificate.stability_certificate import (
-    Certificate,
-    StabilityFinding,
-    StabilityVerdict,
-)
+from trilat_net.analysis.certificate.premises import explain_no_functional
 from trilat_net.analysis.run_end import RunEnd, RunTrace, Stability, classify_run_end
-from trilat_net.analysis.twin_growth import TWINS, measure_virtual_twins
+from trilat_net.analysis.twin_growth import measure_virtual_twins
 from trilat_net.core.ticks import BUCKETS_PER_S, NS_PER_S
 from trilat_net.core.two_link_arm import JOINTS
 from trilat_net.core.vectors import Array
 from trilat_net.errors import ScenarioError
 from trilat_net.execution.fused import FusedRun
-from trilat_net.log.accounting import MIN_COVERAGE, Coverage
 from trilat_net.log.log_reader import Log
-from trilat_net.log.running_digest import DigestState, Integrity
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.studies.sweep.sweep_cell import classify_cell
 from trilat_net.theory.equilibrium import extend_scenario, follow_equilibrium
-from trilat_net.theory.linear_analysis import find_end_pose_roots
 from trilat_net.theory.linear_edge import find_contact_growth, find_rightmost_root
+from trilat_net.theory.loop_roots import find_run_roots
 from trilat_net.theory.operating_point import (
     Equilibrium,
     derive_operating_conditions,
     is_constant_link,
 )
+from trilat_net.theory.run_certificate import decide_virtual_run
 
 from .drawn_loops import (
     SAMPLED,
@@ -122,7 +115,8 @@ class Row(NamedTuple):
 
 
 NEVER_STABLE = ("not stable", "open")
-STABLE = ("stable",)
+AT_REST = ("stable", "settled")
+"""What may be said of a run that comes to rest; stable with a proof alone."""
 
 
 def _load(
@@ -366,29 +360,29 @@ ROWS = (
         NEVER_STABLE,
         "twins",
     ),
-    Row("C1=", "three sites, d 2", _swinging("p_d_margin", 2.0, 1.4), STABLE),
+    Row("C1=", "three sites, d 2", _swinging("p_d_margin", 2.0, 1.4), AT_REST),
     Row(
-        "C1=", "a quarter of the swing, d 1.4", _swinging("p_d_margin", 1.4, 1.4, 50.0), STABLE
+        "C1=", "a quarter of the swing, d 1.4", _swinging("p_d_margin", 1.4, 1.4, 50.0), AT_REST
     ),
-    Row("C1=", "two sites, d 4", _swinging("p_d_margin_two", 4.0, 1.25), STABLE),
+    Row("C1=", "two sites, d 4", _swinging("p_d_margin_two", 4.0, 1.25), AT_REST),
     Row("C2", "one joint, swinging at 2.5 s", _turntables(0.902, 2.5), NEVER_STABLE),
     Row("C2", "at 2.6 s", _turntables(0.902, 2.6), NEVER_STABLE),
     Row("C2", "at 1.75 s, other shares", _turntables(0.902, 1.75, (0.12, 0.88)), NEVER_STABLE),
-    Row("C2=", "one joint, d 2.5", _turntables(2.5, 2.5), STABLE),
+    Row("C2=", "one joint, d 2.5", _turntables(2.5, 2.5), AT_REST),
     Row("C3", "40 and 30 Hz, K 50", _unlike_rates((40, 30), 50.0, 2.0), NEVER_STABLE, "twins"),
     Row("C3", "50 and 30 Hz, K 60", _unlike_rates((50, 30), 60.0, 2.0), NEVER_STABLE, "twins"),
     Row("C3", "40 and 25 Hz", _unlike_rates((40, 25), 50.0, 2.0), NEVER_STABLE, "twins"),
-    Row("C3=", "40 and 30 Hz, d 5", _unlike_rates((40, 30), 50.0, 5.0), STABLE),
-    Row("C3=", "50 and 30 Hz, K 20", _unlike_rates((50, 30), 20.0, 4.0), STABLE),
+    Row("C3=", "40 and 30 Hz, d 5", _unlike_rates((40, 30), 50.0, 5.0), AT_REST),
+    Row("C3=", "50 and 30 Hz, K 20", _unlike_rates((50, 30), 20.0, 4.0), AT_REST),
     Row("C4", "a reserve of 100 J", _reserve(100.0, 100.0, 5.0), NEVER_STABLE),
     Row("C4", "of 1000 J, stiffer", _reserve(1000.0, 200.0, 5.0), NEVER_STABLE),
     Row("C4", "of 1 J, softer", _reserve(1.0, 50.0, 2.0), NEVER_STABLE, "twins"),
-    Row("C4=", "arms that something resists", _reserve(100.0, 40.0, 10.0, 15.0), STABLE),
-    Row("C4=", "a reserve of 1 J, the same", _reserve(1.0, 20.0, 5.0, 8.0), STABLE),
+    Row("C4=", "arms that something resists", _reserve(100.0, 40.0, 10.0, 15.0), AT_REST),
+    Row("C4=", "a reserve of 1 J, the same", _reserve(1.0, 20.0, 5.0, 8.0), AT_REST),
     Row("C6", "wave without motion, b too large", _wave(120.0, 0.0), NEVER_STABLE, "twins"),
     Row("C6", "b 200", _wave(200.0, 0.0), NEVER_STABLE, "twins"),
-    Row("C6=", "without motion, arms that something resists", _wave(5.0, 20.0, 4.0), STABLE),
-    Row("C6=", "the same, b 60", _wave(60.0, 20.0, 2.0), STABLE),
+    Row("C6=", "without motion, arms that something resists", _wave(5.0, 20.0, 4.0), AT_REST),
+    Row("C6=", "the same, b 60", _wave(60.0, 20.0, 2.0), AT_REST),
     Row(
         "C7",
         "the paper's law, swinging at 0.5831 s",
@@ -398,8 +392,8 @@ ROWS = (
     ),
     Row("C7", "for 150 s", _free_swinging(0.5831, duration_s=150.0), NEVER_STABLE, "twins"),
     Row("C7", "at 0.55 s", _free_swinging(0.55), NEVER_STABLE, "nobody pushed"),
-    Row("C7=", "at 1.3 s", _free_swinging(1.3), STABLE),
-    Row("C7=", "by 20 ms", _free_swinging(0.5831, 20.0), STABLE),
+    Row("C7=", "at 1.3 s", _free_swinging(1.3), AT_REST),
+    Row("C7=", "by 20 ms", _free_swinging(0.5831, 20.0), AT_REST),
     Row(
         "S1",
         "a wave line that nobody holds",
@@ -415,10 +409,12 @@ ROWS = (
         "coasting",
     ),
     # it coasts, and pushes grow at +2.7 /s (`find_wide_truth`) to the 3 mrad that the reserve of tdpa holds
-    Row("S1=", "both follow, and are damped", _coasting({"K": 40.0, "d": 6.0}, "pd_d"), STABLE),
+    Row(
+        "S1=", "both follow, and are damped", _coasting({"K": 40.0, "d": 6.0}, "pd_d"), AT_REST
+    ),
     Row("S4", "a hand at one arm only", _touched(1e-6), NEVER_STABLE, "apart"),
-    Row("S4=", "two hands hold 0.4 rad apart", _held_apart(30.0, 0.0), STABLE),
-    Row("S4=", "weaker ones, 0.5 rad apart", _held_apart(12.0, 0.1), STABLE),
+    Row("S4=", "two hands hold 0.4 rad apart", _held_apart(30.0, 0.0), AT_REST),
+    Row("S4=", "weaker ones, 0.5 rad apart", _held_apart(12.0, 0.1), AT_REST),
     Row(
         "F1",
         "the wide group decays, the small one grows",
@@ -433,15 +429,15 @@ ROWS = (
         NEVER_STABLE,
         "joint",
     ),
-    Row("F1=", "both groups decay", _pairs(p_d(4.0), p_d(4.0)), STABLE),
+    Row("F1=", "both groups decay", _pairs(p_d(4.0), p_d(4.0)), AT_REST),
     Row("F2", "a sampled wall of 20 kN/m", _wall(20.0), NEVER_STABLE, "this rest: unstable"),
     Row("F2", "a sampled wall of 28 kN/m", _wall(28.0), NEVER_STABLE, "this rest: unstable"),
     Row("F2", "a sampled wall of 5 kN/m at 100 Hz", _wall(5.0, rate_hz=100), NEVER_STABLE),
-    Row("F2=", "a sampled wall of 8 kN/m", _wall(8.0), STABLE),
-    Row("F2=", "a wall of 28 kN/m that is not sampled", _wall(28.0, sampled=False), STABLE),
+    Row("F2=", "a sampled wall of 8 kN/m", _wall(8.0), AT_REST),
+    Row("F2=", "a wall of 28 kN/m that is not sampled", _wall(28.0, sampled=False), AT_REST),
     Row("F4", "the delay swings at 1.7 Hz", _load("free", PARAMETRIC), NEVER_STABLE, "v rises"),
     Row(
-        "F4=", "by a tenth of that", _load("free", PARAMETRIC, link__amplitude_ms=20.0), STABLE
+        "F4=", "by a tenth of that", _load("free", PARAMETRIC, link__amplitude_ms=20.0), AT_REST
     ),
     Row(
         "F5",
@@ -457,9 +453,9 @@ ROWS = (
         NEVER_STABLE,
         "unstable",
     ),
-    Row("F5=", "P+d, 1.6 s, d 16", _margin(d=16.0, T_ms=1600.0, duration_s=120.0), STABLE),
+    Row("F5=", "P+d, 1.6 s, d 16", _margin(d=16.0, T_ms=1600.0, duration_s=120.0), AT_REST),
     Row("F5", "at its edge, if a sample is lost", _margin(CLOSE | LOSSY, d=0.96), NEVER_STABLE),
-    Row("F5=", "beyond its edge, the same", _margin(CLOSE | LOSSY, d=1.2), STABLE),
+    Row("F5=", "beyond its edge, the same", _margin(CLOSE | LOSSY, d=1.2), AT_REST),
     Row(
         "F5",
         "1.56 s, d 2.6, if a sample is lost",
@@ -471,7 +467,7 @@ ROWS = (
         "F5=",
         "1.56 s, d 16, the same",
         _margin(LOSSY, d=16.0, T_ms=1560.0, duration_s=120.0),
-        STABLE,
+        AT_REST,
     ),
     Row(
         "F6",
@@ -480,7 +476,7 @@ ROWS = (
         NEVER_STABLE,
         "apart",
     ),
-    Row("F6=", "two pairs that do", _pairs(*LEARNT, 0.3), STABLE),
+    Row("F6=", "two pairs that do", _pairs(*LEARNT, 0.3), AT_REST),
     Row("F6", "a hand that cannot hold them apart", _touched(1e-6), NEVER_STABLE, "apart"),
     Row(
         "F7",
@@ -496,7 +492,7 @@ ROWS = (
         NEVER_STABLE,
         "operator acts",
     ),
-    Row("F7=", "30 s of it", _free({"sites.m1.hands": EARLY}), STABLE),
+    Row("F7=", "30 s of it", _free({"sites.m1.hands": EARLY}), AT_REST),
     Row(
         "F8",
         "force reflection hammers",
@@ -508,10 +504,10 @@ ROWS = (
         "F8=",
         "a fifth of the force",
         _load("contact", {"sites.m.control.k_f": 0.2}, duration_s=60.0),
-        STABLE,
+        AT_REST,
     ),
     Row("F8", "100 Hz, no delay: a limit cycle", _load("free", CYCLE), NEVER_STABLE, "v rises"),
-    Row("F8=", "500 Hz, no delay", _load("free", CYCLE, rate_hz=500, duration_s=60.0), STABLE),
+    Row("F8=", "500 Hz, no delay", _load("free", CYCLE, rate_hz=500, duration_s=60.0), AT_REST),
     Row("F8", "a push without end", _margin({"sites.m1.hands": PUSH}), NEVER_STABLE, "drift"),
     Row(
         "F9",
@@ -528,12 +524,12 @@ ROWS = (
         NEVER_STABLE,
         "v ends",
     ),
-    Row("F9=", "a torque limit of 100 N m", _free(limits__tau_limit_nm=100.0), STABLE),
-    Row("F9=", "gravity known", _margin(duration_s=60.0), STABLE),
+    Row("F9=", "a torque limit of 100 N m", _free(limits__tau_limit_nm=100.0), AT_REST),
+    Row("F9=", "gravity known", _margin(duration_s=60.0), AT_REST),
     Row(
         "F9", "arms that sink slowly", _margin(STIFF | {"control.gravity": 0.99}), NEVER_STABLE
     ),
-    Row("F9=", "arms that do not", _margin(STIFF), STABLE),
+    Row("F9=", "arms that do not", _margin(STIFF), AT_REST),
     Row(
         "W",
         "a hand swings ever wider",
@@ -555,8 +551,8 @@ ROWS = (
         NEVER_STABLE,
         "the loop changes",
     ),
-    Row("W=", "a longer delay since long", _slower_from(15.0, 5.0), STABLE),
-    Row("W=", "the hand lets go", _margin({"sites.m1.hands": EARLY}), STABLE),
+    Row("W=", "a longer delay since long", _slower_from(15.0, 5.0), AT_REST),
+    Row("W=", "the hand lets go", _margin({"sites.m1.hands": EARLY}), AT_REST),
 )
 
 
@@ -739,42 +735,17 @@ def say_of(log: Log) -> str:
 
 
 class RunInMemory:
-    """A compiled run with what the roots at its end pose take from a log: its states every 50 ms."""
+    """A compiled run, from whose end the same is said as from its log."""
 
     def __init__(self, scenario: Scenario) -> None:
-        self.scenario, self.sites, self._run = scenario, scenario.names, FusedRun(scenario)
-        self._run.advance_to(scenario.duration_s)
+        self.scenario = scenario
+        self.run = FusedRun(scenario)
+        self.run.advance_to(scenario.duration_s)
 
     def find_end(self) -> RunEnd:
         """The judgement of its end."""
-        run = self._run
+        run = self.run
         return classify_run_end(self.scenario, RunTrace(run.buckets, run.tau_x, run.diverged_s))
-
-    def changes(self, _site: str) -> tuple[()]:
-        """Nobody gives it commands."""
-        return ()
-
-    def __getitem__(self, site: str) -> Any:
-        n, rate_hz = self.sites.index(site), self.scenario.sites[site].rate_hz
-        buckets, end = (
-            self._run.buckets[n],
-            "run" if self._run.diverged_s is None else "diverged",
-        )
-        return LastOfBuckets(
-            rate_hz=rate_hz,
-            mode=[end],
-            t_s=np.arange(1, len(buckets) + 1) / BUCKETS_PER_S - 1.0 / rate_hz,
-            q=buckets[:, 2 * JOINTS :],
-            qd=buckets[:, JOINTS : 2 * JOINTS],
-            theta_hat=np.tile(self._run.theta_hat[n], (len(buckets), 1)),
-        )
-
-
-class LastOfBuckets(SimpleNamespace):
-    """A site's part of such a run: its last q of every bucket, and its largest |qd|."""
-
-    def __len__(self) -> int:
-        return len(self.t_s)
 
 
 def say_of_run(scenario: Scenario) -> str:
@@ -785,16 +756,11 @@ def say_of_run(scenario: Scenario) -> str:
     varies = not all(map(is_constant_link, scenario.links.values()))
     if varies or not explain_no_functional(scenario):
         return say_of(trilat_net.simulate(scenario))
-    run = RunInMemory(scenario)
-    no_v = StabilityVerdict(StabilityFinding.NOT_JUDGED, "")
-    ticks = {site: scenario.ticks(site) for site in scenario.names}
-    whole = Evidence(
-        Coverage(ticks, ticks), None, MIN_COVERAGE, Integrity(DigestState.INTACT, "")
-    )
-    roots = find_end_pose_roots(run)  # type: ignore[arg-type]
-    end = run.find_end()
-    twins = measure_virtual_twins(scenario, end, scenario.duration_s, TWINS)
-    return str(Certificate([], no_v, end, whole, None, roots=roots, twins=twins).stability)
+    whole = RunInMemory(scenario)
+    end = whole.find_end()
+    twins = measure_virtual_twins(scenario, end, scenario.duration_s)
+    roots = find_run_roots(scenario, whole.run)
+    return str(decide_virtual_run(scenario, end, roots, twins).stability)
 
 
 def say_of_sweep(scenario: Scenario) -> str:
@@ -861,11 +827,12 @@ class Tally(NamedTuple):
     near: int
     false_ok: int
     false_alarm: int
+    settled: int
     undecided: int
 
 
 def tally(judged: Iterable[Judged], by: str = "certified") -> Tally:
-    """Counts of what `by` says: wrongly stable, wrongly not, and neither."""
+    """Counts of what `by` says: wrongly stable, wrongly not, settled, and open."""
     rows = [(one.truth, getattr(one, by)) for one in judged]
     return Tally(
         len(rows),
@@ -873,6 +840,7 @@ def tally(judged: Iterable[Judged], by: str = "certified") -> Tally:
         sum(truth.near for truth, _ in rows),
         sum(truth.unstable and word == "stable" for truth, word in rows),
         sum(not truth.unstable and word == "not stable" for truth, word in rows),
+        sum(word == "settled" for _, word in rows),
         sum(word == "open" for _, word in rows),
     )
 
@@ -903,8 +871,10 @@ def main() -> None:
                     TRUTHS.write_text("\n".join([*lines, ""]))
             return
         judged = list(pool.map(judge_experiment, seeds, chunksize=8))
-    print("| experiments | runs | unstable | near an edge | false ok | false alarms | open |")
-    print("|---|---|---|---|---|---|---|")
+    print(
+        "| experiments | runs | unstable | near an edge | false ok | false alarms | settled | open |"
+    )
+    print("|---|---|---|---|---|---|---|---|")
     kinds = sorted({one.drawn.kind for one in judged})
     for by in ("certified", "swept"):
         for kind in (*kinds, ""):

@@ -123,7 +123,7 @@ def test_a_changed_hand_is_found(held: Log) -> None:
         ),
         (
             {"sites.m1.hands": [{"kind": "live"}], "sites.m1.plant": "external"},
-            "the arm is external",
+            "applies only to a simulated arm",
         ),
         (
             {"sites.m1.hands": [{"kind": "live", "mode": "tip", "torque_limit_nm": 2.0}]},

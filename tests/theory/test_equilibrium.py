@@ -121,5 +121,5 @@ def test_a_loop_that_rests_nowhere_is_refused() -> None:
 
 @pytest.mark.parametrize("pose", [(float("nan"), 0.0), (float("inf"), 0.0)])
 def test_a_pose_that_is_none_is_refused(pose: tuple[float, float]) -> None:
-    with pytest.raises(UsageError, match="pose is two angles"):
+    with pytest.raises(UsageError, match="pose must be two angles"):
         find_equilibrium(load_scenario("free"), pose)

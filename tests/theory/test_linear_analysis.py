@@ -20,7 +20,8 @@ from trilat_net.reporting.linear_text import (
 )
 from trilat_net.scenario import load_scenario
 from trilat_net.theory import analyse_linear_loop
-from trilat_net.theory.linear_analysis import LinearAnalysis, find_end_pose_roots
+from trilat_net.theory.linear_analysis import LinearAnalysis
+from trilat_net.theory.loop_roots import find_log_roots
 
 POSE = (-0.1729, 0.0874)
 
@@ -160,7 +161,7 @@ def test_of_several_rates_roots_are_exact_and_those_of_scenario() -> None:
         "sites.m.q0_rad": [0.0, 3.141592],
         "sites.s.q0_rad": [0.0, 3.141593],
     }
-    found = find_end_pose_roots(tn.simulate("two_sites", pair))
+    found = find_log_roots(tn.simulate("two_sites", pair))
     assert (found.verdict, found.exact) == ("unstable", True)
     assert found.rate_per_s == pytest.approx(0.180, abs=1e-3)
     assert found.text.endswith("rad/s, over the period of 0.1 s")
@@ -170,7 +171,7 @@ def test_drawn_delays_have_the_roots_of_samples_in_use() -> None:
     """Its last quarter begins 15 s later than the draws of the linear analysis: they are others."""
     run = {"rate_hz": 200, "duration_s": 40.0}
     found, whole = (
-        find_end_pose_roots(tn.simulate("jitter", run)),
+        find_log_roots(tn.simulate("jitter", run)),
         tn.linear("jitter", run, ports=False),
     )
     assert whole.sampled is not None
@@ -182,7 +183,7 @@ def test_drawn_delays_have_the_roots_of_samples_in_use() -> None:
 
 def test_waves_are_told_in_continuous_time() -> None:
     control = {"law": "wave", "b": 60.0, "K": 50.0, "B": 5.0}
-    found = find_end_pose_roots(
+    found = find_log_roots(
         tn.simulate("two_sites", {"scheme": "digital", "control": control, "duration_s": 2.0})
     )
     assert found.text.startswith(

@@ -272,7 +272,7 @@ def test_poses_that_have_no_loop_are_refused_by_name() -> None:
         ScenarioError, match=r"sites\.m\.q0_rad: the end effector does not reach the pose"
     ):
         find_equilibrium(scenario, (2.5, 0.0, 0.0))
-    with pytest.raises(UsageError, match="pose is a position in m of the end effectors"):
+    with pytest.raises(UsageError, match="pose must be a position in m of the end effectors"):
         find_equilibrium(scenario, (2.5, 0.0))
 
 

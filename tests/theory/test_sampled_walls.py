@@ -84,7 +84,7 @@ def test_runs_have_the_edge_of_the_map() -> None:
     assert found is not None
     assert say(0.95 * found.value) is CellClass.CONVERGED
     assert say(1.05 * found.value) is not CellClass.CONVERGED
-    assert end_alone(0.95 * found.value) is Stability.STABLE
+    assert end_alone(0.95 * found.value) is Stability.SETTLED
     assert end_alone(1.05 * found.value) is Stability.NOT_STABLE
 
 
@@ -93,7 +93,7 @@ def test_the_sweep_over_stiffness_is_monotone() -> None:
     """1 to 40 kN/m: stable up to 15, and from 16 on never."""
     for stable in (
         [say(1e3 * K) is CellClass.CONVERGED for K in range(1, 41)],
-        [end_alone(1e3 * K) is Stability.STABLE for K in range(1, 41)],
+        [end_alone(1e3 * K) is Stability.SETTLED for K in range(1, 41)],
     ):
         assert stable == [K <= 15 for K in range(1, 41)]
 

@@ -141,6 +141,49 @@ def test_the_slaves_best_damping_is_twice_stiffness_times_delay() -> None:
     assert criterion(reflecting(1.02 * 40.0, 0.2, slave_kg=40.0)).below
 
 
+def reflection_damping(w: Any, K: float, M_s: float, d_s: float, T: float) -> Any:
+    """Errata 15: what Llewellyn's condition asks of d_m / k_f at the frequencies w."""
+    psi = np.arctan2(w * d_s, K - M_s * w**2)
+    return K * np.sin(0.5 * psi + w * T) ** 2 / (w * np.sin(psi))
+
+
+def reflection_frequencies(K: float, d_s: float, T: float) -> Any:
+    slow, fast = min(1.0 / T, K / d_s), max(1.0 / T, K / d_s)
+    return np.geomspace(1e-3 * slow, 1e3 * fast, 20001)
+
+
+def test_a_heavy_slave_asks_for_more_than_its_limits_of_low_and_high_frequencies() -> None:
+    """Errata 15: the edge is 1.943, 11 % more than the formula of w = 0, and within the sufficient bound."""
+    K, M_s, d_s, T = 142.0, 0.0512, 4.3, 4.16e-3
+    w = reflection_frequencies(K, d_s, T)
+    asked = reflection_damping(w, K, M_s, d_s, T)
+    edge = float(asked.max())
+    slow, fast = (2.0 * K * T + d_s) ** 2 / (4.0 * d_s), K * M_s / d_s
+    enough = K * (2.0 * M_s + T * d_s) ** 2 / (4.0 * M_s * d_s)
+    assert (edge, slow, fast, enough) == pytest.approx((1.943, 1.747, 1.691, 2.333), abs=5e-4)
+    assert w[asked.argmax()] == pytest.approx(69.0, abs=0.1)
+    for k_f in (1.0, 0.3):
+        wires = (Wire(0, 1, 0.0, 0.0, T, k_f), Wire(1, 0, K, 0.0, T))
+        for part, fails in ((0.99, True), (1.01, False)):
+            network = Network((0.08, M_s), (part * edge * k_f, d_s), (0.0, 0.0), wires)
+            assert bool(criterion(network).below) is fails
+
+
+def test_no_light_slave_asks_for_more_than_the_formula_of_low_frequencies() -> None:
+    """Errata 15: d_s^2 >= 4 K M_s. A heavy slave stays within the larger one of two formulas."""
+    rng = np.random.default_rng(15)
+    for _ in range(300):
+        K, d_s, T = 10.0 ** rng.uniform((0.0, -1.0, -3.0), (3.0, 2.5, 0.5))
+        w = reflection_frequencies(K, d_s, T)
+        slow = (2.0 * K * T + d_s) ** 2 / (4.0 * d_s)
+        critical = d_s**2 / (4.0 * K)
+        light = critical * rng.uniform(0.0, 1.0)
+        assert reflection_damping(w, K, light, d_s, T).max() <= slow * (1.0 + 1e-9)
+        heavy = critical * 10.0 ** rng.uniform(0.0, 3.0)
+        enough = max(slow, K * (2.0 * heavy + T * d_s) ** 2 / (4.0 * heavy * d_s))
+        assert reflection_damping(w, K, heavy, d_s, T).max() <= enough * (1.0 + 1e-9)
+
+
 def test_coupled_hands_are_not_weighed_like_independent_ones() -> None:
     """Errata 9: K1 = 100, K2 = 1, 4 d1 d2 = 1.2 (2 T)^2 K1 K2 withstand any two operators.
 

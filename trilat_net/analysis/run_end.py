@@ -41,6 +41,7 @@ from ..scenario import Scenario
 from .arm_rows import HANGING_RAD, build_arm_rows
 from .envelope_trend import FLOOR_RAD, EnvelopeFit, EnvelopeTrend, fit_envelopes
 from .site_signals import SETTLED_ERROR_RAD
+from .timeline import list_effective_commands
 from .torque_sources import compute_operator_script
 
 SETTLED_SPEED_RAD_S = 1e-2
@@ -92,6 +93,7 @@ class Stability(StrEnum):
     """The stability judgement of a run. The value of each member is the word for people."""
 
     STABLE = "stable"
+    SETTLED = "settled"
     NOT_STABLE = "not stable"
     OPEN = "open"
 
@@ -119,7 +121,7 @@ class EndBehaviour(StrEnum):
         Other knowledge about the run may change it.
         """
         if self in (EndBehaviour.CONVERGED, EndBehaviour.DECAYS):
-            return Stability.STABLE
+            return Stability.SETTLED
         if self in (EndBehaviour.HARDLY, EndBehaviour.UNDECIDED, EndBehaviour.COASTS):
             return Stability.OPEN
         return Stability.NOT_STABLE
@@ -326,7 +328,6 @@ def trace_log(log: Log) -> RunTrace:
     buckets = []
     tau_x = []
     push_times_s = []
-    change_times_s = []
     for site in log.sites:
         part = log[site]
         site_buckets = reduce_to_buckets(
@@ -339,8 +340,8 @@ def trace_log(log: Log) -> RunTrace:
         buckets.append(site_buckets)
         tau_x.append(part.tau_x[-1] if len(part) else np.zeros(1))
         push_times_s.append(_find_unscripted_push_s(log, part))
-        change_times_s += [tick / part.rate_hz for tick in log.changes(site)]
 
+    change_times_s = [change.at_s for change in list_effective_commands(log)]
     return RunTrace(
         buckets=buckets,
         tau_x=tau_x,
@@ -428,7 +429,7 @@ def classify_run_end(scenario: Scenario, trace: RunTrace) -> RunEnd:
 
     if trace.diverged_at_s is not None:
         return end._replace(behaviour=EndBehaviour.DIVERGED, diverged_at_s=trace.diverged_at_s)
-    if end.behaviour.stability is Stability.STABLE:
+    if end.behaviour.stability is Stability.SETTLED:
         reasons = list(_find_disagreement(scenario, trace, t_s, columns))
         reasons += _find_odd_pose(scenario, sites)
         if is_disturbed and not operator_acts:

@@ -30,6 +30,48 @@ from ..scenario.run_changes import describe_change, find_requester
 from ..scenario.scenario_types import Change
 
 
+def list_effective_commands(log: Log) -> list[Change]:
+    """Lists the commands of a run that changed something.
+
+    A command that sets a link or the dominance factors of a site (the weights with which it
+    follows its peers) to what is in force already changes nothing and is left out. Orders to
+    sites, such as "stop", always count.
+
+    Args:
+        log: The log of the run.
+
+    Returns:
+        The commands, by the time at which they take effect.
+
+    Raises:
+        LogError: A record names a change that is not valid.
+    """
+    scenario = log.scenario
+    commands = []
+    for site in log.sites:
+        log.commands(site)  # raises LogError if a change is not valid
+        for texts in log.changes(site).values():
+            commands += [msgspec.json.decode(text, type=Change) for text in texts]
+
+    links: dict[str, LinkBase] = dict(scenario.links)
+    shares = dict(scenario.dominance)
+    effective = []
+    planned = [(change, False) for change in scenario.timeline]
+    requested = [(change, True) for change in commands]
+    changes = sorted([*planned, *requested], key=lambda entry: entry[0].at_s)
+    for change, is_command in changes:
+        has_effect = True
+        if change.link:
+            has_effect = links[change.link] != change.after
+            links[change.link] = change.after
+        elif change.dominance:
+            has_effect = shares[change.dominance] != change.to
+            shares[change.dominance] = change.to
+        if is_command and has_effect:
+            effective.append(change)
+    return effective
+
+
 class AppliedChange(NamedTuple):
     """A change that a site carried out, from the scenario or from a command during the run.
 

@@ -29,10 +29,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..core.delay import DelayKind
 from ..core.exogenous import TorqueKind
 from ..core.ticks import BUCKETS_PER_S
 from ..core.vectors import Array
-from ..errors import NotRepeatable, UsageError
+from ..errors import NotRepeatable, UsageError, count_nouns
 from ..execution.twins import (
     LEAST_PUSH,
     MOST_PUSH,
@@ -49,12 +50,10 @@ from ..execution.twins import (
 from ..log.log_reader import Log, open_log
 from ..results import Result, finite_or_none
 from ..scenario import Scenario
-from .envelope_trend import FLOOR_RAD, EnvelopeFit, EnvelopeTrend, fit_envelopes
-from .run_end import EndBehaviour, RunEnd, Stability, find_coupled_sites
-from .site_signals import SETTLED_ERROR_RAD
+from ..scenario.delay_period import find_final_delay_period, find_final_link
+from .envelope_trend import EnvelopeFit, EnvelopeTrend, fit_envelopes
+from .run_end import RunEnd, find_coupled_sites
 
-TWINS = 8
-"""Default number of twins of a run."""
 LEAST_LEFT_S = 5.0
 """Shortest departure from a rest position that counts, in s."""
 DOUBLES = 2.0
@@ -97,13 +96,16 @@ class PushGrowth(NamedTuple):
             the judged part is too short.
         factor: Factor by which the difference changed over the judged part. 0 if it died down
             to the rounding errors.
-        joint: Name of the joint at which the difference is largest at the end.
+        joint: Name of the joint with the worst trend: the joint at which the difference is
+            largest at the end, or a joint that grows, or stays, although the largest difference
+            dies away.
         group: Index of the group of sites.
         becomes_rad_s: Largest difference in the last second, in rad/s, with all scalings of
             the difference undone.
         ended_s: Time at which the twin ended before the run, in s, because the difference died
             down to the rounding errors or the twin diverged. None if the twin did not end
             early.
+        leads: True if the difference is largest at this joint at the end.
     """
 
     push: Push
@@ -114,6 +116,22 @@ class PushGrowth(NamedTuple):
     group: int
     becomes_rad_s: float
     ended_s: float | None = None
+    leads: bool = True
+
+
+def estimate_miss_probability(directions: int) -> float:
+    """Estimates how likely pushes in random directions miss a mode that grows clearly.
+
+    A mode that grows by `CLEAR_GROWTH` is missed if less than 1 / `CLEAR_GROWTH` of the usual
+    share of every push excites it. The share of a mode in a push with many random components is
+    nearly normally distributed, with the density 1 / sqrt(2 pi) at zero.
+
+    Args:
+        directions: Number of independent random directions.
+    """
+    share = 1.0 / CLEAR_GROWTH
+    single = 2.0 * share / math.sqrt(2.0 * math.pi)
+    return math.pow(single, directions)
 
 
 class RestDeparture(NamedTuple):
@@ -151,6 +169,8 @@ class TwinGrowth(NamedTuple):
             of the repeated run may differ from the log.
         links_random: True if some link draws its delays at random. Slow trends may then be
             chance.
+        delay_period_s: Time after which delays that vary, and the ticks of all sites, repeat,
+            in s. None if delays are constant, random, or never repeat.
         twins: The twins themselves, for figures. None if there are none.
     """
 
@@ -161,6 +181,7 @@ class TwinGrowth(NamedTuple):
     departure: RestDeparture | None = None
     same_platform: bool = True
     links_random: bool = False
+    delay_period_s: float | None = None
     twins: Twins | None = None
 
     @property
@@ -169,11 +190,7 @@ class TwinGrowth(NamedTuple):
 
         A push is a small disturbance in a repetition of the run. None if there are no pushes.
         """
-        return max(
-            self.pushes,
-            key=lambda push: (_TRENDS_FROM_BEST.index(push.trend), push.rate_per_s),
-            default=None,
-        )
+        return max(self.pushes, key=_rank_badness, default=None)
 
     @property
     def trend(self) -> EnvelopeTrend:
@@ -188,30 +205,59 @@ class TwinGrowth(NamedTuple):
     def grows(self) -> bool:
         """True if small pushes of the run grow, so that the run is unstable.
 
-        Arms that follow each other form a group. In at least one group, at least half of the
-        pushes must grow all the time from `from_s` to `to_s`. If network delays are random,
-        they must also grow by a factor of two, to exclude chance.
+        Arms that follow each other form a group. The pushes of a group grow if at least half of
+        them grow all the time from `from_s` to `to_s`. They also grow if the same joint grows
+        all the time after at least two pushes, and is the fastest joint after one of them: a
+        joint that does not act on the others shows only in the pushes that move it. If network
+        delays are random, the pushes must grow by a factor of two, to exclude chance.
         """
-        return self.grows_by(DOUBLES if self.links_random else 1.0, always=True)
+        least_factor = DOUBLES if self.links_random else 1.0
+        grown = []
+        for push in self.pushes:
+            grows_throughout = push.trend is EnvelopeTrend.GROWS
+            if grows_throughout and push.factor >= least_factor:
+                grown.append(push)
 
-    def grows_by(self, factor: float, *, always: bool) -> bool:
-        """Returns True if small pushes of the run grow by a factor at some of the arms.
-
-        Arms that follow each other form a group. At least half of the pushes must grow by the
-        factor in at least one group. The growth is measured from `from_s` to `to_s`.
-
-        Args:
-            factor: Least growth of the effect of a push, as a factor.
-            always: True to count only effects that grow all the time (class "grows").
-        """
         for group in {push.group for push in self.pushes}:
             pushes = [push for push in self.pushes if push.group == group]
-            grown = [push for push in pushes if push.factor >= factor]
-            if always:
-                grown = [push for push in grown if push.trend is EnvelopeTrend.GROWS]
-            if 2 * len(grown) >= len(pushes):
+            grown_in_group = [push for push in grown if push.group == group and push.leads]
+            if 2 * len(grown_in_group) >= len(pushes):
+                return True
+        for joint in {push.joint for push in grown}:
+            with_joint = [push for push in grown if push.joint == joint]
+            if len(with_joint) >= 2 and any(push.leads for push in with_joint):
                 return True
         return False
+
+    @property
+    def _miss_text(self) -> str:
+        """A clause on the probability of missing a growth, if joints were not pushed singly."""
+        directions = {push.push.direction for push in self.pushes if push.push.direction}
+        if not directions:
+            return ""
+        probability = estimate_miss_probability(len(directions))
+        return (
+            f"; {count_nouns(len(directions), 'random direction')} of all joints miss a mode "
+            f"that grows {CLEAR_GROWTH:g} times with a probability of {probability:.0e}"
+        )
+
+    @property
+    def hides_period(self) -> bool:
+        """True if the delays repeat only after more time than the judged part of the run.
+
+        A trend over a part of the period of the delays says nothing about the whole period.
+        """
+        judged_s = self.to_s - self.from_s
+        return self.delay_period_s is not None and self.delay_period_s > judged_s
+
+    @property
+    def period_text(self) -> str:
+        """A sentence for a judged part that is shorter than the period of the delays."""
+        judged_s = self.to_s - self.from_s
+        return (
+            f"the delays repeat after {self.delay_period_s:.6g} s, but the twins were judged "
+            f"over {judged_s:.4g} s"
+        )
 
     @property
     def needs_s(self) -> float | None:
@@ -292,7 +338,7 @@ class TwinGrowth(NamedTuple):
         span = f"in {self.to_s - self.from_s:.4g} s ({worst.rate_per_s:+.3g} /s)"
         if self.trend in _FALLING:
             slowest = f"{name}, to {worst.factor:.3g} of its size {span}"
-            return f"twins: every push dies away; the slowest, {slowest}"
+            return f"twins: every push dies away; the slowest, {slowest}{self._miss_text}"
 
         change = f"x {worst.factor:.3g} {span}, most at {worst.joint}"
         if self.trend is EnvelopeTrend.GROWS:
@@ -303,91 +349,10 @@ class TwinGrowth(NamedTuple):
         return text
 
 
-class TwinVerdict(NamedTuple):
-    """Stability judgement of a run that takes its pushed twins into account.
-
-    A twin is a repeated execution of the run with a small push. Twins show whether small
-    disturbances grow or die away, which the run alone may not show.
-
-    Attributes:
-        stability: The judgement.
-        reason: Why the twins contradict, or cast doubt on, the judgement that follows from the
-            end of the run alone. Empty if they agree with it.
-    """
-
-    stability: Stability
-    reason: str = ""
-
-
-def judge_end_by_twins(
-    end: RunEnd,
-    twins: TwinGrowth,
-    *,
-    settles: bool | None,
-    rises: bool,
-) -> TwinVerdict:
-    """Judges a run by its end and by the growth of small pushes in its twins.
-
-    - A run that grows away from its twins is not stable, however it ends. A run that approaches
-      its twins is not said to grow.
-    - A run with a stable end is stable only if pushes die away. If small motions are known to
-      settle, it is enough that the pushes do not grow.
-    - A run whose end shows no trend is stable if all of its pushes die away, and its arms are
-      too slow to get anywhere or are known to settle.
-
-    Args:
-        end: The end of the run.
-        twins: Growth of the pushes.
-        settles: Whether small motions settle, according to exact roots or to the stability
-            theorem. None if unknown.
-        rises: True if the energy function V rose by energy that nobody supplied.
-    """
-    by_end = TwinVerdict(end.stability)
-    trend = twins.trend
-    if not twins.pushes or end.behaviour is EndBehaviour.DIVERGED:
-        return by_end
-
-    # Growth of pushes, or a departure from a rest, refutes stability.
-    is_slowing = end.speed.trend in _FALLING and end.end_speed_rad_s > FLOOR_RAD
-    has_growth = twins.grows
-    if settles is False and not has_growth:
-        has_growth = twins.grows_by(DOUBLES, always=False)
-    departs = twins.departure is not None and end.behaviour is not EndBehaviour.COASTS
-    moves_away = (has_growth and not is_slowing) or departs
-    if moves_away and not end.operator_acts:
-        return TwinVerdict(Stability.NOT_STABLE, twins.text)
-
-    hardly = trend is EnvelopeTrend.HARDLY
-    dies = trend is EnvelopeTrend.DECAYS or (hardly and bool(settles))
-    if end.stability is Stability.STABLE and not (dies or hardly):
-        is_doubtful = trend is EnvelopeTrend.GROWS or not settles
-        return TwinVerdict(Stability.OPEN, twins.text) if is_doubtful else by_end
-    if end.stability is Stability.NOT_STABLE:
-        # Growth is doubtful if neither the twins nor V confirm it.
-        is_unconfirmed = (
-            end.behaviour is EndBehaviour.GROWS
-            and trend is not EnvelopeTrend.GROWS
-            and not rises
-        )
-        if dies or is_unconfirmed:
-            return TwinVerdict(Stability.OPEN, twins.text)
-        return by_end
-
-    # The end alone shows no trend, but the pushes may decide.
-    has_no_trend = end.behaviour in (EndBehaviour.HARDLY, EndBehaviour.UNDECIDED)
-    judged_s = twins.to_s - twins.from_s
-    rests = end.end_speed_rad_s * judged_s <= SETTLED_ERROR_RAD
-    settles_at_end = settles or (rests and trend is EnvelopeTrend.DECAYS)
-    has_doubts = end.missing_sites or end.reasons or end.operator_acts
-    if has_no_trend and dies and settles_at_end and not has_doubts:
-        return TwinVerdict(Stability.STABLE)
-    return by_end
-
-
 def measure_twins(
     log: Log,
     end: RunEnd,
-    count: int = TWINS,
+    count: int | None = None,
     *,
     own_laws: bool = False,
 ) -> TwinGrowth:
@@ -398,7 +363,7 @@ def measure_twins(
     Args:
         log: The log of the run.
         end: The end of the run, which states from when on the run is judged.
-        count: Number of twins.
+        count: Number of twins. None for one push of every joint.
         own_laws: True to run the code of control laws that are not part of this program.
 
     Returns:
@@ -419,7 +384,7 @@ def measure_virtual_twins(
     scenario: Scenario,
     end: RunEnd,
     duration_s: float,
-    count: int,
+    count: int | None = None,
 ) -> TwinGrowth:
     """Simulates a scenario with small pushes, and judges whether the pushes grow.
 
@@ -430,7 +395,7 @@ def measure_virtual_twins(
         scenario: The description of the experiment.
         end: The end of the run, which states from when on the run is judged.
         duration_s: Length of the run, in s.
-        count: Number of twins.
+        count: Number of twins. None for one push of every joint.
 
     Raises:
         ScenarioError: The scenario cannot run in virtual time.
@@ -462,6 +427,8 @@ def judge_twins(
     has_motion = twins.speed.any(axis=1) | np.isfinite(twins.paths[0].largest).any(axis=1)
     rows = np.flatnonzero(has_motion)
     end = int(rows[-1]) if len(rows) else 0  # without the last interval, which may be one tick
+    period_s = find_varying_period_s(scenario)
+    counts_from_s = _fit_to_period(counts_from_s, float(t_s[end]), period_s)
     first = min(int(np.searchsorted(t_s, counts_from_s)), end)
     quiet = slice(int(np.searchsorted(t_s, quiet_from_s)), end)
 
@@ -477,7 +444,7 @@ def judge_twins(
         for path, amplitude in zip(twins.paths, amplitudes, strict=True):
             is_affected = np.isfinite(amplitude[first:end]).any()
             if is_affected:
-                growth = _judge_push(
+                growth = _judge_worst_joint(
                     path=path,
                     amplitude=amplitude,
                     joints=joints,
@@ -495,8 +462,40 @@ def judge_twins(
         departure=max(departures, key=lambda departure: departure.rate_per_s, default=None),
         same_platform=twins.same,
         links_random=scenario.links_random,
+        delay_period_s=period_s,
         twins=twins,
     )
+
+
+def find_varying_period_s(scenario: Scenario) -> float | None:
+    """Returns the period of delays that vary, in s, as it is at the end of a scenario.
+
+    Args:
+        scenario: The description of the experiment.
+
+    Returns:
+        The period, of all links and of the ticks of all sites. None if all delays are constant,
+        and if some delay never repeats.
+    """
+    links = [find_final_link(scenario, name) for name in scenario.links]
+    if all(link.to_core_model().kind == DelayKind.CONSTANT for link in links):
+        return None
+    return find_final_delay_period(scenario).true_s
+
+
+def _fit_to_period(counts_from_s: float, end_s: float, period_s: float | None) -> float:
+    """Returns a later start of the part that counts, whose second half has whole periods.
+
+    Args:
+        counts_from_s: Start of the part that counts, in s.
+        end_s: End of the part, in s.
+        period_s: Period of the delays, in s. None if they are constant or never repeat.
+    """
+    half_s = 0.5 * (end_s - counts_from_s)
+    if period_s is None or period_s > half_s:
+        return counts_from_s
+    whole_periods = math.floor(half_s / period_s)
+    return end_s - 2.0 * whole_periods * period_s
 
 
 def measure_amplitude(path: TwinPath, group: Sequence[int]) -> Array:
@@ -645,6 +644,50 @@ def _judge_push(
 
     half_s = 0.5 * float(t_s[end - 1] - t_s[start])
     return growth._replace(factor=_exp(fit.rate_per_s * half_s))
+
+
+def _judge_worst_joint(
+    path: TwinPath,
+    amplitude: Array,
+    joints: Sequence[int],
+    part: slice,
+    joint_names: Sequence[str],
+) -> PushGrowth:
+    """Returns how a push developed, at all joints of a group or at the worst of them.
+
+    A slow growth at one joint does not show in the amplitude of the group while a faster joint
+    still decays from a larger amplitude. Therefore each joint is judged by itself, too.
+
+    Args:
+        path: The twin's difference from its run.
+        amplitude: Logarithm of the amplitude of the difference of all joints, shape (K,).
+        joints: Indices of the joints that count.
+        part: Rows of the judged part, and of the part before it.
+        joint_names: Names of all joints.
+    """
+    worst = _judge_push(path, amplitude, joints, part, joint_names)
+    leading_joint = worst.joint
+    if len(joints) == 1 or worst.ended_s is not None:
+        return worst
+    for joint in joints:
+        joint_amplitude = measure_amplitude(path, [joint])
+        actual = joint_amplitude - path.scale
+        joint_amplitude[actual < math.log(SMALLEST)] = -np.inf
+        last_second = joint_amplitude[max(part.start, part.stop - BUCKETS_PER_S) : part.stop]
+        has_died = not np.isfinite(last_second).any()
+        if has_died:
+            continue
+        growth = _judge_push(path, joint_amplitude, [joint], part, joint_names)
+        stays = growth.trend in (EnvelopeTrend.STEADY, EnvelopeTrend.GROWS)
+        if stays and _rank_badness(growth) > _rank_badness(worst):
+            leads = growth.joint == leading_joint
+            worst = growth._replace(leads=leads)
+    return worst
+
+
+def _rank_badness(growth: PushGrowth) -> tuple[int, float]:
+    """Returns a key that orders pushes from the fastest decay to the fastest growth."""
+    return _TRENDS_FROM_BEST.index(growth.trend), growth.rate_per_s
 
 
 def _exp(logarithm: float) -> float:
@@ -850,8 +893,7 @@ def twin(
         pushes = [parse_push(scenario, target, size, at_s) for target, size in targets]
     else:
         pushes = [
-            default._replace(at_s=at_s, again=False)
-            for default in choose_pushes(scenario, TWINS)
+            default._replace(at_s=at_s, again=False) for default in choose_pushes(scenario)
         ]
     growth = judge_twins(scenario, run_twins(log, pushes, own_laws=True), at_s, math.inf)
     linear = _find_linear_sizes(scenario, growth, sizes) if delta else None

@@ -113,7 +113,7 @@ def verify_command(
     raise typer.Exit(result.exit_code)
 
 
-Accepted = StrEnum("Accepted", ["BOUNDED", "OPEN"])
+Accepted = StrEnum("Accepted", ["SETTLED", "BOUNDED", "OPEN"])
 """Results besides a stable run for which `--accept` gives the exit code 0."""
 
 
@@ -124,8 +124,8 @@ def certify_command(
         list[Accepted] | None,
         typer.Option(
             "--accept",
-            help="Also return exit code 0 for a bounded oscillation or an open verdict; "
-            "repeatable.",
+            help="Also return exit code 0 for a settled run, a bounded oscillation or an open "
+            "verdict; repeatable.",
         ),
     ] = None,
     min_coverage: options.MinCoverageOption = options.MIN_COVERAGE,
@@ -137,20 +137,28 @@ def certify_command(
         ),
     ] = False,
     twins: Annotated[
-        int,
+        int | None,
         value(
             "--twins",
             "N",
-            "Number of twins, which are repetitions of the run with a small push.",
+            "Number of twins, which are repetitions of the run with a small push. "
+            "Default: one for each joint, and two more.",
             min=0,
             max=99,
         ),
-    ] = 8,
+    ] = None,
+    cite: Annotated[
+        bool,
+        flag(
+            "--cite",
+            "Print a paragraph for a paper instead, with the numbers of the run and BibTeX.",
+        ),
+    ] = False,
     *,
     laws: options.LawFiles,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Judges whether a run is stable, not stable or undecided (open), and gives the reasons.
+    """Judges whether a run is stable, settled, not stable or open, and says what that rests on.
 
     The command prints the energy function V of the stability proof with its energy balance, the
     conditions of the proof (premises), and the roots of the linearised loop at the final pose.
@@ -158,15 +166,21 @@ def certify_command(
     code of imported control laws runs only with --law or --own-laws. docs/certificate.md
     defines every term and every key of the JSON.
 
-    Exit code 0: stable. 1: not stable (bounded oscillation, drifting, growing, diverged) or
-    open. 2: there is no log.
+    Stable: a proof exists for this loop. Settled: the run came to rest and every push died
+    away, but nothing proves more. Exit code 0: stable. 1: settled, not stable (bounded
+    oscillation, drifting, growing, diverged) or open. 2: there is no log.
     """
-    from ..theory.linear_analysis import certify_run
+    from ..reporting.citation import compose_citation
+    from ..theory.run_certificate import certify_run
 
     own_laws = own_laws or bool(laws.law)
     log = laws.open(*files, runs_them=own_laws)
     certificate = certify_run(log, min_coverage=min_coverage, own_laws=own_laws, twins=twins)
-    terminal.print_result(certificate, as_json=as_json)
+    if cite:
+        for line in compose_citation(log, certificate):
+            terminal.print_line(line)
+    else:
+        terminal.print_result(certificate, as_json=as_json)
     if not certificate.accepts(accept or ()):
         raise typer.Exit(1)
 

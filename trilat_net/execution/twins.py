@@ -33,6 +33,8 @@ from ..log.record_columns import Ints
 from ..scenario import Scenario
 from .fused import FusedRun, RunInputs, explain_not_repeatable, read_run_inputs
 
+MAX_PUSHES = 32
+"""Largest number of pushes that are chosen if the user states no number."""
 PUSH_RAD = 1e-6
 """Usual size of a push, in rad."""
 LARGEST = 1e-4
@@ -62,6 +64,8 @@ class Push(NamedTuple):
             Otherwise the twin ends.
         largest: Difference beyond which the twin is moved closer to the run, in the unit of the
             field. Infinite if this is never done.
+        direction: Number of the random direction in which all joints are pushed, from 1. 0 if
+            the joints were chosen in another way.
     """
 
     name: str
@@ -70,6 +74,7 @@ class Push(NamedTuple):
     at_s: float = 0.0
     again: bool = True
     largest: float = LARGEST
+    direction: int = 0
 
 
 class TwinPath(NamedTuple):
@@ -140,37 +145,60 @@ def list_joints(scenario: Scenario) -> tuple[str, ...]:
     return tuple(joints)
 
 
-def choose_pushes(scenario: Scenario, count: int) -> list[Push]:
-    """Chooses pushes that together can reveal most kinds of instability.
+def choose_pushes(scenario: Scenario, count: int | None = None) -> list[Push]:
+    """Chooses pushes that together can reveal every kind of instability.
 
     A push is a small displacement of the state of a twin, which is a second execution of the
-    run. Different pushes displace different joints or estimates. The order is:
+    run. Different pushes displace different joints or estimates:
 
     - one push of all estimated parameters if the control law of a site estimates any;
-    - up to three pushes of all joints in random directions, with sizes around `PUSH_RAD`. The
+    - up to three pushes of all joints in a random direction, with sizes around `PUSH_RAD`. The
       sizes differ, because growth may depend on the amplitude;
-    - one push of each joint.
+    - one push of each joint, because a joint that does not act on the others shows its growth
+      clearly only if it is pushed itself.
+
+    If there are not enough pushes for all joints, the joints are not pushed one by one, but all
+    together in several random directions.
 
     Args:
         scenario: Description of the experiment.
-        count: Largest number of pushes. Those at the end of the list are left out.
+        count: Number of pushes. None for one push of each joint and the others above, up to
+            `MAX_PUSHES`.
     """
     # The target of "m1 joint 1" is "m1.q1".
     joint_targets = [joint.replace(" joint ", ".q") for joint in list_joints(scenario)]
-    targets = []
     learns = any(scenario.gains(name).law is Law.ADAPTIVE for name in scenario.names)
-    if learns and count > 2:
-        targets.append(("theta", PUSH_RAD))
-    random_count = max(1, min(3, count - len(joint_targets) - len(targets)))
-    random_factors = (1.0, 1e-3, 1e3)[:random_count]
-    targets += [("q", factor * PUSH_RAD) for factor in random_factors]
-    targets += [(target, PUSH_RAD) for target in joint_targets]
+    complete_count = len(joint_targets) + 2
+    if count is None:
+        count = min(complete_count, MAX_PUSHES)
 
     pushes = []
-    for target, size in targets[:count]:
-        push = parse_push(scenario, target, size)
-        pushes.append(push._replace(again=True, largest=LARGEST))
-    return pushes
+    if learns and count > 2:
+        pushes.append(parse_push(scenario, "theta"))
+    if count < complete_count:
+        numbers = range(1, count - len(pushes) + 1)
+        pushes += [_push_in_random_direction(scenario, number) for number in numbers]
+    else:
+        random_count = min(3, count - len(joint_targets) - len(pushes))
+        factors = (1.0, 1e-3, 1e3)[:random_count]
+        pushes += [parse_push(scenario, "q", factor * PUSH_RAD) for factor in factors]
+        pushes += [parse_push(scenario, target) for target in joint_targets]
+    return [push._replace(again=True, largest=LARGEST) for push in pushes]
+
+
+def _push_in_random_direction(scenario: Scenario, number: int) -> Push:
+    """Returns a push of all joints in a random direction.
+
+    Args:
+        scenario: Description of the experiment.
+        number: Number of the direction, counted from 1. Different numbers have different
+            directions.
+    """
+    push = parse_push(scenario, "q")
+    generator = np.random.Generator(np.random.Philox(number))
+    directions = generator.uniform(-1.0, 1.0, push.by.shape)
+    by = np.where(push.by != 0.0, PUSH_RAD * directions, 0.0)
+    return push._replace(name=f"{push.name}, direction {number}", by=by, direction=number)
 
 
 LEAST_PUSH = 1e-11

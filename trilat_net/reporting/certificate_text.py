@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..analysis.certificate.energy_balance import ZERO_ENERGY_J, EnergyBalance
-from ..analysis.certificate.observed_energy import ObservedFinding
+from ..analysis.certificate.observed_energy import NEGATIVE_ENERGY_MEANING, ObservedFinding
 from ..analysis.certificate.premises import Premise
 from ..analysis.certificate.stability_certificate import Certificate, StabilityFinding
 from ..analysis.envelope_trend import EnvelopeTrend
@@ -56,11 +56,10 @@ def compose_certificate(certificate: Certificate) -> Iterator[Block]:
         yield MarkedText(MARKS[line.mark], line.text)
 
     observed = certificate.observed
-    premises = list(certificate.premises)
-    if observed is not None:
-        premises += observed.premises
-    yield ""
-    yield _tabulate_premises(premises)
+    premises = _select_premises(certificate)
+    if premises:
+        yield ""
+        yield _tabulate_premises(premises)
 
     if observed is not None and observed.least:
         rows = []
@@ -75,6 +74,20 @@ def compose_certificate(certificate: Certificate) -> Iterator[Block]:
         cells = [(name, f"{energy_j:.4g}") for name, energy_j in energies]
         yield ""
         yield TextTable(("energy", "J"), cells, align="lr")
+
+
+def _select_premises(certificate: Certificate) -> list[Premise]:
+    """Returns the premises that apply to the control laws of a run.
+
+    The premises of the stability theorem concern its energy function V. They are left out for
+    laws for which V does not exist; only the walls, and the law's own premises, remain.
+    """
+    premises = list(certificate.premises)
+    if not certificate.has_functional:
+        premises = [premise for premise in premises if premise.name == "walls"]
+    if certificate.observed is not None:
+        premises += certificate.observed.premises
+    return premises
 
 
 def _tabulate_premises(premises: Sequence[Premise]) -> TextTable:
@@ -134,6 +147,8 @@ def describe_certificate(certificate: Certificate) -> list[CertificateLine]:
     observed = certificate.observed
     if observed is not None:
         lines.append(CertificateLine(_OBSERVED_MARKS[observed.finding], observed.text))
+        if observed.finding is ObservedFinding.NEGATIVE:
+            lines.append(CertificateLine("note", NEGATIVE_ENERGY_MEANING))
     roots = certificate.roots
     if roots is not None:
         # Roots of an approximation cannot show stability.
@@ -157,12 +172,13 @@ def _describe_verdict(certificate: Certificate) -> list[CertificateLine]:
     if certificate.verdict.finding is StabilityFinding.BROKEN:
         stability_mark = "FAIL"
         verdict_mark = "FAIL"
+    lines = [CertificateLine(stability_mark, describe_judgement(certificate))]
+    if certificate.has_functional:
+        lines.append(CertificateLine(verdict_mark, certificate.verdict.text))
+    lines += [CertificateLine("note", text) for text in certificate.law_conditions]
     end_mark = _JUDGEMENT_MARKS[certificate.end.stability]
-    return [
-        CertificateLine(stability_mark, describe_judgement(certificate)),
-        CertificateLine(verdict_mark, certificate.verdict.text),
-        CertificateLine(end_mark, f"e and qd: {certificate.end.text}"),
-    ]
+    lines.append(CertificateLine(end_mark, f"e and qd: {certificate.end.text}"))
+    return lines
 
 
 def _describe_evidence(certificate: Certificate) -> CertificateLine:
@@ -202,6 +218,7 @@ def describe_judgement(certificate: Certificate) -> str:
 
 _JUDGEMENT_MARKS = {
     Stability.STABLE: "ok",
+    Stability.SETTLED: "ok",
     Stability.NOT_STABLE: "FAIL",
     Stability.OPEN: "open",
 }

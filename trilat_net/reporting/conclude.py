@@ -30,7 +30,7 @@ from ..log.log_reader import Log
 from ..log.mcap_reader import Progress
 from ..process import worker_pool
 from ..scenario.imported_code import allowed_code
-from ..theory.linear_analysis import certify_run
+from ..theory.run_certificate import certify_run
 from .certificate_text import CertificateLine, describe_certificate
 from .result_text import MARKS, Block, MarkedText, TextTable
 from .summary_text import format_run_lines

@@ -648,8 +648,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
 
         scene = self._build_scene()
         result = self.task.judge(scene)
-        has_flags = isinstance(result, tuple)
-        judgement = Judgement(*result) if has_flags else Judgement(result)
+        judgement = Judgement(*result) if isinstance(result, tuple) else Judgement(result)
         diverged = self._run.diverged_s is not None
         terminated = judgement.succeeded or judgement.failed or diverged
         next_k = self._k + self._ticks_per_step

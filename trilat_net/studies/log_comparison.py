@@ -20,7 +20,7 @@ from ..reporting.result_text import Block, MarkedText, TextTable, format_number
 from ..results import Result
 from ..scenario.describe import ScenarioDifference, compare_scenarios
 from ..scenario.scenario_reader import reseed_scenario
-from ..theory.linear_analysis import certify_run
+from ..theory.run_certificate import certify_run
 from .intervals import MeanInterval, mean_interval
 from .tuning.candidate import check_final_posture
 

@@ -326,6 +326,7 @@ class Spectrum(NamedTuple):
             ticks are alike.
         deviation_per_s: Standard deviation of the rightmost root between parts of the span, in
             1/s. None if delays repeat.
+        is_exact: False if the delays of the loop do not repeat exactly after the span.
     """
 
     roots: tuple[CharacteristicRoot, ...]
@@ -335,6 +336,7 @@ class Spectrum(NamedTuple):
     order: int
     span_s: float | None = None
     deviation_per_s: float | None = None
+    is_exact: bool = True
 
     @property
     def basis(self) -> str:
@@ -346,8 +348,10 @@ class Spectrum(NamedTuple):
         """
         if self.span_s is None:
             return ""
-        if self.deviation_per_s is None:
+        if self.is_exact:
             return f", over the period of {self.span_s:.6g} s"
+        if self.deviation_per_s is None:
+            return f", over {self.span_s:.6g} s, after which the delays nearly repeat"
         deviation = f"+- {self.deviation_per_s:.1g} /s"
         return f", over {self.span_s:.4g} s of the delays in use, {deviation}"
 

@@ -485,6 +485,26 @@ def _iterate_memories(
     return rest._replace(theta_hat=theta_hat)
 
 
+def settle_memories(conditions: OperatingConditions, state: Equilibrium) -> Equilibrium:
+    """Returns a state in which the memories of imported control laws suit its pose.
+
+    The memory of an imported law, a law that a user wrote, takes the position of its estimate.
+    It starts with its initial values, and the law is called in the pose of the state until the
+    memory is constant. The estimates of other laws stay.
+
+    Args:
+        conditions: The sites, gains and delays of the loop.
+        state: Angles and estimates of all sites.
+    """
+    initial = _complete_estimates(conditions)
+    rows = []
+    for n, site in enumerate(conditions.sites):
+        is_imported = isinstance(site.law_factory, NumericLaw)
+        rows.append(initial[n] if is_imported else state.theta_hat[n])
+    initialised = state._replace(theta_hat=pad_rows(rows))
+    return _iterate_memories(conditions, initialised, _SETTLING_TICKS)
+
+
 def _build_at_pose(pose: tuple[float, ...], conditions: OperatingConditions) -> Equilibrium:
     """Returns the pose that the user requests, with true estimates and its residual.
 

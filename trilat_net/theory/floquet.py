@@ -45,10 +45,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag, expm
 
-from ..core.delay import DelayKind, TraceEnd
 from ..core.site_setup import Law, Scheme, SiteSetup
 from ..core.vectors import Array, IntArray
 from ..scenario.delay_models import LinkBase
+from ..scenario.delay_period import MAX_NEAR_PERIOD_S, find_delay_period
 from ..scenario.sample_uses import draw_used_samples
 from .characteristic_roots import (
     NAMED_SHARE,
@@ -275,19 +275,12 @@ def couple_ticks(conditions: OperatingConditions, rest: Equilibrium) -> CoupledT
     )
 
 
-MAX_PERIOD_S = 60.0
-"""Longest period that is searched, and longest analysed span of a delay trace, in s."""
 DRAWN_SPAN_S = 30.0
 """Analysed span of delays that are drawn at random, in s."""
 _LEAST_SPAN_S = 0.5
 """Shortest analysed span, in s.
 
 Shorter periods, and periods shorter than twice the ages, are repeated.
-"""
-_SLIP = 0.05
-"""Largest change of delays that count as repeating after a span, as a share of a tick.
-
-If there is no such span, the span with the smallest slip is used, up to half a tick.
 """
 _PART_TICKS = 100
 """Ticks of the fastest site after which columns are scaled.
@@ -321,64 +314,14 @@ class SamplesInUse(NamedTuple):
             the span has the number 0.
         period_s: Time after which the pattern of ticks and delays repeats, in s. The span
             contains it a whole number of times. None if the pattern does not repeat.
+        is_exact: True if the pattern repeats exactly, False if it repeats to within half a tick
+            or not at all.
     """
 
     span_s: float
     used: Mapping[tuple[int, int], IntArray]
     period_s: float | None = None
-
-
-def _find_cycle_s(link: LinkBase) -> float:
-    """Returns the period of a link's delay, in s. 0 if it is constant or does not repeat."""
-    model = link.to_core_model()
-    points = link.points
-    if points is not None and model.kind == DelayKind.TRACE and len(points) > 1:
-        # the last point lasts as long as the point before it
-        last_us = points[-1, 0]
-        end_us = 2 * last_us - points[-2, 0]
-        return float(end_us) * 1e-6
-    if model.kind == DelayKind.SINE:
-        return float(model.extra) * 1e-6
-    return 0.0
-
-
-def _is_ending_trace(link: LinkBase) -> bool:
-    """Returns True if a link plays a delay trace that does not repeat."""
-    model = link.to_core_model()
-    return model.kind == DelayKind.TRACE and model.at_end == TraceEnd.HOLD
-
-
-def _find_period_s(links: Sequence[LinkBase], rates_hz: Sequence[int]) -> float | None:
-    """Returns the period after which tick rates and delays repeat, in s.
-
-    Args:
-        links: The links whose delays vary.
-        rates_hz: Tick rate of each site.
-
-    Returns:
-        The period. None if they do not repeat.
-    """
-    common_hz = math.gcd(*rates_hz)
-    span_count = round(MAX_PERIOD_S * common_hz)
-    spans_s = np.arange(1, span_count + 1) / common_hz
-    # share of a tick by which the delays fail to repeat after each span
-    slips = np.zeros(len(spans_s))
-    for link in links:
-        cycle_s = _find_cycle_s(link)
-        if not cycle_s:
-            continue
-        cycles = np.maximum(1.0, np.round(spans_s / cycle_s))
-        difference_s = np.abs(spans_s - cycle_s * cycles)
-        slips = np.maximum(slips, difference_s * max(rates_hz))
-
-    limit = max(_SLIP, float(slips.min()))
-    first_match = int(np.argmax(slips <= limit))
-    for link in links:
-        if link.random or _is_ending_trace(link):
-            return None
-    if slips[first_match] > 0.5:
-        return None
-    return float(spans_s[first_match])
+    is_exact: bool = False
 
 
 def find_samples_in_use(conditions: OperatingConditions) -> SamplesInUse:
@@ -399,7 +342,8 @@ def find_samples_in_use(conditions: OperatingConditions) -> SamplesInUse:
     links: list[LinkBase] = []
     if conditions.varying:
         links = [link for link, _ in conditions.links.values()]
-    period_s = _find_period_s(links, rates_hz)
+    period = find_delay_period(links, rates_hz)
+    period_s = period.span_s
     delays_ms = [sum(link.moments()) + link.playout_ms for link in links]
     reach_ms = max(delays_ms, default=0.0)
     if period_s is not None:
@@ -409,7 +353,7 @@ def find_samples_in_use(conditions: OperatingConditions) -> SamplesInUse:
         span_s = period_s * periods
     else:
         is_drawn = any(link.random for link in links)
-        longest_s = DRAWN_SPAN_S if is_drawn else MAX_PERIOD_S
+        longest_s = DRAWN_SPAN_S if is_drawn else MAX_NEAR_PERIOD_S
         span_s = math.ceil(longest_s * common_hz) / common_hz
     # the span starts when samples no longer depend on the start of the run
     settled_s = 4e-3 * reach_ms + 0.1
@@ -430,7 +374,7 @@ def find_samples_in_use(conditions: OperatingConditions) -> SamplesInUse:
         else:
             sample_times_s = ticks / hz - conditions.age_s[i, j]
             used[i, j] = np.rint(sample_times_s * peer_hz).astype(np.int64)
-    return SamplesInUse(span_s, used, period_s)
+    return SamplesInUse(span_s, used, period_s, is_exact=period.is_exact)
 
 
 class _TickRun(NamedTuple):
@@ -793,6 +737,7 @@ def compute_sampled_spectrum(
             dropped=0,
             order=0,
             span_s=span_s,
+            is_exact=uses.is_exact,
         )
     with limit_blas_threads():
         span = _SpanMap(loop, rates_hz, uses)
@@ -825,6 +770,7 @@ def compute_sampled_spectrum(
         order=0,
         span_s=span_s,
         deviation_per_s=deviation_per_s,
+        is_exact=uses.is_exact,
     )
 
 

@@ -17,28 +17,17 @@ Invariant:
     - The verdict holds for small motions about the equilibrium only.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import permutations
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import msgspec
 import numpy as np
 
-from ..analysis.certificate.stability_certificate import Certificate, EndPoseRoots, certify
-from ..analysis.run_end import SETTLED_SPEED_RAD_S
-from ..analysis.timeline import recorded_end_s
-from ..analysis.twin_growth import TWINS, measure_twins
 from ..core.vectors import Array
-from ..errors import ScenarioError, UsageError
-from ..log.accounting import MIN_COVERAGE
-from ..log.log_reader import Log
-from ..log.site_log import SiteLog
+from ..errors import UsageError
 from ..results import Result
 from ..scenario import Scenario, load_scenario
-from ..scenario.delay_models.kernel_delays import ConstantDelay
 from ..scenario.describe import (
     IRREVERSIBLE_SHARES,
     describe_law_conditions,
@@ -46,9 +35,9 @@ from ..scenario.describe import (
 )
 from .characteristic_roots import CharacteristicRoot, Spectrum, compute_delay_spectrum
 from .delay_margin import DelayMargin, find_delay_margin
-from .equilibrium import find_equilibrium, follow_equilibrium, pad_rows
-from .floquet import DRAWN_SPAN_S, SamplesInUse, compute_sampled_spectrum
-from .linear_edge import EdgeScan, find_deepest_contact, iterate_linear_edges, parse_edge_range
+from .equilibrium import find_equilibrium
+from .floquet import compute_sampled_spectrum
+from .linear_edge import EdgeScan, iterate_linear_edges, parse_edge_range
 from .linear_loop import LinearLoop, compute_shared_poses, linearise_loop
 from .numeric_law import NumericLaw
 from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
@@ -343,230 +332,3 @@ def _spectrum_to_json(spectrum: Spectrum) -> dict[str, Any]:
         "span_s": spectrum.span_s,
         "deviation_per_s": spectrum.deviation_per_s,
     }
-
-
-_ROOTS = 2
-"""Number of rightmost roots that are computed at the end of a run."""
-
-
-def certify_run(
-    log: Log,
-    *,
-    min_coverage: float = MIN_COVERAGE,
-    own_laws: bool = False,
-    twins: int = TWINS,
-) -> Certificate:
-    """Certifies whether a recorded run was stable, with all available checks.
-
-    In addition to the checks of `certify`, the run is repeated with small pushes, to see
-    whether disturbances grow. The characteristic roots of the coupled arms are computed at the
-    end pose.
-
-    Args:
-        log: The log of the run.
-        min_coverage: Least fraction of the ticks (periods of the control loop) of each arm's
-            process that must be recorded.
-        own_laws: True if the code of users' control laws may be executed.
-        twins: Number of repeated runs with a push. 0 for none.
-
-    Raises:
-        LogError: A record cannot be read, or names a change that does not exist.
-    """
-    certificate = certify(log, min_coverage=min_coverage, own_laws=own_laws)
-    growth = None
-    if twins:
-        growth = measure_twins(log, certificate.end, twins, own_laws=own_laws)
-    return replace(certificate, roots=find_end_pose_roots(log), twins=growth)
-
-
-def find_end_pose_roots(log: Log) -> EndPoseRoots:
-    """Computes whether small motions about the end pose of a recorded run die away.
-
-    The control loop is linearised at this pose, and its characteristic roots are computed.
-
-    Args:
-        log: The log of the run.
-
-    Returns:
-        The roots, or the reason why there are none.
-    """
-    site_logs = [log[site] for site in log.sites]
-    if not all(map(len, site_logs)):
-        return _explain_no_roots("a site has no records")
-    if any(site_log.mode[-1] == "diverged" for site_log in site_logs):
-        return _explain_no_roots("the run diverged")
-    if any(log.changes(site) for site in log.sites):
-        return _explain_no_roots("commands changed the loop while it ran")
-
-    fixed = _fix_delays(log)
-    try:
-        conditions = derive_operating_conditions(fixed.scenario, own_laws=False)
-        for pair, age_s in fixed.mean_age_s.items():
-            conditions.age_s[pair] = age_s
-        q, theta_hat = _choose_end_state(fixed.scenario, site_logs)
-        end = Equilibrium(q, theta_hat, "the end of the log", 0.0)
-        rest = follow_equilibrium(fixed.scenario, end)
-    except ScenarioError as error:
-        return _explain_no_roots(error.problem)
-
-    sampled = compute_sampled_spectrum(conditions, rest, _ROOTS, fixed.uses)
-    if sampled is not None:
-        return _describe_end_pose_roots(
-            sampled, sampled.basis, exact=sampled.deviation_per_s is None
-        )
-
-    continuous = compute_delay_spectrum(linearise_loop(conditions, rest), _ROOTS)
-    basis = ", in continuous time"
-    if conditions.varying or fixed.mean_age_s:
-        basis += ", of the mean ages"
-    return _describe_end_pose_roots(continuous, basis, exact=False)
-
-
-def _describe_end_pose_roots(spectrum: Spectrum, basis: str, *, exact: bool) -> EndPoseRoots:
-    """Returns the rightmost root and the verdict, as the certificate states them.
-
-    Args:
-        spectrum: The roots at the end pose.
-        basis: A phrase that states over which ticks the roots are computed.
-        exact: True if no delay is averaged or assumed to repeat.
-    """
-    root = spectrum.rightmost
-    verdict = spectrum.verdict
-    if root is None:
-        return EndPoseRoots(verdict, None, exact, f"this rest: {verdict}, without roots")
-
-    omega = f" at {abs(root.s.imag):.4g} rad/s" if root.s.imag else ""
-    drift = ""
-    if spectrum.drifting:
-        drift = f"{spectrum.drifting} of its motions keep their speed, the others "
-    text = f"this rest: {verdict}, {drift}{root.s.real:+.3g} /s{omega}{basis}"
-    return EndPoseRoots(verdict, root.s.real, exact, text)
-
-
-class _FixedDelays(NamedTuple):
-    """A recorded scenario in which every delay is known.
-
-    Attributes:
-        scenario: The scenario up to the end of the records. A link whose delays only the
-            records show has its constant mean delay.
-        uses: The samples in use in the last quarter of the run. None if the scenario determines
-            all delays, or if no sample was received over some link.
-        mean_age_s: Mean age of the samples on links with unknown delays, in s, by (index of the
-            receiver, index of the sender).
-    """
-
-    scenario: Scenario
-    uses: SamplesInUse | None
-    mean_age_s: dict[tuple[int, int], float]
-
-
-def _fix_delays(log: Log) -> _FixedDelays:
-    """Returns the scenario of a log with the delays that the records show.
-
-    A tick without a record is assumed to use the samples of the tick before.
-    """
-    scenario = msgspec.structs.replace(log.scenario, duration_s=recorded_end_s(log))
-    has_unknown_delay = {}
-    for name, link in scenario.links.items():
-        has_trace = link.points is not None
-        has_unknown_delay[name] = link.random or link.measured or has_trace
-    if not any(has_unknown_delay.values()):
-        return _FixedDelays(scenario, None, {})
-
-    sites = [log[name] for name in scenario.names]
-    links = dict(scenario.links)
-    rates_hz = [site.rate_hz for site in sites]
-    common_hz = math.gcd(*rates_hz)
-    # start and end of the last quarter, in ticks of the common rate
-    last_ticks = [int(site.tick[-1]) * common_hz // site.rate_hz for site in sites]
-    end = max(1, min(last_ticks))
-    start = max(3 * end // 4, end - round(DRAWN_SPAN_S * common_hz))
-
-    used = {}
-    mean_age_s = {}
-    for (i, site), (j, peer) in permutations(enumerate(sites), 2):
-        first_tick = start * site.rate_hz // common_hz
-        end_tick = end * site.rate_hz // common_hz
-        ticks = np.arange(first_tick, end_tick)
-        rows_after = np.searchsorted(site.tick, ticks, side="right")
-        rows = np.maximum(rows_after - 1, 0)
-        samples = site.used[peer.name][rows]
-        if samples.min() < 0:
-            # the peer had not sent a sample yet, or never sent a sample
-            return _FixedDelays(scenario, None, {})
-
-        first_sample = start * peer.rate_hz // common_hz
-        used[i, j] = samples - first_sample
-        name = f"{peer.name}->{site.name}"
-        if has_unknown_delay[name]:
-            ages_s = ticks / site.rate_hz - samples / peer.rate_hz
-            mean_age_s[i, j] = float(ages_s.mean())
-            links[name] = ConstantDelay(delay_ms=1e3 * mean_age_s[i, j])
-
-    span_s = (end - start) / common_hz
-    uses = SamplesInUse(span_s, used)
-    fixed_scenario = msgspec.structs.replace(scenario, links=links)
-    return _FixedDelays(fixed_scenario, uses, mean_age_s)
-
-
-def _explain_no_roots(reason: str) -> EndPoseRoots:
-    """Returns a result without roots, with the reason."""
-    return EndPoseRoots("", None, False, f"this rest: no roots: {reason}")
-
-
-def _choose_end_state(scenario: Scenario, site_logs: Sequence[SiteLog]) -> tuple[Array, Array]:
-    """Chooses the angles and the estimates of all sites at the end of a run.
-
-    For a site at rest they are those of the last record, for any other site the mean of the
-    last quarter. If arms chatter at a sampled wall, the state of the last quarter that is
-    deepest in the wall is chosen.
-
-    Args:
-        scenario: Scenario of the run.
-        site_logs: Logs of all sites.
-
-    Returns:
-        Angles, shape (N, n), in rad.
-        Estimates, shape (N, P).
-    """
-    count = min(map(len, site_logs))
-    rows = slice(3 * count // 4, count)
-    first_times = site_logs[0].t_s[rows]
-    have_same_times = True
-    for site_log in site_logs:
-        have_same_times &= np.array_equal(site_log.t_s[rows], first_times)
-
-    if have_same_times and not all(map(_is_at_rest, site_logs)):
-        joints = max(site_log.q.shape[1] for site_log in site_logs)
-        padded = []
-        for site_log in site_logs:
-            missing_joints = joints - site_log.q.shape[1]
-            padding = ((0, 0), (0, missing_joints))
-            padded.append(np.pad(site_log.q[rows], padding))
-        q = np.stack(padded, axis=1)
-        deepest = find_deepest_contact(scenario, q)
-        if deepest is not None:
-            estimates = [site_log.theta_hat[rows][deepest] for site_log in site_logs]
-            return q[deepest], pad_rows(estimates)
-
-    angles = [_find_end_value(site_log, site_log.q) for site_log in site_logs]
-    estimates = [_find_end_value(site_log, site_log.theta_hat) for site_log in site_logs]
-    return pad_rows(angles), pad_rows(estimates)
-
-
-def _is_at_rest(site_log: SiteLog) -> bool:
-    """Returns True if no joint moved faster than `SETTLED_SPEED_RAD_S` in the last second."""
-    t_s = site_log.t_s
-    in_last_second = t_s > t_s[-1] - 1.0
-    last_speeds = np.abs(site_log.qd[in_last_second])
-    return float(last_speeds.max()) <= SETTLED_SPEED_RAD_S
-
-
-def _find_end_value(site_log: SiteLog, values: Array) -> Array:
-    """Returns a signal's last value if the arm is at rest, else its last quarter's mean."""
-    if _is_at_rest(site_log):
-        return np.asarray(values[-1])
-    t_s = site_log.t_s
-    in_last_quarter = t_s >= 0.75 * t_s[-1]
-    mean = values[in_last_quarter].mean(axis=0)
-    return np.asarray(mean)

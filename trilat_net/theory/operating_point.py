@@ -34,9 +34,9 @@ from ..files import find_page
 from ..laws.conditions import LinearForm, LinearSituation
 from ..scenario import Scenario
 from ..scenario.delay_models import LinkBase
+from ..scenario.delay_period import find_final_link
 from ..scenario.imported_code import ImportedLaw
 from ..scenario.sample_uses import draw_used_samples
-from ..scenario.scenario_types import scheduled_links
 from ..scenario.validate import refuse_external_arms
 from .numeric_law import NumericLaw
 from .site_dynamics import SiteRates, evaluate_site_rates
@@ -338,8 +338,8 @@ def _explain_missing_gains(law: Any) -> str:
     """Returns the reason why a law has no linear loop, as part of a sentence."""
     if isinstance(law, ImportedLaw):
         return (
-            f"{law.code} is known by its code only; "
-            "trilat linear runs that code, and this command does not"
+            f"{law.code} is known by its code only, which may not run here; "
+            "trilat linear and trilat certify --own-laws run it"
         )
     others = (
         "adaptive, adaptive_box, p_d, pd_d, p_f and others have one, "
@@ -360,11 +360,7 @@ def _find_final_link(scenario: Scenario, name: str, notes: list[str]) -> LinkBas
     Raises:
         ScenarioError: The delay of the link is measured during the run, and unknown before.
     """
-    end_ns = round(scenario.duration_s * 1e9)
-    link: LinkBase = scenario.links[name]
-    for from_ns, later in scheduled_links(scenario.timeline, name):
-        link = later if from_ns <= end_ns else link
-
+    link = find_final_link(scenario, name)
     if link.measured:
         raise ScenarioError(
             "must not be 'measured', because the delay of a measured link is not known "

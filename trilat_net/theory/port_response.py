@@ -201,8 +201,8 @@ def build_admittance(loop: LinearLoop) -> PortResponse:
     torques = loop.B.shape[1]
     if velocities != torques:
         raise RuntimeFault(
-            "a loop with ports must have as many velocities as torques, but there are "
-            f"{velocities} velocities and {torques} torques"
+            "a loop with ports must have as many velocities as torques, but their numbers are "
+            f"{velocities} and {torques}"
         )
 
     def evaluate_admittance(w_rad_s: Array) -> Complex:

@@ -4,6 +4,7 @@ Energies of the built-in laws that keep account of it, as the certificate books 
 """
 
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,15 +13,21 @@ import pytest
 from tests.energy_runs import CONSTANT, FOLLOWER, JITTER, LAWS, pair
 from tests.log_editing import edited, opened, recorded
 from tests.unit_arm import hand, unit_scenario
-from trilat_net.analysis.certificate.observed_energy import ObservedFinding, observe_energies
+from trilat_net.analysis.certificate.observed_energy import (
+    NEGATIVE_ENERGY_MEANING,
+    ObservedFinding,
+    observe_energies,
+)
 from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net.analysis.run_end import Stability
 from trilat_net.errors import LogError
 from trilat_net.execution.virtual import simulate_scenario
+from trilat_net.files import find_page
 from trilat_net.log.log_reader import Log
 from trilat_net.reporting.certificate_text import describe_certificate
 from trilat_net.reporting.figures.registry import figure
 from trilat_net.scenario import load_scenario
+from trilat_net.studies.tuning.tuning_report import list_energy_notes
 
 B, DELAY_S, TO, HAND, WALL = 10.0, 0.05, 0.3, 50.0, 1000.0
 PAIR = f"""
@@ -169,6 +176,7 @@ def test_jolt_beyond_reserve_leaves_observer_negative_and_certificate_says_so() 
         simulate_scenario(load_scenario("two_sites", {**changes, "control.reserve_J": 0.0}))
     )
     assert found.observed.finding is ObservedFinding.NEGATIVE
+    assert ("note", NEGATIVE_ENERGY_MEANING) in describe_certificate(found)
     known = next(one for one in found.observed.least if one.name == "known at s of m")
     assert known.amount_j < -1e-7
     assert found.observed.text in found.reasons
@@ -235,3 +243,17 @@ def test_a_record_without_the_laws_memory_is_told(mem: list[float]) -> None:
     assert observe_energies(opened(data)).curves
     with pytest.raises(LogError, match="a record of s does not have"):
         observe_energies(opened(broken))
+
+
+def test_three_places_explain_a_negative_energy_in_the_same_words() -> None:
+    """The certificate, `compare --tune` and the page of the laws."""
+    page = find_page("laws.md").read_text(encoding="utf-8")
+    assert NEGATIVE_ENERGY_MEANING in " ".join(page.split())
+    tuned: Any = SimpleNamespace(
+        found=[SimpleNamespace(space=SimpleNamespace(law=law)) for law in ("p_d", "tdpa")]
+    )
+    (note,) = list_energy_notes(tuned)
+    assert note.startswith("tdpa declare")
+    assert note.endswith(NEGATIVE_ENERGY_MEANING)
+    tuned.found.pop()
+    assert list_energy_notes(tuned) == []

@@ -16,12 +16,12 @@ from tests.log_editing import edited, opened, recorded, without
 from tests.log_surgery import taken_apart
 from trilat_net.analysis.certificate.stability_certificate import (
     Certificate,
-    EndPoseRoots,
     StabilityFinding,
     certify,
     describe_unsupplied_growth,
 )
 from trilat_net.analysis.run_end import EndBehaviour, Stability
+from trilat_net.analysis.stability_decision import LoopRoots
 from trilat_net.log.log_reader import Log
 from trilat_net.net.messages import State
 from trilat_net.scenario import parse_scenario
@@ -239,13 +239,14 @@ def test_a_broken_balance_is_never_accepted() -> None:
     assert not found.accepts(("bounded", "open"))
 
 
-def test_an_unstable_rest_leaves_a_run_open() -> None:
-    roots = EndPoseRoots("unstable", 0.012, True, "this rest: unstable, +0.012 /s")
-    assert replace(still(), roots=roots).stability is Stability.OPEN
-    assert roots.text in replace(still(), roots=roots).reasons
-    assert not replace(
-        still(), roots=roots._replace(exact=False)
-    ).passed  # a doubt, if no proof
+def test_an_unstable_rest_refutes_or_leaves_a_run_open() -> None:
+    roots = LoopRoots("unstable", 0.012, True, "this rest: unstable, +0.012 /s")
+    refuted = replace(still(), roots=roots)
+    assert refuted.stability is Stability.NOT_STABLE
+    assert refuted.headline().endswith("rests on: exact roots, fastest growing +0.012 /s")
+    doubtful = replace(still(), roots=roots._replace(exact=False))
+    assert doubtful.stability is Stability.OPEN
+    assert roots.text in doubtful.reasons
     assert replace(still(), roots=roots._replace(verdict="stable")).passed
 
 

@@ -21,7 +21,7 @@ from trilat_net.studies.sweep.sweep_cell import (
     classify_end,
     is_conclusive,
 )
-from trilat_net.theory.linear_analysis import certify_run
+from trilat_net.theory.run_certificate import certify_run
 
 RUNS: dict[str, tuple[str, dict[str, Any]]] = {
     "converged": ("two_sites", {"duration_s": 20.0}),
@@ -131,11 +131,9 @@ def test_few_per_cent_beside_edge_word_is_right(d: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("d", "verdict"), [(0.93, CellClass.UNDECIDED), (1.0, CellClass.CONVERGED)]
+    ("d", "verdict"), [(0.93, CellClass.BOUNDED), (1.0, CellClass.CONVERGED)]
 )
-def test_what_hardly_moves_beside_an_unstable_rest_is_undecided(
-    d: float, verdict: CellClass
-) -> None:
+def test_roots_decide_about_arms_that_hardly_move(d: float, verdict: CellClass) -> None:
     """Arms 1e-3 rad apart: by their speed they rest, and the rightmost root is +0.002 /s or -0.02 /s."""
     starts = {
         f"sites.{name}.q0_rad": [-0.6, 1.8 + off]
@@ -157,15 +155,17 @@ def test_a_run_that_diverges_says_when() -> None:
     assert found.end_speed_rad_s > 5.0
 
 
-def test_a_cell_and_a_trial_see_no_roots() -> None:
-    """The limit that docs/definitions.md states: arms that start at one pose stay, however unstable it is."""
+def test_a_trial_sees_no_roots_but_a_cell_and_a_certificate_do() -> None:
+    """Arms that start at one pose stay there, however unstable it is (docs/definitions.md)."""
     together = {f"sites.{name}.q0_rad": [0.2, 0.3] for name in ("m1", "m2", "s")}
     scenario = load_scenario(
         "p_d_margin", {**together, "control.d": 0.5, "rate_hz": 100, "duration_s": 5.0}
     )
-    assert classify_cell(scenario.text, 5.0).verdict is CellClass.CONVERGED
-    assert measure_virtual_run(scenario).end.stability is Stability.STABLE
+    cell = classify_cell(scenario.text, 5.0)
+    assert cell.verdict is CellClass.BOUNDED
+    assert "this rest: unstable" in cell.reasons
+    assert measure_virtual_run(scenario).end.stability is Stability.SETTLED
     found = certify_run(trilat_net.simulate(scenario))
-    assert found.end.stability is Stability.STABLE
-    assert found.stability is Stability.OPEN
-    assert [reason[:14] for reason in found.reasons] == ["twins: a push ", "this rest: uns"]
+    assert found.end.stability is Stability.SETTLED
+    assert found.stability is Stability.NOT_STABLE
+    assert found.decision.rests_on.startswith("exact roots, fastest growing +")

@@ -153,7 +153,7 @@ def test_what_is_no_range_is_refused(text: str) -> None:
 def test_a_range_is_read_as_it_is_written() -> None:
     assert parse_search_range("control.d=0.2:3") == WITHIN
     assert format_range_axis(WITHIN) == "control.d=0.2,3"
-    with pytest.raises(UsageError, match="share of the edge's value"):
+    with pytest.raises(UsageError, match="fraction of the value at the edge"):
         parse_search_range("control.d=0.2:3", 0.0)
 
 

@@ -193,7 +193,10 @@ def test_a_scenario_that_is_live_only_is_refused() -> None:
     ("laws", "words"),
     [
         (["p_dd"], ("laws", "no law 'p_dd'", "did you mean 'p_d'?")),
-        (["mine.laws:Law"], ("no module mine.laws",)),
+        (
+            ["mine.laws:Law"],
+            ("the module mine.laws, which mine.laws:Law names, was not found",),
+        ),
         (["p_d", "p_f"], ("with law p_f", "two sites")),
     ],
 )

@@ -358,7 +358,9 @@ def test_the_compiled_loop_gives_the_records_of_the_ticks(changes: dict[str, Any
         asked, {name: taken.append for name, taken in ticked.items()}
     )
     assert (
-        run_compiled_in_batches(asked, {n: taken.append for n, taken in looped.items()})
+        run_compiled_in_batches(
+            asked, {n: taken.append for n, taken in looped.items()}
+        ).diverged_s
         == diverged_at_s
     )
     for name in asked.names:

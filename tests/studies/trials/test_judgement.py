@@ -98,7 +98,7 @@ def test_a_link_without_samples_meets_no_limit_of_age() -> None:
 @pytest.mark.parametrize(
     ("behaviour", "stability"),
     [
-        (EndBehaviour.DECAYS, Stability.STABLE),
+        (EndBehaviour.DECAYS, Stability.SETTLED),
         (EndBehaviour.HARDLY, Stability.OPEN),
         (EndBehaviour.BOUNDED, Stability.NOT_STABLE),
     ],
@@ -108,7 +108,7 @@ def test_stable_asks_for_the_judgement_and_open_is_neither(
 ) -> None:
     end = CALM.end._replace(behaviour=behaviour)
     outcome = only(Expect(stable=stable), end=end)
-    wanted = Stability.STABLE if stable else Stability.NOT_STABLE
+    wanted = Stability.SETTLED if stable else Stability.NOT_STABLE
     assert outcome.held is (stability is wanted)
     assert outcome.measured == f"{stability}: {end.text}"
     assert only(

@@ -23,6 +23,7 @@ Invariant:
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from functools import cached_property
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -33,7 +34,8 @@ from ...log.accounting import MIN_COVERAGE
 from ...log.log_reader import Log
 from ...results import JsonObject, Result, finite_or_none
 from ..run_end import EndBehaviour, RunEnd, Stability, classify_log_end
-from ..twin_growth import TwinGrowth, TwinVerdict, judge_end_by_twins
+from ..stability_decision import LoopRoots, RunFindings, StabilityDecision, decide_stability
+from ..twin_growth import TwinGrowth
 from . import energy_terms
 from .energy_balance import (
     EXTERNAL_SOURCES,
@@ -130,28 +132,6 @@ class StabilityVerdict(NamedTuple):
     tolerance: float = 0.0
 
 
-class EndPoseRoots(NamedTuple):
-    """Characteristic roots of the control loop, linearised at the pose at which a run ended.
-
-    The roots show whether small motions about this pose die away. They are computed by
-    `theory.linear_analysis` and added to a certificate there.
-
-    Attributes:
-        verdict: "stable", "unstable" or "at the edge", for small motions. Empty if the loop
-            cannot be linearised.
-        rate_per_s: Largest real part of the roots, in 1/s, without those that are zero because
-            of the structure of the loop. None if there is no such root.
-        exact: True if the loop was analysed with its ticks and its repeating delays. Otherwise
-            the roots may cast doubt on a run, but prove nothing.
-        text: The pose and its roots, or the reason why there are no roots.
-    """
-
-    verdict: str
-    rate_per_s: float | None
-    exact: bool
-    text: str
-
-
 @dataclass(frozen=True, repr=False)
 class Certificate(Result):
     """Stability certificate of a recorded run, created by `certify`.
@@ -171,6 +151,9 @@ class Certificate(Result):
         roots: Roots of the loop at the pose where the run ended. None if not computed.
         observed: Check of the energies that control laws declare. None if no law declares any.
         twins: Growth of small pushes in repeated runs. None if not computed.
+        law_proofs: Phrases that name the stability conditions of control laws that hold at
+            every site and prove that small motions die away. Empty if there are none.
+        law_conditions: Sentences on the stability conditions of the control laws of the run.
     """
 
     premises: list[Premise]
@@ -181,9 +164,17 @@ class Certificate(Result):
     paper_balance: EnergyBalance | None = None
     groups: tuple[tuple[str, ...], ...] = ()
     energies: Mapping[str, SiteEnergy] = field(default_factory=lambda: MappingProxyType({}))
-    roots: EndPoseRoots | None = None
+    roots: LoopRoots | None = None
     observed: ObservedEnergy | None = None
     twins: TwinGrowth | None = None
+    law_proofs: tuple[str, ...] = ()
+    law_conditions: tuple[str, ...] = ()
+
+    @property
+    def has_functional(self) -> bool:
+        """True if the energy function V of the stability proof exists for the laws."""
+        laws = [premise.holds for premise in self.premises if premise.name == "law"]
+        return laws != [False]
 
     @property
     def paper_weights_rise(self) -> FunctionalRise | None:
@@ -215,62 +206,55 @@ class Certificate(Result):
         return failed == ["shares"] and constant
 
     @property
-    def reasons(self) -> tuple[str, ...]:
-        """Reasons why the run cannot be called stable, a sentence for each.
+    def proofs(self) -> tuple[str, ...]:
+        """Phrases that name the proofs for this loop, apart from its characteristic roots.
 
-        They come from these checks, in this order: the motion at the end of the run, repeated
-        runs with a small disturbance (twins), the energy of the stability proof, the
-        characteristic roots of the loop at the end pose, the energies that control laws
-        declare, and the completeness of the log.
+        The stability theorem is a proof if all of its premises hold and V did not rise. The
+        stability condition of a control law is a proof if it holds at every site.
         """
-        reasons = [*self.end.reasons]
-        twin_reason = self._twin_verdict.reason
-        if twin_reason:
-            reasons.append(twin_reason)
-        if self.verdict.finding is StabilityFinding.BROKEN:
-            reasons.append(self.verdict.text)
-        elif self.balance is not None:
-            reasons += describe_unsupplied_growth(self.balance, self.verdict.tolerance)
-
-        roots = self.roots
-        if roots is not None and roots.verdict == "unstable":
-            # Twins repeat the recorded ticks. Therefore roots that are not exact do not count
-            # if the twins exclude growth at the rate of the roots.
-            is_disproved = False
-            if self.twins is not None and not roots.exact and roots.rate_per_s is not None:
-                is_disproved = not roots.rate_per_s <= self.twins.excluded_rate_per_s
-            if not is_disproved:
-                reasons.append(roots.text)
-
-        if self.observed is not None and self.observed.finding in _REFUTING_FINDINGS:
-            reasons.append(self.observed.text)
-        reasons += self.evidence.reasons
-        return tuple(reasons)
+        covered = self.verdict.finding is StabilityFinding.COVERED
+        all_hold = all(premise.holds is True for premise in self.premises)
+        theorem = ("the theorem, all of whose premises hold",) if covered and all_hold else ()
+        return (*theorem, *self.law_proofs)
 
     @property
-    def _twin_verdict(self) -> TwinVerdict:
-        """Judgement of the run by its end and, if they were computed, by its twins."""
-        if self.twins is None:
-            return TwinVerdict(self.end.stability)
-        settles = None
-        if self.verdict.finding is StabilityFinding.COVERED:
-            settles = True
-        elif self.roots is not None and self.roots.exact:
-            settles = {"stable": True, "unstable": False}.get(self.roots.verdict)
-        rose = self.verdict.finding is StabilityFinding.ROSE
-        return judge_end_by_twins(self.end, self.twins, settles=settles, rises=rose)
+    def _doubts(self) -> tuple[str, ...]:
+        """Sentences on V, declared energies and the log that contradict a stable run."""
+        doubts = []
+        if self.verdict.finding is StabilityFinding.BROKEN:
+            doubts.append(self.verdict.text)
+        elif self.balance is not None:
+            doubts += describe_unsupplied_growth(self.balance, self.verdict.tolerance)
+        if self.observed is not None and self.observed.finding in _REFUTING_FINDINGS:
+            doubts.append(self.observed.text)
+        return (*doubts, *self.evidence.reasons)
+
+    @cached_property
+    def decision(self) -> StabilityDecision:
+        """The decision whether the run is stable, with its basis and what speaks against it."""
+        findings = RunFindings(
+            end=self.end,
+            twins=self.twins,
+            roots=self.roots,
+            proofs=self.proofs,
+            doubts=self._doubts,
+            rises=self.verdict.finding is StabilityFinding.ROSE,
+        )
+        return decide_stability(findings)
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Sentences on everything that prevents a stable judgement or refutes it.
+
+        They concern the end of the run, V, the roots at the end pose, the energies that control
+        laws declare, and the completeness of the log.
+        """
+        return self.decision.reasons
 
     @property
     def stability(self) -> Stability:
-        """The stability judgement of the run, as a whole.
-
-        The end of the run decides, together with its twins, repeated runs with a small push. If
-        they say "stable" but there are `reasons` against it, the run is left open.
-        """
-        stability = self._twin_verdict.stability
-        if stability is Stability.STABLE and self.reasons:
-            return Stability.OPEN
-        return stability
+        """The stability judgement of the run, as a whole, see `stability_decision`."""
+        return self.decision.stability
 
     @property
     def passed(self) -> bool:
@@ -280,9 +264,8 @@ class Certificate(Result):
     def headline(self) -> str:
         """Returns one line for people: the judgement, and how the run ended."""
         text = f"{self.stability}: {self.end.behaviour}"
-        if self.stability is Stability.STABLE and self.end.stability is not Stability.STABLE:
-            text += ", yet every push dies away"
-        return text
+        rests_on = self.decision.rests_on
+        return f"{text}; rests on: {rests_on}" if rests_on else text
 
     def to_dict(self) -> JsonObject:
         """Returns the certificate as plain values, with the keys of `trilat certify --json`."""
@@ -292,6 +275,7 @@ class Certificate(Result):
         return {
             "passed": self.passed,
             "stability": self.stability.value,
+            "rests_on": self.decision.rests_on,
             "reasons": list(self.reasons),
             "verdict": verdict.finding.name.lower(),
             "text": verdict.text,
@@ -328,14 +312,17 @@ class Certificate(Result):
         A run with a broken energy balance or a changed log is never accepted.
 
         Args:
-            accepted: Further judgements to accept: "bounded" for a bounded oscillation, "open"
-                for a run that cannot be decided.
+            accepted: Further judgements to accept: "settled" for a run that came to rest and
+                whose pushes all died away, "bounded" for a bounded oscillation, "open" for a
+                run that cannot be decided.
         """
         if self.verdict.finding is StabilityFinding.BROKEN:
             return False
         if not self.evidence.integrity.passed:
             return False
         if "bounded" in accepted and self.end.behaviour is EndBehaviour.BOUNDED:
+            return True
+        if "settled" in accepted and self.stability is Stability.SETTLED:
             return True
         if "open" in accepted and self.stability is Stability.OPEN:
             return True

@@ -189,11 +189,10 @@ class LogMetrics(Result):
 
         There is a row for each quantity and each subject (run, site, link or wall) that has it.
         """
-        rows = []
+        rows: list[dict[str, Any]] = []
         for description, metric in self._list_values():
             if metric.applies:
-                result = {"value": metric.value, "why": metric.why}
-                rows.append(description | result)
+                rows.append({**description, "value": metric.value, "why": metric.why})
         return rows
 
     def _list_values(self) -> Iterator[tuple[dict[str, str], Metric]]:

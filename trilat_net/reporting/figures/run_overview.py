@@ -25,7 +25,7 @@ from ...analysis.timeline import recorded_end_s
 from ...core.vectors import Array
 from ...errors import UsageError
 from ...log.log_reader import Log
-from ...theory.linear_analysis import certify_run
+from ...theory.run_certificate import certify_run
 from .. import style
 from ..appearance import REPORT_SIZE, SITE_COLOURS, FigureSize
 from .figure_entry import draws

@@ -160,7 +160,12 @@ _QUANTITIES_BY_TASK = {
     "disagree": ["hand_nm"],
     "contact": ["stiffness_n_m", "force_peak_n"],
 }
-_JUDGEMENTS = (Stability.STABLE, Stability.OPEN, Stability.NOT_STABLE)
+_JUDGEMENTS = (
+    Stability.STABLE,
+    Stability.SETTLED,
+    Stability.OPEN,
+    Stability.NOT_STABLE,
+)
 
 
 class BenchCellResult(NamedTuple):
@@ -194,11 +199,12 @@ class BenchCellResult(NamedTuple):
         """Whether the control law is stable in all runs of this task over this link.
 
         The value is the worst judgement of the runs: not stable if a run is not stable,
-        otherwise open if a run could not be decided, otherwise stable.
+        otherwise open if a run could not be decided, otherwise settled if a run only came to
+        rest, otherwise stable.
         """
-        if self.count(Stability.NOT_STABLE):
-            return Stability.NOT_STABLE
-        return Stability.OPEN if self.count(Stability.OPEN) else Stability.STABLE
+        from_worst = (Stability.NOT_STABLE, Stability.OPEN, Stability.SETTLED)
+        present = [stability for stability in from_worst if self.count(stability)]
+        return present[0] if present else Stability.STABLE
 
     @property
     def masked(self) -> bool:

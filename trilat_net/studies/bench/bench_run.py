@@ -27,13 +27,15 @@ from ...analysis.dominance_history import evaluate_ramps, list_scripted_ramps
 from ...analysis.run_end import THROWN_RAD, RunEnd, Stability
 from ...analysis.site_signals import SETTLED_ERROR_RAD
 from ...analysis.torque_sources import list_walls, wall_force
-from ...analysis.twin_growth import TwinGrowth, judge_end_by_twins, measure_virtual_twins
+from ...analysis.twin_growth import TwinGrowth, measure_virtual_twins
 from ...core.ticks import NS_PER_S
 from ...core.vectors import Array
 from ...errors import UsageError
 from ...files import make_results_folder, refuse_link, write_whole
 from ...scenario import Scenario
 from ...scenario.operators.kernel_operators import ViscousEnvironment
+from ...theory.loop_roots import find_run_roots
+from ...theory.run_certificate import decide_virtual_run
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
 from ..measure_run import RecordBatch, run_whole
 from ..study_folder import RunJournal, StudyFolder, build_resume_hint, describe_program
@@ -164,18 +166,18 @@ def _judge(scenario: Scenario, length_s: float, twins: int) -> _JudgedRun:
         twins: Number of twins.
     """
     scenario = msgspec.structs.replace(scenario, duration_s=length_s)
-    records, end = run_whole(scenario)
+    records, end, run = run_whole(scenario)
     growth = TwinGrowth("no twins were requested")
     if end.diverged_at_s is None and twins:
         growth = measure_virtual_twins(scenario, end, length_s, twins)
-    verdict = judge_end_by_twins(end, growth, settles=None, rises=False)
+    decision = decide_virtual_run(scenario, end, find_run_roots(scenario, run), growth)
     return _JudgedRun(
         scenario=scenario,
         records=records,
         end=end,
         twins=growth,
-        stability=verdict.stability,
-        text=verdict.reason or end.text,
+        stability=decision.stability,
+        text="; ".join(decision.reasons) or decision.rests_on or end.text,
     )
 
 

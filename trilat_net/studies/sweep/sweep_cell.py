@@ -29,6 +29,9 @@ from ...execution.fused import FusedRun, RunTotals, check_fusable
 from ...results import finite_or_none
 from ...scenario import Scenario, parse_scenario
 from ...scenario.validate import refuse_live_only
+from ...theory.characteristic_roots import STABILITY_EDGE_PER_S
+from ...theory.linear_edge import find_contact_growth
+from ...theory.loop_roots import find_run_roots
 
 
 class CellClass(StrEnum):
@@ -59,7 +62,7 @@ def classify_end(end: RunEnd) -> CellClass:
     Args:
         end: Judgement of the end of the run.
     """
-    if end.stability is Stability.STABLE:
+    if end.stability is Stability.SETTLED:
         return CellClass.CONVERGED
     if end.stability is not Stability.NOT_STABLE:
         return CellClass.UNDECIDED
@@ -185,6 +188,13 @@ def classify_cell(text: str, longest_s: float) -> CellResult:
         outcome = _build_result(run, scenario, totals, extended)
 
     undecided = CellClass.UNDECIDED
+    roots = find_run_roots(scenario, run)
+    if roots.is_refutation and outcome.verdict is not CellClass.DIVERGED:
+        return msgspec.structs.replace(outcome, verdict=CellClass.BOUNDED, reasons=roots.text)
+    if roots.is_proof and outcome.verdict is CellClass.BOUNDED:
+        return msgspec.structs.replace(outcome, verdict=undecided, reasons=roots.text)
+    if roots.is_proof and outcome.verdict is CellClass.CONVERGED:
+        return outcome
     has_trend = outcome.motion in (EndBehaviour.GROWS, EndBehaviour.DECAYS)
     if scenario.links_random and has_trend and not _has_pronounced_trend(outcome):
         return msgspec.structs.replace(outcome, verdict=undecided)
@@ -259,10 +269,6 @@ def _advance_in_contact(scenario: Scenario, run: FusedRun) -> float:
     states = run.run_and_sample(scenario.duration_s)
     if run.diverged_s is not None:
         return 0.0
-
-    # Imported here, because SciPy costs a worker half a second and only sampled walls need it.
-    from ...theory.characteristic_roots import STABILITY_EDGE_PER_S
-    from ...theory.linear_edge import find_contact_growth
 
     growth_per_s = find_contact_growth(scenario, *states)
     return growth_per_s if growth_per_s > STABILITY_EDGE_PER_S else 0.0

@@ -1,0 +1,170 @@
+"""What the words stable, settled, not stable and open rest on (docs/definitions.md, "Stable")."""
+
+import math
+
+import pytest
+
+from trilat_net.analysis.envelope_trend import EnvelopeFit, EnvelopeTrend
+from trilat_net.analysis.run_end import EndBehaviour, RunEnd, Stability
+from trilat_net.analysis.stability_decision import (
+    LoopRoots,
+    RunFindings,
+    StabilityDecision,
+    decide_stability,
+)
+from trilat_net.analysis.twin_growth import PushGrowth, RestDeparture, TwinGrowth
+from trilat_net.execution.twins import choose_pushes
+from trilat_net.scenario import load_scenario
+
+PUSHES = choose_pushes(load_scenario("two_sites"))
+STABLE_ROOTS = LoopRoots("stable", -0.163, True, "this rest: stable, -0.163 /s")
+UNSTABLE_ROOTS = LoopRoots("unstable", 0.0424, True, "this rest: unstable, +0.0424 /s")
+NO_ROOTS = LoopRoots("", None, False, "this rest: no roots: its code may not run")
+THEOREM = "the theorem, all of whose premises hold"
+
+
+def end(behaviour: EndBehaviour = EndBehaviour.CONVERGED, **more: object) -> RunEnd:
+    trend = EnvelopeTrend.STEADY
+    if behaviour in (EndBehaviour.CONVERGED, EndBehaviour.DECAYS):
+        trend = EnvelopeTrend.DECAYS
+    if behaviour is EndBehaviour.GROWS:
+        trend = EnvelopeTrend.GROWS
+    fit = EnvelopeFit(trend, -0.1, True)
+    whole = RunEnd(behaviour, fit, fit, end_error_rad=1e-4, end_speed_rad_s=0.5)
+    return whole._replace(**more)
+
+
+def pushed(
+    trend: EnvelopeTrend = EnvelopeTrend.DECAYS, rate_per_s: float = -0.2, **more: object
+) -> TwinGrowth:
+    factor = math.exp(10.0 * rate_per_s)
+    pushes = tuple(
+        PushGrowth(push, trend, rate_per_s, factor, "m joint 1", 0, 1e-7) for push in PUSHES
+    )
+    return TwinGrowth("", from_s=10.0, to_s=20.0, pushes=pushes)._replace(**more)
+
+
+GROWING = pushed(EnvelopeTrend.GROWS, 0.2)
+
+
+def decide(**findings: object) -> StabilityDecision:
+    return decide_stability(RunFindings(**{"end": end(), **findings}))  # type: ignore[arg-type]
+
+
+def test_stable_needs_a_proof() -> None:
+    assert decide().stability is Stability.OPEN
+    assert decide(twins=pushed()).stability is Stability.SETTLED
+    assert decide(twins=pushed(), roots=NO_ROOTS).stability is Stability.SETTLED
+    assert decide(twins=pushed(), roots=STABLE_ROOTS).stability is Stability.STABLE
+    assert decide(twins=pushed(), proofs=[THEOREM]).stability is Stability.STABLE
+    assert decide(proofs=[THEOREM]).stability is Stability.STABLE
+
+
+def test_decision_says_what_it_rests_on() -> None:
+    assert decide(roots=STABLE_ROOTS).rests_on == "exact roots, slowest -0.163 /s"
+    both = decide(roots=STABLE_ROOTS, proofs=[THEOREM])
+    assert both.rests_on == f"{THEOREM}; exact roots, slowest -0.163 /s"
+    settled = decide(twins=pushed(), roots=NO_ROOTS)
+    expected = f"{len(PUSHES)} pushes over 20 s, all of which died away; {NO_ROOTS.text}"
+    assert settled.rests_on == expected
+    moving = end(EndBehaviour.UNDECIDED)
+    assert decide(end=moving, twins=GROWING).rests_on == GROWING.text
+
+
+@pytest.mark.parametrize(
+    "roots", [STABLE_ROOTS._replace(exact=False), STABLE_ROOTS._replace(verdict="at the edge")]
+)
+def test_roots_that_are_not_exact_or_not_stable_prove_nothing(roots: LoopRoots) -> None:
+    assert decide(twins=pushed(), roots=roots).stability is Stability.SETTLED
+
+
+@pytest.mark.parametrize(
+    "behaviour", [b for b in EndBehaviour if b is not EndBehaviour.DIVERGED]
+)
+def test_exact_roots_exclude_the_opposite_word(behaviour: EndBehaviour) -> None:
+    """Whatever the end and the twins of a run within its limits look like."""
+    for twins in (None, pushed(), GROWING, pushed(EnvelopeTrend.STEADY, 0.0)):
+        stable = decide(end=end(behaviour), twins=twins, roots=STABLE_ROOTS)
+        assert stable.stability is not Stability.NOT_STABLE
+        unstable = decide(end=end(behaviour), twins=twins, roots=UNSTABLE_ROOTS)
+        assert unstable.stability is Stability.NOT_STABLE
+        assert unstable.rests_on == "exact roots, fastest growing +0.0424 /s"
+
+
+def test_unstable_roots_of_a_distant_rest_are_a_doubt() -> None:
+    """The run may come to rest in another pose, whose roots may be stable."""
+    distant = UNSTABLE_ROOTS._replace(distance_rad=0.3)
+    decision = decide(twins=pushed(), roots=distant)
+    assert decision.stability is Stability.OPEN
+    assert decision.reasons == (distant.text,)
+    assert decide(twins=pushed(delay_period_s=145.2), roots=distant).stability is (
+        Stability.NOT_STABLE
+    )
+
+
+def test_diverged_run_is_not_stable_whatever_proves_it() -> None:
+    diverged = end(EndBehaviour.DIVERGED, diverged_at_s=3.0)
+    decision = decide(end=diverged, twins=pushed(), roots=STABLE_ROOTS, proofs=[THEOREM])
+    assert decision.stability is Stability.NOT_STABLE
+
+
+@pytest.mark.parametrize(
+    "behaviour", [EndBehaviour.BOUNDED, EndBehaviour.DRIFTS, EndBehaviour.GROWS]
+)
+def test_end_that_is_not_stable_stands_unless_pushes_contradict_it(
+    behaviour: EndBehaviour,
+) -> None:
+    bad = end(behaviour)
+    assert decide(end=bad).stability is Stability.NOT_STABLE
+    assert decide(end=bad, twins=pushed()).stability is Stability.OPEN
+    assert decide(end=bad, twins=GROWING).stability is Stability.NOT_STABLE
+    beat = pushed(EnvelopeTrend.STEADY, 0.0, delay_period_s=592.9)
+    assert decide(end=bad, twins=beat).stability is Stability.OPEN
+
+
+def test_operator_who_acts_leaves_a_run_open() -> None:
+    acting = end(operator_acts=True, reasons=("an operator acts",))
+    for roots in (None, STABLE_ROOTS, UNSTABLE_ROOTS):
+        assert decide(end=acting, twins=GROWING, roots=roots).stability is Stability.OPEN
+
+
+def test_slow_run_agrees_with_a_root_that_its_slowest_push_confirms() -> None:
+    """P+d at 190 ms and d = 0.93: -0.00134 /s, of which 40 s show a factor of 0.97."""
+    slow_root = STABLE_ROOTS._replace(rate_per_s=-0.00134)
+    swinging = end(EndBehaviour.BOUNDED)
+    confirming = pushed(EnvelopeTrend.STEADY, -0.00131)
+    assert decide(end=swinging, twins=confirming, roots=slow_root).stability is Stability.STABLE
+    flat = pushed(EnvelopeTrend.STEADY, 1e-5)
+    open_run = decide(end=swinging, twins=flat, roots=slow_root)
+    assert open_run.stability is Stability.OPEN
+    assert "a run of 4.14e+03 s would tell" in open_run.reasons[0]
+
+
+def test_departure_from_a_rest_is_not_stable_without_a_proof() -> None:
+    leaving = pushed(departure=RestDeparture(1.0, 9.0, 0.3, "m joint 1"))
+    assert decide(twins=leaving).stability is Stability.NOT_STABLE
+    assert decide(twins=leaving, roots=STABLE_ROOTS).stability is not Stability.NOT_STABLE
+
+
+def test_doubts_and_hidden_periods_leave_a_run_open() -> None:
+    doubt = ["V rises at the end"]
+    decision = decide(twins=pushed(), roots=STABLE_ROOTS, doubts=doubt)
+    assert (decision.stability, decision.reasons) == (Stability.OPEN, tuple(doubt))
+    hidden = pushed(delay_period_s=145.2)
+    assert decide(twins=hidden).stability is Stability.OPEN
+    assert decide(twins=hidden, roots=STABLE_ROOTS).stability is Stability.STABLE
+
+
+def test_inexact_unstable_roots_are_a_doubt_unless_twins_exclude_their_rate() -> None:
+    """Pushes that die away over 10 s exclude growth by a hundredfold: 0.46 /s."""
+    slow = UNSTABLE_ROOTS._replace(exact=False)
+    assert decide(twins=pushed(), roots=slow).stability is Stability.OPEN
+    fast = slow._replace(rate_per_s=0.5)
+    assert decide(twins=pushed(), roots=fast).stability is Stability.SETTLED
+
+
+def test_missing_twins_are_explained() -> None:
+    no_twins = TwinGrowth("its law may not run")
+    decision = decide(twins=no_twins)
+    assert decision.stability is Stability.OPEN
+    assert "its law may not run" in decision.reasons[0]

@@ -1,0 +1,192 @@
+"""The final loop of a run and its roots (docs/linear.md; docs/certificate.md, "End of the run")."""
+
+import io
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import trilat_net as tn
+from trilat_net.analysis.run_end import classify_log_end
+from trilat_net.analysis.timeline import list_effective_commands
+from trilat_net.execution import virtual
+from trilat_net.execution.fused import FusedRun
+from trilat_net.log.log_reader import Log, open_log
+from trilat_net.scenario import Scenario, load_scenario
+from trilat_net.scenario.delay_period import find_final_delay_period
+from trilat_net.scenario.run_changes import LinkTables, resolve_change, to_core_change
+from trilat_net.theory.loop_roots import find_log_roots, find_run_roots, resolve_final_scenario
+from trilat_net.theory.run_certificate import certify_run
+
+PAIR = {
+    "arm.g_m_s2": 0.0,
+    "control": {"law": "p_d", "K": 10.0, "d": 2.0},
+    "rate_hz": 200,
+    "sites.m.hands": [],
+    "sites.m.q0_rad": [0.3, 0.1],
+    "sites.s.q0_rad": [0.299, 0.1],
+}
+
+
+def sine(period_s: float, **more: float) -> dict[str, Any]:
+    return {
+        "model": "sine",
+        "delay_ms": 200.0,
+        "amplitude_ms": 195.0,
+        "period_s": period_s,
+        **more,
+    }
+
+
+def pair(**overrides: Any) -> Scenario:
+    return load_scenario("two_sites", {**PAIR, **overrides})
+
+
+def looped_trace(folder: Path, period_s: float) -> dict[str, Any]:
+    """Delays of 60 ms, and of 400 ms in the last tenth of the period."""
+    times_s = np.arange(0.0, period_s, 0.01)
+    delays_ms = np.where(times_s < 0.9 * period_s, 60.0, 400.0)
+    rows = [f"{t:.2f},{delay:.3f}" for t, delay in zip(times_s, delays_ms, strict=True)]
+    (folder / "trace.csv").write_text("t_s,delay_ms\n" + "\n".join(rows) + "\n")
+    return {"model": "trace", "file": str(folder / "trace.csv"), "at_end": "loop"}
+
+
+def measure_growth(scenario: Scenario, until_s: float) -> float:
+    """Growth of the logarithm of the largest |qd| per second, over the last 3/4 of a long run.
+
+    A least-squares line through the maxima of 1 s averages over the beat between the motion and
+    the period of the delays.
+    """
+    run = FusedRun(scenario)
+    run.advance_to(until_s)
+    speeds = np.max([buckets[:, 2:4].max(axis=1) for buckets in run.buckets], axis=0)
+    seconds = len(speeds) // 20
+    maxima = speeds[: 20 * seconds].reshape(seconds, 20).max(axis=1)
+    start = seconds // 4
+    slope, _ = np.polyfit(np.arange(start, seconds), np.log(maxima[start:]), 1)
+    return float(slope)
+
+
+@given(
+    periods=st.lists(st.sampled_from([480, 500, 600, 605, 1210, 1400]), min_size=1, max_size=2),
+    rate_hz=st.sampled_from([100, 200]),
+)
+def test_common_period_is_the_least_common_multiple(periods: list[int], rate_hz: int) -> None:
+    """The shortest time that is a whole number of ticks and of every period of a delay."""
+    links = {
+        f"links.{link}": sine(period / 1000.0)
+        for link, period in zip(("m->s", "s->m"), periods, strict=False)
+    }
+    period = find_final_delay_period(pair(rate_hz=rate_hz, **links))
+    tick = Fraction(1, rate_hz)
+    cycles = [Fraction(ms, 1000) for ms in periods]
+    smallest = next(
+        k * tick
+        for k in range(1, 10**6)
+        if all((k * tick / c).denominator == 1 for c in cycles)
+    )
+    assert period.true_s == pytest.approx(float(smallest), rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    "link",
+    [
+        {"model": "uniform", "delay_ms": 20.0, "half_width_ms": 10.0},
+        {"model": "constant", "delay_ms": 20.0, "loss": 0.1},
+    ],
+)
+def test_random_delays_have_no_period(link: dict[str, Any]) -> None:
+    assert find_final_delay_period(pair(link=link)).true_s is None
+
+
+def test_two_sinusoids_have_the_growth_of_their_common_period() -> None:
+    """0.6 s and 0.7 s repeat after 4.2 s; one more second of delay swings the pair up."""
+    links = {"links.m->s": sine(0.6), "links.s->m": sine(0.7)}
+    scenario = pair(**{"control.d": 1.2, "duration_s": 20.0, **links})
+    roots = find_log_roots(tn.simulate(scenario))
+    assert roots.exact
+    assert "over the period of 4.2 s" in roots.text
+    assert roots.rate_per_s == pytest.approx(measure_growth(scenario, 84.0), abs=2e-3)
+
+
+@pytest.mark.parametrize("d", [0.75, 1.3])
+def test_looped_trace_is_decided_over_its_period(d: float, tmp_path: Path) -> None:
+    """A run of 1.4 periods shows neither; the record of one period repeats for ever."""
+    link = looped_trace(tmp_path, 10.0)
+    scenario = pair(**{"control.d": d, "duration_s": 14.0, "link": link})
+    certificate = certify_run(tn.simulate(scenario))
+    roots = certificate.roots
+    assert roots is not None
+    assert roots.exact
+    assert "over the period of 10 s" in roots.text
+    assert roots.rate_per_s == pytest.approx(measure_growth(scenario, 400.0), abs=2e-3)
+    assert roots.rate_per_s is not None
+    assert str(certificate.stability) == ("stable" if roots.rate_per_s < 0.0 else "not stable")
+    assert "exact roots" in certificate.decision.rests_on
+    assert str(tn.linear(scenario, ports=False).verdict) == roots.verdict
+
+
+def test_trace_that_has_ended_is_its_last_delay(tmp_path: Path) -> None:
+    link = {**looped_trace(tmp_path, 4.0), "at_end": "hold"}
+    damped = {"control.d": 4.0, "duration_s": 8.0}
+    ended = find_log_roots(tn.simulate(pair(link=link, **damped)))
+    constant = {"model": "constant", "delay_ms": 400.0}
+    settled = find_log_roots(tn.simulate(pair(link=constant, **damped)))
+    assert ended.exact
+    assert ended.rate_per_s == pytest.approx(settled.rate_per_s, abs=1e-5)
+
+
+def test_log_and_fused_run_have_the_same_roots() -> None:
+    scenario = pair(duration_s=10.0)
+    run = FusedRun(scenario)
+    run.advance_to(10.0)
+    assert find_run_roots(scenario, run) == find_log_roots(tn.simulate(scenario))
+
+
+def commanded(scenario: Scenario, *requests: tuple[float, dict[str, Any]]) -> Log:
+    """A run in virtual time in which site s gets commands at some times."""
+    schedule: dict[int, list[Any]] = {}
+    for at_s, request in requests:
+        tables = LinkTables(scenario.links, ())
+        change = resolve_change(scenario, tables, request, round(at_s * 1e9))
+        tick = round(at_s * scenario.sites["s"].rate_hz)
+        schedule.setdefault(tick, []).append(to_core_change(scenario, change))
+    stream = io.BytesIO()
+    virtual.write_virtual_log(scenario, stream, commands={"s": schedule})
+    stream.seek(0)
+    return open_log(stream)
+
+
+SLOWER = {"link": "m->s", "to": {"model": "constant", "delay_ms": 300.0}}
+SAME = {"link": "m->s", "to": {"model": "constant", "delay_ms": 200.0}}
+
+
+def test_command_that_changes_nothing_changes_nothing() -> None:
+    """From 200 ms to 200 ms, and the same factors again."""
+    scenario = pair(**{"link.delay_ms": 200.0, "duration_s": 14.0})
+    same_shares = {"dominance": "s", "to": dict(scenario.dominance["s"]), "ramp_s": 0.0}
+    log = commanded(scenario, (9.0, SAME), (9.5, same_shares))
+    plain = tn.simulate(scenario)
+    assert log.changes("s")
+    assert list_effective_commands(log) == []
+    assert classify_log_end(log) == classify_log_end(plain)
+    assert find_log_roots(log) == find_log_roots(plain)
+    assert certify_run(log).decision == certify_run(plain).decision
+
+
+def test_roots_are_of_the_loop_after_the_last_command() -> None:
+    scenario = pair(**{"link.delay_ms": 200.0, "duration_s": 14.0})
+    log = commanded(scenario, (3.0, SLOWER))
+    final = resolve_final_scenario(log)
+    assert [change.link for change in final.timeline] == ["m->s"]
+    slower = pair(**{"link.delay_ms": 200.0, "links.m->s": SLOWER["to"], "duration_s": 14.0})
+    expected = find_log_roots(tn.simulate(slower)).rate_per_s
+    assert find_log_roots(log).rate_per_s == pytest.approx(expected, abs=1e-5)
+    back = commanded(scenario, (3.0, SLOWER), (5.0, SAME))
+    assert len(list_effective_commands(back)) == 2
+    unchanged = find_log_roots(tn.simulate(scenario)).rate_per_s
+    assert find_log_roots(back).rate_per_s == pytest.approx(unchanged, abs=1e-5)

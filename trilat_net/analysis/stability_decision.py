@@ -1,0 +1,319 @@
+"""Decides whether a run is stable, settled, not stable, or open, for every command.
+
+The decision combines what is known about a run:
+
+- how its motion ends, which `run_end` judges without any theory;
+- how small pushes in repeated runs (twins) develop, which `twin_growth` measures;
+- proofs that hold for its control loop: the stability theorem with all its premises, the
+  stability condition of a control law, or the characteristic roots of the loop.
+
+The words mean:
+
+- Stable: a proof exists for this loop, and the run does not contradict it.
+- Settled: the run came to rest and every push died away, but nothing proves more.
+- Not stable: the run diverged, oscillates, drifts or grows, or its loop has an exact root with
+  a positive real part, and no proof says otherwise.
+- Open: everything else.
+
+Invariant:
+    - Stable is said only with a proof. Without a proof and without twins, a run is open.
+    - Roots count as a proof only if they are exact: delays are constant, or repeat after a
+      known period over which the loop was analysed.
+    - Exact roots in the left half-plane exclude the word "not stable", except for a run that
+      left its limits.
+    - A decision states what it rests on.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from .envelope_trend import FLOOR_RAD, EnvelopeTrend
+from .run_end import EndBehaviour, RunEnd, Stability
+from .site_signals import SETTLED_ERROR_RAD
+from .twin_growth import DOUBLES, TwinGrowth
+
+NEAR_REST_RAD = 0.02
+"""Largest distance of a run from a rest whose unstable roots refute the run, in rad.
+
+A run that is further away may come to rest in another pose, whose roots may be stable.
+"""
+RATE_AGREEMENT_SHARE = 0.25
+"""Largest difference between the rates of a push and of the slowest root, as a share."""
+RATE_AGREEMENT_PER_S = 2e-4
+"""Difference of these rates that always confirms the root, in 1/s."""
+_FALLING = (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY)
+_UNTREND_ENDS = (EndBehaviour.HARDLY, EndBehaviour.UNDECIDED)
+
+
+class LoopRoots(NamedTuple):
+    """Characteristic roots of the control loop, linearised at the pose at which a run ended.
+
+    The roots show whether small motions about this pose die away. `theory.loop_roots` computes
+    them for every command.
+
+    Attributes:
+        verdict: "stable", "unstable" or "at the edge", for small motions. Empty if the loop
+            cannot be linearised.
+        rate_per_s: Largest real part of the roots, in 1/s, without those that are zero because
+            of the structure of the loop. None if there is no such root.
+        exact: True if the loop was analysed with its ticks and its repeating delays. Otherwise
+            the roots may cast doubt on a run, but prove nothing.
+        text: The pose and its roots, or the reason why there are no roots.
+        distance_rad: Largest difference between the last angle of a joint and its angle at the
+            pose at rest to which the roots belong, in rad.
+    """
+
+    verdict: str
+    rate_per_s: float | None
+    exact: bool
+    text: str
+    distance_rad: float = 0.0
+
+    @property
+    def is_proof(self) -> bool:
+        """True if the roots prove that small motions about the final pose die away."""
+        return self.exact and self.verdict == "stable"
+
+    @property
+    def is_refutation(self) -> bool:
+        """True if the roots prove that small motions about the final pose grow."""
+        return self.exact and self.verdict == "unstable"
+
+    def describe_as_basis(self) -> str:
+        """Returns the roots as the basis of a decision, for example "exact roots"."""
+        if self.rate_per_s is None:
+            return "exact roots"
+        decisive = "fastest growing" if self.is_refutation else "slowest"
+        return f"exact roots, {decisive} {self.rate_per_s:+.3g} /s"
+
+
+class StabilityDecision(NamedTuple):
+    """Decision whether a run is stable, and what it rests on.
+
+    Attributes:
+        stability: The decision.
+        rests_on: What the decision rests on, as a phrase for the user.
+        reasons: Sentences that prevent a better decision. Empty if the run is stable.
+    """
+
+    stability: Stability
+    rests_on: str
+    reasons: tuple[str, ...] = ()
+
+
+class RunFindings(NamedTuple):
+    """Everything that is known about the stability of a run.
+
+    Attributes:
+        end: How the motion ends.
+        twins: How small pushes in repeated runs develop. None if no run was repeated.
+        roots: Roots of the loop at the end of the run. None if they were not computed.
+        proofs: Phrases that name further proofs for this loop, such as the stability theorem.
+        doubts: Sentences on findings that contradict a stable run, such as an energy function
+            that rises, or missing records.
+        rises: True if the energy function V of the stability proof rose by energy that nobody
+            supplied.
+    """
+
+    end: RunEnd
+    twins: TwinGrowth | None = None
+    roots: LoopRoots | None = None
+    proofs: Sequence[str] = ()
+    doubts: Sequence[str] = ()
+    rises: bool = False
+
+    @property
+    def has_pushes(self) -> bool:
+        """True if twins of the run exist."""
+        return self.twins is not None and bool(self.twins.pushes)
+
+    @property
+    def has_stable_roots(self) -> bool:
+        """True if exact roots prove that small motions about the final pose die away."""
+        return self.roots is not None and self.roots.is_proof
+
+    @property
+    def all_proofs(self) -> list[str]:
+        """Phrases that name the proofs for this loop, exact roots last."""
+        proofs = list(self.proofs)
+        if self.has_stable_roots:
+            assert self.roots is not None
+            proofs.append(self.roots.describe_as_basis())
+        return proofs
+
+
+def decide_stability(run: RunFindings) -> StabilityDecision:
+    """Decides whether a run is stable, settled, not stable, or open.
+
+    The module's docstring defines the words.
+
+    Args:
+        run: Everything that is known about the run.
+    """
+    end = run.end
+    if end.behaviour is EndBehaviour.DIVERGED:
+        return StabilityDecision(Stability.NOT_STABLE, end.text, (end.text,))
+
+    reasons = _list_reasons(run)
+    refutation = _find_refutation(run)
+    if refutation:
+        stability = Stability.OPEN if end.operator_acts else Stability.NOT_STABLE
+        return StabilityDecision(stability, refutation, reasons)
+
+    proofs = run.all_proofs
+    if proofs and not reasons and _agrees_with_proof(run):
+        return StabilityDecision(Stability.STABLE, "; ".join(proofs))
+    looks_unstable = end.stability is Stability.NOT_STABLE
+    if looks_unstable and not run.has_stable_roots and not _pushes_excuse_end(run):
+        return StabilityDecision(Stability.NOT_STABLE, f"the end of the run: {end.text}")
+    if not reasons and _has_settled(run):
+        return StabilityDecision(Stability.SETTLED, _describe_pushes(run))
+    return StabilityDecision(Stability.OPEN, "", reasons or (_explain_open(run),))
+
+
+def _list_reasons(run: RunFindings) -> tuple[str, ...]:
+    """Returns the sentences that prevent a stable or settled run, in the order of the text."""
+    reasons = [*run.end.reasons]
+    reasons += [f"no record of {site}" for site in run.end.missing_sites]
+    twins = run.twins
+    if twins is not None and twins.hides_period and not run.all_proofs:
+        reasons.append(twins.period_text)
+    reasons += run.doubts
+    roots = run.roots
+    if roots is not None and roots.verdict == "unstable":
+        # Twins repeat the recorded ticks. Roots that are not exact do not count if the twins
+        # exclude growth at their rate.
+        excluded_per_s = math.inf if twins is None else twins.excluded_rate_per_s
+        is_excluded = roots.rate_per_s is not None and roots.rate_per_s > excluded_per_s
+        if roots.exact or not is_excluded:
+            reasons.append(roots.text)
+    return tuple(reasons)
+
+
+def _find_refutation(run: RunFindings) -> str:
+    """Returns the evidence that small motions grow. Empty if there is none.
+
+    The growth of pushes is no evidence if the run slows down, because the run then approaches
+    its twins, or if exact roots are stable.
+    """
+    end = run.end
+    if run.roots is not None and run.roots.is_refutation and _is_near_rest(run):
+        return run.roots.describe_as_basis()
+    if run.twins is None or not run.twins.pushes or run.has_stable_roots:
+        return ""
+    twins = run.twins
+    is_slowing = end.speed.trend in _FALLING and end.end_speed_rad_s > FLOOR_RAD
+    departs = twins.departure is not None and end.behaviour is not EndBehaviour.COASTS
+    grows = twins.grows and not is_slowing and not twins.hides_period
+    return twins.text if grows or departs else ""
+
+
+def _is_near_rest(run: RunFindings) -> bool:
+    """Returns True if the final rest of a run is that of its roots.
+
+    This is so if the run ended near that rest. A run that is shorter than the period of its
+    delays cannot show by itself where it ends, so that the roots decide.
+    """
+    assert run.roots is not None
+    hides_period = run.twins is not None and run.twins.hides_period
+    return hides_period or run.roots.distance_rad <= NEAR_REST_RAD
+
+
+def _agrees_with_proof(run: RunFindings) -> bool:
+    """Returns True if neither the end of a run nor its twins contradict a proof.
+
+    A run that is shorter than the period of its delays contradicts nothing: it may show a beat.
+    """
+    end = run.end
+    if not run.has_pushes:
+        return end.stability is Stability.SETTLED
+    assert run.twins is not None
+    if run.twins.hides_period or run.twins.trend in _FALLING:
+        return True
+    is_calm = end.stability is Stability.SETTLED or end.behaviour is EndBehaviour.HARDLY
+    if is_calm and run.twins.trend is not EnvelopeTrend.GROWS:
+        return True
+    return _confirms_slowest_root(run)
+
+
+def _confirms_slowest_root(run: RunFindings) -> bool:
+    """Returns True if the slowest push decays as slowly as the slowest root predicts."""
+    roots = run.roots
+    worst = None if run.twins is None else run.twins.worst
+    if worst is None or roots is None or not roots.is_proof or roots.rate_per_s is None:
+        return False
+    difference_per_s = abs(worst.rate_per_s - roots.rate_per_s)
+    tolerance_per_s = RATE_AGREEMENT_SHARE * abs(roots.rate_per_s) + RATE_AGREEMENT_PER_S
+    return worst.rate_per_s < 0.0 and difference_per_s <= tolerance_per_s
+
+
+def _pushes_excuse_end(run: RunFindings) -> bool:
+    """Returns True if the pushes contradict a run whose end looks not stable.
+
+    They do if all of them die away, or if the run seems to grow although no push grows and the
+    energy function V did not rise. They also do if the judged part of the run is shorter than
+    the period of its delays, so that it may show a beat.
+    """
+    if not run.has_pushes:
+        return False
+    assert run.twins is not None
+    if run.twins.trend is EnvelopeTrend.DECAYS or run.twins.hides_period:
+        return True
+    end_grows = run.end.behaviour is EndBehaviour.GROWS
+    return end_grows and run.twins.trend is not EnvelopeTrend.GROWS and not run.rises
+
+
+def _has_settled(run: RunFindings) -> bool:
+    """Returns True if a run came to rest and every push died away."""
+    end = run.end
+    if not run.has_pushes:
+        return False
+    assert run.twins is not None
+    if run.twins.trend is not EnvelopeTrend.DECAYS:
+        return False
+    if end.stability is Stability.SETTLED:
+        return True
+    # A run without a trend counts if its arms are too slow to get anywhere.
+    judged_s = run.twins.to_s - run.twins.from_s
+    travel_rad = end.end_speed_rad_s * judged_s
+    return end.behaviour in _UNTREND_ENDS and travel_rad <= SETTLED_ERROR_RAD
+
+
+def _describe_pushes(run: RunFindings) -> str:
+    """Returns the basis of a settled run: the number of pushes, and why nothing proves more."""
+    assert run.twins is not None
+    pushes = len({growth.push.name for growth in run.twins.pushes})
+    duration_s = run.twins.to_s
+    text = f"{pushes} pushes over {duration_s:.4g} s, all of which died away"
+    roots = run.roots
+    if roots is None:
+        return text
+    if not roots.verdict:
+        return f"{text}; {roots.text}"
+    if not roots.exact:
+        return f"{text}; its roots are not exact"
+    return text
+
+
+def _explain_open(run: RunFindings) -> str:
+    """Returns why a run is open although nothing contradicts a stable run."""
+    if run.twins is None:
+        return "no proof exists, and no run with small pushes was made"
+    if not run.twins.pushes:
+        return f"no proof exists, and there are no {run.twins.text}"
+    if run.end.stability is Stability.SETTLED:
+        return run.twins.text
+    if run.all_proofs:
+        needed_s = _estimate_needed_s(run)
+        text = f"the run is too short to agree with its proof: {run.end.text}"
+        return f"{text}; a run of {needed_s:.3g} s would tell" if needed_s else text
+    return run.end.text
+
+
+def _estimate_needed_s(run: RunFindings) -> float | None:
+    """Returns a duration after which the slowest root has decayed clearly, in s."""
+    roots = run.roots
+    if roots is None or roots.rate_per_s is None or not roots.rate_per_s < 0.0:
+        return None
+    return 8.0 * math.log(DOUBLES) / -roots.rate_per_s
