@@ -314,12 +314,12 @@ WRONG: dict[str, tuple[Callable[[Path], object], str]] = {
     "tune": (lambda _: tn.tune("free", gravity_percent=5), "^gravity_percent must be from 50"),
     "rerun": (
         lambda file: tn.rerun(file),
-        r"replace=NAME \(of m, s\), or closed_loop=True for all",
+        r"replace=NAME \(one of m, s\), or closed_loop=True for all",
     ),
     "figure": (lambda file: tn.figure(file, "positions", "x"), "3.5 or 7 inches, not x"),
     "linear": (
         lambda _: tn.linear("two_sites", pose=["x"]),
-        "a pose consists of angles in rad",
+        "a pose must consist of angles in rad",
     ),
     "bench": (lambda _: tn.bench(seeds=0), "^seeds must be a number from 1 to 1000, not 0"),
 }

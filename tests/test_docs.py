@@ -28,7 +28,7 @@ from trilat_net.core import delay, link, live_hand, session_life, site_arrays, t
 from trilat_net.execution import twins, verify
 from trilat_net.log import accounting, log_file, mcap_reader, mcap_records, site_log
 from trilat_net.net import arm_client, offset, requests, session, timing, zenoh_config
-from trilat_net.scenario import laws, operators, resolve
+from trilat_net.scenario import delay_period, laws, operators, resolve
 from trilat_net.studies import dask_cluster, executor
 from trilat_net.studies.bench import bench_plan, bench_results, bench_run
 from trilat_net.studies.sweep import (
@@ -191,7 +191,7 @@ STATED: list[tuple[str, str, float, float]] = [
     ("recording.md", "for 10 s after its last question", 10, site_process.LINGER_NS / 1e9),
     ("recording.md", "at most 10 s after the signal", 10, record_process.END_NS / 1e9),
     ("recording.md", "busy for 80 % of the time", 80, 100 * machine_load.BUSY_SHARE),
-    ("linear.md", "of at most 60 s", 60, floquet.MAX_PERIOD_S),
+    ("linear.md", "the shorter span, at most 60 s", 60, delay_period.MAX_NEAR_PERIOD_S),
     ("linear.md", "30 s of the draws", 30, floquet.DRAWN_SPAN_S),
     ("linear.md", "at most eight times its duration", 8, equilibrium.MAX_PROLONGATION),
     ("linear.md", "to a residual of 1e-10", 1e-10, equilibrium.MAX_EQUILIBRIUM_RESIDUAL),

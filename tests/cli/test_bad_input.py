@@ -290,7 +290,9 @@ def test_an_unsendable_number_is_refused_before_anybody_is_asked(
 
 
 def test_a_session_has_a_short_name(tmp_path: Path) -> None:
-    trilat("stop", "--session", "9" * 5000, cwd=tmp_path).refuses("at most 80 letters")
+    trilat("stop", "--session", "9" * 5000, cwd=tmp_path).refuses(
+        "must have 1 to 80 characters"
+    )
 
 
 def test_what_others_wrote_has_no_effect_on_a_terminal() -> None:

@@ -65,7 +65,7 @@ def test_a_cell_is_a_command_that_runs(tmp_path: Path) -> None:
         (("--law", "adaptiv"), ["no law 'adaptiv'"]),
         (("--cell", "free/p_d/rtt9"), ["no cell 'free/p_d/rtt9'"]),
         (("--tune", "--law", "p_dd"), ["--law: p_dd is not a law of the study full"]),
-        (("--jobs", "2", "--on", "tcp://127.0.0.1:1"), ["--jobs is the number of processes"]),
+        (("--jobs", "2", "--on", "tcp://127.0.0.1:1"), ["--jobs sets the number of processes"]),
     ],
 )
 def test_what_cannot_be_asked_is_refused_in_a_line(

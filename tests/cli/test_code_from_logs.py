@@ -322,7 +322,7 @@ def test_a_file_that_differs_is_refused_before_it_runs(
 ) -> None:
     if text is not None:
         (place / name).write_text(text)
-    asked = fact.startswith(("defines", "is no law: it", "is not valid Python"))
+    asked = fact.startswith(("defines", "is not a law: the", "is not valid Python"))
     with pytest.raises(error, match=fact):
         tn.open_log("run.mcap", law=name, other_version=asked)
     done = trilat("verify", "run.mcap", "--law", name, *["--other-version"] * asked, cwd=place)

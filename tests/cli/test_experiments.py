@@ -44,7 +44,7 @@ def test_what_is_wrong_is_said_in_a_sentence(tmp_path: Path) -> None:
     )
     assert "contains no experiment" in trilat("experiment", "status", ".", cwd=tmp_path).err
     assert (
-        "reaching.toml: exists"
+        "reaching.toml: already exists"
         in trilat("experiment", "new", "reaching.toml", cwd=tmp_path).err
     )
 

@@ -38,7 +38,7 @@ def test_the_default_is_pdf_and_png_beside_the_log(folder: Path) -> None:
     assert paths == [f"run-figures/control_torques.{kind}" for kind in ("pdf", "png")]
     assert b"MediaBox [ 0 0 504 " in (folder / paths[0]).read_bytes()
     trilat("figure", "run.mcap", "control_torques", cwd=folder).refuses(
-        "torques.pdf: exists", "--force"
+        "torques.pdf: already exists", "--force"
     )
 
 

@@ -41,11 +41,11 @@ def test_a_log_is_exported_beside_itself(form: str, folder: Path) -> None:
 def test_an_export_replaces_only_what_it_may(folder: Path) -> None:
     command = ("log", "export", "run.mcap", "--to", "csv", "-o", "tables")
     trilat(*command, cwd=folder).succeeds()
-    trilat(*command, cwd=folder).refuses("tables: exists", "--force")
+    trilat(*command, cwd=folder).refuses("tables: already exists", "--force")
     trilat(*command, "--force", cwd=folder).succeeds()
     assert pl.read_csv(folder / "tables" / "s_state.csv").height == 120
     done = trilat("log", "export", "run.mcap", "--to", "npz", "-o", "run.mcap", cwd=folder)
-    done.refuses("run.mcap: exists")
+    done.refuses("run.mcap: already exists")
     assert (folder / "run.mcap").read_bytes() == recorded("paper")
 
 
@@ -72,13 +72,13 @@ def test_a_folder_of_logs_becomes_a_set_of_episodes(folder: Path) -> None:
     assert (
         text == "logs-lerobot: 8 frames in 2 episodes; 0 frames lie in gaps and are left out\n"
     )
-    trilat(*command, cwd=folder).refuses("logs-lerobot: exists", "--force")
+    trilat(*command, cwd=folder).refuses("logs-lerobot: already exists", "--force")
     assert (
         "12 frames in 2"
         in trilat(*command, "--set", "fps=50", "--force", cwd=folder).succeeds()
     )
     trilat(*command, "--set", "log=x", cwd=folder).refuses(
-        "no setting 'log'; it has fps, program"
+        "no setting 'log'; the settings of lerobot are fps, program, actions"
     )
     (folder / "none").mkdir()
     trilat("log", "export", "none", "--to", "lerobot", cwd=folder).refuses(

@@ -107,7 +107,7 @@ def test_a_foreign_mcap_file_is_checked_for_its_structure(tmp_path: Path) -> Non
     done = trilat("log", "check", written(tmp_path, foreign()), cwd=tmp_path)
     assert done.code == 0
     assert len(done.out.splitlines()) == 4
-    assert "no log of trilat-net" in done.err
+    assert "not a trilat-net log" in done.err
 
 
 def test_no_mcap_file_is_bad_input_or_a_finding(tmp_path: Path) -> None:

@@ -10,7 +10,6 @@ import pytest
 import trilat_net as tn
 from tests.cli.running import simulated, trilat
 from tests.execution.logs import without_records
-from trilat_net.analysis.twin_growth import TWINS
 from trilat_net.cli.runs import certify_command
 from trilat_net.errors import NotRepeatable
 from trilat_net.execution.fused import explain_not_repeatable
@@ -127,5 +126,5 @@ def test_a_certificate_without_twins_has_none(folder: Path) -> None:
     )
     three = json.loads(trilat("certify", "run.mcap", "--twins", "3", "--json", cwd=folder).out)
     assert without["twins"] is None
-    assert signature(certify_command).parameters["twins"].default == TWINS
+    assert signature(certify_command).parameters["twins"].default is None
     assert len(three["twins"]["pushes"]) == 3

@@ -352,7 +352,7 @@ def test_nothing_is_replaced_unasked_and_the_file_itself_never(tmp_path: Path) -
     torn = tmp_path / "run.mcap.active"
     torn.write_bytes(log()[:-100])
     (tmp_path / "run.mcap").write_bytes(b"precious")
-    with pytest.raises(UsageError, match=r"run\.mcap: exists"):
+    with pytest.raises(UsageError, match=r"run\.mcap: already exists"):
         recover(torn)
     with pytest.raises(UsageError, match="is the source file"):
         recover(torn, torn, force=True)

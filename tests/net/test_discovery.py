@@ -102,7 +102,7 @@ def test_a_session_that_has_not_begun_takes_no_changes() -> None:
 def test_whoever_gives_no_answer_is_named() -> None:
     with (
         closing(Answering(running=True, deaf=True)) as site,
-        pytest.raises(SessionError, match="no answer"),
+        pytest.raises(SessionError, match="s did not answer"),
     ):
         site.asked("s", link="m1->s", to={"delay_ms": 350.0})
 

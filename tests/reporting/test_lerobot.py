@@ -244,7 +244,7 @@ def test_settings_that_are_none_are_refused(
 
 
 def test_a_form_without_settings_says_so(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="csv has no setting 'fps'; it has none"):
+    with pytest.raises(UsageError, match="csv has no setting 'fps'; csv has no settings"):
         Exporter("csv", tmp_path / "set", settings={"fps": 30})
     with pytest.raises(UsageError, match="exports a single log"):
         Exporter("csv", tmp_path / "set").export(log(), log())

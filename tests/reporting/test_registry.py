@@ -148,7 +148,7 @@ def test_force_of_wall_is_what_record_says_of_arm():
     ("names", "options", "said"),
     [
         (["setling"], {}, "did you mean 'settling'"),
-        (["x"], {}, "there are overview, operation"),
+        (["x"], {}, "the figures are overview, operation"),
         (["authority"], {}, "shares of all sites are constant"),
         (["contact"], {"width_in": 5.0}, "3.5 or 7 in"),
         (["contact"], {"formats": ["eps"]}, "pdf, png, svg"),

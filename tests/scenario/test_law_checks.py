@@ -19,19 +19,19 @@ OUTSIDE = {"sites.s.plant": "external", "sites.s.arm.known": False}
             "two_sites",
             {**OUTSIDE, "sites.s.control.law": "p_d"},
             "sites.s.control.gravity",
-            "p_d takes",
+            "p_d computes gravity",
         ),
         (
             "two_sites",
             {**OUTSIDE, "sites.s.control.law": "pd_d"},
             "sites.s.control.gravity",
-            "pd_d takes",
+            "pd_d computes gravity",
         ),
         (
             "two_sites",
             {**OUTSIDE, "sites.s.control.law": "p_f"},
             "sites.s.control.gravity",
-            "p_f takes",
+            "p_f computes gravity",
         ),
         (
             "two_sites",

@@ -115,8 +115,9 @@ def chain_dtype(joints: int) -> np.dtype[np.void]:
     """Returns the NumPy data type of the row that stores a joint of a chain.
 
     A row contains the constants of the joint and the work space of the algorithms. A link is
-    the body that the joint moves, and its frame moves with it. `lin` and `ang` are the linear
-    and the angular part of a spatial vector at the origin of this frame. Positions are in m.
+    the body that the joint moves, and its frame moves with it. Names with lin and ang are the
+    linear and the angular part of a spatial vector at the origin of this frame. Positions are
+    in m.
 
     - Constants: the fields of `ChainJoint` for the axis and the drive; `origin`, the origin of
       the link's frame in that of the previous link; `slide`, the axis of a prismatic joint in

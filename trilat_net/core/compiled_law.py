@@ -65,7 +65,9 @@ def compiled(law: T) -> T:
     """
     if not isinstance(law, type):
         # called from a law in plain Python it stays a Python function, which takes any objects
-        return cast(T, register_jitable(**_CHECKED)(law))
+        function: Any = law
+        callable_from_python: T = register_jitable(**_CHECKED)(function)
+        return callable_from_python
     law.is_compiled = True  # type: ignore[attr-defined]
     return cast(T, law)
 

@@ -623,18 +623,18 @@ class Site:
         s.reason = int(memory[shared])
         remaining = memory[shared + 1 :]
 
-        used_ns, remaining = remaining[:peers], remaining[peers:]
-        tau_held, remaining = remaining[:joints], remaining[joints:]
-        self._links["used_ns"] = used_ns
-        s.tau_held = tau_held
+        # Each number is removed from `remaining` once it is restored.
+        self._links["used_ns"] = remaining[:peers]
+        remaining = remaining[peers:]
+        s.tau_held = remaining[:joints]
+        remaining = remaining[joints:]
         if self.layout.task:
-            q_rest, remaining = remaining[:joints], remaining[joints:]
-            qd_rest, remaining = remaining[:joints], remaining[joints:]
-            s.q_rest = q_rest
-            s.qd_rest = qd_rest
+            s.q_rest = remaining[:joints]
+            s.qd_rest = remaining[joints : 2 * joints]
+            remaining = remaining[2 * joints :]
         if self._degrades:
-            gone, remaining = remaining[:peers], remaining[peers:]
-            self._links["gone"] = gone
+            self._links["gone"] = remaining[:peers]
+            remaining = remaining[peers:]
         # Orders and missed ticks are inputs of the tick that applies them: none is waiting.
         s.order = 0
         s.skipped = 0

@@ -722,8 +722,8 @@ def _make_entry_column(
     """Makes the column of one entry of a statistics field whose values are maps.
 
     For example, the field `delay_us` maps each peer to a delay. Its entry of the peer m2
-    becomes the column `delay_m2_us`. A field without a unit counts something: the entry m2 of
-    `accepted` becomes `accepted_m2_count`.
+    becomes the column delay_m2_us. A field without a unit counts something: the entry m2 of
+    `accepted` becomes accepted_m2_count.
 
     Args:
         source: Name of the file for error messages.
