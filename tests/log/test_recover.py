@@ -101,6 +101,7 @@ def made(data: bytes, folder: Path, name: str = "run.mcap.active") -> tuple[Reco
 @anywhere
 @given(made_by=LOGS, share=positions)
 @example(made_by=log, share=0.0)
+@example(made_by=earlier_log, share=0.65625)
 def test_of_a_file_cut_anywhere_every_whole_chunk_is_kept(
     made_by: Callable[[], bytes], share: float, tmp_path: Path
 ) -> None:
@@ -417,7 +418,7 @@ def test_the_exit_code_says_what_came_of_it(
     assert facts["messages"] == len(messages((tmp_path / "other.mcap").read_bytes()))
     assert not active_path(tmp_path / "other.mcap").exists()
     trilat("log", "recover", "run.mcap.active", cwd=tmp_path).refuses(
-        "run.mcap: exists", "--force"
+        "run.mcap: already exists", "--force"
     )
 
 

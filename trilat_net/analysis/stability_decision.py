@@ -298,16 +298,16 @@ def _describe_pushes(run: RunFindings) -> str:
 
 def _explain_open(run: RunFindings) -> str:
     """Returns why a run is open although nothing contradicts a stable run."""
+    if run.all_proofs:
+        needed_s = _estimate_needed_s(run)
+        text = f"the run is too short to agree with its proof: {run.end.text}"
+        return f"{text}; a run of {needed_s:.3g} s would tell" if needed_s else text
     if run.twins is None:
         return "no proof exists, and no run with small pushes was made"
     if not run.twins.pushes:
         return f"no proof exists, and there are no {run.twins.text}"
     if run.end.stability is Stability.SETTLED:
         return run.twins.text
-    if run.all_proofs:
-        needed_s = _estimate_needed_s(run)
-        text = f"the run is too short to agree with its proof: {run.end.text}"
-        return f"{text}; a run of {needed_s:.3g} s would tell" if needed_s else text
     return run.end.text
 
 

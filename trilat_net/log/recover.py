@@ -777,8 +777,11 @@ class _FileCopy:
         self._identified.add(number)
         topic = self._content.identify(payload) if self._content is not None else ""
         is_unidentified = not topic
-        does_definition_agree = known is not None and known[1] == topic
-        if is_unidentified or does_definition_agree:
+        definition = self._definitions.get((Opcode.CHANNEL, number))
+        defined_topic = definition.topic if definition is not None else ""
+        if known is not None:
+            defined_topic = known[1]
+        if is_unidentified or defined_topic == topic:
             return known or self._open_channel(number)
 
         self._misnamed.append(topic)
