@@ -277,7 +277,7 @@ class MessageLimits:
             now_ns: Present time on the monotonic clock, in ns.
 
         Returns:
-            False if the page has sent too many messages, so that this one must be dropped.
+            False if the page has sent too many messages and this one must be dropped.
         """
         if kind not in _RATES:
             return True

@@ -17,7 +17,7 @@ Invariant:
       too many, too large or not allowed for the page's role are refused and counted. None of
       their contents reaches a site.
     - The number of pages of each role is limited, see `page_entrance`.
-    - One thread serves all pages and receives the session's messages, so that no locks are
+    - One thread serves all pages and receives the session's messages. Therefore no locks are
       needed.
 """
 
@@ -189,7 +189,7 @@ class Page:
     """State of one page that is open in a browser: its rights, and what was sent to it.
 
     The server sends frames, messages from which the page draws the session. A frame describes
-    the present state, so that a slow page may miss some.
+    the present state. Therefore a slow page may miss some frames.
 
     Attributes:
         connection: WebSocket connection to the page.
@@ -242,7 +242,7 @@ class Page:
 
 @dataclass(frozen=True, slots=True)
 class PageOptions:
-    """States how the page of a session is served, as the options of the command line say.
+    """Command-line options that determine how the page of a session is served.
 
     Attributes:
         host: Address at which the server listens.

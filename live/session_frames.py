@@ -8,7 +8,7 @@ link, and with new points of the plots.
 
 Invariant:
     - A frame is computed from the records since the previous frame. It describes the whole
-      state, so that a page may miss frames.
+      state. Therefore a page may miss frames.
     - The plots show the extremes of the records between two frames, so that short peaks are
       visible.
     - Forces act on the arm and are in N. The forces of people and of the control law follow
@@ -725,8 +725,8 @@ def _count_samples(receiving: SiteView, peer: str) -> Json:
 def _describe_alarm(alarm: LifeAlarm) -> Json:
     """Returns an alarm for a page.
 
-    The page has a button for the command that ends the alarm, so that the advice does not name
-    a shell command.
+    The page has a button for the command that ends the alarm. Therefore the advice does not
+    name a shell command.
     """
     advice = alarm.before if alarm.order else alarm.advice
     return {

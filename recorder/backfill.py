@@ -112,7 +112,7 @@ class GapRepair:
     def probe(self) -> None:
         """Makes `poll` request the newest messages of every channel of the site.
 
-        The messages of a channel are numbered, so that a message reveals whether earlier ones
+        The messages of a channel are numbered. Therefore a message reveals whether earlier ones
         were lost. The loss of the last messages is revealed only by this request.
         """
         self._probes = set(SITE_CHANNELS)
@@ -158,7 +158,7 @@ class GapRepair:
         """Sends the next request to the site, if messages are missing and the request is due.
 
         A message that has just been noticed as missing may only be late. Therefore the first
-        request is due `GRACE_NS` after that. The due time then stays in the past, so that a
+        request is due `GRACE_NS` after that. The due time then stays in the past. Therefore a
         request without a reply is repeated at once after its timeout. A reply sets a new due
         time, see `_accept_reply`. If nothing is missing any more, the due time is cleared.
 
@@ -286,9 +286,9 @@ class GapRepair:
         if is_other_channel or backfill.first > highest_first:
             raise WireError(
                 "out of range",
-                f"the reply has {backfill.channel} from number {backfill.first} on, of "
-                f"{published}, but {request.channel} from number {request.first} on was "
-                "requested",
+                f"the reply contains {backfill.channel} starting at number {backfill.first} "
+                f"(of {published} published), but {request.channel} starting at number "
+                f"{request.first} was requested",
             )
         return backfill
 

@@ -101,11 +101,12 @@ class Recorder:
         """Waits until the session begins. If it is running already, the recorder joins it.
 
         Args:
-            timeout_s: Longest time to wait, in s. None does not limit it.
+            timeout_s: Longest time to wait, in s. None means no limit.
 
         Returns:
-            The common start time of the session and the boots of its members, the numbers that
-            identify their starts. None if the recorder must end before the session begins.
+            The common start time of the session, and the boot number of each member, which
+            identifies a start of its process. None if the recorder has to stop before the
+            session begins.
 
         Raises:
             SessionError: The session did not begin in time.
@@ -274,8 +275,8 @@ def record_session(
         session: Name of the session.
         storage: Place where the log is written.
         connection: How to connect to the session, see `connect_to_session`.
-        join_timeout_s: Longest time to wait until the session begins, in s. None does not limit
-            it.
+        join_timeout_s: Longest time to wait until the session begins, in s. None means no
+            limit.
         clock: Clock of the recorder.
         say: Function that prints a line for the user.
         afterwards: Function that processes the finished log, unless the session was

@@ -574,9 +574,9 @@ class Recording:
         still runs. A site is a process that runs one arm. There are three cases for each site:
 
         - The site has left: no more messages of it are expected (`_has_left`).
-        - The site runs and sends messages. Its messages are numbered, so that gaps show which
-          ones are missing. If there are no gaps `SETTLE_NS` after the recorder was told to end,
-          the messages that were in transit at that time have arrived.
+        - The site runs and sends messages. Its messages are numbered. Gaps in the numbers show
+          which messages are missing. If there are no gaps `SETTLE_NS` after the recorder was
+          told to end, the messages that were in transit at that time have arrived.
         - Otherwise, the site has ended or is silent, but has not left. It may have sent
           messages of which the recorder knows nothing, or the last check of its messages is
           still pending. The recorder then waits until the site runs again or has left.

@@ -296,18 +296,18 @@ class SiteReception:
         return SiteMessage(event.n, event.n, event.t_ns, event)
 
     def _check(self, channel: str, sender: str, boot: int, number: int, ticks: int) -> None:
-        """Checks that a message comes from this start of the site and is possible by now.
+        """Checks that a message comes from the current start of the site and is plausible now.
 
         Args:
             channel: Channel of the message.
             sender: Name of the site that the message states.
             boot: Number that identifies the sender's start, as the message states it.
             number: Number of the message in its channel.
-            ticks: Number of ticks that the site has executed if the message is true.
+            ticks: Number of ticks that the site has executed according to the message.
 
         Raises:
-            WireError: The sender is another one, the number is too large, or the ticks are in
-                the future.
+            WireError: The message comes from a different sender or start, its number is too
+                large, or its ticks lie in the future.
         """
         if sender != self.name or boot != self._boot:
             raise WireError(
@@ -469,8 +469,8 @@ class SiteReception:
     def count_previous_start(self, ticks: int) -> None:
         """Takes into account how many ticks the previous start of the site executed at least.
 
-        The previous start may have been killed, so that it could not state this number itself.
-        But other sites have received its samples.
+        The previous start may have been killed. In that case it could not state this number
+        itself, but other sites have received its samples.
 
         Args:
             ticks: Number of ticks that another site reports.

@@ -1,12 +1,13 @@
 """Limits the computing time of a user's own code: a control law, an operator or a plant.
 
 A site is a process that controls one arm. An operator is a program that moves an arm, and a
-plant is a model of an arm. A site calls such code in its control loop, so that slow code would
-make the ticks of the loop late. Each call may take 75 % (`SHARE`) of the period at which the
-code is called. If a call takes longer, the excess is added to the overtime. If it takes less,
-the overtime is reduced by the unused time. If the overtime exceeds `OVERTIME_LIMIT_NS`, the
-code is too slow, and the run ends with an error. One call counts for at most `HICCUP_NS`, so
-that a single slow call, for example during garbage collection, does not end the run.
+plant is a model of an arm. A site calls such code in its control loop. Slow code would
+therefore make the ticks of the loop late. Each call may take 75 % (`SHARE`) of the period at
+which the code is called. If a call takes longer, the excess is added to the overtime. If it
+takes less, the overtime is reduced by the unused time. If the overtime exceeds
+`OVERTIME_LIMIT_NS`, the code is too slow, and the run ends with an error. One call counts for
+at most `HICCUP_NS`, so that a single slow call, for example during garbage collection, does not
+end the run.
 
 If the operating system has interrupted the thread during a call, the computing time of the
 thread counts instead of the elapsed time. The load of the machine by other programs is thus no

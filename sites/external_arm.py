@@ -455,7 +455,10 @@ class DeadManSwitch:
         program.counts = True
 
     def _forget_program(self) -> None:
-        """Forgets the oldest program that does not hold the switch, or the oldest of all."""
+        """Forgets the oldest program that does not hold the switch.
+
+        If every program holds its switch, the oldest program is forgotten.
+        """
         idle = [boot for boot, program in self._programs.items() if program.pressed_ns is None]
         oldest = idle[0] if idle else next(iter(self._programs))
         del self._programs[oldest]

@@ -8,7 +8,7 @@ the command `trilat hand`, replies with the decisions of the class.
 Invariant:
     - Each decision names the tick of its view. The site applies the decision a fixed time after
       that tick, so that delays on the network do not change the run.
-    - Views that are too old for a decision in time are skipped, so that a slow class does not
+    - Views that are too old to be answered in time are skipped, so that a slow class does not
       fall further and further behind.
     - If the class fails, the arm is released and the process ends. If the process is killed,
       the site releases the arm, because no more messages arrive.

@@ -59,7 +59,7 @@ A peer's sample that is in use is found among them by its tick.
 AHEAD_S = 0.5
 """Time from the newest known tick of any site to the tick at which a session is ended, in s.
 
-Sites report their tick every 100 ms, so that the known ticks are slightly out of date.
+Sites report their tick every 100 ms. Therefore the known ticks are slightly out of date.
 """
 
 

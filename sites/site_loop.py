@@ -324,10 +324,10 @@ def may_hold_samples(scenario: Scenario, name: str) -> bool:
 class StateBlock:
     """Collects the records of a site's ticks, and sends them to the recorders in blocks.
 
-    A record is the stored result of one tick, and a sample is the part of it that the peers
-    need. Blocks of records cost less computing time than single messages. A record is always
-    sent after the sample of its tick, because it contains the time at which the sample was
-    sent.
+    A record is the stored result of one tick, and a sample is the part of a record that the
+    peers need. Blocks of records cost less computing time than single messages. A record is
+    always sent after the sample of its tick, because it contains the time at which the sample
+    was sent.
 
     Args:
         site: The site in the simulation kernel.

@@ -129,7 +129,7 @@ def find_page(name: str) -> Path:
 def open_regular(path: Path, **options: Any) -> Any:
     """Opens a file for reading. Pipes and devices are refused.
 
-    They are refused because they may have no end, so that reading would never return.
+    They are refused because they may have no end. Reading would then never return.
 
     Args:
         path: The file.
@@ -252,7 +252,7 @@ def digest_file(path: Path) -> str:
     """Returns the SHA-256 digest of a file's content, in hexadecimal.
 
     Args:
-        path: The file, which is read in parts, so that it may be large.
+        path: The file, which is read in parts. The file may therefore be large.
     """
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
@@ -297,7 +297,7 @@ SYSTEM_FOLDERS = ("/dev", "/dev/fd", "/proc/self/fd")
 def refuse_link(path: Path) -> None:
     """Checks that an output path is not a symbolic link.
 
-    Another user could have created the link, so that the output would replace a file elsewhere.
+    Another user could have created the link. The output would then replace a file elsewhere.
 
     Args:
         path: The output path.
@@ -582,7 +582,7 @@ def describe_write_error(
 ) -> LogRefused | UsageError:
     """Returns the error of a failed write, for the caller to raise.
 
-    A full disk needs another remedy than a wrong path, so that the two cases have different
+    A full disk needs another remedy than a wrong path. Therefore the two cases have different
     errors.
 
     Args:

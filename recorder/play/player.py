@@ -166,7 +166,7 @@ class LatenessHistogram:
 
         The p-th percentile is the smallest lateness up to which at least p percent of the
         messages were counted. The comparison 100 * (messages up to here) >= p * (all messages)
-        uses integers, so that it is exact.
+        uses integers and is therefore exact.
 
         Returns:
             Median, 99th percentile and maximum of the lateness, in us. None if no message was
@@ -341,8 +341,8 @@ class Player:
         For each message, the method has four steps:
 
         1. It waits for the deadline, and meanwhile does other work, such as replies to other
-           programs. If the playback is late, so that there is no time left, the other work is
-           done every `SERVICE_EVERY_NS` nevertheless.
+           programs. If the playback is late and there is no time left, the other work is done
+           every `SERVICE_EVERY_NS` nevertheless.
         2. It notes by how much the message is late.
         3. It publishes the message. The network blocks this call while a receiver is slow. If
            it blocks for longer than `HELD_NS`, the duration counts as waiting for a receiver.

@@ -114,7 +114,7 @@ class SpaceMouse:
             now_ns: Present time, in ns.
 
         Returns:
-            True if a report was read, so that another one may follow. False if no report was
+            True if a report was read. Another report may then follow. False if no report was
             waiting.
 
         Raises:

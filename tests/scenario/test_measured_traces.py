@@ -114,7 +114,7 @@ def test_column_says_its_unit_and_whether_it_is_round_trip(tmp_path: Path) -> No
     [
         ("irtt", "{}", "is not in the format irtt"),
         ("irtt", "[1", "is not in the format irtt"),
-        ("ping", "nothing", "no line reports an answer"),
+        ("ping", "nothing", "no line reports a reply"),
         ("csv", "a,b\n1,2\n", "has no column such as t_ms"),
         ("csv", "t_s,delay_ms\n0,x\n", "line 2 has no time or delay in the columns"),
         ("csv", "t_s,delay_ms\n", "the file has no samples"),

@@ -1,13 +1,13 @@
-"""Computes inertia, torque, energy and end effector of an arm, for many records at once.
+"""Computes inertia, torque, energy and end-effector motion of an arm, for many records at once.
 
 A record is the state of an arm in one period of its control loop. There are two kinds of arms:
 the planar arm with two joints, and chains of any number of joints. `PlanarArmRows` and
 `ChainArmRows` have the same methods. Row k of their arguments and results belongs to record k.
 
 A chain has ten inertial parameters per link, but its torques depend only on some linear
-combinations of them, the base parameters. Estimation errors are stated in these. They are found
-with a QR decomposition: M. Gautier, "Numerical calculation of the base inertial parameters of
-robots", J. Robotic Systems 8 (1991).
+combinations of them, the base parameters. Estimation errors are expressed in the base
+parameters, which are found with a QR decomposition: M. Gautier, "Numerical calculation of the
+base inertial parameters of robots", J. Robotic Systems 8 (1991).
 
 Whether a rigid body can have the parameters of a link is checked by its pseudo-inertia: P. M.
 Wensing, S. Kim, J.-J. Slotine, "Linear matrix inequalities for physically consistent inertial
@@ -132,8 +132,8 @@ class PlacedArm:
         """Returns the Coriolis matrix C(q, qd), shape (2, 2, ...), in kg m^2/s.
 
         C(q, qd) qd is the torque of the Coriolis and centrifugal forces. C is built from
-        Christoffel symbols, so that M' - 2 C is skew-symmetric with the rate M' of the inertia
-        matrix.
+        Christoffel symbols. Therefore M' - 2 C is skew-symmetric with the rate M' of the
+        inertia matrix.
 
         Args:
             theta: Dynamic parameters of the arm, shape (5, ...).

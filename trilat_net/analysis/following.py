@@ -73,7 +73,7 @@ def find_task_reference(
 class JointFollowing(NamedTuple):
     """How a site that follows joint by joint turns errors into motion and torque.
 
-    Its coordinates are the joint angles, so that every function is a product with a gain, or
+    Its coordinates are the joint angles. Therefore every function is a product with a gain, or
     the identity. `TaskFollowing` has the same methods for sites that follow with the end
     effector. In all methods `rows` selects the K rows of the records that are evaluated.
 
@@ -120,7 +120,7 @@ class JointFollowing(NamedTuple):
     def compute_joint_torque(self, rows: Rows, force: Array) -> Array:  # noqa: ARG002
         """Returns the joint torque of a force along the shared coordinates, shape (K, n).
 
-        The shared coordinates are the joint angles here, so that the force is the torque.
+        The shared coordinates are the joint angles here. Therefore the force is the torque.
 
         Args:
             rows: Rows of the records. Not needed here, as the result depends on no pose.

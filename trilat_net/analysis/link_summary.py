@@ -402,7 +402,7 @@ class SampleCounts(NamedTuple):
         judged: Samples of which the log shows whether they arrived.
         arrived: Samples that arrived, each counted once.
         missing: Judged samples that did not arrive.
-        lost: Samples that arrived, but that the emulated network loses, so that they were not
+        lost: Samples that arrived, but were lost by the emulated network and therefore not
             used.
         late: Samples that arrived after the tick in which they should have come into use.
         superseded: Samples that came too late to be used, because a newer sample was in use.

@@ -599,7 +599,7 @@ def _judge_joint(
 def _find_fed_joints(joints: Sequence[RunEnd], owners: Ints, group: Sequence[int]) -> list[int]:
     """Finds the steady joints that may receive energy from a faster joint of the coupled sites.
 
-    Modes that decay at several frequencies beat, so that a joint may be steady for a while
+    Modes that decay at several frequencies beat. Therefore a joint may be steady for a while
     although all modes decay.
 
     Args:

@@ -203,7 +203,7 @@ class TwinGrowth(NamedTuple):
 
     @property
     def grows(self) -> bool:
-        """True if small pushes of the run grow, so that the run is unstable.
+        """True if small pushes of the run grow, that is, if the run is unstable.
 
         Arms that follow each other form a group. The pushes of a group grow if at least half of
         them grow all the time from `from_s` to `to_s`. They also grow if the same joint grows

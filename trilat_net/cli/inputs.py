@@ -132,7 +132,7 @@ def new_hand_command(
     file: Annotated[Path, typer.Argument(help="File to write, for example myhand.py.")],
     force: options.ForceOption = False,
 ) -> None:
-    """Writes a working hand, which acts as a user, as a starting point, and a test of it."""
+    """Creates a working hand (a program that acts as a user) to start from, and its test."""
     from ..scenario.skeletons import new_hand
 
     key = """'sites.m2.hands=[{{kind="own", class="{}"}}]'"""
@@ -144,7 +144,7 @@ def new_plant_command(
     file: Annotated[Path, typer.Argument(help="File to write, for example myplant.py.")],
     force: options.ForceOption = False,
 ) -> None:
-    """Writes a working plant, a model of an arm, as a starting point, and a test of it."""
+    """Creates a working plant (a model of an arm) to start from, and its test."""
     from ..scenario.skeletons import new_plant
 
     _print_skeleton("plant", new_plant(file, force=force), "sites.s.plant={}", "verify")

@@ -542,7 +542,7 @@ def linear_command(
 
 
 def _parse_pose(text: str | None) -> tuple[float, ...] | None:
-    """Parses joint angles from a text such as "0.1,0.3".
+    """Parses joint angles from a string such as "0.1,0.3".
 
     Args:
         text: The text. None if the user gave no pose.

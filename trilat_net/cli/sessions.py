@@ -483,7 +483,7 @@ def _connect(session: str, reach: options.Reach, *, stops: bool = False) -> "Run
     Args:
         session: Name of the session.
         reach: The options by which the command reaches the session.
-        stops: True if the command only stops arms, so that expired keys are accepted.
+        stops: True if the command only stops arms. Expired keys are then accepted.
     """
     from sites.running_session import RunningSession
 

@@ -27,7 +27,7 @@ link is p:
   accelerations a, and f is the spatial force on the link.
 
 The result is tau = M a + C v + G, in which C depends on qd. The product of V and W is
-symmetric. It corresponds to the Christoffel symbols, so that dM/dt - 2 C is skew-symmetric.
+symmetric. It corresponds to the Christoffel symbols. Therefore dM/dt - 2 C is skew-symmetric.
 
 The adaptive control law needs the product Y' r. Y is the regressor, the matrix for which Y
 theta = tau, and r = qd - v is the filtered error. The product is the gradient of r' tau with

@@ -132,8 +132,8 @@ def perron_vector(alpha: Array) -> Array:
 
     They are the positive solution of beta' = beta' alpha with the sum 1, which the paper writes
     as beta' Upsilon = 0. The method is the elimination of Grassmann, Taksar and Heyman (1985).
-    It contains no subtraction, so that each entry is accurate to a few units in the last place
-    even if the dominance factors differ by many orders of magnitude.
+    It contains no subtraction. Therefore each entry is accurate to a few units in the last
+    place even if the dominance factors differ by many orders of magnitude.
 
     Args:
         alpha: Irreducible dominance matrix, shape (N, N), see `is_irreducible`.
@@ -142,8 +142,7 @@ def perron_vector(alpha: Array) -> Array:
         The weights, shape (N,).
 
     Raises:
-        ValueError: alpha is reducible, so that the weight of some site is zero or beta is not
-            unique.
+        ValueError: alpha is reducible: the weight of some site is zero, or beta is not unique.
     """
     if not is_irreducible(alpha):
         raise ValueError("alpha is reducible: beta has a zero entry or is not unique")

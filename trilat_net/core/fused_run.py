@@ -699,7 +699,7 @@ def run_until(
         arrays: The arrays of all sites, see `stack_site_arrays`.
         chains: Its `chain` once more: as an argument that is None it keeps Numba from compiling
             the leaves of chains.
-        laws: The users' compiled laws; None: there are none.
+        laws: The users' compiled laws. None if there are none.
     """
     count = progress.shape[0]
     while True:

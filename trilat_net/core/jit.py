@@ -266,8 +266,8 @@ class _LeafCacheImpl(CompileResultCacheImpl):
 class _CompressedFiles(IndexDataCacheFile):
     """The cache files of one function, compressed to a quarter.
 
-    Numba numbers the files, so that two processes may write different code into one file. Here
-    the name of a file contains a hash of its key.
+    Numba numbers the files. Therefore two processes may write different code into one file.
+    Here the name of a file contains a hash of its key.
     """
 
     def save(self, key: Any, code: Any) -> None:

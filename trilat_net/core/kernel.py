@@ -5,7 +5,7 @@ tick has eight stages, in this order:
 
 - 1 accept: store the samples (states) that arrived from other sites.
 - 2 release: take the newest sample of each site whose simulated delay has passed.
-- 3 reference: compute the position that the arm shall follow.
+- 3 reference: compute the position that the arm should follow.
 - 4 errors: compute the tracking errors.
 - 5 estimate: update the estimate of the arm's dynamic parameters.
 - 6 torque: compute the torque of the control law.
@@ -178,7 +178,7 @@ def _guard_torque(k: int, t_ns: int, s: SiteRow, chain: RowArray | None) -> None
 
     This is the last part of stage 6 of a tick, after the law has written the torque `tau`. The
     rate of every torque is limited. Under the rule `glide`, by which an arm comes to rest while
-    a peer (another arm) is silent, these cases change the torque before:
+    a peer (another arm) is silent, the torque is first modified in these cases:
 
     - The torque is not finite: the mode becomes FAULT, in which the arm comes to rest.
     - The arm comes to rest or is at rest: damping and an integral term are added, see
@@ -455,7 +455,7 @@ def reference_stages(
     """Computes reference, tracking errors and parameter estimate of a control period.
 
     These are stages 3 to 5 of a tick. They use the newest samples (states) of the other arms
-    whose delay has passed. At last, the external torque of operators and environments is
+    whose delay has passed. Finally, the external torque of operators and environments is
     computed.
 
     Args:
@@ -496,11 +496,11 @@ def sense_stages(
 
     - 1 accept: store the samples that arrived, until their simulated delay has passed.
     - 2 release: put into use the newest sample of each peer whose delay has passed.
-    - 3 reference: compute the position that the arm shall follow.
+    - 3 reference: compute the position that the arm should follow.
     - 4 errors: compute the tracking errors.
     - 5 estimate: update the estimate of the arm's dynamic parameters.
 
-    At last, the torque of operators and environments on the arm is computed.
+    Finally, the torque of operators and environments on the arm is computed.
 
     Args:
         k: Number of the tick.

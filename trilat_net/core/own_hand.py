@@ -259,7 +259,7 @@ class OwnHand:
     def release(self, k: int) -> None:
         """Makes the program release the arm in control period k.
 
-        All earlier decisions of the program that have not acted yet are cancelled.
+        All earlier decisions of the program that have not yet taken effect are cancelled.
         """
         self._due.clear()
         self._schedule(k, k, (), grip=False)

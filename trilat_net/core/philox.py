@@ -58,7 +58,7 @@ def philox(
 ) -> PhiloxWords:
     """Returns four random 32-bit words for a counter and a key, by the Philox generator.
 
-    The same arguments always give the same words, so that no generator has a state. All words
+    The same arguments always give the same words. Therefore no generator has a state. All words
     are 32-bit numbers in uint64, so that products keep their upper halves.
 
     Args:

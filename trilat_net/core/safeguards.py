@@ -102,7 +102,7 @@ def _limit_turn(site: SiteRow) -> None:
 def is_torque_finite(site: SiteRow) -> bool:
     """Returns True if the torque that the control law wrote is finite for each joint.
 
-    NaN is found too, so that a law that wrote no torque is noticed.
+    NaN is found too. Therefore a law that wrote no torque is noticed.
     """
     finite = True
     for i in range(site.joints):

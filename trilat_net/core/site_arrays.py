@@ -79,10 +79,11 @@ class SiteArrays(NamedTuple):
         points: Traces and outages, shape (n, 2); stacked sites share one table.
         ramps: Changes of the dominance factors, shape (R, RAMP_COLUMNS + P).
         actors: Operators and environments, shape (A,), see `torque_source_dtype`.
-        table: Their recorded torques, shape (rows, 1 + n); stacked sites share one table.
-        chain: The joints of a chain, shape (n,), see `chain_dtype`; None: the planar two-link
-            arm.
-        channel: The numbers that the peers' laws send, per peer, for a user's law; None: the
+        table: Recorded torques of the operators and environments, shape (rows, 1 + n); stacked
+            sites share one table.
+        chain: The joints of a chain, shape (n,), see `chain_dtype`. None for the planar
+            two-link arm.
+        channel: The numbers that the peers' laws send to a user's law, per peer. None if the
             kernel computes the law.
     """
 

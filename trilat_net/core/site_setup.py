@@ -404,7 +404,7 @@ class ChainSetup(NamedTuple):
         gravity_m_s2: Gravitational acceleration in the frame of the base, m/s^2.
         tip_m: Position of the end effector in the frame of the last link, m.
         tip_rotation: Orientation of the end effector in that frame.
-        task: The setup in task space; None: the arm follows joint by joint.
+        task: The setup in task space. None if the arm follows joint by joint.
     """
 
     joints: tuple[ChainJoint, ...]
@@ -477,10 +477,10 @@ class SiteSetup(NamedTuple):
         ramps: The scripted changes of the dominance factors, in the order of their starts.
         on_stale: The rule for a stale peer.
         external: True: the arm is outside of the program: it is measured, and not integrated.
-        law_factory: Creates the user's law; None: the kernel computes the law.
+        law_factory: Creates the user's law. None if the kernel computes the law.
         theta_known: False: `theta` does not describe the arm, which is external and not
             identified.
-        chain: The arm if it is a chain; None: the planar two-link arm.
+        chain: The arm if it is a chain. None for the planar two-link arm.
         channel: The numbers that the site's law sends to its peers.
         limits: Limits of the motion.
         rest: The gains with which the arm comes to rest.

@@ -186,7 +186,7 @@ def put_source_torque(
         s: Settings of the site (the process that runs the arm).
         state: Two joint angles in rad, followed by two joint velocities in rad/s.
         actors: Operators and environments, one row for each.
-        table: Numbers of all operators and environments, for example recorded torques.
+        table: Numeric data of all operators and environments, for example recorded torques.
         sampled: 1 for the torque of the sampled operators and environments, 0 for all others.
         torque: Receives the torque on the arm, shape (2,), N m.
     """
@@ -224,7 +224,7 @@ def update_external_torque(
             whole torque and `held` the first part, N m. `wall_n` receives the largest force of
             a wall, N. `sensed` is the measured torque, N m.
         actors: Operators and environments, one row for each.
-        table: Numbers of all operators and environments, for example recorded torques.
+        table: Numeric data of all operators and environments, for example recorded torques.
     """
     q = pair(s.q)
     qd = pair(s.qd)
@@ -317,7 +317,7 @@ def rk4_step(
         g: Gravitational acceleration, m/s^2.
         lengths: Lengths of the two links, m.
         actors: Operators and environments, one row for each.
-        table: Numbers of all operators and environments, for example recorded torques.
+        table: Numeric data of all operators and environments, for example recorded torques.
 
     Returns:
         Joint angles and joint velocities at the end of the period.

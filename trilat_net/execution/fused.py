@@ -668,7 +668,7 @@ class FusedRun:
     def has_programs(self) -> bool:
         """True if users' programs act as operators, or compute the motion of an arm.
 
-        The state of such programs is not part of the state of the run, so that the run cannot
+        The state of such programs is not part of the state of the run. Therefore the run cannot
         be copied.
         """
         return bool(self._hands or self._plants)

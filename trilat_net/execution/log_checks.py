@@ -336,7 +336,7 @@ def _check_execution(result: VerifyResult, recorded: str) -> Finding:
 
 
 def _describe_gaps(gaps: Sequence[tuple[str, int, int]]) -> str:
-    """Returns the ranges of ticks of each site as a text, such as "m1 3-7, 12; s 5".
+    """Returns the ranges of ticks of each site as a string, such as "m1 3-7, 12; s 5".
 
     At most `MAX_GAPS_NAMED` ranges are listed. The others are counted.
 

@@ -631,8 +631,8 @@ def _describe_site_limits(effect: SiteEffect, absent_ticks: int) -> Iterator[str
     A site is a process that runs one arm, a tick is a period of its control loop, and its
     record in the log is the stored result. There is a sentence for each of these facts:
 
-    - Ticks could not be executed because the log contains too little, so that their recorded
-      results were copied.
+    - Ticks could not be executed because the log contains too little. The recorded results of
+      these ticks were copied.
     - Ticks have no record. They were executed with assumed arrivals of samples.
     - The site had left the live session for some ticks, which are executed nevertheless.
     - Samples (states of other sites) arrived, but the log does not contain them. The ticks were

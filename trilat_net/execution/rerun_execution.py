@@ -332,7 +332,7 @@ def _describe_changes(request: RerunRequest) -> Iterator[tuple[str, str, str]]:
 
     Yields:
         The subject ("link" or the name of a key), its owner (a link or site, or empty for the
-        whole scenario), and the change as a text.
+        whole scenario), and the change as a string.
     """
     replaced_objects: set[str] = set()  # as group.owner
     for change in request.changes:
@@ -486,7 +486,7 @@ class RerunSite:
 
     @property
     def is_done(self) -> bool:
-        """True if the site has executed its last tick, so that nothing is left to do."""
+        """True if the site has executed its last tick and nothing is left to do."""
         return self.diverged or self.k > self._last_tick
 
     @property

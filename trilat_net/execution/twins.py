@@ -269,7 +269,7 @@ def parse_push(
 
 
 def _describe_target(site: str | None, kind: str, number: str | None) -> str:
-    """Returns the unit and target of a push as a text, for example "rad at m1 joint 1"."""
+    """Returns the unit and target of a push as a string, for example "rad at m1 joint 1"."""
     noun = "estimate" if kind == "theta" else "joint"
     unit = {"q": "rad at", "qd": "rad/s at", "theta": "of"}[kind]
     if number:

@@ -81,7 +81,7 @@ class RecordDifference(NamedTuple):
 
 
 def _format_value(value: object) -> str:
-    """Returns a value as a text. The text of a floating-point number also shows its bits."""
+    """Returns a value as a string. The text of a floating-point number also shows its bits."""
     return f"{value!r} ({value.hex()})" if isinstance(value, float) else repr(value)
 
 
@@ -105,9 +105,9 @@ def equal_to_tolerance(a: float, b: float) -> bool:
 def describe_law_failure(failure: LawFailed) -> RecordDifference:
     """Describes a user's control law that fails when a log is executed again.
 
-    In the log it did not fail. The site with the law (process that runs one arm) cannot be
-    executed further. The report treats the failure like a record of the log that the new
-    execution does not have.
+    The law did not fail in the logged session. The site with the law (process that runs one
+    arm) cannot be executed further. The report counts the failure as a logged record that the
+    new execution did not reproduce.
 
     Args:
         failure: The error of the control law.
@@ -544,7 +544,7 @@ class SiteVerifier:
         """Replaces the executed site by a new one, whose state is still to be restored.
 
         A law must keep all its state in its `memory`, which the records contain. Other state is
-        lost by the replacement, so that the following records differ and the fault is found.
+        lost by the replacement. Therefore the following records differ and the fault is found.
 
         This method only marks the state as uncertain. The caller then restores it from the two
         records before the next one, as after a gap of the log. Nothing happens if the state is

@@ -296,7 +296,7 @@ class SiteChannels:
 
 
 def render_accounts(sites: Iterable[SiteChannels]) -> dict[str, str]:
-    """Returns a text for each channel of a log, with the number of its messages.
+    """Returns a string for each channel of a log, with the number of its messages.
 
     A channel is a series of messages of one kind from one site (process that runs one arm). A
     log contains these texts, so that a reader notices missing messages.

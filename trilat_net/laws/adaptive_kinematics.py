@@ -327,7 +327,7 @@ class AdaptiveKinematics(ControlLaw):
             situation: The site, its peers (the other sites) and the delays between them.
 
         Returns:
-            The condition as a text. It is never decided (`holds` is None), because only a run
+            The condition as a string. It is never decided (`holds` is None), because only a run
             shows whether the elbows stay bent.
         """
         if np.isnan(situation.longest_s):

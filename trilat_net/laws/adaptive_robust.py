@@ -122,7 +122,7 @@ class AdaptiveRobust(AdaptiveBox):
             situation: The site, its peers (the other sites) and the delays between them.
 
         Returns:
-            The bound as a text. It holds if all delays are constant, and is undecided
+            The bound as a string. It holds if all delays are constant, and is undecided
             otherwise.
         """
         pairs = zip(self.rho_nm, self.width_rad_s, strict=True)

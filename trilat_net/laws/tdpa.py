@@ -377,7 +377,7 @@ def find_affordable_velocity(
 
     The peer is another arm. Its velocity moves the goal to which a spring pulls this arm, and
     the torque of the spring does work. Delays could make this work larger than the energy that
-    the peer has put in, so that the arms would be driven by energy from nowhere. Therefore the
+    the peer has put in. The arms would then be driven by energy from nowhere. Therefore the
     velocity is reduced if its work would exceed the energy that the peer is known to have put
     in and that is not spent (`find_known_energy`).
 
@@ -943,7 +943,7 @@ class Tdpa(EnergyLaw):
           work of up to tau qdd h^2 / 2, where tau is the torque.
 
         Returns:
-            The assumptions as a text, with a condition that holds.
+            The assumptions as a string, with a condition that holds.
         """
         passive_coupling = (
             "motion stays bounded (decay is not proved): couplings are passive for any delays, "

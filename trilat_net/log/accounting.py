@@ -1,7 +1,7 @@
 """Counts the messages of a session: which were received, and which are missing.
 
-The messages of a channel are numbered consecutively, so that a gap in the numbers shows that a
-message is missing. An `Account` holds these counts for one channel. A recorder updates its
+The messages of a channel are numbered consecutively. Therefore a gap in the numbers shows that
+a message is missing. An `Account` holds these counts for one channel. A recorder updates its
 accounts while it records, and a tool can compute them again later from the log.
 
 A site is a process that runs one arm. A tick is one period of its control loop, and a record is
@@ -369,7 +369,7 @@ class Account:
                 first message of the session.
 
         Returns:
-            A text "first-last" for each range. Empty if no message is missing.
+            A string "first-last" for each range. Empty if no message is missing.
         """
         gaps = islice(self._gaps, most)
         return [f"{base + first}-{base + last}" for first, last in gaps]
@@ -393,9 +393,9 @@ class StartGap:
     A site that is killed cannot state how many messages it published. After its next start it
     continues at a later tick. The messages in between were either published and lost on the way
     to the recorder, or never published. Other sites may have received samples of the earlier
-    start, so that they know a number of messages that it published at least. Their reports may
-    arrive before or after the next start. A few messages were still in transit to the recorder
-    when the site was killed. These count as unpublished.
+    start. In that case these sites know a number of messages that the earlier start published
+    at least. Their reports may arrive before or after the next start. A few messages were still
+    in transit to the recorder when the site was killed. These count as unpublished.
 
     The numbers of the gap are divided at one point, which only moves up:
 
@@ -542,7 +542,7 @@ class Coverage(NamedTuple):
         return ", ".join(map(self._describe_site, incomplete))
 
     def _describe_site(self, site: str) -> str:
-        """Returns the coverage of a site as a text, such as "m1 990 of 1000 ticks (99 %)"."""
+        """Returns the coverage of a site as a string, such as "m1 990 of 1000 ticks (99 %)"."""
         ticks = count_nouns(self.expected[site], "tick")
         percent = _format_percent(self._share(site))
         return f"{site} {self.judged.get(site, 0)} of {ticks} ({percent})"
@@ -903,8 +903,9 @@ class SessionAccounts:
         """Lists the message counts of a topic, separately for each start of its sender.
 
         An `Account` holds the numbers of received and missing messages. Events are numbered
-        from 0 again whenever their sender is started, so that each start has its own account.
-        All other messages continue their numbers, so that their topic has a single account.
+        from 0 again whenever their sender is started. Therefore each start has its own account.
+        All other messages continue their numbers. Therefore the topic of such messages has a
+        single account.
 
         Args:
             topic: Topic of the channel. It must be counted, see `open_channel`.

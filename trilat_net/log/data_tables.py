@@ -606,8 +606,8 @@ def build_arrivals_table(site: SiteLog, source: str, *, live: bool) -> Table:
     Args:
         site: Records of the receiving site, which list the arrivals.
         source: Name of the file for error messages.
-        live: True if the session was live, so that the delays were measured. In virtual time
-            they are the ages of the samples.
+        live: True if the session was live. The delays were then measured. In virtual time the
+            delays are the ages of the samples.
 
     Raises:
         LogError: A record contains an arrival from a peer that the site does not have.
@@ -712,7 +712,7 @@ def _list_reasons(dropped: Iterable[Mapping[str, int]]) -> list[str]:
 
 
 def _to_word(text: str) -> str:
-    """Converts a text to a part of a column name: small letters, digits and underscores."""
+    """Converts a string to a part of a column name: small letters, digits and underscores."""
     return re.sub(r"[^a-z0-9]+", "_", text.lower())[:31]
 
 
@@ -791,7 +791,7 @@ def build_events_table(timed: TimedMessages[Event], source: str) -> Table:
 
 
 def _to_text(value: str | Mapping[str, Any]) -> str:
-    """Converts a field of an event to a text.
+    """Converts a field of an event to a string.
 
     A map becomes JSON, and an empty map an empty text.
     """

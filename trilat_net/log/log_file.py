@@ -463,7 +463,7 @@ class LogFile:
 
 
 def _describe_content(path: Path) -> str:
-    """Returns the numbers of records and other messages in a finished log, as a text.
+    """Returns the numbers of records and other messages in a finished log, as a string.
 
     The numbers are read from the statistics at the end of the file.
     """

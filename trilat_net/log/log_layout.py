@@ -160,7 +160,7 @@ def parse_channel_filter(include: Collection[str], exclude: Collection[str]) -> 
         exclude: Key expressions of `--exclude`.
 
     Raises:
-        UsageError: A text is not a key expression, so that it would match no channel.
+        UsageError: A string is not a key expression and would match no channel.
     """
     for option, texts in (("--include", include), ("--exclude", exclude)):
         for text in texts:

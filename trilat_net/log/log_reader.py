@@ -151,7 +151,7 @@ class Log(Result, Mapping[str, SiteLog]):
         return f"{self.source}: {kind}; {summary}{state}"
 
     def _describe_records(self) -> str:
-        """Returns the length of the session and the numbers of its records, as a text."""
+        """Returns the length of the session and the numbers of its records, as a string."""
         last_times_s = [float(self[name].t_s[-1]) for name in self.sites if len(self[name])]
         length_s = max(last_times_s, default=0.0)
         records = sum(len(self[name]) for name in self.sites)

@@ -250,7 +250,7 @@ def _read_chain(path: Path, progress: Progress | None) -> tuple[Integrity, dict[
 
     Digests are checksums of the contents (`running_digest`), which are computed again while the
     log is read. A log whose digests agree (`DigestState.INTACT`), but whose end mark is
-    missing, counts as unfinished (`DigestState.OPEN`), so that it is not signed.
+    missing, counts as unfinished (`DigestState.OPEN`) and is not signed.
 
     Args:
         path: The log.

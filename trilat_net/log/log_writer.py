@@ -553,7 +553,7 @@ class LogParts:
         """Completes the last part, so that the log is finished.
 
         Args:
-            accounts: Numbers of received and missing messages as a text, by topic, and other
+            accounts: Numbers of received and missing messages as a string, by topic, and other
                 counts by name.
 
         Raises:

@@ -483,7 +483,7 @@ class RecordScanner:
         """Reads the footer of the file, which states where the index is.
 
         Returns:
-            The footer. None if the file is not finished, so that it has none.
+            The footer. None if the file is not finished and therefore has no footer.
         """
         content = self.read(max(0, self.size - FOOTER_BYTES) + RECORD_HEAD_BYTES, 20)
         return parse_record(Opcode.FOOTER, content) if self.ends else None

@@ -73,7 +73,7 @@ class Sink(Protocol):
 
 
 def pack_text(text: str) -> bytes:
-    """Encodes a text as MCAP files require: its length in bytes, then its bytes in UTF-8."""
+    """Encodes a string as MCAP files require: its length in bytes, then its bytes in UTF-8."""
     # The name of a file may contain surrogates, which UTF-8 cannot encode.
     data = text.encode(errors="backslashreplace")
     return _pack_bytes(data)

@@ -130,8 +130,8 @@ def _part_index(part: LogContents) -> int:
 def _sum_other_counts(parts: Sequence[LogContents]) -> dict[str, str]:
     """Adds the recorders' counts that belong to no channel, such as dropped messages.
 
-    A recorder continues its counts from part to part, so that its last part contains the
-    totals. The totals of different recorders are added.
+    A recorder continues its counts from part to part. Therefore the last part of a recorder
+    contains the totals. The totals of different recorders are added.
 
     Args:
         parts: The parts, in the order of their first messages.

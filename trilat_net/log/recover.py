@@ -70,7 +70,7 @@ _REGENERATED = frozenset(
     {Opcode.MESSAGE_INDEX, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.STATISTICS}
     | {Opcode.METADATA_INDEX, Opcode.SUMMARY_OFFSET, Opcode.DATA_END, Opcode.FOOTER}
 )
-"""Kinds of records that the writer computes from the content, so that their loss is no loss."""
+"""Kinds of records that the writer computes from the content; losing them loses no data."""
 
 
 @dataclass(repr=False)
@@ -490,10 +490,8 @@ class _FileCopy:
     def _copy_attachment(self, content: bytes) -> None:
         """Copies an attachment.
 
-        A damaged attachment is renamed with the suffix `DAMAGED_SUFFIX`.
-
-        Under its own name, nobody would notice the damage, because the writer adds a valid
-        checksum.
+        A damaged attachment is renamed with the suffix `DAMAGED_SUFFIX`. If it kept its name,
+        nobody would notice the damage, because the writer adds a valid checksum.
         """
         entry = mcap_records.parse_record(Opcode.ATTACHMENT, content)
         name = entry.name
@@ -592,7 +590,7 @@ class _FileCopy:
 
         Raises:
             UnreadableRecord: The content contradicts the session or cannot be checked, or the
-                file of another program has chunks, so that a message outside of them is the
+                file of another program has chunks and a message outside of them, which is the
                 result of damage.
         """
         if self._content is not None:
@@ -911,7 +909,7 @@ class _FileCopy:
             offset: Offset of the chunk in the source file.
 
         Returns:
-            The problem that ended the copy, as a text for the user. Empty if all blocks were
+            The problem that ended the copy, as a string for the user. Empty if all blocks were
             copied.
         """
         can_check_messages = self._content is not None or not self.is_session_log

@@ -2,9 +2,9 @@
 
 A log contains two SHA-256 digests: one of all messages in order, and one of everything that
 describes the messages (metadata, scenario, schemas and channels). If a log has several parts,
-each part repeats the digest of the previous one, so that the digests form a chain. The digests
-reveal alterations. They cannot show that a whole file was written anew with new digests.
-Signatures protect against that (`log_signature`).
+each part repeats the digest of the previous one. Therefore the digests form a chain. The
+digests reveal alterations. They cannot show that a whole file was written anew with new
+digests. Signatures protect against that (`log_signature`).
 
 Invariant:
     - The digests depend on the records of the file, and not on their division into chunks or on
@@ -40,7 +40,7 @@ class DigestState(StrEnum):
 
     - INTACT: The file agrees with its digests.
     - ABSENT: The file has no digests, because an old program wrote it.
-    - OPEN: The file was not finished or is damaged, so that it cannot be compared.
+    - OPEN: The file was not finished or is damaged, and cannot be compared.
     - CHANGED: The file differs from its digests, or the digests were removed.
     """
 
@@ -127,7 +127,7 @@ class RunningDigest:
 
         Args:
             metadata: All metadata of the file, by name. They contain its digests.
-            finished: True if the file was finished, so that it must contain digests.
+            finished: True if the file was finished. A finished file must contain digests.
             damaged: True if a part of the file cannot be read.
 
         Returns:

@@ -714,8 +714,9 @@ class SessionCheck:
         At the end of a file, the recorder states for each channel how many messages it received
         and how many are missing. The comparison is not possible if these counts include
         messages of parts that were not read, or if several recorders wrote the log. The
-        recorder's own statistics have no numbers, so that their counts cannot be compared.
-        Since version `_ACCOUNTS_SINCE` of the schema, every channel must have an account.
+        recorder's own statistics have no numbers. Therefore the counts of statistics cannot be
+        compared. Since version `_ACCOUNTS_SINCE` of the schema, every channel must have an
+        account.
 
         Returns:
             The finding, with a problem for each channel whose account is wrong or missing.
@@ -821,7 +822,7 @@ def _describe_unexplained_gap(log: Log, site: str) -> str:
 
     Returns:
         The description. Empty if the records agree with the statements of the recorder, or if
-        a part of the file cannot be read, so that records may be missing for this reason.
+        a part of the file cannot be read, because records may be missing for this reason.
     """
     if log.damaged:
         return ""

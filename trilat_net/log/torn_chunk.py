@@ -1,9 +1,9 @@
 """Recovers the records of a chunk that was cut off, block by block.
 
 An MCAP file stores messages in compressed chunks. If a recording is interrupted, the last chunk
-may be incomplete. The checksum of a chunk covers all of its records, so that it proves nothing
-if the end is missing. But the compressed data consist of blocks, pieces that can be unpacked as
-a whole, and all complete blocks can be used.
+may be incomplete. The checksum of a chunk covers all of its records. Therefore the checksum
+proves nothing if the end is missing. But the compressed data consist of blocks, pieces that can
+be unpacked as a whole, and all complete blocks can be used.
 
 Invariant:
     - The records of a block are used together or not at all, because damage in the compressed

@@ -15,7 +15,7 @@ applies the torque that the site publishes:
 person or a program move an arm as its operator.
 
 Torques and forces are read from the record that the site publishes in every tick. The recorder
-stores the same records, so that the log contains exactly what was applied to the arm.
+stores the same records. Therefore the log contains exactly what was applied to the arm.
 
 Invariant:
     - `ArmClient.torque` returns None if no valid torque is available. The arm must then brake.

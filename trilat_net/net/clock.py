@@ -26,7 +26,7 @@ class Clock(Protocol):
     def monotonic_ns(self) -> int:
         """Returns the reading of a clock that never steps, in ns.
 
-        The zero of this clock is arbitrary, so that only differences of readings have a
+        The zero of this clock is arbitrary. Therefore only differences of readings have a
         meaning.
         """
 
@@ -46,7 +46,7 @@ class Clock(Protocol):
         """
 
     def identity(self) -> str:
-        """Returns a text that identifies the monotonic clock.
+        """Returns a string that identifies the monotonic clock.
 
         Readings of two processes can be compared only if their clocks have the same identity.
         This is the case for processes on one machine.
@@ -73,7 +73,7 @@ class SystemClock:
             time.sleep(remaining_ns * 1e-9)
 
     def identity(self) -> str:
-        """Returns a text that identifies the monotonic clock of this machine.
+        """Returns a string that identifies the monotonic clock of this machine.
 
         On Linux it consists of the kernel's boot identifier and the time namespace, because
         containers may have a clock of their own. On other systems it contains the name of the

@@ -174,7 +174,7 @@ class Connection:
         settings: Zenoh settings from a user's file or from keys.
         keys_of: Name of the member whose keys are used. Empty if there are no keys. With keys,
             all messages are encrypted, and both ends prove their identities by certificates.
-        keys_end: End of the validity of the keys, in UTC. None if there are no keys.
+        keys_end: Time at which the keys expire, in UTC. None if there are no keys.
     """
 
     listen: Sequence[Endpoint] = ()
@@ -188,7 +188,7 @@ class Connection:
         """Converts endpoints to encrypted endpoints, if this process has keys.
 
         An endpoint is an address such as "tcp/127.0.0.1:10241". With keys, all connections are
-        encrypted, so that TLS replaces TCP. Without keys, the endpoints are returned unchanged.
+        encrypted: TLS replaces TCP. Without keys, the endpoints are returned unchanged.
 
         Args:
             endpoints: Endpoints as text, or groups of endpoints from a user's Zenoh file. The

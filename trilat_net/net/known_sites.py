@@ -97,7 +97,7 @@ def make_site_known(
     network instead.
 
     No file is written if the user has configured the network connection with a Zenoh file.
-    Other processes need the same Zenoh file to reach the site, so that the endpoints alone
+    Other processes need the same Zenoh file to reach the site. Therefore the endpoints alone
     would not help.
 
     Args:

@@ -340,7 +340,7 @@ def _format_member_list(member: str, members: Sequence[str], ends: datetime.date
     Args:
         member: Name of the member.
         members: Names of all members.
-        ends: End of the validity of the keys.
+        ends: Time at which the keys expire.
     """
     content = {"member": member, "members": list(members), "ends": ends.isoformat()}
     return f"{json.dumps(content)}\n"
@@ -353,7 +353,7 @@ def _sign_authority(
 
     Args:
         key: Private key of the authority.
-        ends: End of the validity of the keys.
+        ends: Time at which the keys expire.
     """
     constraints = x509.BasicConstraints(ca=True, path_length=0)
     builder = _start_certificate(_ISSUER, key.public_key(), ends)
@@ -402,7 +402,7 @@ def _start_certificate(
     Args:
         subject: Name of the member, or of the authority.
         public_key: Its public key.
-        ends: End of the validity of the keys. That of the certificate is `STOPPING_TIME` later.
+        ends: Time at which the keys expire. The certificate expires `STOPPING_TIME` later.
     """
     return (
         x509.CertificateBuilder()
@@ -486,8 +486,9 @@ def _read_trusted(path: Path) -> bytes:
 def _check_permissions(path: Path, status: os.stat_result) -> None:
     """Checks that no other user can change a file or folder.
 
-    In a folder with the sticky bit, users cannot change the files of others, so that it may be
-    shared. On Windows, permission bits do not tell who can write, and nothing is checked.
+    In a folder with the sticky bit, users cannot change the files of others. Therefore such a
+    folder may be shared. On Windows, permission bits do not tell who can write, and nothing is
+    checked.
 
     Args:
         path: The file or folder.

@@ -431,7 +431,7 @@ class Membership:
 
         Args:
             may_have_started: True if this member has published that it is ready. From then on
-                the session may start before this member knows, so that the identity of a
+                the session may start before this member knows. Therefore the identity of a
                 running site is no reason to refuse the session.
 
         Raises:

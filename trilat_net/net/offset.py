@@ -15,9 +15,9 @@ estimate of the offset, as in NTP. Their difference is the round trip time, and 
 the error bound.
 
 The time stamps are divided into windows. Of each window, only the lowest ceiling and the
-highest floor are kept. They may come from different exchanges, so that the error bound is half
-of the shortest delay in one direction plus half of the shortest delay in the other. Over the
-windows, the offset is modelled as a straight line. All lines below every ceiling and above
+highest floor are kept. They may come from different exchanges. Therefore the error bound is
+half of the shortest delay in one direction plus half of the shortest delay in the other. Over
+the windows, the offset is modelled as a straight line. All lines below every ceiling and above
 every floor are admissible, and the range of their values at present is the range of the offset.
 
 Assumptions: the clocks drift apart by less than DRIFT_LIMIT, and their drift deviates from its
@@ -221,7 +221,7 @@ class OffsetEstimator:
                 the stored limits.
 
         Returns:
-            The estimate. None if there is no ceiling or no floor, so that the offset is not
+            The estimate. None if there is no ceiling or no floor: the offset is then not
             limited on both sides.
         """
         while self._ceilings and self._floors:
@@ -344,8 +344,8 @@ class _AdmissibleLines:
         deviation of the drift before any measurement.
 
         A limit from a slow message contains little information. Therefore its weight falls with
-        its distance from the tightest limit of the group. This distance depends on the slope,
-        so that the weights are computed again in each round (iteratively reweighted least
+        its distance from the tightest limit of the group. This distance depends on the slope.
+        Therefore the weights are computed again in each round (iteratively reweighted least
         squares). In the first round all weights are equal.
 
         Returns:

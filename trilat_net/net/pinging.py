@@ -31,8 +31,8 @@ QUERY_PERIOD_NS = 200_000_000
 class RepeatedQuery:
     """Sends a query repeatedly, and collects the replies to all of its copies.
 
-    A query may be lost, so that it is sent several times. Each reply is assigned to the copy of
-    the query that it answers, which gives the round trip time.
+    A query may be lost and is therefore sent several times. Each reply is assigned to the copy
+    of the query that it answers, which gives the round trip time.
 
     Args:
         bus: Network connection of the member that sends the query.

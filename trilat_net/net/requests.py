@@ -6,7 +6,8 @@ that move arms). Published messages, which everybody receives, are defined in `m
 
 A session is a run in which processes ("sites") each control one arm. In each tick, a period of
 its control loop, a site publishes a record with the result of the tick. The log contains the
-records and events, so that it does not contain the messages of this module, but their effects:
+records and events. Therefore the log does not contain the messages of this module, but their
+effects:
 
 - A change is logged as an event.
 - A lost message that was sent again is logged like all others.

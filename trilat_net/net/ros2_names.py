@@ -16,7 +16,7 @@ Each part consists of letters, digits and _, and does not start with a digit.
 
 
 def check_ros_name(name: str, kind: str) -> str:
-    """Checks that a text is a valid name of ROS 2.
+    """Checks that a string is a valid name of ROS 2.
 
     Args:
         name: The name, which may begin with a slash.

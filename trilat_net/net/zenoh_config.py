@@ -390,7 +390,7 @@ def _list_problems(source: str, problems: Sequence[str]) -> str:
 
     Args:
         source: Name of the file.
-        problems: A text for each problem, at least one.
+        problems: A string for each problem, at least one.
     """
     if len(problems) == 1:
         return f"{source}: {problems[0]}"
@@ -405,7 +405,7 @@ def _find_problems(settings: Mapping[str, Any]) -> Iterator[str]:
         settings: Content of the file.
 
     Yields:
-        A text for each problem, which begins with the key.
+        A string for each problem, which begins with the key.
     """
     for key, value in _iterate_leaves(settings, ()):
         compared = _expand_mode(settings, value) if key in _SET_BY_MODE else value

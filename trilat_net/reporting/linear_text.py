@@ -124,7 +124,7 @@ def describe_effective_delays(analysis: LinearAnalysis) -> Iterator[str]:
 
 
 def tabulate_roots(analysis: LinearAnalysis) -> TextTable:
-    """Returns a table of the rightmost characteristic roots, which decide about stability.
+    """Returns a table of the rightmost characteristic roots, which determine stability.
 
     A motion with the root s changes as exp(s t), and grows if the real part of s is positive.
     The table describes the motion of each root.
@@ -200,7 +200,7 @@ def describe_linear_verdict(analysis: LinearAnalysis) -> str:
     tick by tick".
 
     Args:
-        analysis: Result of the linear stability analysis. The roots that decide about stability
+        analysis: Result of the linear stability analysis. The roots that determine stability
             (`decisive`) are those of the sampled loop, whose controllers compute in ticks, if
             it could be analysed, and otherwise those of the continuous loop.
 

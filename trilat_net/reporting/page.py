@@ -837,7 +837,7 @@ def _render_swatch(log: Log, site: str) -> str:
 
 
 def _render_note(text: str) -> str:
-    """Returns a text as a paragraph in small type."""
+    """Returns a string as a paragraph in small type."""
     return f'<p class="note">{escape(text)}</p>'
 
 

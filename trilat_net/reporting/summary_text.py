@@ -268,7 +268,7 @@ def _format_number(value: float) -> str:
 
 
 def _describe_losses(use: link_summary.LinkSummary, counts: link_summary.SampleCounts) -> str:
-    """Returns how many samples of a link were not used, by the reason, with their percentages.
+    """Returns the number and percentage of a link's samples that were not used, by reason.
 
     Args:
         use: Summary of the link.

@@ -94,7 +94,7 @@ def sanitize(text: object, most: int = 300) -> str:
     `most` characters is cut off.
 
     Args:
-        text: The text, or an object that is converted to a text.
+        text: The text, or an object that is converted to a string.
         most: Largest number of characters.
     """
     # One character more than the limit tells whether the text is too long.

@@ -273,7 +273,7 @@ class LoggedUserLaw(NamedTuple):
     Attributes:
         code: Class of the law, for example "package.module:Law".
         sites: Names of the sites that the law controls.
-        settings: Arguments of the class, as a text for people.
+        settings: Arguments of the class, as a string for people.
         allowed: True if the file may run with these arguments.
         file: The file that a person permitted, or else the file that Python's import finds for
             the module. None if there is no such file.

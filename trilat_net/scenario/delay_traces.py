@@ -8,7 +8,7 @@ A link of the model "trace" repeats the delays of a trace. The table is a CSV fi
 
 or it is taken from the log of a run. `import_trace` builds such a table from the output of
 `irtt` or `ping`, programs that measure the delay of a network. A resolved scenario contains the
-trace as a text, see `format_trace`.
+trace as a string, see `format_trace`.
 
 Invariant:
     - A resolved scenario does not need the file any more.
@@ -126,7 +126,7 @@ def read_trace(path: Path, link: str) -> str:
 
 
 def format_trace(points: Sequence[TracePoint]) -> str:
-    """Returns a delay trace as a text, in the form in which a scenario contains it.
+    """Returns a delay trace as a string, in the form in which a scenario contains it.
 
     A delay trace is a table of send times and the delay that each message had. The form of the
     text is "t_us delay_us, t_us delay_us, ...", in microseconds, with "lost" in place of the
@@ -351,7 +351,7 @@ class MeasuredTrace(Result):
         return lines
 
     def write_rows(self) -> str:
-        """Returns the trace as a text in CSV format, with the columns `t_s,delay_ms`.
+        """Returns the trace as CSV text with the columns `t_s,delay_ms`.
 
         If the text is saved in a file, a link of the model "trace" can use that file. The
         method itself writes no file.

@@ -536,7 +536,7 @@ class ScenarioDifference(NamedTuple):
         key: Dotted path of the key, without `sites.NAME` for a key of a site.
         owners: Names of the sites that have the difference. Empty for a key of the whole
             experiment.
-        values: Value in each experiment as a text. "none" if the experiment lacks the key.
+        values: Value in each experiment as a string. "none" if the experiment lacks the key.
     """
 
     key: str

@@ -71,7 +71,7 @@ class Distribution(Frozen, frozen=True, omit_defaults=True, kw_only=True):
         return float(f"{number:.9g}")
 
     def describe(self) -> str:
-        """Returns a text that describes the distribution to a user.
+        """Returns a string that describes the distribution to a user.
 
         It states the mean and standard deviation of a normal distribution, or the limits of a
         uniform distribution. For a copied start pose, it says so.

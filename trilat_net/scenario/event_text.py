@@ -1,4 +1,6 @@
-"""Renders an event of a session as a sentence for people, also for logs of older versions.
+"""Renders an event of a session as a human-readable sentence.
+
+Logs of older versions are supported too.
 
 An event reports something that happened during a session (a joint run of several arms), for
 example that the delay of a network link was changed. Older versions of the program stored the

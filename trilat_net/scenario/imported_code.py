@@ -215,7 +215,7 @@ def describe_new_settings(key: CodeKey) -> str:
 
 
 def _list_differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """Returns a text for each argument whose value differs, such as "gain = 5 (was 3)".
+    """Returns a string for each argument whose value differs, such as "gain = 5 (was 3)".
 
     An argument that is missing on one side has its default there.
     """
@@ -235,7 +235,7 @@ LONGEST_SETTING = 300
 
 
 def describe_setting(value: Any) -> str:
-    """Returns the value of an argument as a text for messages.
+    """Returns the value of an argument as a string for messages.
 
     It is a JSON text, which contains no control characters. A long text is shortened in the
     middle, because paths of files differ at their ends.
@@ -559,7 +559,7 @@ def name_law_class(kind: type) -> str:
         module = Path(getattr(sys.modules[module], "__file__", None) or "").stem
     if not module or not name.isidentifier():
         raise ScenarioError(
-            f"{name} is not defined in a file, so that a log cannot refer to it: write the "
+            f"{name} is not defined in a file, so a log cannot refer to it: write the "
             "class to a file (in a notebook, with %%writefile mylaws.py) and import it from "
             f"there; see {find_page('own-controller.md')}"
         )

@@ -182,7 +182,7 @@ def _split_entry(key: str) -> tuple[str, str]:
     """Splits the key of an entry of a list, such as "q0_rad.1".
 
     Returns:
-        Key of the list, and number of the entry as a text. For other keys, the key itself and
+        Key of the list, and number of the entry as a string. For other keys, the key itself and
         an empty text.
     """
     vector, _, entry = key.rpartition(".")
@@ -348,7 +348,7 @@ def _list_index(entries: list[Any], name: str, path: str) -> int:
 
     Args:
         entries: The list.
-        name: Index as a text.
+        name: Index as a string.
         path: Path of the entry, for the error message.
 
     Raises:
@@ -391,7 +391,7 @@ def split_assignment(text: str) -> Override | None:
     """Splits a text KEY=VALUE into its key and its value.
 
     Args:
-        text: The text. A value that is not valid TOML is a bare word, and is taken as a text.
+        text: The text. A value that is not valid TOML is a bare word, and is taken as a string.
 
     Returns:
         The key and the value. None if the text does not have this form.

@@ -134,7 +134,7 @@ def read_ping(text: str, every_s: float) -> PingProbes:
             return _arrange_probes(
                 answers={}, mentioned=set(), first=1, summary=summary, every_s=every_s
             )
-    raise ValueError("no line reports an answer, as in 'icmp_seq=1 ttl=63 time=60.6 ms'")
+    raise ValueError("no line reports a reply, such as 'icmp_seq=1 ttl=63 time=60.6 ms'")
 
 
 def _parse_summary(pattern: re.Pattern[str], line: str) -> _Summary | None:

@@ -10,7 +10,7 @@ run.
 
 Invariant:
     - A request may state only the settings that change. They are completed with the settings
-      before the change, and the log contains the complete change as a text. Therefore all
+      before the change, and the log contains the complete change as a string. Therefore all
       programs that read the log derive the same `CoreChange`, the record that the control loop
       uses.
 """

@@ -364,7 +364,7 @@ def parse_embedded(text: str, source: str = "") -> Scenario:
     """Converts the text of a scenario from a log or another process to a scenario.
 
     Such a text is not trusted. A table for all links could repeat a long trace of delays for
-    every link, so that a short text would fill the memory. Therefore the traces of all links
+    every link. A short text would then fill the memory. Therefore the traces of all links
     together may not be longer than the text.
 
     Args:
@@ -372,7 +372,8 @@ def parse_embedded(text: str, source: str = "") -> Scenario:
         source: Name of the text, for error messages.
 
     Raises:
-        ScenarioError: The scenario is not valid, names a file, or is larger than its text.
+        ScenarioError: The scenario is not valid, names a file, or has traces of delays that are
+            together longer than its text.
     """
     scenario = parse_scenario(text, source, folder=None)
     changed_links = [change.after for change in scenario.timeline if change.link]
@@ -388,7 +389,7 @@ def parse_embedded(text: str, source: str = "") -> Scenario:
 def embedded_names_reader(source: str) -> Callable[[str], tuple[str, ...]]:
     """Returns a function that extracts the names of the sites from the text of a scenario.
 
-    The text may come from a log or another computer, so that it is not trusted, see
+    The text may come from a log or another computer. Therefore the text is not trusted, see
     `parse_embedded`.
 
     Args:

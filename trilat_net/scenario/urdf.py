@@ -193,8 +193,8 @@ class _Robot(NamedTuple):
 
     Attributes:
         links: XML elements of the links, by name.
-        above: For each link except the root, the joint on which it hangs.
-        below: For each link, the joints that it carries.
+        above: For each link except the root, its parent joint.
+        below: For each link, its child joints.
     """
 
     links: Mapping[str, Element]
@@ -351,7 +351,7 @@ def _joint(name: str) -> str:
 
 
 def _list_names(names: Sequence[str]) -> str:
-    """Returns the first names of a list as a text, and the number of the others."""
+    """Returns the first names of a list as a string, and the number of the others."""
     text = ", ".join(map(_quote, names[:_MAX_LISTED_NAMES]))
     more = len(names) - _MAX_LISTED_NAMES
     return f"{text} and {more} more" if more > 0 else text

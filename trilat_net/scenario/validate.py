@@ -123,7 +123,7 @@ def refuse_live_only(scenario: Scenario) -> None:
 
     Raises:
         ScenarioError: An arm is external, or a link has the model "measured": it injects no
-            delay, so that the real network decides. In virtual time there is no real network.
+            delay: the real network decides. In virtual time there is no real network.
     """
     refuse_external_arms(scenario)
     if scenario.measured:

@@ -129,7 +129,7 @@ def explain_unfit_worker(
 
 
 def _list_properties(identity: WorkerIdentity, names: Sequence[str]) -> str:
-    """Returns some properties of a worker as a text for an error message."""
+    """Returns some properties of a worker as a string for an error message."""
     return ", ".join(f"{name} {identity.get(name, 'unknown')}" for name in names)
 
 

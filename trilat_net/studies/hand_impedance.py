@@ -388,8 +388,9 @@ def _compute_phasors(
     A phasor is the complex amplitude of a signal at one frequency. Segments have a Hann window
     and overlap by half. The spectrum of the window is zero at the other sines, which are two or
     more multiples of 1 / segment_s away. The spectrum falls with the third power of the
-    frequency, so that transients and drift, which are slower than the sines, hardly contribute.
-    The first half segment is left out. Segments with too many missing records are skipped.
+    frequency. Therefore transients and drift, which are slower than the sines, hardly
+    contribute. The first half segment is left out. Segments with too many missing records are
+    skipped.
 
     Args:
         records: Records of the site.

@@ -469,7 +469,7 @@ _END_NS = round(END_WINDOW_S * NS_PER_S)
 class SiteStats:
     """Statistics of one site over a run, which are updated batch by batch.
 
-    The metrics of the run are computed from the statistics of all sites, so that no records
+    The metrics of the run are computed from the statistics of all sites. Therefore no records
     need to be kept. Below, e is the error of the site against its reference, and |e| its
     magnitude.
 
@@ -951,8 +951,8 @@ class ExpectationResult(msgspec.Struct, frozen=True):
     Attributes:
         key: Key in the table [expect], or the name of a requirement that every run must meet.
         held: True if the run met the expectation.
-        measured: Measured value as a text with its unit.
-        limit: Limit as a text with its unit.
+        measured: Measured value as a string with its unit.
+        limit: Limit as a string with its unit.
         margin: Distance of the measured value to the limit as a fraction of the limit, negative
             beyond the limit. None if the expectation is not about a number.
         value: Measured number in the unit of the limit. None if the expectation is not about a

@@ -240,15 +240,16 @@ def _check_expectations_reachable(scenario: Scenario, source: str) -> None:
         source: Name or path of the scenario, for error messages.
 
     Raises:
-        ScenarioError: The scenario expects nothing, a metric is unknown, or a time lies after
-            the end of the run.
+        ScenarioError: The scenario has no expectations, a metric is unknown, or a time lies
+            after the end of the run.
     """
     expect = scenario.expect
     end_s = scenario.duration_s
     if not expect.has_expectations:
         raise ScenarioError(
-            "expects nothing: add a table [expect] with keys such as stable = true or "
-            "synchronised_by_s = 12.0; the template of `trilat scenario new` lists all keys",
+            "the scenario has no expectations: add a table [expect] with keys such as "
+            "stable = true or synchronised_by_s = 12.0; the template of `trilat scenario new` "
+            "lists all keys",
             source=source,
         )
 

@@ -357,7 +357,7 @@ class Spectrum(NamedTuple):
 
     @property
     def rightmost(self) -> CharacteristicRoot | None:
-        """The characteristic root with the largest real part, which decides about stability.
+        """The characteristic root with the largest real part, which determines stability.
 
         Roots that are zero because of the structure of the loop are not considered: they exist,
         for example, because all arms can rest in other poses too. None if there are no other

@@ -114,7 +114,7 @@ class DelayMargin(NamedTuple):
             for every delay.
         crossings: All crossings of the imaginary axis for delays up to `MAX_COMMON_DELAY_S`, by
             rising delay.
-        lossless: True if the links carry waves without losses, so that some roots are on the
+        lossless: True if the links carry waves without losses. Some roots are then on the
             imaginary axis for every delay.
     """
 
@@ -248,8 +248,7 @@ def find_axis_crossings(loop: LinearLoop) -> tuple[list[AxisCrossing], bool]:
     Returns:
         The crossings for delays up to `MAX_COMMON_DELAY_S`.
         True if the loop is lossless: its open-loop response G has an eigenvalue of modulus 1 at
-        every frequency, so that roots are on the axis for every delay. There are no crossings
-        then.
+        every frequency. Roots are then on the axis for every delay, and there are no crossings.
     """
     common_loop = set_common_delay(loop, 1.0)
     pencil, *_ = characteristic_roots.find_moving_part(common_loop)

@@ -4,9 +4,9 @@ The linear stability analysis describes small motions about one of these equilib
 the equilibrium at the end of a run, the equilibrium nearest to a given pose, or the equilibrium
 that the arms reach from their start poses according to their linear model.
 
-Any pose on which all arms agree may be an equilibrium, so that there are infinitely many.
-Therefore the equilibrium nearest to a known pose is computed. A simulated run may supply this
-pose, but the equilibrium itself is found by solving the equations.
+Any pose on which all arms agree may be an equilibrium: there are infinitely many. Therefore the
+equilibrium nearest to a known pose is computed. A simulated run may supply this pose, but the
+equilibrium itself is found by solving the equations.
 
 Invariant:
     - The result solves the equations to 1e-10, or a note states that it does not.

@@ -277,7 +277,7 @@ def check_passivity(
             of torque times output is then a physical power, if the outputs are velocities.
 
     Returns:
-        The least eigenvalue over frequency, which decides about passivity, and related numbers.
+        The least eigenvalue over frequency, which determines passivity, and related numbers.
     """
 
     def evaluate_weighted(w: Array) -> Complex:

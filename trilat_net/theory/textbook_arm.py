@@ -31,7 +31,7 @@ If end effectors instead of joints follow each other, the reference motion is co
 
 Invariant:
     - The arithmetic of the compiled simulation is not used.
-    - Every function is analytic in every argument, so that a complex step gives derivatives
+    - Every function is analytic in every argument. Therefore a complex step gives derivatives
       that are exact to rounding. The only exception is a chain that meets a joint stop, where
       the real part of the argument decides.
 """

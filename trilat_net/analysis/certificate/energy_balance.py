@@ -170,7 +170,7 @@ class SiteEnergy:
     def uncertainty(self) -> float:
         """Estimated numerical error of the site's energies, in J.
 
-        Energies are integrated from records at the ticks, so that motion between the ticks
+        Energies are integrated from records at the ticks. Therefore motion between the ticks
         causes errors. The error of the trapezoid rule is estimated from the curvature of the
         total power. The error of torques that are constant between ticks is estimated from the
         changes of these torques, times the changes of the filtered error r = qd - v. Here qd is

@@ -91,7 +91,8 @@ class EnergyCurve(NamedTuple):
         """Short name of the energy for reports.
 
         With sites m and s, the energy on the way from m to s is named "line m->s". The part of
-        it that s knows is "known at s of m". The energy stored at s is "store of s".
+        this energy that is known to s is named "known at s of m". The energy
+        stored at s is named "store of s".
         """
         if self.kind == "line":
             return f"line {self.peer}->{self.site}"

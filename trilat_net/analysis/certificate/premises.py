@@ -815,7 +815,7 @@ def _join_limited(items: Sequence[str]) -> str:
 
 
 def _format_by_site(values: Mapping[str, float]) -> str:
-    """Returns a text such as "m1 0.5, s 2" of a value per site."""
+    """Returns a string such as "m1 0.5, s 2" of a value per site."""
     return ", ".join(f"{site} {value:.4g}" for site, value in values.items())
 
 

@@ -146,7 +146,7 @@ class Certificate(Result):
         paper_balance: Energy balance with the weights of the paper, which are 1 for every site.
             None if these are the right weights, or if there is no balance.
         groups: Closed groups of sites, which follow nobody outside their group. Empty unless
-            there are several, so that beta is not unique.
+            there are several; beta is then not unique.
         energies: Energies of every site, by name. Empty if V does not exist.
         roots: Roots of the loop at the pose where the run ended. None if not computed.
         observed: Check of the energies that control laws declare. None if no law declares any.

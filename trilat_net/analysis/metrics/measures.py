@@ -30,7 +30,7 @@ class Metric(NamedTuple):
         value: The number, which is finite. None if there is none.
         why: The reason why there is no number. Empty if there is one.
         applies: False if the quantity cannot exist for this subject in any run of this
-            scenario, so that no information is missing.
+            scenario. In that case no information is missing.
     """
 
     value: float | None

@@ -207,7 +207,7 @@ class StiffnessEstimate(NamedTuple):
         joint: Number of the joint, from 1.
         torque_nm: Change of the operator's torque on its arm.
         angle_rad: Change of the joint's angle.
-        stiffness_nm_rad: Ratio of both changes. None if the joint did not move, so that it is
+        stiffness_nm_rad: Ratio of both changes. None if the joint did not move and is therefore
             too stiff to be measured.
     """
 

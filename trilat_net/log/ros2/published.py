@@ -429,7 +429,7 @@ class SiteMessages:
 
 
 def _name_array_topic(name: str) -> str:
-    """Returns the topic of an array. The topic `mode` contains the mode as a text already."""
+    """Returns the topic of an array. The topic `mode` contains the mode as a string already."""
     return "mode_number" if name == "mode" else name
 
 

@@ -367,7 +367,7 @@ def _read_joint_frame(joint: Element, joint_names: Sequence[str]) -> _JointFrame
 
 
 def _describe_robot(root: Element, site: str, site_number: int) -> str:
-    """Returns the URDF of a site's arm as a text for viewers.
+    """Returns the URDF of a site's arm as a string for viewers.
 
     The elements are changed: the site's name is put in front of the names of the links, and
     links get plain shapes if the URDF contains none.

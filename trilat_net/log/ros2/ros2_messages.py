@@ -142,7 +142,7 @@ _MODE_NUMBERS: dict[Mode | str, float] = {
 
 
 def pack_event(event: Event, stamp_ns: int) -> NamedMessages:
-    """Encodes an event for viewers in two forms: as a text, and as a line for the ROS log.
+    """Encodes an event for viewers in two forms: as a string, and as a line for the ROS log.
 
     Args:
         event: The event, such as the loss of a connection.
@@ -319,7 +319,7 @@ class Ros2SiteChannels:
         return Ros2Channel(cdr.JOINT_STATE, metadata)
 
     def _join_units(self, revolute_unit: str) -> str:
-        """Returns the units of all joints as a text, such as "rad or m".
+        """Returns the units of all joints as a string, such as "rad or m".
 
         Args:
             revolute_unit: Unit of the quantity for a revolute joint.

@@ -376,7 +376,7 @@ class _SiteBuckets:
 
         A bucket is a time interval. Its two rows get the times at the beginning and in the
         middle of the interval, so that the rows of successive buckets are evenly spaced. The
-        extremes of different curves occur at different times, so that no exact time exists.
+        extremes of different curves occur at different times. Therefore no exact time exists.
 
         Args:
             records: The records of the bucket, at least one. They are sorted by time in place.
@@ -432,7 +432,7 @@ def _stamp_extremes(stamps_ns: Sequence[int], curves: Iterable[SignalRow]) -> li
     A row contains one value of each curve at one time. The first row contains the extreme of
     each curve (minimum or maximum) that occurs first, and the second row the other extreme.
 
-    The extremes of different curves occur at different times, so that no exact time of a row
+    The extremes of different curves occur at different times. Therefore no exact time of a row
     exists. The rows get the times at the beginning and in the middle of the interval instead,
     so that the rows of successive intervals are evenly spaced.
 

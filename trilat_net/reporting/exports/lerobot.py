@@ -414,7 +414,7 @@ def _read_commands(
         The commands of each user, shape (F, n), and the names of their n numbers.
 
     Raises:
-        LogError: The users' arms have different joints, so that they have no common action.
+        LogError: The users' arms have different joints, so the users have no common action.
     """
     if actions == "tip":
         positions = []
@@ -446,7 +446,7 @@ def _read_commands(
     for user in users:
         if joints[user] != joints[first_user]:
             raise LogError(
-                f"{log.source}: {user} and {first_user} have different joints, so that the two "
+                f"{log.source}: {user} and {first_user} have different joints, so the two "
                 "users have no common action: use --actions tip"
             )
     angles = []

@@ -122,7 +122,10 @@ def draw_functional(
     in_report=True,
 )
 def _draw_certificate(log: Log, form: FigureSize) -> Figure:
-    """Draws V of a log, for the registry of figures."""
+    """Draws the energy function V of the stability proof over the course of a log.
+
+    This function is called through the registry of figures.
+    """
     return draw_functional(log, certify(log), form)
 
 

@@ -174,7 +174,9 @@ def _list_lines(pushed: PushedTwins, twins: Twins) -> Iterator[_DifferenceLine]:
 
 
 def _style_joints(log: Log, joints: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Returns the line options of each joint: the colour of its site, and dashes by its number.
+    """Returns the line style of each joint.
+
+    The colour is that of the joint's site. The dash pattern is chosen by the joint's number.
 
     Args:
         log: Log with the sites.

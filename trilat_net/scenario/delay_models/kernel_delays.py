@@ -299,7 +299,7 @@ class ConstantDelay(LinkBase, frozen=True, kw_only=True, tag="constant"):
         return self.delay_ms, 0.0
 
     def _describe_delay(self) -> str:
-        """Returns the delay as a text."""
+        """Returns the delay as a string."""
         return f"{self.delay_ms:g} ms"
 
 

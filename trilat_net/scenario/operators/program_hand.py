@@ -304,7 +304,7 @@ class HandPlayer:
 
         Args:
             k: Number of the tick in which it lets go.
-            problem: Reason of the failure, as a text for the user.
+            problem: Reason of the failure, as a string for the user.
         """
         self.failure = f"{self._site}: its hand {self._code} failed at tick {k}: {problem}"
         self.news.append((k, f"{self.failure}; it lets go and is not asked again"))

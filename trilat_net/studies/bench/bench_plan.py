@@ -463,7 +463,7 @@ def find_stale(entries: Iterable[TunedGains]) -> list[str]:
         entries: The gains to check.
 
     Returns:
-        A text for each, such as "wave (three, 68 ms)". Empty if all are up to date.
+        A string for each, such as "wave (three, 68 ms)". Empty if all are up to date.
     """
     return [
         str(gains) for gains in entries if fingerprint_tuning(*gains.key) != gains.fingerprint

@@ -37,7 +37,7 @@ class CompletionTime(NamedTuple):
     """Completion time of the trials under one condition.
 
     Some trials may end without success at a time limit. Their completion time is not known,
-    only that it is longer (it is censored), so that medians are used instead of means.
+    only that it is longer (it is censored). Therefore medians are used instead of means.
 
     Attributes:
         condition: Name of the condition.
@@ -89,7 +89,7 @@ class CompletionComparison(NamedTuple):
 
 
 def is_completed(row: Row) -> bool:
-    """Tells whether a trial was completed, so that its time is known.
+    """Tells whether a trial was completed and its time is therefore known.
 
     Args:
         row: The trial. A row without the key `succeeded` counts as completed.
@@ -267,7 +267,7 @@ def _compare(
 def _find_median_difference(pairs: Sequence[tuple[float, float]]) -> float | None:
     """Returns the median of the differences of two conditions, in s.
 
-    A median that was not reached may have any value above 0, so that each difference lies
+    A median that was not reached may have any value above 0. Therefore each difference lies
     between two bounds. The median difference is known if the medians of both bounds agree.
 
     Args:

@@ -256,8 +256,7 @@ class ExperimentAnalysis(Result):
 
         A questionnaire has several items. A completed questionnaire, called form, belongs to
         one participant and one block of trials. Two numbers are counted: the items without an
-        answer, and the forms in which at least one answer is missing, so that they have no
-        score.
+        answer, and the forms that have no score because at least one answer is missing.
 
         A block has one condition. A questionnaire that people answer only once, after the whole
         experiment, belongs to no condition. Its condition is the empty text.

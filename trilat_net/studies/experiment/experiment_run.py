@@ -181,7 +181,8 @@ class Experiment(Result):
         the second trial, the participant chooses the trial with the larger value. The
         difference of a pair depends on whether the earlier choices of the block were right.
 
-        The choices follow from the plan, so that they can be drawn before any trial is run.
+        The choices follow from the plan. Therefore the choices can be drawn before any trial is
+        run.
 
         Args:
             staircase: Settings of the test. It also contains the model of the participant's

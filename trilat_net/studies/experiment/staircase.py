@@ -153,7 +153,7 @@ class Staircase(Frozen, frozen=True):
     def draw_choice(self, difference: float, comparison: int, seed: int) -> int:
         """Draws which trial of a pair a synthetic participant chooses.
 
-        The participant perceives each trial with a normal error, so that the choice is right
+        The participant perceives each trial with a normal error. Therefore the choice is right
         with probability Phi(difference / (sqrt(2) deviation)) (Green and Swets, 1966).
 
         Args:

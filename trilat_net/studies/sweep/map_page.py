@@ -296,8 +296,8 @@ def _draw_panel(axes: Axes, plane: MapPlane, panel: MapPanel, lines: Sequence[Ma
 def _draw_cells(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
     """Draws the coloured cells of a panel.
 
-    The colour shows the growth exponent, the stable share over several seeds, or the class of
-    the single run.
+    The colour shows the growth exponent, the fraction of seeds with a stable run, or the class
+    of the single run.
     """
     colours: dict[str, Any]
     values: Any

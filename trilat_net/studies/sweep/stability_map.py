@@ -105,7 +105,7 @@ class MapPanel(NamedTuple):
     setting of these other keys.
 
     Attributes:
-        title: The setting as a text, such as "p d, delay 200 ms". Empty if there are no such
+        title: The setting as a string, such as "p d, delay 200 ms". Empty if there are no such
             axes.
         settings: The setting as pairs of a key and a value. The key of a swept law is "law".
         counts: Number of runs for each grid point and class, shape (y, x, 4). The classes are
@@ -750,7 +750,7 @@ class MapLine(NamedTuple):
 
     @property
     def crosses_map(self) -> bool:
-        """True if this line lies between grid points of the map, so that it is visible.
+        """True if this line lies between grid points of the map and is therefore visible.
 
         This is so if somewhere four neighbouring grid points all have a value, and only some of
         them are on the stable side of the line.
@@ -934,15 +934,15 @@ def _place_zeros(
     """Changes a quantity along a column so that its linear interpolation is zero at the edges.
 
     The lines of a map are drawn where the linear interpolation between grid points is zero. The
-    quantity may be nonlinear between two grid points, so that this zero would differ from the
-    true zero, the edge. Therefore the value above each edge is changed. Let v be the value
-    below the edge, u the value above it, and f the position of the edge in the interval, from 0
-    to 1. The linear interpolation is zero there if
+    quantity may be nonlinear between two grid points. This zero would then differ from the true
+    zero, the edge. Therefore the value above each edge is changed. Let v be the value below the
+    edge, u the value above it, and f the position of the edge in the interval, from 0 to 1. The
+    linear interpolation is zero there if
 
         v + f (u - v) = 0,   that is,   u = v (1 - 1/f).
 
     u keeps its sign, which is opposite to that of v. The values are changed from the bottom to
-    the top, so that v is the value that may have been changed for an edge below it.
+    the top. Therefore v is the value that may have been changed for an edge below it.
 
     All other values stay. They decide where the line passes between this column and the next
     one, if it is so steep that it crosses neither column nearby.

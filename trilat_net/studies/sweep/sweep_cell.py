@@ -97,7 +97,7 @@ class CellResult(msgspec.Struct, frozen=True):
         effort_nm: See `RunTotals`.
         force_peak_n: See `RunTotals`.
         walls_j: See `RunTotals`.
-        reasons: Reasons why the run is undecided, as a text.
+        reasons: Reasons why the run is undecided, as a string.
         exponent_per_s: Growth exponent of the run's twins over the scenario's duration, in 1/s,
             see `measure_exponent`. None without twins, or if no twin moved.
     """
@@ -358,7 +358,7 @@ numbers of the base, and lines that the base does not contain.
 
 
 def diff_lines(text: str, base: str) -> LineDiff:
-    """Encodes a text by its differences from a similar text, to save space in a file.
+    """Encodes a string by its differences from a similar text, to save space in a file.
 
     `apply_diff` restores the text. The differences need not be minimal. Each line is looked up
     in the base: first at the position after the previous line, and then at its first

@@ -842,7 +842,7 @@ def _describe_owner(tables: list[str], scenario: Scenario | None) -> str:
         scenario: Scenario in which the kind of an operator or a wall is looked up.
 
     Returns:
-        A text such as " of s". Empty if the key is common to all sites or links.
+        A string such as " of s". Empty if the key is common to all sites or links.
     """
     match tables:
         case ["sites", site, ("hands" | "environment") as group, number]:

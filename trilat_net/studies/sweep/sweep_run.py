@@ -395,7 +395,7 @@ def refuse_oversized_sweep(
 
 
 def format_wall_time(seconds: float) -> str:
-    """Returns a duration as a text with a readable unit, as in "2.5 h".
+    """Returns a duration as a string with a readable unit, as in "2.5 h".
 
     A larger unit is used from one and a half units on, and days from two days on.
 

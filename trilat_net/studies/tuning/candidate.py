@@ -124,8 +124,8 @@ def build_twin(scenario: Scenario) -> Scenario | None:
         scenario: Scenario of the candidate.
 
     Returns:
-        The twin. None if the scenario has no such walls and operators, so that no twin is
-        needed.
+        The twin. None if no twin is needed because the scenario has no such walls and
+        operators.
     """
     sites = {}
     for name, spec in scenario.sites.items():
@@ -402,10 +402,12 @@ class CandidateScore(msgspec.Struct, frozen=True):
             error of a site against its peers. None if |e| is larger at the end.
         saturated: Fraction of all joint torques that were at the torque limit.
         diverged_s: Time at which the first site left its limits, in s. None if no site did.
-        seeds: Number of runs over which the score is averaged. The class is the worst of them.
+        seeds: Number of runs over which the score is averaged. The class is the worst class
+            among these runs.
         error_half_rad: Half the width of the 95 % interval of the mean error. None for a single
             run.
-        effort_half_nm: The same for the mean effort.
+        effort_half_nm: Half the width of the 95 % interval of the mean effort. None for a
+            single run.
     """
 
     outcome: CandidateClass

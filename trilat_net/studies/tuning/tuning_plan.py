@@ -248,8 +248,8 @@ class CandidateSearch:
         """Returns the gains that are to be tried in a round.
 
         The first round spreads its candidates evenly over the ranges of the gains by a Latin
-        hypercube. The later rounds refine the best candidates so far, so that the scores of all
-        earlier rounds must have been recorded.
+        hypercube. The later rounds refine the best candidates so far. Therefore the scores of
+        all earlier rounds must have been recorded.
 
         Args:
             round_number: 0 for the Latin hypercube, and 1 to 4 for the refinement rounds.
@@ -687,7 +687,7 @@ class TuningResult(Result):
             search: Search of the law.
 
         Returns:
-            A text for each such gain. Empty if there are none.
+            A string for each such gain. Empty if there are none.
         """
         if not search.front:
             return []

@@ -215,7 +215,7 @@ def _format_score(score: CandidateScore) -> tuple[str, ...]:
 
 
 def _format_mean(mean: float | None, half: float | None) -> str:
-    """Returns a mean as a text, with its interval if it has one.
+    """Returns a mean as a string, with its interval if it has one.
 
     Args:
         mean: The mean, or None.
