@@ -673,7 +673,8 @@ class Recording:
         """Describes the first problem of the recording, for the error message at its end.
 
         Returns:
-            The site that disappeared or lacks messages, as a text. None if there is no problem.
+            The site that disappeared or lacks messages, as a string. None if there is no
+            problem.
         """
         for name, site in self._sites.items():
             if site.final_ticks is None:

@@ -293,7 +293,7 @@ def _examine_reaching(
 def _examine_quic(endpoint: str, member_keys: MemberKeys | None) -> DoctorFinding:
     """Checks if another member answers over QUIC, by connecting as a member.
 
-    Python has no QUIC client in its standard library, so that the connection uses Zenoh.
+    Python has no QUIC client in its standard library. Therefore the connection uses Zenoh.
 
     Args:
         endpoint: The endpoint.

@@ -90,6 +90,6 @@ def describe_load(busy_share: float | None) -> str:
         processors = count_nouns(cores, "processor is", "processors are")
     return (
         f"this machine's {processors} {busy_share:.0%} busy with other programs, "
-        "so that ticks may be late and the recorder may miss records: "
+        "so ticks may be late and the recorder may miss records: "
         "end those programs, or lower the rate, as in --set rate_hz=200"
     )

@@ -438,7 +438,7 @@ def watch_law(
 def _run_warm_up(setup: SiteSetup, site: Site, step: Callable[[TickInput], TickRecord]) -> None:
     """Executes ticks of a temporary site, and encodes and decodes the messages of each tick.
 
-    Every tick but the first receives a sample of every peer, so that all code of a tick runs.
+    Every tick but the first receives a sample of every peer. Therefore all code of a tick runs.
 
     Args:
         setup: Settings of the site.

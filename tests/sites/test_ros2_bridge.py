@@ -210,7 +210,7 @@ def test_topics_are_called_as_a_file_says(tmp_path: Path) -> None:
     [
         ("joint_state = 'a'", "there is no topic 'joint_state'.*joint_states"),
         ("joint_states = 'a b'", "joint_states 'a b' is not a valid ROS 2 name"),
-        ("joint_states = true", "joint_states must be a text in quotes, not True"),
+        ("joint_states = true", "joint_states must be a string in quotes, not True"),
         ("joint_states", "is not a valid TOML file"),
         ("joint_states = 'a'\nreference = 'a'", "two topics have the same name"),
         (

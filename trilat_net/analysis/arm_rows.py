@@ -602,7 +602,7 @@ class ChainArmRows(NamedTuple):
     The arm is a chain of rigid links. Torques are computed by the same recursions from link to
     link as in the simulation. The parameters theta determine the inertia matrix M, the Coriolis
     matrix C and the gravity torque G of the links. The inertia of the drives (armature) and the
-    friction of the joints are known to the control laws, so that the torques of the laws
+    friction of the joints are known to the control laws. Therefore the torques of the laws
     include them.
 
     Attributes:

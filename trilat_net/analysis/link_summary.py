@@ -49,8 +49,8 @@ class PredictedDelivery(NamedTuple):
             a lost sample.
         drawn_ns: Times at which they would come into use because of the delay alone, without
             duplicates, reordering and play-out buffer, shape (M,).
-        measured: True if the delay is that of the real network, so that a sample comes into use
-            as soon as it arrives, shape (M,).
+        measured: True if the delay is that of the real network, shape (M,). A sample then comes
+            into use as soon as it arrives.
         copies: Number of duplicates that the link makes.
     """
 

@@ -75,7 +75,7 @@ _TRENDS_FROM_BEST = (
 )
 _FALLING = (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY)
 _AMPLITUDE_FLOOR = 1e-300
-"""Smallest amplitude in a fit. The amplitudes are scaled, so that no unit applies."""
+"""Smallest amplitude in a fit. The amplitudes are scaled and have no unit."""
 SAME_SCALED = math.log(1.1)
 """Largest difference of the logarithms of two scaled twins that count as equal: 10 %."""
 MOST_LOG = 700.0
@@ -165,8 +165,8 @@ class TwinGrowth(NamedTuple):
         to_s: End of this part, in s.
         pushes: Growth of every push, in every group of sites that follow each other.
         departure: Fastest departure of the run from a rest. None if there was none.
-        same_platform: False if the run was recorded on another platform, so that the last bits
-            of the repeated run may differ from the log.
+        same_platform: False if the run was recorded on another platform. The last bits of the
+            repeated run may then differ from the log.
         links_random: True if some link draws its delays at random. Slow trends may then be
             chance.
         delay_period_s: Time after which delays that vary, and the ticks of all sites, repeat,

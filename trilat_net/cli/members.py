@@ -369,8 +369,8 @@ def _conclude(parts: list[Path], *, png: bool) -> None:
         png: True to write every figure as a PNG file too.
 
     Raises:
-        CodeWithheld: The log names a user's code, which was not executed, so that the log could
-            not be verified completely.
+        CodeWithheld: The log names a user's code, which was not executed. Therefore the log
+            could not be verified completely.
         RunFailed: The log failed a check, or the session ended with a failure.
     """
     log, conclusion = terminal.conclude_files(parts, parts[0].parent, png=png)

@@ -413,7 +413,7 @@ class _LeafLibrary(JITCodeLibrary):
 def _as_inner(result: Any) -> Any:
     """Returns a compiled inner leaf that other leaves can call.
 
-    Leaves find a function by its entry point. An inner leaf has no machine code, so that any
+    Leaves find a function by its entry point. An inner leaf has no machine code. Therefore any
     object serves.
     """
     result = result._replace(entry_point=object())

@@ -74,11 +74,11 @@ class LawEnergies(NamedTuple):
         gave: Per peer, the energy that was sent to it.
         took: Per peer, the energy that the law took out of the energy that the peer sent, part
             by part.
-        port: Energy that the arm gave to the law, by the law's own account; None: the energy
+        port: Energy that the arm gave to the law, by the law's own account. None if the energy
             is computed from the records.
         store: Energy that the law stores.
-        taken: Energy that the law has dissipated, by its own formula; None: the remainder of
-            the other energies.
+        taken: Energy that the law has dissipated, by its own formula. None if it is the
+            remainder of the other energies.
         observed: Per peer, the energy that the site knows to remain of the energy sent by the
             peer; () if the law does not observe it.
         weight: Weight of the arm's energy in the sum over all sites.

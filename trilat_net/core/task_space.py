@@ -162,7 +162,7 @@ def _update_jacobian_rate(s: Row, chain: RowArray, tip: Three) -> None:
 
 @leaf
 def update_orientation_reference(s: Row, links: RowArray) -> None:
-    """Computes the orientation that the end effector shall reach, and its angular velocity.
+    """Computes the orientation that the end effector should reach, and its angular velocity.
 
     The reference results from the own orientation R_i by a rotation towards the other arms. The
     rotation vector is

@@ -1,6 +1,6 @@
 """Checks a log by executing its run again, and reports one finding for each check.
 
-A log contains the inputs and the results of every period (tick) of the control loops, so that
+A log contains the inputs and the results of every period (tick) of the control loops. Therefore
 the results can be computed again. The checks answer these questions: Are records missing? Is
 the file as it was written? Which control laws of users does it name? Does a repeated execution
 give the same records? Was an arm moved by something outside of this program, such as a real

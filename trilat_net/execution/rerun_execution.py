@@ -384,7 +384,7 @@ def _describe_replacement(
 
 
 def _shorten(value: object) -> str:
-    """Returns a value as a text. For a list of tables, the text contains only their number."""
+    """Returns a value as a string. A list of tables is represented by its length only."""
     if isinstance(value, list) and value and isinstance(value[0], dict):
         return f"{len(value)} {'entry' if len(value) == 1 else 'entries'}"
     return describe_value(value)

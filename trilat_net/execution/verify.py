@@ -1,7 +1,7 @@
 """Verifies a log: executes every site again, and compares every computed field of every record.
 
 A record is the logged result of one tick of a site's control loop. The inputs of the tick, such
-as the samples that arrived, are in the log as well, so that the tick can be computed again.
+as the samples that arrived, are in the log as well. Therefore the tick can be computed again.
 
 Invariant (L3, L5):
     - `Site.step` gets its inputs only from the log, and its code from the program and from

@@ -200,7 +200,8 @@ class Impedance(ControlLaw):
     def explain_idle_shares(self, situation: LawSituation) -> str:  # noqa: ARG002
         """Explains to the user that the dominance factors of a master have no effect.
 
-        A master stays at its start pose and follows nobody, so that its weights do not matter.
+        A master stays at its start pose and follows nobody. Therefore the weights of a master
+        do not matter.
 
         Returns:
             A sentence. Empty for the slave.
@@ -245,7 +246,7 @@ class Impedance(ControlLaw):
         hands = situation.hands or (None,) * len(laws)
         slave_loads = hands[slave]
         if slave_loads == ():
-            text = "the slave touches nothing, so that no loop is closed, whatever the delays"
+            text = "the slave touches nothing, so no loop is closed, whatever the delays"
             bound = _describe_stiffest_wall(situation, slave)
             return StabilityCondition(True, f"{text}; {bound}")
         if np.isnan(situation.longest_s):

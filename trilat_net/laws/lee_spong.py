@@ -2,7 +2,7 @@
 
 PD+d couples an arm by a spring (P) and a damper (D) to its peers, the arms that it follows. A
 second damper (d) brakes the arm itself. Its damping is computed from the stiffness of the
-spring and the largest delay, so that the user states a delay instead of a damping.
+spring and the largest delay. Therefore the user states a delay instead of a damping.
 
 The simulation kernel, the compiled code of a tick, computes this law
 (`core.control.damped_torque`). `LeeSpong.compute_torque` states the same law in plain Python,

@@ -579,7 +579,7 @@ class _FileCopy:
             self._copy_chunk_record(opcode, content)
 
     def _copy_single_message(self, content: bytes) -> None:
-        """Copies a message that is not in a chunk, so that no checksum covers it.
+        """Copies a message that is not in a chunk and not covered by a checksum.
 
         In the log of a session, the content of the message must show that it is the next one of
         its channel (`content_check`), which requires the scenario. Other programs may write

@@ -150,7 +150,7 @@ class SkewedClock:
         self._clock.sleep_until(self._start_ns + base_duration_ns)
 
     def identity(self) -> str:
-        """Returns a text that identifies this clock, with its offset, its drift and its start.
+        """Returns a string that identifies this clock, with its offset, drift and start.
 
         From these numbers, readers of a log can convert readings of this clock to readings of
         the base clock.

@@ -206,7 +206,7 @@ class EventPublisher:
     def answer_queries(self) -> None:
         """Replies with the current identity of the member to all queries that are waiting.
 
-        The method does not wait, so that a control loop may call it.
+        The method does not wait. Therefore a control loop may call it.
         """
         while (query := self._queries.poll()) is not None:
             query.reply(encode(self.info))
@@ -361,8 +361,8 @@ class Membership:
     def clocks(self) -> dict[str, str]:
         """Returns the identity of the clock of each member that is present, including this one.
 
-        Members whose clocks have the same identity run on the same machine, so that their times
-        can be compared directly.
+        Members whose clocks have the same identity run on the same machine. Therefore the times
+        of these members can be compared directly.
 
         Returns:
             The identities, by the name of the member.

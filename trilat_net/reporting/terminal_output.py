@@ -61,7 +61,7 @@ class TextConsole(Console):
     """
 
     def render_str(self, text: str, **options: Any) -> Text:
-        """Converts a text to the type of Rich, with control characters replaced by their names.
+        """Converts a string to the type of Rich, with names in place of control characters.
 
         Rich calls this for every text that it prints.
 

@@ -439,7 +439,7 @@ def _describe_tasks(scenario: Scenario) -> list[str]:
         singular_values = np.linalg.svd(J, compute_uv=False)
         least = singular_values[-1]
         bound = spec.task.singular_value
-        consequence = ", so that its inverse is damped there" if least < bound else ""
+        consequence = ", so its inverse is damped there" if least < bound else ""
         axes = [TASK_AXES[n] for n in np.flatnonzero(is_followed)]
         lines.append(
             f"{name} follows along {', '.join(axes)}: least singular value of its start pose "

@@ -325,7 +325,7 @@ def read_code(code: str, path: str, file: Path | None = None) -> CodeSource:
     Args:
         code: Module and class, for example "package.module:Law".
         path: Path of the key in the scenario, for error messages.
-        file: The file. None: the file that Python's import finds for the module.
+        file: The file. None for the file that Python's import finds for the module.
 
     Raises:
         ScenarioError: There is no such file, or it cannot be read.
@@ -588,7 +588,7 @@ def _searching(folder: Path | None) -> Iterator[None]:
     """Makes Python search a folder for modules before all others, inside the `with` block.
 
     Args:
-        folder: The folder. None: the working directory, unless Python searches it already.
+        folder: The folder. None for the working directory, unless Python searches it already.
     """
     search_path = str(folder or Path.cwd())
     if folder is None and search_path in sys.path:

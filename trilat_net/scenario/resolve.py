@@ -391,7 +391,7 @@ def _resolve_user_law(
 
 
 def _use_unix_line_ends(value: Any) -> Any:
-    r"""Returns a string, or a list of texts, with "\n" at the end of each line.
+    r"""Returns a string, or a list of strings, with "\n" at the end of each line.
 
     TOML stores line ends in this form. Without the conversion, a file that was written on
     Windows would be another experiment. Values of other types are returned unchanged.

@@ -194,8 +194,8 @@ class SiteSpec(Frozen, frozen=True):
         plant: Who moves the arm. "simulated": The program. "external": A real robot, whose
             state is measured. Otherwise a user's class, which computes the motion.
         view: Delay, loss and order of the picture in which the user of the site sees the other
-            arms. It has the keys of a link. None: the user sees the samples that the controller
-            uses. It enters no formula.
+            arms. It has the keys of a link. None if the user sees the samples that the
+            controller uses. The view enters no formula.
     """
 
     role: Literal["master", "slave"]
@@ -590,7 +590,7 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @property
     def measured(self) -> bool:
-        """True if at least one link has no artificial delay, so that the real network decides.
+        """True if at least one link has no artificial delay; the real network then decides.
 
         Such a scenario can only run live.
         """

@@ -1097,7 +1097,7 @@ def _read_stated_inertial(
 ) -> tuple[float | None, _Pose, Matrix | None]:
     """Returns the mass, the frame and the tensor of an <inertial> element.
 
-    Parts that the scenario replaces are not read, so that errors in them do not matter.
+    Parts that the scenario replaces are not read. Therefore errors in such parts do not matter.
 
     Args:
         inertial: The element.

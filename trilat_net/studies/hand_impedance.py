@@ -8,10 +8,11 @@ the angular frequency w of each sine, these responses satisfy
     F(j w) = -(M (j w)^2 + B j w + K) X(j w)
 
 with the mass M, the damping B and the stiffness K of the hand, which are matrices over the axes
-of space. The person's voluntary movements do not follow the sines, so that their contribution
-vanishes in the mean over segments of the run. In the terms of system identification, the sines
-are an instrument. M, B and K are fitted by weighted least squares. Their confidence intervals
-come from the jackknife, which repeats the fit without one segment at a time.
+of space. The person's voluntary movements do not follow the sines. Therefore the contribution
+of these movements vanishes in the mean over segments of the run. In the terms of system
+identification, the sines are an instrument. M, B and K are fitted by weighted least squares.
+Their confidence intervals come from the jackknife, which repeats the fit without one segment at
+a time.
 
 Sources:
     - Stiffness along several axes at once: E. J. Perreault, R. F. Kirsch, A. M. Acosta,
@@ -338,7 +339,7 @@ def _find_sines(scenario: Scenario) -> _Sines:
         multisines += [hand for hand in spec.hands if isinstance(hand, Multisine)]
     if not multisines:
         raise UsageError(
-            "no operator of kind 'multisine' in the scenario moves an arm, so that the "
+            "no operator of kind 'multisine' in the scenario moves an arm, so the "
             "reaction of a hand cannot be distinguished from its own movements (docs/ports.md)"
         )
     frequencies_hz: list[float] = []

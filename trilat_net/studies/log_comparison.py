@@ -222,7 +222,7 @@ def _tabulate_quantities(
 
     Args:
         metrics: The metrics.
-        means: Mean of each row, for another column. Empty if there shall be no such column.
+        means: Mean of each row, for another column. Empty if there is no such column.
     """
     rows: list[list[str]] = []
     mean_by_row = dict(zip(metrics.rows, means, strict=True)) if means else {}

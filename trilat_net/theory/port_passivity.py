@@ -233,7 +233,7 @@ def find_lacking_damping(Y: Complex, w_rad_s: Array) -> float:
     A port is where an operator acts on an arm. A damper b at every port adds b to the impedance
     Z = Y^-1, the inverse of the admittance. The arms are then passive if Z + Z^H + 2 b has no
     negative eigenvalue, where Z^H is the conjugate transpose. A control law with an integrator
-    can lack damping without bound towards low frequencies, so that no b suffices.
+    can lack damping without bound towards low frequencies. In that case no b suffices.
 
     Args:
         Y: Admittance (velocity per torque) of p ports at F frequencies, shape (F, p, p), in
@@ -358,7 +358,7 @@ def clamp_ports(Y: Complex, keep: list[int], clamped: list[int]) -> Complex:
     """Returns the admittance at some ports while the velocity of other ports is held at zero.
 
     The admittance is the velocity per torque. The result is a Schur complement. At ports in
-    neither list no torque acts, so that they move freely.
+    neither list no torque acts: they move freely.
 
     Args:
         Y: Admittance at all ports, shape (F, p, p).

@@ -458,7 +458,7 @@ def compute_energy_balance(
         energies: Energies of the sites in scenario order. No site may follow a site outside the
             group.
         paper_weights: True to give all sites the same weight, as in the paper on which the
-            control law is based. The transferred energies may then not cancel, so that the
+            control law is based. The transferred energies may then not cancel. In that case the
             balance does not close.
     """
     times = find_common_times(energies)

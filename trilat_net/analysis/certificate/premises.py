@@ -57,7 +57,7 @@ from .energy_terms import SiteConstants, derive_site_constants
 CONSTANT_DELAY_TOLERANCE_S = 1e-7
 """Ages of samples that differ by less than this count as equal, in s.
 
-Time stamps are whole nanoseconds, so that constant delays differ by rounding.
+Time stamps are whole nanoseconds. Therefore constant delays differ by rounding.
 """
 SAMPLING_RISE_SHARE = 1e-4
 """Largest rise of V that may be an effect of sampling, as a share of the scale of V.
@@ -86,7 +86,7 @@ NO_COMMON_TIME = "there is no time at which every site has records"
 NO_PERIOD = "there is no period whose records are complete"
 _ORIENTATIONS_TEXT = (
     "the arm follows orientations, for which ed is not the derivative of e, "
-    "so that dV/dt has terms of either sign"
+    "so dV/dt has terms of either sign"
 )
 
 

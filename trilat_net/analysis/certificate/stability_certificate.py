@@ -458,7 +458,7 @@ def _judge_decidability(run: FunctionalFacts, _: Sequence[Premise]) -> Stability
     if run.tolerance <= COARSE_TOLERANCE_SHARE * scale + 2.0 * ZERO_ENERGY_J:
         return None
     text = (
-        "the period is too long for these gains, so that its energies are known only to "
+        "the period is too long for these gains, so its energies are known only to "
         f"{run.tolerance:.3g} J of {scale:.4g} J"
     )
     return StabilityVerdict(StabilityFinding.NOT_JUDGED, text)

@@ -390,7 +390,7 @@ class CdrReader:
         Each entry must have at least one byte.
 
         Raises:
-            ValueError: Fewer bytes than entries remain, so that the number must be wrong.
+            ValueError: Fewer bytes than entries remain. The number must therefore be wrong.
         """
         (count,) = self.numbers("I")
         # A wrong length would let the caller reserve memory for entries that do not exist.

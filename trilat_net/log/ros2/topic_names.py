@@ -122,7 +122,7 @@ def make_session_name(text: str) -> str:
 
 
 def read_topic_table(source: str) -> TopicTable:
-    """Reads under which names the topics of a session shall appear in ROS 2.
+    """Reads under which names the topics of a session should appear in ROS 2.
 
     The names follow a built-in convention, or come from a TOML file. The conventions are
     "crisp" (a set of ROS 2 controllers) and "crtk" (the Collaborative Robotics Toolkit). The
@@ -201,7 +201,7 @@ def _check_names(source: str, names: Mapping[str, object]) -> None:
             suggestion = suggest_nearest(topic, known_topics)
             raise UsageError(f"{source}: there is no topic {topic!r}{suggestion}")
         if not isinstance(name, str):
-            raise UsageError(f"{source}: {topic} must be a text in quotes, not {name!r}")
+            raise UsageError(f"{source}: {topic} must be a string in quotes, not {name!r}")
         check_ros_name(name, f"{source}: {topic}")
 
 

@@ -135,9 +135,9 @@ def draw_observed_energy(
     """Draws the energies that the control laws keep account of and record, in J over time.
 
     Some laws ensure stability by not returning more energy than they received. There is a panel
-    for each kind that the laws declare: the energy in the lines between sites; the part of it
-    that the receivers know; stored energy; and energy that the arms gave to the laws or that
-    the laws dissipated. A line between sites has the colour of its receiver.
+    for each kind that the laws declare: the energy in the lines between sites; the part of this
+    energy that is known to the receivers; stored energy; and energy that the arms gave to the
+    laws or that the laws dissipated. A line between sites has the colour of its receiver.
 
     Args:
         log: Log of the run.

@@ -114,7 +114,7 @@ class _JudgedRun(NamedTuple):
 def run_bench_task(item: BenchRunItem) -> BenchRun:
     """Simulates a run of the benchmark, judges its stability, and measures its performance.
 
-    The function needs nothing but its argument, so that any worker process can call it.
+    The function needs nothing but its argument. Therefore any worker process can call it.
 
     Args:
         item: The run to execute.

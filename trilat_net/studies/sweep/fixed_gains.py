@@ -28,7 +28,7 @@ def describe_fixed_gains(plan: SweepPlan) -> list[str]:
     """Lists the gains that a sweep did not vary, on which its results depend, too.
 
     An entry is a text such as "p_d of s: K 10, gravity 1". Sites with the same law and the same
-    gains share a text. A text that applies to all sites names no site.
+    gains share a string. A string that applies to all sites names no site.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.

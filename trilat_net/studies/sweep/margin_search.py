@@ -352,7 +352,7 @@ def search_margins(
 def search_margin_task(task: MarginItem) -> GridPointMargin:
     """Finds the limits of stability at one grid point of a sweep, by runs and by theory.
 
-    The function needs nothing but its argument, so that any worker process can call it.
+    The function needs nothing but its argument. Therefore any worker process can call it.
 
     Args:
         task: The grid point (a combination of swept parameters), the seed of the runs, and the

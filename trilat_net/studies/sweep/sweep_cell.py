@@ -254,8 +254,7 @@ def _advance_in_contact(scenario: Scenario, run: FusedRun) -> float:
     """Runs a scenario to its duration, and checks the contact with sampled walls.
 
     A sampled wall is one whose force is computed once per tick and held. Such a wall can
-    generate energy, so that small motions in contact grow (chatter), see
-    `find_contact_growth`.
+    generate energy. Small motions in contact then grow (chatter), see `find_contact_growth`.
 
     Returns:
         Growth rate of small motions in contact, in 1/s. It is 0 if they do not grow, and if no
@@ -358,7 +357,7 @@ numbers of the base, and lines that the base does not contain.
 
 
 def diff_lines(text: str, base: str) -> LineDiff:
-    """Encodes a string by its differences from a similar text, to save space in a file.
+    """Encodes a string by its differences from a similar string, to save space in a file.
 
     `apply_diff` restores the text. The differences need not be minimal. Each line is looked up
     in the base: first at the position after the previous line, and then at its first
@@ -414,7 +413,7 @@ class CellRun(msgspec.Struct, frozen=True):
     Attributes:
         cell: Number of the cell.
         seed: Seed of the run.
-        random: True if the run draws random numbers, so that another seed gives another run.
+        random: True if the run draws random numbers. Another seed then gives another run.
         law: Control laws of the sites, without duplicates.
         sha256: Digest of the run's scenario.
         scenario: Canonical text of the run's scenario, as differences from the scenario of the

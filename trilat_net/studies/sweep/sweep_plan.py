@@ -1,7 +1,7 @@
 """Plans a sweep: the runs of one scenario over a grid of parameters, control laws and seeds.
 
 A scenario is the description of an experiment. An axis is a key of the scenario together with
-the values that the key shall have, such as "link.delay_ms=0:400:50". A cell is one combination
+the values that the key should have, such as "link.delay_ms=0:400:50". A cell is one combination
 of the values of all axes and of a control law. Each cell is run once per seed of the random
 numbers. This module parses the axes, laws and seeds, combines them with the scenario, and
 checks the result before anything runs.

@@ -278,7 +278,7 @@ class CellItem(NamedTuple):
 def run_cell(task: CellItem) -> CellRun:
     """Executes one run of a sweep.
 
-    The function needs nothing but its argument, so that any worker process can call it.
+    The function needs nothing but its argument. Therefore any worker process can call it.
 
     Args:
         task: The run.

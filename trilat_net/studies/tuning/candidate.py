@@ -763,7 +763,7 @@ def build_candidate_item(seeds: Sequence[TuningScenario]) -> CandidateItem:
 def measure_candidate_task(task: CandidateItem) -> CandidateScore:
     """Runs a candidate with all of its seeds, and returns its average score.
 
-    The function needs nothing but its argument, so that any worker process can call it.
+    The function needs nothing but its argument. Therefore any worker process can call it.
 
     Args:
         task: The runs of the candidate.
