@@ -121,7 +121,7 @@ def new_law_command(
     file: Annotated[Path, typer.Argument(help="File to write, for example mylaw.py.")],
     force: options.ForceOption = False,
 ) -> None:
-    """Writes a working, commented control law as a starting point, and a test of it."""
+    """Creates a working, commented control law to start from, and its test."""
     from ..scenario.skeletons import new_law
 
     _print_skeleton("law", new_law(file, force=force), "control.law={}", "certify")

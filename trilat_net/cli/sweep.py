@@ -500,8 +500,8 @@ def _refuse_plan_options(used_options: Sequence[str]) -> None:
 def parse_seed_count(text: str | None) -> int | list[int]:
     """Parses the option --seeds of a sweep.
 
-    A text such as 10 is a number of seeds. Texts such as 1..20, 1,5,9 or 7, (with a comma) are
-    lists of seeds.
+    A string such as 10 is a number of seeds. Strings such as 1..20, 1,5,9 or 7, (with a comma)
+    are lists of seeds.
 
     Args:
         text: The text. None if the user did not use the option.

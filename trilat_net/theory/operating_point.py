@@ -163,7 +163,7 @@ class OperatingConditions(NamedTuple):
 
     @property
     def needs_sampled_loop(self) -> bool:
-        """True if the controllers' ticks affect stability and must therefore be modelled.
+        """True if the controllers' ticks matter for stability and must therefore be modelled.
 
         A tick is one period of the control loop. This is so in three cases:
 

@@ -563,8 +563,8 @@ class TrackTrial(TrialTask, frozen=True, tag="track"):
     def needs_pair(self) -> bool:
         """True if the tracking task needs two users.
 
-        This is so if the users see different targets and must agree on a position of the slave
-        arm.
+        This is so if the users see different targets and must therefore agree on a position of
+        the slave arm.
         """
         return self.apart_m > 0.0
 
