@@ -492,12 +492,17 @@ def _is_at_end_effector(actor: Row) -> bool:
 
 @leaf
 def _call_user_function(actor: Row, t_s: float, table: TorqueTable) -> None:
-    """Calls a user's function, which reads `at` and `speed` of the row and writes `effort`.
+    """Calls the compiled function of an operator or environment that a user wrote.
+
+    The function exchanges its numbers through the row of the actor: the caller has written the
+    position (`at`) and the velocity (`speed`), and the function writes the torque or force
+    (`effort`), which is zero until then.
 
     Args:
-        actor: Row of the actor.
-        t_s: Time since the epoch, s.
-        table: Tables of all actors, which contain the numbers of the user's model.
+        actor: Row of the actor. `call` is the address of the function.
+        t_s: Time since the epoch (the common start of the session), s.
+        table: Tables of all actors. The rows `table_first` to `table_first + table_count` hold
+            the numbers of the user's model.
     """
     actor.t_s = t_s
     for i in range(actor.coordinates):

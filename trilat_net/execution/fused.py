@@ -12,10 +12,9 @@ Invariant:
       run, bit for bit. The state that a site receives may carry a time stamp in the future,
       because the clocks of two computers may differ. It is then delivered in the first tick
       after the stamp, because a site does not use it earlier.
-    - `FusedRun.scale_difference` changes the state of a run so that its difference from a
-      second run is multiplied by a factor. This is done for floating-point numbers. Counters,
-      times and modes are copied from the second run. Numbers that are equal in both runs keep
-      their bits.
+    - Two runs of the same scenario may differ by a small disturbance.
+      `FusedRun.scale_difference` multiplies this difference by a factor, for all floating-point
+      numbers of the state. Numbers that are equal in both runs keep their bits.
 """
 
 import math

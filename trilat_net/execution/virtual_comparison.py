@@ -290,9 +290,11 @@ def compare_with_virtual(log: Log, progress: Progress | None = None) -> VirtualC
         def execute(
             network: Network | None, ticks_before: int
         ) -> Iterator[tuple[str, TickRecord]]:
-            """Simulates the scenario with the changes, operators and external arms of the log.
+            """Simulates the scenario of the recorded session once more, tick by tick.
 
-            The ticks are executed one by one, while the results are read.
+            The simulation receives the commands, the actions of live operators and the motion
+            of external arms (arms that are not simulated) from the log. A tick (period of the
+            control loop) is executed when its record is read.
 
             Args:
                 network: Network that delivers the samples. None for one in which they arrive at

@@ -138,10 +138,11 @@ class Impedance(ControlLaw):
             now.tau[i] = tau
 
     def linear_gains(self, theta: Array) -> Gains | None:
-        """Returns gains for the linear analysis that only compensate gravity.
+        """Returns the part of this law that the linear analysis can express by gains: gravity.
 
-        The linear analysis considers small motions around a pose at rest. `linear_form` adds
-        the spring, the damper and the forces of this law.
+        The linear analysis considers small motions about a pose at rest. The gains compensate
+        the torque of gravity. The spring, the damper and the forces of this law are no such
+        gains; `linear_form` describes them as matrices.
 
         Args:
             theta: Parameters of the arm's dynamics, such as masses, shape (P,), where P is

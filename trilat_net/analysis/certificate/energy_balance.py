@@ -615,6 +615,19 @@ def _trace_weights(
     beta_by_matrix: dict[bytes, Array] = {}
 
     def compute_beta(t_s: Array, ahead_s: float) -> Array:
+        """Computes the weights beta of the sites in V from the dominance factors.
+
+        Dominance factors seldom change. Therefore the weights of a matrix of factors are
+        computed once and kept in `beta_by_matrix`.
+
+        Args:
+            t_s: Times, shape (T,), in s.
+            ahead_s: Time by which the factors are taken later than `t_s`, in s.
+
+        Returns:
+            The weights, shape (T, N) for N sites. All are 1 if the paper's weights are asked
+            for.
+        """
         count = len(t_s)
         if paper_weights:
             return np.ones((count, len(Kd)))

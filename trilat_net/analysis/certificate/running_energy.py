@@ -373,10 +373,17 @@ class RunningEnergy:
     def _derive_energies(
         self, tick_spans: Mapping[str, tuple[int, int]]
     ) -> dict[str, SiteEnergy]:
-        """Returns the energies of all sites over a span of ticks.
+        """Computes the energies of all sites over a span of ticks, as the records arrive.
+
+        A site uses samples that its peers sent earlier. Therefore the records of each peer are
+        needed from the oldest sample in use on, and two ticks more, because the motion between
+        samples is interpolated.
 
         Args:
             tick_spans: First and last tick of the span, by site.
+
+        Returns:
+            The energies, by site.
         """
         records = {}
         # for each site, the first tick whose sample a peer may still use

@@ -702,8 +702,8 @@ class TuningResult(Result):
     def list_overall_front(self, search: CandidateSearch) -> list[int]:
         """Lists the gains of a law that are on the common Pareto front of all compared laws.
 
-        No tried gains of any law are at least as good in both objective (error or settling
-        time) and effort (motor torque).
+        Gains are on the front if no other gains of any law have both a smaller objective (error
+        or settling time) and a smaller effort (motor torque).
 
         Args:
             search: Tried gains of the law, with their scores.
