@@ -35,7 +35,7 @@ from .conditions import (
     LinearSituation,
     StabilityCondition,
 )
-from .interface import DAMPING, INERTIA, STIFFNESS, ControlLaw, TuningSite
+from .interface import DAMPING, INERTIA, STIFFNESS, ControlLaw, TuningRun, TuningSite
 
 MOST_HANDS = 4
 """Largest number of hands at the masters whose selections are tried one by one."""
@@ -286,6 +286,56 @@ class Impedance(ControlLaw):
         )
         return StabilityCondition(largest_gain < 1.0, text)
 
+    def target_motion(self, run: TuningRun) -> Array | None:
+        """Computes the motion of the impedances that the user has chosen, without any delay.
+
+        The outside torques of the run drive the model
+
+            M qdd + B (qd - qd_ref) + K (q - q_ref) = tau_h + sum_j f_j
+
+        A master of the model stays at its start pose (q_ref is constant) and feels the
+        present torque of the environment at the slave. The slave of the model follows the
+        present pose of the masters of the model. The arms differ from the model by the delays,
+        by the torque limits and by the ticks of the controllers.
+
+        Args:
+            run: The motion of all arms in the run of a candidate.
+
+        Returns:
+            Joint angles of the model, shape (N, K, n), in rad. None if a site uses another law,
+            or if there is not exactly one slave.
+        """
+        followers = []
+        for n, law in enumerate(run.laws):
+            if law.kind is not Impedance:
+                return None
+            if getattr(law, "follows", False):
+                followers.append(n)
+        if len(followers) != 1:
+            return None
+
+        slave = followers[0]
+        period_s = float(run.t_s[1] - run.t_s[0])
+        shares = run.alpha[:, slave]  # shape (K, N)
+        target = np.empty_like(run.q)
+        reference = np.zeros_like(run.q[slave])
+        for n, law in enumerate(run.laws):
+            if n == slave:
+                continue
+            felt = shares[:, n, np.newaxis] * run.outside_nm[slave]
+            offset = move_impedance(law, run.outside_nm[n] + felt, period_s)
+            target[n] = run.q[n, 0] + offset
+            reference += shares[:, n, np.newaxis] * target[n]
+
+        law: Any = run.laws[slave]
+        start = run.q[slave, 0]
+        reference_rate = np.gradient(reference, period_s, axis=0)
+        spring = np.array(law.K) * (reference - start)
+        damper = np.array(law.B) * reference_rate
+        force = run.outside_nm[slave] + spring + damper
+        target[slave] = start + move_impedance(law, force, period_s)
+        return target
+
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:
         """Returns the settings of this law for one site, after its gains were tuned.
@@ -452,3 +502,30 @@ def _describe_stiffest_wall(situation: LawSituation, slave: int) -> str:
         f"at a spring {limit} at the slave for constant delays of any length, with and without "
         "the hands at the masters (small gain: sufficient, in continuous time)"
     )
+
+
+def move_impedance(law: Any, force: Array, period_s: float) -> Array:
+    """Computes the motion of a mass M on a spring K and a damper B under a force.
+
+    The mass starts at rest at the position 0. The force is held over each period, and the
+    solution is exact for such a force.
+
+    Args:
+        law: Settings of the law with M, B and K.
+        force: The force, shape (K, n), in N m.
+        period_s: Time between two values of the force, in s.
+
+    Returns:
+        The position at the K times, shape (K, n), in rad.
+    """
+    # Imported here, because SciPy costs half a second and a session does not need it.
+    from scipy.signal import cont2discrete, lfilter
+
+    joints = force.shape[1]
+    gains = [np.broadcast_to(gain, joints) for gain in (law.M, law.B, law.K)]
+    position = np.empty_like(force)
+    for joint in range(joints):
+        M, B, K = (float(gain[joint]) for gain in gains)
+        numerator, denominator, _ = cont2discrete(([1.0], [M, B, K]), period_s, method="zoh")
+        position[:, joint] = lfilter(numerator.ravel(), denominator, force[:, joint])
+    return position

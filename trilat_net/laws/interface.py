@@ -69,6 +69,29 @@ class TuningSite(NamedTuple):
     longest_ms: float
 
 
+class TuningRun(NamedTuple):
+    """The motion of all arms in a run for which gains are tuned.
+
+    The method `target_motion` of a law receives it. The run has N sites, n joints per arm, and
+    K times at equal distances.
+
+    Attributes:
+        laws: Settings of the law of each site.
+        t_s: The times, shape (K,), in s.
+        q: Joint angles, shape (N, K, n), in rad.
+        outside_nm: Torques with which operators and environments act on the arms, shape (N, K,
+            n), in N m.
+        alpha: Dominance factors, shape (K, N, N). Row i contains the weights with which site i
+            follows the other sites.
+    """
+
+    laws: "Sequence[LawSettings]"
+    t_s: Array
+    q: Array
+    outside_nm: Array
+    alpha: Array
+
+
 class LawSettings(Frozen, frozen=True):
     """Gains of a control law as a scenario stores them, and properties that follow from them.
 
@@ -212,6 +235,22 @@ class LawSettings(Frozen, frozen=True):
         exist with D_i alpha_ij = D_j alpha_ji for all pairs of sites.
         """
         return False
+
+    def target_motion(self, run: TuningRun) -> Array | None:  # noqa: ARG002
+        """Computes the motion that the law promises for the arms, as the goal of its tuning.
+
+        Gains are tuned for arms that move together and rest at the pose to which the operators
+        pull them. A law that promises another motion defines this method. Its gains are then
+        tuned for arms that follow this motion.
+
+        Args:
+            run: The motion of all arms in the run of a candidate.
+
+        Returns:
+            Joint angles of the promised motion, shape (N, K, n), in rad. None if the law
+            promises that the arms move together.
+        """
+        return None
 
     def resolve_shares(self, names: Sequence[str], alpha: Array) -> Any:  # noqa: ARG002
         """Computes settings of the law that depend on the dominance factors of the scenario.

@@ -28,7 +28,14 @@ from ..core.user_law import LawContext, LawInput
 from ..core.vectors import Array
 from ..fields import NotNegativeParameters, Parameters, PositiveJoints
 from .conditions import LawSituation, StabilityCondition
-from .interface import ADAPTATION, CONVERGENCE, DAMPING, ControlLaw, TuningSite
+from .interface import (
+    ADAPTATION,
+    CONVERGENCE,
+    DAMPING,
+    ControlLaw,
+    TuningRun,
+    TuningSite,
+)
 
 
 @compiled
@@ -180,6 +187,24 @@ class Sync(ControlLaw):
             "hanging (cos q1 = 0 and cos(q1 + q2) = 0), wherever users move them"
         )
         return StabilityCondition(True, text)
+
+    def target_motion(self, run: TuningRun) -> Array | None:
+        """Computes the mean motion of the arms, because the law promises agreement only.
+
+        The law makes the outputs r of all arms equal. It does not promise that they rest at the
+        pose to which the operators pull them: under gravity it does not.
+
+        Args:
+            run: The motion of all arms in the run of a candidate.
+
+        Returns:
+            The mean over the arms for each arm, shape (N, K, n), in rad. None if a site uses
+            another law.
+        """
+        if any(law.kind is not Sync for law in run.laws):
+            return None
+        mean = run.q.mean(axis=0)
+        return np.broadcast_to(mean, run.q.shape)
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], site: TuningSite) -> dict[str, Any]:

@@ -14,6 +14,12 @@ arms would agree if gravity did not act on them:
 Here beta_i is the influence of arm i. It follows from the dominance factors alpha_ij, the
 weights with which arm i follows arm j, by beta' alpha = beta' with sum_i beta_i = 1.
 
+A law may promise another motion than agreement at q*, see `LawSettings.target_motion`. For
+such a law, the distance between the arms is replaced by the distance of each arm from the
+promised motion, and a run is judged by where the promised motion ends instead of q*. The
+distance of the mean from q* stays part of the error, so that arms that do not move at all are
+no solution.
+
 Walls, and operators who push without a target, do not determine a pose. If a scenario has them,
 its twin is run too, which is the same scenario without them.
 
@@ -21,7 +27,8 @@ Invariant:
     - A score is a function of the scenario alone. The errors of a run that does not reach its
       end are None.
     - Neither gains nor control laws enter q*.
-    - Only settled runs, which are stable and end at q*, may be part of a Pareto front.
+    - Only settled runs, which are stable and end at q* or at the pose that their law promises,
+      may be part of a Pareto front.
     - The end of a log is reported if an arm hangs down (both of its links point down) and did
       not hang at the start, even if all arms are close to each other. It is also reported if
       the mean pose of the arms is more than 0.2 rad from q*, although no operator or wall can
@@ -38,13 +45,19 @@ import msgspec
 import numpy as np
 
 from ...analysis.arm_rows import build_arm_rows
-from ...analysis.dominance_history import find_closed_groups, left_perron_vector
+from ...analysis.dominance_history import (
+    evaluate_ramps,
+    find_closed_groups,
+    left_perron_vector,
+    list_scripted_ramps,
+)
 from ...analysis.run_end import EndBehaviour, RunEnd, Stability, find_hanging_sites
 from ...analysis.site_signals import SETTLED_ERROR_RAD
 from ...analysis.torque_sources import compute_target_motion
 from ...core.ticks import NS_PER_S
 from ...core.vectors import Array
 from ...errors import ScenarioError
+from ...laws.interface import LawSettings, TuningRun
 from ...log.log_reader import Log
 from ...scenario import Scenario, parse_scenario
 from ...scenario.expect import END_WINDOW_S
@@ -282,10 +295,10 @@ def classify_candidate(
     Args:
         ends: Judgements of the end of the run and of the second run. Without a second run, the
             judgement of the run is given twice.
-        fall_rad: Predicted distance, in rad, between the mean pose of the arms and q* at the
-            end of a run twice as long. The largest distance over the joints counts.
-        apart_rad: Largest distance of a joint from the mean of all arms in the last second, in
-            rad.
+        fall_rad: Predicted distance, in rad, between the mean pose of the arms and q*, or the
+            mean of the promised motion, at the end of a run twice as long. The largest distance over the joints counts.
+        apart_rad: Largest distance of a joint from the mean of all arms, or from the promised
+            motion, in the last second, in rad.
 
     Returns:
         The worst class that applies to one of the runs.
@@ -395,7 +408,8 @@ class CandidateScore(msgspec.Struct, frozen=True):
         outcome: Class of the candidate.
         error_rad: RMS distance of the arms from the pose q*, in rad. None if the run diverged.
         spread_rad: Part of the error that is the distance between the arms at the same time,
-            without delays.
+            without delays. For a law that promises another motion, it is the distance of the
+            arms from this motion.
         pose_rad: Part of the error that is the distance of the arms' mean from q*.
         effort_nm: RMS of the torque minus the gravity torque at the arm's own pose, in N m.
         settled_s: Time from which the largest |e| stays below 0.01 rad, in s, where e is the
@@ -513,7 +527,8 @@ class _RunMeasures(NamedTuple):
         end: Judgement of the end of the run.
         fall_rad: Predicted distance from q*, see `classify_candidate`.
         apart_rad: Distance between the arms at the end, see `classify_candidate`.
-        spread_rad: RMS distance of the arms from their mean, in rad.
+        spread_rad: RMS distance of the arms from their mean, or from the motion that their law
+            promises, in rad.
         pose_rad: RMS distance of the arms' mean from q*, in rad.
         effort_nm: See `CandidateScore`.
         settled_s: See `CandidateScore`.
@@ -534,19 +549,25 @@ def _measure_run(scenario: Scenario) -> _RunMeasures:
     """Runs a scenario in virtual time, and measures the run."""
     records_by_site, end, _ = run_whole(scenario)
     records = list(records_by_site.values())
-    t_s, q, e = _sample_at_common_times(records)
+    t_s, q, e, tau_x = _sample_at_common_times(records)
     mean_rad = q.mean(axis=0)
-    from_mean_rad = q - mean_rad
     from_pose_rad = mean_rad - compute_consensus_pose(scenario, t_s)
+    promised_rad = _compute_promised_motion(scenario, t_s, q, tau_x)
+    if promised_rad is None:
+        from_target_rad = q - mean_rad
+        from_end_rad = from_pose_rad
+    else:
+        from_target_rad = q - promised_rad
+        from_end_rad = mean_rad - promised_rad.mean(axis=0)
     in_last_second = t_s > t_s[-1] - END_WINDOW_S
-    final_distance_rad = np.abs(from_mean_rad[:, in_last_second])
+    final_distance_rad = np.abs(from_target_rad[:, in_last_second])
 
     effort_nm, saturated = _measure_torques(scenario, records)
     return _RunMeasures(
         end=end,
-        fall_rad=_predict_fall_rad(t_s, from_pose_rad),
+        fall_rad=_predict_fall_rad(t_s, from_end_rad),
         apart_rad=float(final_distance_rad.max()),
-        spread_rad=_rms(from_mean_rad),
+        spread_rad=_rms(from_target_rad),
         pose_rad=_rms(from_pose_rad),
         effort_nm=effort_nm,
         settled_s=_find_settling_time(t_s, e),
@@ -554,15 +575,45 @@ def _measure_run(scenario: Scenario) -> _RunMeasures:
     )
 
 
+def _compute_promised_motion(
+    scenario: Scenario, t_s: Array, q: Array, tau_x: Array
+) -> Array | None:
+    """Computes the motion that the law of the first site promises for all arms.
+
+    Args:
+        scenario: Scenario of the run.
+        t_s: Times, shape (K,), in s.
+        q: Joint angles, shape (N, K, n), in rad.
+        tau_x: Recorded exogenous torques, shape (N, K, n), in N m. Their sign is opposite to
+            that of the torques from outside.
+
+    Returns:
+        The promised joint angles, shape (N, K, n), in rad. None if the law promises that the
+        arms move together.
+    """
+    laws = [scenario.sites[name].control for name in scenario.names]
+    if not isinstance(laws[0], LawSettings):
+        return None
+    alpha = np.zeros((len(t_s), len(laws), len(laws)))
+    for site, name in enumerate(scenario.names):
+        start, ramps = list_scripted_ramps(scenario, name)
+        period_s = 1.0 / scenario.sites[name].rate_hz
+        peers = [scenario.names.index(peer) for peer in scenario.peers(name)]
+        alpha[:, site, peers] = evaluate_ramps(start, ramps, t_s, period_s).alpha
+    run = TuningRun(laws=laws, t_s=t_s, q=q, outside_nm=-tau_x, alpha=alpha)
+    return laws[0].target_motion(run)
+
+
 def _predict_fall_rad(t_s: Array, from_pose_rad: Array) -> float:
-    """Predicts the distance from q* at the end of a run twice as long.
+    """Predicts the distance from the promised pose at the end of a run twice as long.
 
     The distance is averaged over the second before the middle of the run and over the last
     second. If it grew in the second half, the growth is assumed to continue at the same pace.
 
     Args:
         t_s: Times, shape (K,), in s.
-        from_pose_rad: Distance of the mean pose from q*, shape (K, n), in rad.
+        from_pose_rad: Distance of the mean pose from q* or from the mean of the promised
+            motion, shape (K, n), in rad.
 
     Returns:
         The distance, the largest over the joints, in rad.
@@ -623,8 +674,10 @@ def _measure_torques(scenario: Scenario, records: Sequence[RecordBatch]) -> tupl
     return float(rms_effort_nm), float(saturated_share)
 
 
-def _sample_at_common_times(records: Sequence[RecordBatch]) -> tuple[Array, Array, Array]:
-    """Returns the joint angles and errors of all sites at common times.
+def _sample_at_common_times(
+    records: Sequence[RecordBatch],
+) -> tuple[Array, Array, Array, Array]:
+    """Returns the joint angles, errors and exogenous torques of all sites at common times.
 
     Sites may have different tick rates. The times are those of the slowest site's ticks, and of
     every other site the latest record is taken.
@@ -633,20 +686,22 @@ def _sample_at_common_times(records: Sequence[RecordBatch]) -> tuple[Array, Arra
         records: Records of each site.
 
     Returns:
-        The times, shape (K,), in s; the joint angles, shape (N, K, n), in rad; and the errors,
-        shape (N, K, n), in rad.
+        The times, shape (K,), in s; the joint angles, shape (N, K, n), in rad; the errors,
+        shape (N, K, n), in rad; and the exogenous torques, shape (N, K, n), in N m.
     """
     end_ns = min(record.t_ns[-1] for record in records)
     slowest_ns = min((record.t_ns for record in records), key=len)
     times_ns = slowest_ns[slowest_ns <= end_ns]
     q = []
     e = []
+    tau_x = []
     for record in records:
         next_indices = np.searchsorted(record.t_ns, times_ns, side="right")
         latest = next_indices - 1
         q.append(record.q[latest])
         e.append(record.e[latest])
-    return times_ns / NS_PER_S, np.array(q), np.array(e)
+        tau_x.append(record.tau_x[latest])
+    return times_ns / NS_PER_S, np.array(q), np.array(e), np.array(tau_x)
 
 
 def _rms(values: Array) -> float:
