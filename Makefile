@@ -8,7 +8,7 @@ LOCKED := --quiet --require-hashes --only-binary :all: -r
 # uv takes a quarter of pip's time; pip does what uv cannot, as where only its own settings name a package index
 INSTALL = @$(BIN)/uv pip install --python $(BIN)/python $(LOCKED) $< || $(PIP) $(LOCKED) $<
 
-.PHONY: help demo play setup extras test pytest sessions containers push-set lint platforms test-long faults docs bench lock clean
+.PHONY: help demo play setup extras test pytest sessions containers push-set lint platforms test-long faults docs bench suite-gains suite lock clean
 
 help:
 	@echo "make demo    run the paper's experiment live, 20 s, and look at what it made"
@@ -22,6 +22,8 @@ help:
 	@echo "make faults       docs/faults.md: two thousand sessions in which things go wrong, and the matrix of faults"
 	@echo "make docs         the documentation as a site, with search, offline: build/site/html/index.html"
 	@echo "make bench   the figures of docs/benchmarks.md, measured on this machine"
+	@echo "make suite-gains  docs/bench.md: tunes the gains that are out of date; entered again, it continues"
+	@echo "make suite        docs/bench.md: the whole suite of control laws; entered again, it continues"
 
 demo: setup
 	@$(BIN)/trilat demo paper $(OPTIONS)
@@ -110,6 +112,14 @@ docs: $(VENV)/docs.stamp
 
 bench: $(VENV)/dev.stamp
 	$(BIN)/python -m benchmarks
+
+suite-gains: setup
+	$(BIN)/trilat bench --tune
+	$(BIN)/trilat bench --tune --study round-trips
+
+suite: setup
+	$(BIN)/trilat bench
+	$(BIN)/trilat bench --study round-trips
 
 lock: $(VENV)/uv.stamp
 	$(BIN)/uv pip compile -q --universal --generate-hashes --python-version 3.11 --no-annotate \

@@ -533,8 +533,8 @@ def bench(
         links: Names of the selected links (network conditions), as in "rtt68-loss10" or "4g".
             Empty selects all links of the study.
         seeds: Number of seeds of random delays and losses. By default that of the study.
-        confirm: True to run each unstable combination again for 100 s, which confirms or
-            refutes the verdict.
+        confirm: Has no effect any more: every run that is not stable is repeated over twice
+            its length, which confirms or refutes the verdict.
         out: Folder of the results. A suite in it is continued. By default runs/bench-STUDY.
         jobs: Number of processes. None uses one per core.
         on: Address of a Dask scheduler, or an executor, that executes the runs instead.

@@ -526,7 +526,9 @@ def _measure_delay(text: str, reach: options.Reach) -> str:
 def _tune_bench(laws: list[str], study: str, jobs: int | None, on: str | None) -> None:
     """Tunes the control laws of a study of the benchmark, and stores their gains.
 
-    The file of the gains is part of the program.
+    The file of the gains is part of the program. The gains of each law are stored as soon as
+    they are tuned. Gains that are up to date are kept, so that the same command continues an
+    interrupted tuning.
 
     Args:
         laws: Names of the laws. Empty selects all laws of the study.
@@ -537,7 +539,13 @@ def _tune_bench(laws: list[str], study: str, jobs: int | None, on: str | None) -
     Raises:
         UsageError: A law is not part of the study.
     """
-    from ..studies.bench.bench_plan import GAINS_FILE, STUDIES, tune_laws, write_gains
+    from ..studies.bench.bench_plan import (
+        GAINS_FILE,
+        STUDIES,
+        read_gains,
+        tune_laws,
+        write_gains,
+    )
 
     laws_by_form = STUDIES[study].laws
     all_laws = {law for form_laws in laws_by_form.values() for law in form_laws}
@@ -552,8 +560,14 @@ def _tune_bench(laws: list[str], study: str, jobs: int | None, on: str | None) -
             selected_by_form[form] = selected_laws
 
     with show_progress("tuning", terminal.print_note) as progress:
-        gains = tune_laws(selected_by_form, jobs, on, progress)
-    write_gains(gains)
+        tune_laws(
+            selected_by_form,
+            jobs,
+            on,
+            progress,
+            known=read_gains().values(),
+            store=lambda gains: write_gains([gains]),
+        )
     terminal.print_paths([GAINS_FILE])
 
 
@@ -566,7 +580,7 @@ def _run_bench(
         folder: Folder of the benchmark.
         jobs: Number of processes. None uses one per core.
         on: Address of a Dask scheduler that executes the runs instead.
-        confirm: True to repeat the runs that are not stable over a longer time.
+        confirm: Accepted for older commands, see `run_bench`.
     """
     from ..studies.bench import run_bench
 
@@ -616,9 +630,10 @@ def bench_command(
     Options:
         link: Use these links instead of the links of the study, for example rtt68-loss10,4g.
         cell: Only print the commands that write the logs of this cell of the tables.
-        tune: Tune the laws again, and store their gains with the suite.
-        confirm: Repeat the runs that are not stable over 100 s, to confirm or refute the
-            verdict.
+        tune: Tune the laws whose gains are out of date, and store their gains with the suite;
+            the same command continues an interrupted tuning.
+        confirm: Has no effect any more: every run that is not stable is repeated over twice
+            its length, to confirm or refute the verdict.
         output: Folder for the results; a suite that the folder already contains is continued.
             Default: runs/bench-STUDY.
     """

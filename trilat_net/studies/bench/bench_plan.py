@@ -9,6 +9,9 @@ One procedure, `trilat bench --tune`, tunes the gains of all laws and stores the
 selects the gains with the smallest error among the choices that also stay stable if all delays
 grow by the factor `TUNING_MARGIN`. A study is a named selection of tasks, laws and links.
 
+The tuning of each law at each round trip is stored as soon as it has finished, so that an
+interrupted tuning continues.
+
 Invariant:
     - Gains are never set by hand. They come from `trilat bench --tune` only.
     - Gains carry a fingerprint of the scenario and of the source code of the law for which they
@@ -18,10 +21,11 @@ Invariant:
     - A selection that cannot run is refused before the first run.
 """
 
+import ast
 import hashlib
 import inspect
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from importlib import resources
 from pathlib import Path
@@ -33,6 +37,7 @@ from ...core import control
 from ...errors import UsageError
 from ...fields import suggest_nearest
 from ...files import write_whole
+from ...laws.interface import ControlLaw
 from ...laws.six_channel import complementary_shares
 from ...scenario.laws import BUILT_IN
 from ...scenario.resolve import GRID_LOSSES_PERCENT, GRID_ROUND_TRIPS_MS
@@ -138,6 +143,8 @@ class BenchTask(NamedTuple):
             arm. None if no connection fails.
         duration_s: Time from the start over which errors and efforts are measured, in s. A run
             lasts at least as long.
+        gravity: Factor by which the gravity parameters that the laws get differ from the true
+            ones.
     """
 
     about: str
@@ -145,6 +152,7 @@ class BenchTask(NamedTuple):
     users: int = 1
     cut_s: tuple[float, float] | None = None
     duration_s: float = 20.0
+    gravity: float = 1.0
 
 
 _HANDOVER: dict[str, Any] = {
@@ -183,6 +191,11 @@ TASKS = {
         "during free motion, all links of the slave fail for 3 s",
         {"sites.m1.hands": [_build_hand(_OUT)]},
         cut_s=_CUT_S,
+    ),
+    "gravity-90": BenchTask(
+        "as free, but the laws get 90 % of the true gravity parameters",
+        {"sites.m1.hands": [_build_hand(_OUT)]},
+        gravity=0.9,
     ),
 }
 
@@ -224,8 +237,17 @@ SHORTER_REACH: Settings = {"sites.m1.hands": [_build_hand(_LESS_OUT)]}
 The stiffness at the hand follows from the difference between both reaches.
 """
 
+EQUAL_LAWS = {"six_channel": "four_channel"}
+"""Laws that the suite leaves out, and the law of the suite that computes the same torque.
+
+`six_channel` is `four_channel` with a check that the dominance factors follow from one factor.
+The factors of all tasks do, because a task has the same factors for all laws. With other
+factors, `six_channel` would be another task and not another law.
+"""
 _ROLES = ("master", "master", "slave")
-_TUNED_LAWS = {name: law for name, law in BUILT_IN.items() if law.tune}
+_TUNED_LAWS = {
+    name: law for name, law in BUILT_IN.items() if law.tune and name not in EQUAL_LAWS
+}
 LAWS_OF_ANY = tuple(name for name, law in _TUNED_LAWS.items() if not law.explain_misfit(_ROLES))
 """Names of the tuned laws that fit two users and a slave."""
 LAWS_OF_TWO = tuple(name for name in _TUNED_LAWS if name not in LAWS_OF_ANY)
@@ -337,7 +359,7 @@ def build_settings(form: str, task: str, link: str, seed: int | None = None) -> 
 GAINS_FILE = Path(str(resources.files("trilat_net.studies.bench") / "bench_gains.json"))
 """File of the tuned gains, which is part of the program."""
 KNOWLEDGE = ModelInformation()
-"""What the laws know about the arms: gravity exactly, for all laws."""
+"""What the laws know about the arms while they are tuned: gravity exactly, for all laws."""
 TUNING_BUDGET = 16
 """Number of candidates per gain of a law, at each round trip."""
 TUNING_MARGIN = 1.5
@@ -414,13 +436,57 @@ def load_tuning_task(form: str, round_trip_ms: int) -> TuningScenario:
     return load_tuning_scenario(BASES[form], format_settings(settings))
 
 
+TUNING_VERSION = 2
+"""Number of the procedure. Gains that an earlier procedure has tuned are out of date.
+
+Since the second procedure, a law may define its own objective.
+"""
+_TEXTS_OF_LAWS = ("condition", "explain_idle_shares", "explain_no_linear_form")
+"""Methods of a law that compute texts for the user, and have no influence on its motion."""
+
+
+def _read_law_code(kind: type[ControlLaw]) -> str:
+    """Returns the code that determines the motion of a law, without comments and docstrings.
+
+    A correction of a sentence therefore makes no gains out of date.
+
+    Args:
+        kind: The class of the law.
+    """
+    modules = [control]
+    for base in kind.__mro__:
+        module = inspect.getmodule(base)
+        is_law = issubclass(base, ControlLaw) and module is not inspect.getmodule(ControlLaw)
+        if is_law and module is not None and module not in modules:
+            modules.append(module)
+
+    codes = []
+    for module in modules:
+        tree = ast.parse(inspect.getsource(module))
+        for node in ast.walk(tree):
+            body = getattr(node, "body", None)
+            if not isinstance(body, list):
+                continue
+            node.body = [statement for statement in body if not _is_text(statement)]  # type: ignore[attr-defined]
+        codes.append(ast.unparse(tree))
+    return "\0".join(codes)
+
+
+def _is_text(statement: ast.stmt) -> bool:
+    """Returns True for a docstring, and for a method that only computes texts for the user."""
+    if isinstance(statement, ast.FunctionDef):
+        return statement.name in _TEXTS_OF_LAWS
+    is_expression = isinstance(statement, ast.Expr)
+    return is_expression and isinstance(statement.value, ast.Constant)
+
+
 @cache
 def fingerprint_tuning(form: str, law: str, round_trip_ms: int) -> str:
     """Returns a digest of everything on which tuned gains depend.
 
-    These are the scenario, the source code of the law, the ranges in which its gains are
-    searched, and the constants of the procedure. If stored gains have another fingerprint, they
-    were tuned for another experiment or another version of the law.
+    These are the scenario, the code of the law without its texts, the ranges in which its gains
+    are searched, and the procedure. If stored gains have another fingerprint, they were tuned
+    for another experiment or another version of the law.
 
     Args:
         form: Kind of scenario in which the law runs, a key of `BASES`.
@@ -429,12 +495,11 @@ def fingerprint_tuning(form: str, law: str, round_trip_ms: int) -> str:
     """
     space = SEARCH_SPACES[law]
     assert space.kind is not None
-    modules = (control, inspect.getmodule(space.kind))
-    sources = "".join(inspect.getsource(module) for module in modules if module is not None)
+    code = _read_law_code(space.kind)
     ranges = json.dumps([knob._asdict() for knob in space.knobs])
     scenario_text = load_tuning_task(form, round_trip_ms).scenario.text
-    procedure = f"{TUNING_BUDGET} {TUNING_MARGIN} {MARGIN_LENGTHS}"
-    content = "\0".join([scenario_text, sources, ranges, procedure])
+    procedure = f"{TUNING_VERSION} {TUNING_BUDGET} {TUNING_MARGIN} {MARGIN_LENGTHS}"
+    content = "\0".join([scenario_text, code, ranges, procedure])
     return hashlib.sha256(content.encode()).hexdigest()[:16]
 
 
@@ -514,10 +579,13 @@ def tune_laws(
     on: Workers = None,
     progress: Progress = ignore_progress,
     budget: int = TUNING_BUDGET,
+    known: Iterable[TunedGains] = (),
+    store: Callable[[TunedGains], None] = lambda _: None,
 ) -> list[TunedGains]:
     """Tunes control laws for the benchmark, at each of several round trips of the links.
 
-    The round trips are `TUNED_ROUND_TRIPS_MS`.
+    The round trips are `TUNED_ROUND_TRIPS_MS`. Gains that are known and up to date are not
+    tuned again, so that an interrupted tuning continues.
 
     Args:
         laws_by_form: Names of the laws to tune, by the kind of scenario in which they run, such
@@ -528,28 +596,51 @@ def tune_laws(
             tunings.
         budget: Number of choices of gains to try, per gain of a law. A law with three gains
             gets three times this number.
+        known: Gains that were tuned before. Those that are out of date are ignored.
+        store: Function that is called with the gains of each law at each round trip as soon as
+            they are tuned. It is not called for known gains.
 
     Returns:
         The gains of every law at every round trip.
     """
+    known_by_key = {gains.key: gains for gains in known if not find_stale([gains])}
     tuned: list[TunedGains] = []
     total = len(TUNED_ROUND_TRIPS_MS) * sum(map(len, laws_by_form.values()))
     for form, laws in laws_by_form.items():
         for round_trip_ms in TUNED_ROUND_TRIPS_MS:
-            base = load_tuning_task(form, round_trip_ms)
-            gain_counts = {law: len(SEARCH_SPACES[law].knobs) for law in laws}
-            # a plan has one budget for all of its laws, so laws are grouped by their gains
-            for count in sorted(set(gain_counts.values())):
-                plan = plan_tuning(
-                    base.source,
-                    base.overrides,
-                    laws=[law for law in laws if gain_counts[law] == count],
-                    budget=count * budget,
-                )
-                searches = plan.run(jobs, on=on).found
-                tuned += [_select_gains(form, round_trip_ms, search) for search in searches]
+            for law in laws:
+                gains = known_by_key.get((form, law, round_trip_ms))
+                if gains is None:
+                    gains = _tune_law(form, law, round_trip_ms, jobs, on, budget)
+                    store(gains)
+                tuned.append(gains)
                 progress(len(tuned), total)
     return tuned
+
+
+def _tune_law(
+    form: str, law: str, round_trip_ms: int, jobs: int | None, on: Workers, budget: int
+) -> TunedGains:
+    """Tunes a law at one round trip.
+
+    Args:
+        form: Kind of scenario in which the law runs, a key of `BASES`.
+        law: Name of the law.
+        round_trip_ms: Round trip of the links, in ms.
+        jobs: Number of processes.
+        on: Cluster that tries the gains.
+        budget: Number of choices of gains to try, per gain of the law.
+    """
+    base = load_tuning_task(form, round_trip_ms)
+    gain_count = len(SEARCH_SPACES[law].knobs)
+    plan = plan_tuning(
+        base.source,
+        base.overrides,
+        laws=[law],
+        budget=gain_count * budget,
+    )
+    (search,) = plan.run(jobs, on=on).found
+    return _select_gains(form, round_trip_ms, search)
 
 
 def _select_gains(form: str, round_trip_ms: int, search: CandidateSearch) -> TunedGains:
@@ -644,6 +735,7 @@ class BenchCell(NamedTuple):
         parts = (
             _load_base_text(self.form),
             build_settings(self.form, self.task, self.link),
+            TASKS[self.task].gravity,
             self.tuned,
         )
         return hashlib.sha256(repr(parts).encode()).hexdigest()[:12]
@@ -665,7 +757,8 @@ class BenchCell(NamedTuple):
         """
         settings = build_settings(self.form, self.task, self.link, seed)
         base = load_tuning_scenario(BASES[self.form], format_settings(settings))
-        return base.with_gains(SEARCH_SPACES[self.law], KNOWLEDGE, self.tuned.gains)
+        knowledge = ModelInformation(TASKS[self.task].gravity)
+        return base.with_gains(SEARCH_SPACES[self.law], knowledge, self.tuned.gains)
 
 
 class BenchPlan(NamedTuple):
@@ -753,6 +846,13 @@ def plan_bench(
     elif not 1 <= seeds <= MAX_BENCH_SEEDS:
         raise UsageError(f"--seeds must be a number from 1 to {MAX_BENCH_SEEDS}, not {seeds}")
     all_laws = [law for form_laws in bench_study.laws.values() for law in form_laws]
+    for law in laws:
+        if law in EQUAL_LAWS:
+            equal = EQUAL_LAWS[law]
+            raise UsageError(
+                f"--law: {law} computes the torque of {equal} in all tasks of the suite; "
+                f"choose {equal}"
+            )
     tasks = _select_names("task", tasks, default=bench_study.tasks)
     laws = _select_names("law", laws, default=all_laws)
     links = _select_names("link", links, default=bench_study.links, known=list(LINKS))
@@ -788,8 +888,8 @@ def _explain_no_cells(tasks: Sequence[str], laws: Sequence[str], without: list[s
             "choose another link or law"
         )
     return (
-        f"{law_names} cannot run in {', '.join(tasks)}: two users or a handover are more than "
-        "the law supports; choose another task or law"
+        f"{law_names} cannot run in {', '.join(tasks)}: two users, a handover or wrong gravity "
+        "parameters are more than the law supports; choose another task or law"
     )
 
 
@@ -810,6 +910,8 @@ def explain_no_cell(law: str, form: str, task: str) -> str:
         - "-" if the task needs two users, and the form has a single user.
         - "no handover" if one user hands the control over to the other in this task, and the
           law cannot change how much each user leads.
+        - "exact model" if the gravity parameters are wrong in this task, and the law takes the
+          exact model of the arm instead.
         - `NO_GAINS` otherwise. In this case, the tuning of the law found no stable gains.
     """
     bench_task = TASKS[task]
@@ -817,7 +919,24 @@ def explain_no_cell(law: str, form: str, task: str) -> str:
         return "-"
     if "timeline" in bench_task.settings and BUILT_IN[law].Settings.fixed_shares:
         return "no handover"
+    if bench_task.gravity != 1.0 and not _gets_gravity(form, law):
+        return "exact model"
     return NO_GAINS
+
+
+@cache
+def _gets_gravity(form: str, law: str) -> bool:
+    """Returns True if the settings of a law depend on the gravity parameters that it gets.
+
+    Args:
+        form: Kind of scenario in which the law runs, a key of `BASES`.
+        law: Name of the control law.
+    """
+    space = SEARCH_SPACES[law]
+    scenario = load_tuning_scenario(BASES[form]).scenario
+    gains = {knob.name: knob.low for knob in space.knobs}
+    exact = space.controls(scenario, KNOWLEDGE, gains)
+    return space.controls(scenario, ModelInformation(0.9), gains) != exact
 
 
 def _list_cells(

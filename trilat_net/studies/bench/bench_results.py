@@ -37,8 +37,8 @@ PASSIVE_J = -1e-3
 
 It is not 0, because the energy is a numerical integral.
 """
-LONGEST_S = 100.0
-"""Duration in s of the longest runs, and of the repeated runs of those that are not stable."""
+CONFIRMATION_LENGTHS = 2.0
+"""Duration of the repetition of a run that is not stable, in durations of the run."""
 LEAST_SEEDS = 20
 """Smallest number of runs for which an interval is computed."""
 
@@ -74,7 +74,8 @@ class BenchRun(msgspec.Struct, frozen=True):
         to_s: Requested duration, in s, of a run that was repeated because it was not stable. 0
             for a first run.
         confirmed: True if the repeated run was not stable either. False if it was, so that it
-            refuted the first run. None if there is no repeated run.
+            refuted the first run. None if there is no repeated run, because the first run was
+            not judged "not stable", or diverged.
         bounded: True if no joint exceeded the velocity `BOUND_RAD_S`, or moved more than
             `THROWN_RAD` away from its start.
         energy_j: Smallest value over time of the energy that operators, friction and wall had
@@ -89,8 +90,12 @@ class BenchRun(msgspec.Struct, frozen=True):
         wall_n: Mean force of the wall in the last quarter of the task, in N. None without a
             wall.
         force_peak_n: Largest force of the wall, in N. None without a wall.
-        stiffness_n_m: Stiffness that the user feels, in N/m, from two runs with different
-            reaches. None unless the arms come to rest in both.
+        stiffness_n_m: Stiffness that the user feels 2 s after contact, in N/m, from two runs
+            with different reaches. None without such contact in both.
+        impedance_n_s_m: |Z| at 1 Hz that the user feels in contact minus that in free motion,
+            in N s/m. None without contact.
+        free_impedance_n_s_m: |Z| at 1 Hz that the user feels in free motion, in N s/m. It is
+            measured in the task `contact` only.
     """
 
     name: str
@@ -113,6 +118,8 @@ class BenchRun(msgspec.Struct, frozen=True):
     wall_n: float | None = None
     force_peak_n: float | None = None
     stiffness_n_m: float | None = None
+    impedance_n_s_m: float | None = None
+    free_impedance_n_s_m: float | None = None
 
     @property
     def cell(self) -> str:
@@ -128,12 +135,17 @@ class BenchRun(msgspec.Struct, frozen=True):
     def needs_confirmation(self) -> bool:
         """True if this run was judged not stable, but a longer run might be stable.
 
-        False if the run diverged, which means that the motion grew without bound. Also false if
-        the run already lasted for `LONGEST_S`.
+        False if the run diverged, which means that the motion grew without bound: a longer run
+        would end at the same time. Also false if this run is itself a repetition.
         """
         diverged = self.behaviour is EndBehaviour.DIVERGED
-        is_short = self.length_s < LONGEST_S
-        return self.stability is Stability.NOT_STABLE and not diverged and is_short
+        is_first = not self.to_s
+        return self.stability is Stability.NOT_STABLE and not diverged and is_first
+
+    @property
+    def confirmation_s(self) -> float:
+        """Duration of the repetition that confirms or refutes this run, in s."""
+        return CONFIRMATION_LENGTHS * self.length_s
 
     @property
     def masked(self) -> bool:
@@ -150,7 +162,9 @@ QUANTITIES = {
     "effort_nm": "effort, RMS of tau - G(q), N m",
     "hand_nm": "RMS torque of the hands, N m",
     "force_peak_n": "largest force of the wall, N",
-    "stiffness_n_m": "stiffness at the user's hand, by two reaches, N/m",
+    "stiffness_n_m": "stiffness at the user's hand 2 s after contact, N/m",
+    "impedance_n_s_m": "|Z| at 1 Hz at the user's hand in contact, minus free motion, N s/m",
+    "free_impedance_n_s_m": "|Z| at 1 Hz at the user's hand in free motion, N s/m",
     "settled_s": "time from which all arms stay at their final poses, s",
 }
 """Labels of the quantities that are averaged over the seeds of a cell."""
@@ -158,7 +172,12 @@ _QUANTITIES_OF_ALL = ("error_rad", "effort_nm", "settled_s")
 _QUANTITIES_BY_TASK = {
     "free": ["hand_nm"],
     "disagree": ["hand_nm"],
-    "contact": ["stiffness_n_m", "force_peak_n"],
+    "contact": [
+        "stiffness_n_m",
+        "impedance_n_s_m",
+        "free_impedance_n_s_m",
+        "force_peak_n",
+    ],
 }
 _JUDGEMENTS = (
     Stability.STABLE,
@@ -362,10 +381,9 @@ def _list_used_gains(results: BenchResults) -> list[TunedGains]:
 
 
 def _confirm_run(runs: dict[tuple[str, int], BenchRun], cell: BenchCell, seed: int) -> BenchRun:
-    """Returns a run of a cell, with the judgement of its repeated run if there is one.
+    """Returns a run of a cell, or its repetition over twice its length if there is one.
 
-    A run that is not stable may be repeated over `LONGEST_S`. The longer run decides. A run
-    that lasted that long from the beginning confirms itself.
+    A run that is not stable is repeated. The longer run decides, and its numbers count.
 
     Args:
         runs: All runs by name of their cell in the journal, and by seed.
@@ -373,19 +391,12 @@ def _confirm_run(runs: dict[tuple[str, int], BenchRun], cell: BenchCell, seed: i
         seed: Seed of the run.
     """
     run = runs[cell.key, seed]
-    if run.stability is not Stability.NOT_STABLE:
+    if not run.needs_confirmation:
         return run
-    if run.length_s >= LONGEST_S:
-        return msgspec.structs.replace(run, confirmed=True)
-
-    repeated = runs.get((name_run(cell.key, LONGEST_S), seed))
-    if repeated is None:
-        # Either the user did not request the repetition, or the run diverged.
-        return run
+    repeated = runs[name_run(cell.key, run.confirmation_s), seed]
     return msgspec.structs.replace(
-        run,
-        stability=repeated.stability,
-        text=f"of {LONGEST_S:g} s: {repeated.text}",
+        repeated,
+        text=f"of {repeated.length_s:g} s: {repeated.text}",
         confirmed=repeated.stability is Stability.NOT_STABLE,
     )
 
@@ -439,8 +450,8 @@ def name_law(law: str, form: str) -> str:
 def tabulate_verdicts(results: BenchResults) -> TextTable:
     """Returns a table of how many links each law copes with: a row per law, a column per task.
 
-    An entry counts the links over which the law is stable, those over which this is undecided
-    (open), and those over which it is not stable.
+    An entry counts the links over which the law is stable, those over which it only settles,
+    those over which this is undecided (open), and those over which it is not stable.
 
     Args:
         results: Results of the suite or of a part of it.
@@ -450,7 +461,8 @@ def tabulate_verdicts(results: BenchResults) -> TextTable:
     for law, form in results.plan.laws:
         cells = [_count_verdicts(results, law, form, task) for task in tasks]
         rows.append([name_law(law, form), *cells])
-    return TextTable(("links: stable / open / not stable", *tasks), rows, align="lr")
+    verdicts = " / ".join(_JUDGEMENTS)
+    return TextTable((f"links: {verdicts}", *tasks), rows, align="lr")
 
 
 def _count_verdicts(results: BenchResults, law: str, form: str, task: str) -> str:
@@ -463,8 +475,8 @@ def _count_verdicts(results: BenchResults, law: str, form: str, task: str) -> st
         task: Name of the task.
 
     Returns:
-        A text such as "12 / 1 / 3" for stable, open and not stable links. If the law did not
-        run in the task, the reason.
+        A text such as "12 / 0 / 1 / 3" for stable, settled, open and not stable links. If the
+        law did not run in the task, the reason.
     """
     verdicts = [result.judgement for result in results.select(task, law)]
     if not verdicts:
@@ -669,11 +681,12 @@ def describe_bench(results: BenchResults) -> Iterator[str]:
     yield f"{cells}, {runs}: one per cell without randomness, otherwise {seeds}"
 
     unstable = [run for run in results.runs if run.stability is Stability.NOT_STABLE]
+    diverged = sum(run.behaviour is EndBehaviour.DIVERGED for run in unstable)
     confirmed = sum(bool(run.confirmed) for run in unstable)
     refuted = sum(run.confirmed is False for run in results.runs)
     yield (
-        f"not stable: {count_nouns(len(unstable), 'run')}; runs of {LONGEST_S:g} s confirmed "
-        f"{confirmed} of them, and refuted {refuted} more"
+        f"not stable: {count_nouns(len(unstable), 'run')}, of which {diverged} diverged; runs "
+        f"of twice the length confirmed {confirmed}, and refuted {refuted} more"
     )
 
     for task in plan.tasks:

@@ -2,14 +2,18 @@
 
 A run is judged by its end (`analysis.run_end`) and by its twins (`analysis.twin_growth`). A
 twin is a repetition of the run with a small disturbance, which shows whether disturbances grow.
-A run is made longer if its judgement needs more time. Its errors, efforts and forces are
-measured over the time of the task only, from the same records that `trilat sim` writes.
+A run is made longer if its judgement needs more time: it then lasts for `TIME_CONSTANTS` of its
+slowest time constants. A run that is not stable is repeated over twice its length. Errors,
+efforts and forces are measured over the time of the task only, from the same records that
+`trilat sim` writes.
 
 Invariant:
     - The numbers of a run depend on its scenario alone. The number of processes, their order
       and interruptions have no influence.
     - A run that is in the journal of the folder is not executed again. A run with other gains
-      counts as another run.
+      counts as another run, and so does the repetition of a run over twice its length.
+    - The duration of a run has no limit except `MAX_RUN_TICKS`. If this limit ends a run, its
+      text says so.
     - A folder contains only runs of one version of the program on one kind of arithmetic, see
       `describe_program`.
 """
@@ -24,8 +28,9 @@ import numpy as np
 
 from ...analysis.arm_rows import build_arm_rows
 from ...analysis.dominance_history import evaluate_ramps, list_scripted_ramps
-from ...analysis.run_end import THROWN_RAD, RunEnd, Stability
+from ...analysis.run_end import THROWN_RAD, EndBehaviour, RunEnd, Stability
 from ...analysis.site_signals import SETTLED_ERROR_RAD
+from ...analysis.stability_decision import LoopRoots
 from ...analysis.torque_sources import list_walls, wall_force
 from ...analysis.twin_growth import TwinGrowth, measure_virtual_twins
 from ...core.ticks import NS_PER_S
@@ -40,8 +45,15 @@ from ..executor import Progress, Workers, ignore_progress, open_worker_pool
 from ..measure_run import RecordBatch, run_whole
 from ..study_folder import RunJournal, StudyFolder, build_resume_hint, describe_program
 from ..tuning.candidate import load_tuning_scenario
-from .bench_plan import SHORTER_REACH, TASKS, BenchCell, BenchPlan, format_settings
-from .bench_results import LONGEST_S, BenchResults, BenchRun, name_run
+from .bench_plan import (
+    SHORTER_REACH,
+    TASKS,
+    BenchCell,
+    BenchPlan,
+    Settings,
+    format_settings,
+)
+from .bench_results import BenchResults, BenchRun, name_run
 
 SLAVE = "s"
 USER = "m1"
@@ -55,14 +67,31 @@ REST_S = 2.0
 
 All joints stay within `SETTLED_ERROR_RAD` of their final angles.
 """
-TWINS = 3
-"""Number of twins of the run with the first seed. Runs with other seeds have one twin.
-
-The disturbances of the three twins are at all joints, at single joints, and in the estimates of
-the adaptive laws.
-"""
 TIME_CONSTANTS = 6.0
-"""Shortest duration of a run in units of its slowest time constant, up to `LONGEST_S`."""
+"""Duration of a run whose judgement needs more time, in units of its slowest time constant."""
+MAX_RUN_TICKS = 3_000_000
+"""Largest number of ticks to which a run is made longer, over all sites.
+
+It is a safety limit for the memory: three sites at 1 kHz reach it after 1000 s, when their
+records take a quarter of a gigabyte. A repetition over twice the length may take twice as many.
+"""
+STIFFNESS_S = 2.0
+"""Time after the first contact at which the stiffness is measured, in s.
+
+Laws that integrate an error in contact become stiffer with time, so a later measurement would
+be one of the duration of the run.
+"""
+STIFFNESS_WINDOW_S = 0.2
+"""Duration over which positions and forces are averaged for the stiffness, in s."""
+IMPEDANCE_HZ = 1.0
+"""Frequency at which the impedance is measured, in Hz."""
+IMPEDANCE_PERIODS = 4
+"""Number of periods over which the impedance is measured."""
+SHAKING_N = 0.5
+"""Amplitude of the force with which the user's arm is shaken for the impedance, in N.
+
+It is half of the least force of the wall that counts as contact, so the slave keeps contact.
+"""
 
 
 class BenchRunItem(NamedTuple):
@@ -71,8 +100,8 @@ class BenchRunItem(NamedTuple):
     Attributes:
         cell: The task, control law and link of the run, with the tuned gains.
         seed: Seed of the run.
-        to_s: Duration in s, if the run repeats a first run over a longer time to check that it
-            is not stable. 0 for a first run.
+        to_s: Duration in s, if the run repeats a first run over twice its length to check that
+            it is not stable. 0 for a first run.
     """
 
     cell: BenchCell
@@ -94,6 +123,7 @@ class _JudgedRun(NamedTuple):
         records: All records of the run, by site.
         end: Analysis of the end of the run.
         twins: Growth of the small disturbances of the twins.
+        roots: Characteristic roots of the loop at the end of the run.
         stability: The judgement.
         text: Explanation of the judgement.
     """
@@ -102,6 +132,7 @@ class _JudgedRun(NamedTuple):
     records: dict[str, RecordBatch]
     end: RunEnd
     twins: TwinGrowth
+    roots: LoopRoots
     stability: Stability
     text: str
 
@@ -125,7 +156,8 @@ def run_bench_task(item: BenchRunItem) -> BenchRun:
     """
     cell = item.cell
     scenario = cell.build(item.seed).scenario
-    twins = TWINS if item.seed == cell.seeds[0] else 1
+    # Each joint is pushed in the run of the first seed, and all joints together in the others.
+    twins = None if item.seed == cell.seeds[0] else 1
     is_repeated = item.to_s > 0.0
     if is_repeated:
         judged = _judge(scenario, item.to_s, twins)
@@ -152,70 +184,96 @@ def run_bench_task(item: BenchRunItem) -> BenchRun:
     task = TASKS[cell.task]
     run = _measure(run, judged, task.duration_s)
     if cell.task == "contact" and not run.masked:
-        stiffness_n_m = _estimate_stiffness(item, judged)
-        run = msgspec.structs.replace(run, stiffness_n_m=stiffness_n_m)
+        run = _measure_contact(run, item, judged)
     return run
 
 
-def _judge(scenario: Scenario, length_s: float, twins: int) -> _JudgedRun:
+def _judge(scenario: Scenario, length_s: float, twins: int | None) -> _JudgedRun:
     """Executes a scenario and its twins, and judges the run.
 
     Args:
         scenario: The scenario. Its own duration is ignored.
         length_s: Duration of the run, in s.
-        twins: Number of twins.
+        twins: Number of twins. None for one per joint.
     """
     scenario = msgspec.structs.replace(scenario, duration_s=length_s)
     records, end, run = run_whole(scenario)
-    growth = TwinGrowth("no twins were requested")
-    if end.diverged_at_s is None and twins:
+    growth = TwinGrowth("the run diverged")
+    if end.diverged_at_s is None:
         growth = measure_virtual_twins(scenario, end, length_s, twins)
-    decision = decide_virtual_run(scenario, end, find_run_roots(scenario, run), growth)
+    roots = find_run_roots(scenario, run)
+    decision = decide_virtual_run(scenario, end, roots, growth)
     return _JudgedRun(
         scenario=scenario,
         records=records,
         end=end,
         twins=growth,
+        roots=roots,
         stability=decision.stability,
         text="; ".join(decision.reasons) or decision.rests_on or end.text,
     )
 
 
-def _lengthen(judged: _JudgedRun, twins: int) -> _JudgedRun:
+def _lengthen(judged: _JudgedRun, twins: int | None) -> _JudgedRun:
     """Repeats a run over a longer time if its judgement needs more time.
 
-    A run must last for `TIME_CONSTANTS` of its slowest time constants, which follow from the
-    rates at which its errors and the disturbances of its twins decay. After that, a run that is
-    not stable is repeated over twice its duration, and the longer run is judged.
+    A run that is stable or settled, and whose arms are at rest at its end, is long enough. Any
+    other run must last for `TIME_CONSTANTS` of its slowest time constants.
 
     Args:
         judged: The run.
-        twins: Number of twins of a repeated run.
+        twins: Number of twins of a repeated run. None for one per joint.
 
     Returns:
         The longer run, or the same run if it is long enough.
     """
     if judged.diverged:
         return judged
-    end = judged.end
-    rates = [end.error.rate_per_s, end.speed.rate_per_s]
-    rates += [push.rate_per_s for push in judged.twins.pushes if push.factor > 0.0]
-    # A rate below 0 means decay. Its time constant is the inverse.
-    time_constants_s = [-1.0 / rate for rate in rates if rate < 0.0]
-    slowest_s = max(time_constants_s, default=0.0)
+    is_decided = judged.stability in (Stability.STABLE, Stability.SETTLED)
+    if is_decided and judged.end.behaviour is EndBehaviour.CONVERGED:
+        return judged
 
     length_s = judged.scenario.duration_s
-    required_s = TIME_CONSTANTS * slowest_s
-    # If LONGEST_S is too short, repeating the run can only help if its judgement is open.
-    if judged.stability is Stability.OPEN or required_s < LONGEST_S:
-        required_s = min(required_s, LONGEST_S)
-        if length_s < required_s:
-            length_s = float(math.ceil(required_s))
-            judged = _judge(judged.scenario, length_s, twins)
+    required_s = TIME_CONSTANTS * _find_slowest_s(judged)
+    limit_s = compute_longest_s(judged.scenario)
+    longer_s = float(math.ceil(min(required_s, limit_s)))
+    if longer_s > length_s:
+        judged = _judge(judged.scenario, longer_s, twins)
+    if required_s <= limit_s or judged.diverged:
+        return judged
+    limit_text = (
+        f"ended after {judged.scenario.duration_s:.4g} s by the safety limit of "
+        f"{MAX_RUN_TICKS} ticks, but {TIME_CONSTANTS:g} of its slowest time constants are "
+        f"{required_s:.4g} s"
+    )
+    return judged._replace(text=f"{judged.text}; {limit_text}")
 
-    if judged.stability is Stability.NOT_STABLE and not judged.diverged:
-        return _judge(judged.scenario, 2.0 * length_s, twins)
-    return judged
+
+def compute_longest_s(scenario: Scenario) -> float:
+    """Returns the duration at which a run reaches the safety limit `MAX_RUN_TICKS`, in s.
+
+    Args:
+        scenario: The scenario, whose sites have tick rates.
+    """
+    ticks_per_s = sum(site.rate_hz for site in scenario.sites.values())
+    return MAX_RUN_TICKS / ticks_per_s
+
+
+def _find_slowest_s(judged: _JudgedRun) -> float:
+    """Returns the slowest time constant of a run, in s. 0 if nothing decays.
+
+    It is that of the slowest root of the loop. If the loop has no roots, it is that of the
+    slowest decay of an envelope of the motion, or of a push in a twin.
+    """
+    root_per_s = judged.roots.rate_per_s
+    if root_per_s is not None:
+        return -1.0 / root_per_s if root_per_s < 0.0 else 0.0
+    end = judged.end
+    rates_per_s = [end.error.rate_per_s, end.speed.rate_per_s]
+    rates_per_s += [push.rate_per_s for push in judged.twins.pushes if push.factor > 0.0]
+    # A rate below 0 means decay. Its time constant is the inverse.
+    time_constants_s = [-1.0 / rate for rate in rates_per_s if rate < 0.0]
+    return max(time_constants_s, default=0.0)
 
 
 def _measure(run: BenchRun, judged: _JudgedRun, duration_s: float) -> BenchRun:
@@ -367,61 +425,251 @@ def _find_settled_s(records: dict[str, RecordBatch]) -> float | None:
     return float(settled_s) if settled_s <= end_s - REST_S else None
 
 
-def _estimate_stiffness(item: BenchRunItem, far: _JudgedRun) -> float | None:
+def _measure_contact(run: BenchRun, item: BenchRunItem, far: _JudgedRun) -> BenchRun:
+    """Measures what the user feels of the wall: a stiffness and an impedance.
+
+    Args:
+        run: The run without these numbers.
+        item: The run of the task `contact`, as it was executed.
+        far: The same run with its records.
+
+    Returns:
+        The run with the numbers that could be measured.
+    """
+    contact_s = _find_contact_s(far.scenario, far.records)
+    if contact_s is None:
+        return run
+    stiffness_n_m = _estimate_stiffness(item, far, contact_s)
+    impedances = _estimate_impedance(item, far, contact_s)
+    if impedances is None:
+        return msgspec.structs.replace(run, stiffness_n_m=stiffness_n_m)
+    in_contact, in_free_motion = impedances
+    return msgspec.structs.replace(
+        run,
+        stiffness_n_m=stiffness_n_m,
+        impedance_n_s_m=in_contact - in_free_motion,
+        free_impedance_n_s_m=in_free_motion,
+    )
+
+
+def _find_contact_s(scenario: Scenario, records: dict[str, RecordBatch]) -> float | None:
+    """Returns the time at which the slave first touches a wall, in s. None if it does not."""
+    record = records[SLAVE]
+    tip = build_arm_rows(scenario, SLAVE).place_end_effector(record.q, record.qd)
+    t_s = record.t_ns / NS_PER_S
+    contact_times_s = []
+    for wall in list_walls(scenario.sites[SLAVE]):
+        touching = np.flatnonzero(wall_force(wall, t_s, tip) > 0.0)
+        if len(touching):
+            contact_times_s.append(float(t_s[touching[0]]))
+    return min(contact_times_s, default=None)
+
+
+def _run_variant(
+    item: BenchRunItem, settings: Settings, duration_s: float
+) -> tuple[Scenario, dict[str, RecordBatch]] | None:
+    """Executes a run with other settings, without a judgement.
+
+    Args:
+        item: The run.
+        settings: Overrides of its scenario.
+        duration_s: Duration, in s.
+
+    Returns:
+        The scenario and its records. None if the run diverged.
+    """
+    built = item.cell.build(item.seed)
+    overrides = (*built.overrides, *format_settings(settings))
+    scenario = load_tuning_scenario(built.source, overrides).scenario
+    scenario = msgspec.structs.replace(scenario, duration_s=duration_s)
+    records, end, _ = run_whole(scenario)
+    return None if end.diverged_at_s is not None else (scenario, records)
+
+
+def _estimate_stiffness(item: BenchRunItem, far: _JudgedRun, contact_s: float) -> float | None:
     """Estimates the stiffness that the user feels along the normal of the wall.
 
     The same run is executed with a shorter reach of the user. The stiffness is the difference
-    of the forces, divided by the difference of the positions of the user's arm, when both runs
-    are at rest.
+    of the forces, divided by the difference of the positions of the user's arm. In each run,
+    they are measured `STIFFNESS_S` after its first contact.
 
     Args:
         item: The run with the longer reach.
         far: The same run with its records.
+        contact_s: Time of the first contact of the longer reach, in s.
 
     Returns:
-        The stiffness in N/m. None if one of the runs does not come to rest.
+        The stiffness in N/m. None if one of the runs has no contact for so long.
     """
-    built = item.cell.build(item.seed)
-    overrides = (*built.overrides, *format_settings(SHORTER_REACH))
-    shorter = load_tuning_scenario(built.source, overrides)
-    near = _judge(shorter.scenario, far.scenario.duration_s, twins=0)
-    near_settled_s = _find_settled_s(near.records)
-    far_settled_s = _find_settled_s(far.records)
-    if near_settled_s is None or far_settled_s is None:
+    variant = _run_variant(item, SHORTER_REACH, TASKS[item.cell.task].duration_s)
+    if variant is None:
         return None
-    near_m, near_n = _measure_push(near)
-    far_m, far_n = _measure_push(far)
-    force_n = far_n - near_n
-    distance_m = far_m - near_m
-    return float(force_n / distance_m)
+    near_scenario, near_records = variant
+    near_contact_s = _find_contact_s(near_scenario, near_records)
+    if near_contact_s is None:
+        return None
+    near = _measure_push(near_scenario, near_records, near_contact_s + STIFFNESS_S)
+    longer = _measure_push(far.scenario, far.records, contact_s + STIFFNESS_S)
+    if near is None or longer is None:
+        return None
+    distance_m = longer.position_m - near.position_m
+    force_n = longer.force_n - near.force_n
+    return float(force_n / distance_m) if distance_m else None
 
 
-def _measure_push(judged: _JudgedRun) -> tuple[float, float]:
-    """Measures how far and how hard the user pushes at the end of a run.
+class _Push(NamedTuple):
+    """Where and how hard the user pushes, along the normal of the wall.
+
+    Attributes:
+        position_m: Position of the user's end effector along x, in m.
+        force_n: Force of the user on it along x, in N.
+    """
+
+    position_m: float
+    force_n: float
+
+
+def _measure_push(
+    scenario: Scenario, records: dict[str, RecordBatch], time_s: float
+) -> _Push | None:
+    """Measures how far and how hard the user pushes at a time.
+
+    Args:
+        scenario: The scenario.
+        records: All records of the run, by site.
+        time_s: The time, in s. Numbers are averaged over `STIFFNESS_WINDOW_S` around it.
+
+    Returns:
+        The position and the force. None if the run ends before.
+    """
+    window_s = (time_s - 0.5 * STIFFNESS_WINDOW_S, time_s + 0.5 * STIFFNESS_WINDOW_S)
+    motion = _measure_tip(scenario, records, window_s)
+    if motion is None:
+        return None
+    return _Push(float(motion.position_m.mean()), float(motion.force_n.mean()))
+
+
+class _TipMotion(NamedTuple):
+    """Motion of the user's end effector along the normal of the wall, over K records.
+
+    Attributes:
+        q: Joint angles, shape (K, n), in rad.
+        position_m: Position, shape (K,), in m.
+        speed_m_s: Velocity, shape (K,), in m/s.
+        force_n: Force of the user, shape (K,), in N.
+    """
+
+    q: Array
+    position_m: Array
+    speed_m_s: Array
+    force_n: Array
+
+
+def _measure_tip(
+    scenario: Scenario, records: dict[str, RecordBatch], window_s: tuple[float, float]
+) -> _TipMotion | None:
+    """Computes the motion of the user's end effector, and the force on it, within a window.
 
     The force F of the operator on the end effector follows from the torque tau of the operator
     on the joints: J' F = tau, where J is the Jacobian of the end effector.
 
     Args:
-        judged: The run.
+        scenario: The scenario.
+        records: All records of the run, by site.
+        window_s: Start and end of the window, in s.
 
     Returns:
-        Position of the end effector in m and force in N, both along x and averaged over the
-        last second.
+        The motion along x. None if the run ends within the window.
     """
-    scenario = judged.scenario
-    record = judged.records[USER]
-    last_second_ns = record.t_ns[-1] - NS_PER_S
-    record = record.since(last_second_ns)
+    start_ns, end_ns = (round(time_s * NS_PER_S) for time_s in window_s)
+    if records[USER].t_ns[-1] < end_ns - NS_PER_S // scenario.sites[USER].rate_hz:
+        return None
+    record = records[USER].between(start_ns, end_ns)
     arm = build_arm_rows(scenario, USER)
     tip = arm.place_end_effector(record.q, record.qd)
     torque = _compute_hand_torque(scenario, USER, record)
     J_transposed = np.swapaxes(tip.J, 1, 2)
     torque_columns = torque[:, :, np.newaxis]
     force = np.linalg.solve(J_transposed, torque_columns)
-    force_x = force[:, 0, 0]
-    position_x = tip.position[:, 0]
-    return float(position_x.mean()), float(force_x.mean())
+    return _TipMotion(
+        q=record.q,
+        position_m=tip.position[:, 0],
+        speed_m_s=tip.speed[:, 0],
+        force_n=force[:, 0, 0],
+    )
+
+
+def _estimate_impedance(
+    item: BenchRunItem, far: _JudgedRun, contact_s: float
+) -> tuple[float, float] | None:
+    """Estimates the impedance |Z| at `IMPEDANCE_HZ` that the user feels, with and without wall.
+
+    The user's arm is shaken by a small sine of force along the normal of the wall. Z is the
+    ratio of the phasors of the user's force and of the velocity, both along the normal. Each
+    phasor is that of the difference between the shaken run and the same run without the sine,
+    so that slow changes of the motion do not count. The run in free motion lacks the wall, and
+    its user moves to the pose that the user has in contact, so that the inertia of the arm is
+    the same.
+
+    Args:
+        item: The run of the task `contact`.
+        far: The same run with its records.
+        contact_s: Time of the first contact, in s.
+
+    Returns:
+        |Z| in contact and in free motion, in N s/m. None if a run is too short or diverges.
+    """
+    start_s = contact_s + STIFFNESS_S
+    end_s = start_s + IMPEDANCE_PERIODS / IMPEDANCE_HZ
+    window_s = (start_s, end_s)
+    still = _measure_tip(far.scenario, far.records, window_s)
+    if still is None:
+        return None
+
+    pose_rad = still.q.mean(axis=0)
+    no_motion = np.zeros_like(pose_rad)
+    arm = build_arm_rows(far.scenario, USER)
+    J = arm.place_end_effector(pose_rad[np.newaxis], no_motion[np.newaxis]).J[0]
+    shaking = {
+        "kind": "multisine",
+        "amplitude_nm": (SHAKING_N * J[0]).tolist(),
+        "frequencies_hz": [IMPEDANCE_HZ],
+    }
+    (hand,) = TASKS[item.cell.task].settings[f"sites.{USER}.hands"]
+    hand_to_pose = {**hand, "to_rad": pose_rad.tolist()}
+    no_wall: Settings = {f"sites.{SLAVE}.environment": []}
+    in_contact = _run_window(item, {f"sites.{USER}.hands": [hand, shaking]}, window_s)
+    free_hands = {f"sites.{USER}.hands": [hand_to_pose]}
+    free_shaken_hands = {f"sites.{USER}.hands": [hand_to_pose, shaking]}
+    free = _run_window(item, no_wall | free_hands, window_s)
+    free_shaken = _run_window(item, no_wall | free_shaken_hands, window_s)
+    if in_contact is None or free is None or free_shaken is None:
+        return None
+    return _compute_impedance(in_contact, still), _compute_impedance(free_shaken, free)
+
+
+def _run_window(
+    item: BenchRunItem, settings: Settings, window_s: tuple[float, float]
+) -> _TipMotion | None:
+    """Executes a run with other settings, and returns the user's motion within a window.
+
+    Args:
+        item: The run.
+        settings: Overrides of its scenario.
+        window_s: Start and end of the window, in s. The run ends with the window.
+    """
+    variant = _run_variant(item, settings, window_s[1])
+    return None if variant is None else _measure_tip(*variant, window_s)
+
+
+def _compute_impedance(shaken: _TipMotion, still: _TipMotion) -> float:
+    """Computes |Z| from a shaken run and the same run without the sine, in N s/m."""
+    count = len(shaken.force_n)
+    turns = IMPEDANCE_PERIODS * np.arange(count) / count
+    wave = np.exp(-2j * np.pi * turns)
+    force = np.dot(wave, shaken.force_n - still.force_n)
+    speed = np.dot(wave, shaken.speed_m_s - still.speed_m_s)
+    return float(np.abs(force) / np.abs(speed))
 
 
 def _measure_error_rad(scenario: Scenario, records: dict[str, RecordBatch]) -> float:
@@ -517,7 +765,7 @@ def run_bench(
     on: Workers = None,
     progress: Progress = ignore_progress,
     *,
-    confirm: bool = False,
+    confirm: bool = False,  # noqa: ARG001
 ) -> BenchResults:
     """Executes the runs of a benchmark that are not finished yet.
 
@@ -526,8 +774,8 @@ def run_bench(
         jobs: Number of processes, as for `trilat_net.bench`.
         on: Cluster that executes the runs, as for `trilat_net.bench`.
         progress: Function that is called with the number of finished runs and of all runs.
-        confirm: True to repeat runs that were judged not stable, with the longer duration
-            `LONGEST_S`, because a longer run may show that they are stable.
+        confirm: Accepted for older programs, and has no effect: every run that is not stable is
+            repeated over twice its length, because a longer run may show that it is stable.
 
     Returns:
         The results of all runs.
@@ -541,14 +789,12 @@ def run_bench(
     with folder.journal() as journal:
         _run_pending(journal, items, jobs, on, progress)
 
-        if confirm:
-            repeated = []
-            for item in items:
-                run = journal.done[item.cell.key, item.seed]
-                if run.needs_confirmation:
-                    longer_item = item._replace(to_s=LONGEST_S)
-                    repeated.append(longer_item)
-            _run_pending(journal, repeated, jobs, on, progress)
+        repeated = []
+        for item in items:
+            run = journal.done[item.cell.key, item.seed]
+            if run.needs_confirmation:
+                repeated.append(item._replace(to_s=run.confirmation_s))
+        _run_pending(journal, repeated, jobs, on, progress)
         return BenchResults(plan, journal.done)
 
 

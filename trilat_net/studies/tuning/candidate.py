@@ -296,7 +296,8 @@ def classify_candidate(
         ends: Judgements of the end of the run and of the second run. Without a second run, the
             judgement of the run is given twice.
         fall_rad: Predicted distance, in rad, between the mean pose of the arms and q*, or the
-            mean of the promised motion, at the end of a run twice as long. The largest distance over the joints counts.
+            mean of the promised motion, at the end of a run twice as long. The largest distance
+            over the joints counts.
         apart_rad: Largest distance of a joint from the mean of all arms, or from the promised
             motion, in the last second, in rad.
 
