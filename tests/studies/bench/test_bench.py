@@ -11,19 +11,25 @@ import pytest
 from scipy import optimize, stats
 
 import trilat_net
-from trilat_net.analysis.run_end import EndBehaviour, Stability
+from trilat_net.analysis.envelope_trend import EnvelopeFit, EnvelopeTrend
+from trilat_net.analysis.run_end import EndBehaviour, RunEnd, Stability
+from trilat_net.analysis.stability_decision import LoopRoots
+from trilat_net.analysis.twin_growth import TwinGrowth
 from trilat_net.core.vectors import Array
 from trilat_net.errors import UsageError
 from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import load_scenario
+from trilat_net.scenario.laws import BUILT_IN
 from trilat_net.studies.bench import (
     BenchResults,
     bench_plan,
+    bench_run,
     plan_bench,
     prepare_bench_folder,
     run_bench,
 )
 from trilat_net.studies.bench.bench_plan import (
+    EQUAL_LAWS,
     KNOWLEDGE,
     LINKS,
     SHORTER_REACH,
@@ -32,11 +38,15 @@ from trilat_net.studies.bench.bench_plan import (
     TUNED_ROUND_TRIPS_MS,
     BenchCell,
     BenchPlan,
+    TunedGains,
     build_settings,
     choose_round_trip,
+    explain_no_cell,
     find_stale,
+    fingerprint_tuning,
     format_settings,
     read_gains,
+    read_law_code,
     tune_laws,
     write_gains,
 )
@@ -47,7 +57,14 @@ from trilat_net.studies.bench.bench_results import (
     build_bench_page,
     encode_runs,
 )
-from trilat_net.studies.bench.bench_run import BenchRunItem, find_least_energy, run_bench_task
+from trilat_net.studies.bench.bench_run import (
+    MAX_RUN_TICKS,
+    BenchRunItem,
+    JudgedRun,
+    find_least_energy,
+    lengthen_run,
+    run_bench_task,
+)
 from trilat_net.studies.measure_run import RecordBatch
 from trilat_net.studies.study_folder import encode_csv
 from trilat_net.studies.tuning import plan_tuning
@@ -135,9 +152,10 @@ def test_effort_is_that_of_the_compiled_run(whole: BenchResults) -> None:
     assert whole.runs[0].effort_nm == pytest.approx(run.totals.effort_nm, rel=1e-12)
 
 
-def test_the_stiffness_at_the_hand_is_that_of_statics() -> None:
-    """Of P+d two springs, and the wall behind them, move the user's end effector by so much more."""
+def test_stiffness_at_the_hand_is_that_of_statics() -> None:
+    """Two springs and the wall of P+d, which is at rest 2 s after contact with these gains."""
     (cell,) = asked(tasks=["contact"], links=["rtt8"]).cells
+    cell = with_gains(cell, K=60.0, d=12.0)
     K, ends = cell.tuned.gains["K"], []
     for settings in (SHORTER_REACH, TASKS["contact"].settings):
         target = settings["sites.m1.hands"][0]["to_rad"]
@@ -153,7 +171,7 @@ def test_the_stiffness_at_the_hand_is_that_of_statics() -> None:
         ends.append((tip[0], np.linalg.solve(jacobian.T, 50.0 * (np.array(target) - q))[0]))
     (near_m, near_n), (far_m, far_n) = ends
     found = run_bench_task(BenchRunItem(cell, 1)).stiffness_n_m
-    assert found == pytest.approx((far_n - near_n) / (far_m - near_m), rel=1e-3)
+    assert found == pytest.approx((far_n - near_n) / (far_m - near_m), rel=1e-2)
 
 
 def reach(q: Array) -> tuple[Array, Array]:
@@ -180,11 +198,12 @@ def test_a_wall_that_is_hardly_touched_masks_the_numbers() -> None:
     assert "no contact" in build_bench_page(results, "trilat bench")
 
 
-def test_what_is_not_stable_stays_so_over_twice_the_length() -> None:
+def test_what_is_not_stable_stays_so_over_twice_the_length(tmp_path: Path) -> None:
     (cell,) = asked(links=["rtt272"]).cells
-    run = run_bench_task(BenchRunItem(with_gains(cell, K=60.0, d=0.5), 1))
+    plan = BenchPlan("round-trips", [with_gains(cell, K=60.0, d=0.5)], [("p_d", "level")])
+    (run,) = run_bench(prepare_bench_folder(plan, tmp_path / "suite"), jobs=1).runs
     assert run.stability is Stability.NOT_STABLE
-    assert run.behaviour is EndBehaviour.DIVERGED or run.length_s >= 40.0
+    assert run.behaviour is EndBehaviour.DIVERGED or run.confirmed
     assert (
         run_bench_task(BenchRunItem(with_gains(cell, K=10.0, d=4.0), 1)).stability
         is Stability.STABLE
@@ -209,6 +228,101 @@ def test_least_energy_is_that_of_outside_until_any_instant() -> None:
     assert find_least_energy({"s": batch(t_ns, np.ones(3001), np.zeros(3001))}) == 0.0
 
 
+def test_an_interrupted_confirmation_goes_on(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Every run is repeated once over twice its length, and no finished run a second time."""
+    made: list[float] = []
+
+    def run(item: BenchRunItem) -> BenchRun:
+        made.append(item.to_s)
+        return make_run(
+            item.cell,
+            item.seed,
+            stability=Stability.NOT_STABLE,
+            behaviour=EndBehaviour.BOUNDED,
+            length_s=item.to_s or 30.0,
+            to_s=item.to_s,
+        )
+
+    shown: list[int] = []
+
+    def stop(done: int, _total: int) -> None:
+        shown.append(done)
+        if len(shown) == 4:  # the first of three repetitions
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(bench_run, "run_bench_task", run)
+    folder = prepare_bench_folder(asked(), tmp_path / "suite")
+    with ThreadPoolExecutor(1) as executor, pytest.raises(KeyboardInterrupt):
+        run_bench(folder, on=executor, progress=stop)
+    assert made.count(0.0) == 3
+    before = len(made)
+    with ThreadPoolExecutor(1) as executor:
+        results = run_bench(prepare_bench_folder(asked(), tmp_path / "suite"), on=executor)
+    assert made[before:] == [60.0, 60.0]
+    assert [(one.confirmed, one.length_s) for one in results.runs] == [(True, 60.0)] * 3
+
+
+def judged_run(rate_per_s: float | None, **more: Any) -> JudgedRun:
+    """A run of 20 s of two sites that decays slowly."""
+    fit = EnvelopeFit(EnvelopeTrend.HARDLY, -0.02)
+    facts = {
+        "scenario": asked(links=["rtt8"]).cells[0].build(1).scenario,
+        "records": {},
+        "end": RunEnd(EndBehaviour.HARDLY, fit, fit, 0.1, 0.1),
+        "twins": TwinGrowth(""),
+        "roots": LoopRoots("stable" if rate_per_s else "", rate_per_s, True, ""),
+        "stability": Stability.OPEN,
+        "text": "open",
+        **more,
+    }
+    return JudgedRun(**facts)
+
+
+@pytest.mark.parametrize(
+    ("rate_per_s", "length_s", "words"),
+    [
+        (-0.01, 600.0, ""),  # the root, six time constants of 100 s
+        (None, 300.0, ""),  # no roots: the envelope, six of 50 s
+        (-0.001, 1500.0, f"safety limit of {MAX_RUN_TICKS} ticks"),  # 6000 s of two sites
+        (-1.0, 20.0, ""),
+    ],
+)
+def test_length_follows_the_slowest_time_constant(
+    rate_per_s: float | None, length_s: float, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    judged = judged_run(rate_per_s)
+    monkeypatch.setattr(
+        bench_run,
+        "_judge",
+        lambda scenario, to_s, _: judged._replace(
+            scenario=msgspec.structs.replace(scenario, duration_s=to_s)
+        ),
+    )
+    longer = lengthen_run(judged, 1)
+    assert longer.scenario.duration_s == length_s
+    assert words in longer.text
+
+
+def test_a_decided_run_at_rest_is_long_enough() -> None:
+    fit = EnvelopeFit(EnvelopeTrend.DECAYS, -0.02)
+    end = RunEnd(EndBehaviour.CONVERGED, fit, fit, 0.0, 0.0)
+    judged = judged_run(-0.001, end=end, stability=Stability.SETTLED)
+    assert lengthen_run(judged, 1) is judged
+
+
+def test_impedance_in_free_motion_is_that_of_the_arm() -> None:
+    """A weak spring and the damper d of P+d, and the friction and inertia of the user's arm."""
+    (cell,) = asked(tasks=["contact"], links=["rtt8"]).cells
+    run = run_bench_task(BenchRunItem(with_gains(cell, K=40.0, d=30.0), 1))
+    assert run.impedance_n_s_m is not None
+    assert run.free_impedance_n_s_m is not None
+    assert run.impedance_n_s_m > 0.0
+    # The damper alone: (d + 0.5) |J^-T J^-1| is of this size at a reach of 1.3 m.
+    assert 10.0 < run.free_impedance_n_s_m < 200.0
+
+
 def test_a_longer_run_refutes_or_confirms() -> None:
     cell = asked(links=["rtt8"]).cells[0]
     judged = [
@@ -217,7 +331,7 @@ def test_a_longer_run_refutes_or_confirms() -> None:
     ]
     for longer, stability, confirmed in judged:
         run = make_run(cell, 1, stability=Stability.NOT_STABLE, length_s=40.0)
-        again = make_run(cell, 1, stability=longer, length_s=100.0, to_s=100.0)
+        again = make_run(cell, 1, stability=longer, length_s=80.0, to_s=80.0)
         results = BenchResults(
             BenchPlan("round-trips", [cell], [("p_d", "level")]),
             {(one.cell, 1): one for one in (run, again)},
@@ -239,6 +353,30 @@ def test_a_law_without_stable_gains_has_an_empty_row(monkeypatch: pytest.MonkeyP
     assert "| pd_d (two sites) | no gains |" in page
     with pytest.raises(UsageError, match="no candidate was stable for pd_d"):
         plan_bench("round-trips", laws=["pd_d"], tasks=["free"], links=["rtt8"])
+
+
+def test_laws_of_equal_torque_run_once() -> None:
+    """`six_channel` is `four_channel` with a check of the shares, so it would run the same."""
+    for law, equal in EQUAL_LAWS.items():
+        kind, equal_kind = BUILT_IN[law], BUILT_IN[equal]
+        assert (kind.torque, kind.begin) == (equal_kind.torque, equal_kind.begin)
+        assert kind.Settings.__struct_fields__ == equal_kind.Settings.__struct_fields__
+        with pytest.raises(UsageError, match=f"{law} computes the torque of {equal}"):
+            plan_bench("full", laws=[law])
+        assert all(law not in laws for laws in STUDIES["full"].laws.values())
+
+
+def test_laws_get_nine_tenths_of_gravity() -> None:
+    laws = STUDIES["full"].laws
+    for form in laws:
+        for law in laws[form]:
+            reason = explain_no_cell(law, form, "gravity-90")
+            assert reason == ("exact model" if law == "impedance" else bench_plan.NO_GAINS)
+    (told,) = plan_bench("full", laws=["p_d"], tasks=["gravity-90"], links=["rtt68"]).cells
+    (exact,) = plan_bench("full", laws=["p_d"], tasks=["free"], links=["rtt68"]).cells
+    assert told.inputs != exact.inputs
+    found = [cell.build(1).scenario.sites["s"].control for cell in (told, exact)]
+    assert [control.gravity for control in found] == [0.9, 1.0]  # type: ignore[attr-defined]
 
 
 def test_a_law_whose_shares_stay_hands_nothing_over() -> None:
@@ -372,6 +510,41 @@ def test_kept_gains_are_the_least_error_that_keeps_the_margin(tmp_path: Path) ->
         map(str, found)
     )
     assert find_stale(found) == []
+
+
+def test_an_interrupted_tuning_goes_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Gains are stored one by one, and those that are up to date are not tuned again."""
+    path, made = tmp_path / "gains.json", []
+
+    def tune(form: str, law: str, round_trip_ms: int, *_: Any) -> TunedGains:
+        if len(made) == 2:
+            raise KeyboardInterrupt
+        made.append(round_trip_ms)
+        mark = fingerprint_tuning(form, law, round_trip_ms)
+        return TunedGains(form, law, round_trip_ms, {"K": 1.0}, 1, 1, 0, 0.1, 1.0, mark)
+
+    def go_on() -> list[TunedGains]:
+        return tune_laws(
+            {"level": ["p_d"]},
+            known=read_gains(path).values(),
+            store=lambda gains: write_gains([gains], path),
+        )
+
+    monkeypatch.setattr(bench_plan, "_tune_law", tune)
+    with pytest.raises(KeyboardInterrupt):
+        go_on()
+    assert len(read_gains(path)) == 2
+    made.clear()
+    assert len(go_on()) == 3
+    assert made == [TUNED_ROUND_TRIPS_MS[-1]]
+
+
+def test_texts_of_a_law_do_not_outdate_its_gains() -> None:
+    code = read_law_code(BUILT_IN["four_channel"])
+    assert "def torque" in code
+    assert "Lawrence" not in code  # its docstring
+    assert "def condition" not in code
+    assert read_law_code(BUILT_IN["six_channel"]).endswith(code.split("\0")[-1])
 
 
 def test_gains_are_those_of_the_next_longer_round_trip() -> None:

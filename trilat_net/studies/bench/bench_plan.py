@@ -445,7 +445,7 @@ _TEXTS_OF_LAWS = ("condition", "explain_idle_shares", "explain_no_linear_form")
 """Methods of a law that compute texts for the user, and have no influence on its motion."""
 
 
-def _read_law_code(kind: type[ControlLaw]) -> str:
+def read_law_code(kind: type[ControlLaw]) -> str:
     """Returns the code that determines the motion of a law, without comments and docstrings.
 
     A correction of a sentence therefore makes no gains out of date.
@@ -495,7 +495,7 @@ def fingerprint_tuning(form: str, law: str, round_trip_ms: int) -> str:
     """
     space = SEARCH_SPACES[law]
     assert space.kind is not None
-    code = _read_law_code(space.kind)
+    code = read_law_code(space.kind)
     ranges = json.dumps([knob._asdict() for knob in space.knobs])
     scenario_text = load_tuning_task(form, round_trip_ms).scenario.text
     procedure = f"{TUNING_VERSION} {TUNING_BUDGET} {TUNING_MARGIN} {MARGIN_LENGTHS}"

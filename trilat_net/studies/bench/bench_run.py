@@ -112,7 +112,7 @@ class BenchRunItem(NamedTuple):
         return f"{self.cell.name}, seed {self.seed}"
 
 
-class _JudgedRun(NamedTuple):
+class JudgedRun(NamedTuple):
     """A run of the suite with all of its records, and the judgement whether it is stable.
 
     The judgement takes twins into account: repeated runs with a small disturbance, which show
@@ -163,7 +163,7 @@ def run_bench_task(item: BenchRunItem) -> BenchRun:
         judged = _judge(scenario, item.to_s, twins)
     else:
         judged = _judge(scenario, scenario.duration_s, twins)
-        judged = _lengthen(judged, twins)
+        judged = lengthen_run(judged, twins)
 
     run = BenchRun(
         name=cell.name,
@@ -188,7 +188,7 @@ def run_bench_task(item: BenchRunItem) -> BenchRun:
     return run
 
 
-def _judge(scenario: Scenario, length_s: float, twins: int | None) -> _JudgedRun:
+def _judge(scenario: Scenario, length_s: float, twins: int | None) -> JudgedRun:
     """Executes a scenario and its twins, and judges the run.
 
     Args:
@@ -203,7 +203,7 @@ def _judge(scenario: Scenario, length_s: float, twins: int | None) -> _JudgedRun
         growth = measure_virtual_twins(scenario, end, length_s, twins)
     roots = find_run_roots(scenario, run)
     decision = decide_virtual_run(scenario, end, roots, growth)
-    return _JudgedRun(
+    return JudgedRun(
         scenario=scenario,
         records=records,
         end=end,
@@ -214,7 +214,7 @@ def _judge(scenario: Scenario, length_s: float, twins: int | None) -> _JudgedRun
     )
 
 
-def _lengthen(judged: _JudgedRun, twins: int | None) -> _JudgedRun:
+def lengthen_run(judged: JudgedRun, twins: int | None) -> JudgedRun:
     """Repeats a run over a longer time if its judgement needs more time.
 
     A run that is stable or settled, and whose arms are at rest at its end, is long enough. Any
@@ -259,7 +259,7 @@ def compute_longest_s(scenario: Scenario) -> float:
     return MAX_RUN_TICKS / ticks_per_s
 
 
-def _find_slowest_s(judged: _JudgedRun) -> float:
+def _find_slowest_s(judged: JudgedRun) -> float:
     """Returns the slowest time constant of a run, in s. 0 if nothing decays.
 
     It is that of the slowest root of the loop. If the loop has no roots, it is that of the
@@ -276,7 +276,7 @@ def _find_slowest_s(judged: _JudgedRun) -> float:
     return max(time_constants_s, default=0.0)
 
 
-def _measure(run: BenchRun, judged: _JudgedRun, duration_s: float) -> BenchRun:
+def _measure(run: BenchRun, judged: JudgedRun, duration_s: float) -> BenchRun:
     """Measures the errors, efforts, forces and energies of a run.
 
     Args:
@@ -425,7 +425,7 @@ def _find_settled_s(records: dict[str, RecordBatch]) -> float | None:
     return float(settled_s) if settled_s <= end_s - REST_S else None
 
 
-def _measure_contact(run: BenchRun, item: BenchRunItem, far: _JudgedRun) -> BenchRun:
+def _measure_contact(run: BenchRun, item: BenchRunItem, far: JudgedRun) -> BenchRun:
     """Measures what the user feels of the wall: a stiffness and an impedance.
 
     Args:
@@ -486,7 +486,7 @@ def _run_variant(
     return None if end.diverged_at_s is not None else (scenario, records)
 
 
-def _estimate_stiffness(item: BenchRunItem, far: _JudgedRun, contact_s: float) -> float | None:
+def _estimate_stiffness(item: BenchRunItem, far: JudgedRun, contact_s: float) -> float | None:
     """Estimates the stiffness that the user feels along the normal of the wall.
 
     The same run is executed with a shorter reach of the user. The stiffness is the difference
@@ -600,7 +600,7 @@ def _measure_tip(
 
 
 def _estimate_impedance(
-    item: BenchRunItem, far: _JudgedRun, contact_s: float
+    item: BenchRunItem, far: JudgedRun, contact_s: float
 ) -> tuple[float, float] | None:
     """Estimates the impedance |Z| at `IMPEDANCE_HZ` that the user feels, with and without wall.
 
