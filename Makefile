@@ -119,7 +119,7 @@ suite-gains: setup
 
 suite: setup
 	$(BIN)/trilat bench
-	$(BIN)/trilat bench --study round-trips
+	$(BIN)/trilat bench --study round-trips --seeds 4
 
 lock: $(VENV)/uv.stamp
 	$(BIN)/uv pip compile -q --universal --generate-hashes --python-version 3.11 --no-annotate \

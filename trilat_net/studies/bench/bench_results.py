@@ -73,6 +73,7 @@ class BenchRun(msgspec.Struct, frozen=True):
         length_s: Duration of the judged run, in s.
         to_s: Requested duration, in s, of a run that was repeated because it was not stable. 0
             for a first run.
+        at_limit: True if the run would have needed more ticks than the safety limit allows.
         confirmed: True if the repeated run was not stable either. False if it was, so that it
             refuted the first run. None if there is no repeated run, because the first run was
             not judged "not stable", or diverged.
@@ -108,6 +109,7 @@ class BenchRun(msgspec.Struct, frozen=True):
     text: str
     length_s: float = 0.0
     to_s: float = 0.0
+    at_limit: bool = False
     confirmed: bool | None = None
     bounded: bool = False
     energy_j: float | None = None
@@ -393,7 +395,9 @@ def _confirm_run(runs: dict[tuple[str, int], BenchRun], cell: BenchCell, seed: i
     run = runs[cell.key, seed]
     if not run.needs_confirmation:
         return run
-    repeated = runs[name_run(cell.key, run.confirmation_s), seed]
+    repeated = runs.get((name_run(cell.key, run.confirmation_s), seed))
+    if repeated is None:
+        return run
     return msgspec.structs.replace(
         repeated,
         text=f"of {repeated.length_s:g} s: {repeated.text}",
@@ -688,6 +692,9 @@ def describe_bench(results: BenchResults) -> Iterator[str]:
         f"not stable: {count_nouns(len(unstable), 'run')}, of which {diverged} diverged; runs "
         f"of twice the length confirmed {confirmed}, and refuted {refuted} more"
     )
+    limited = sum(run.at_limit for run in results.runs)
+    if limited:
+        yield f"ended by the safety limit of ticks: {count_nouns(limited, 'run')}"
 
     for task in plan.tasks:
         yield f"{task}: {TASKS[task].about}"

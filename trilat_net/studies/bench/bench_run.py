@@ -21,7 +21,7 @@ Invariant:
 import json
 import math
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -126,6 +126,7 @@ class JudgedRun(NamedTuple):
         roots: Characteristic roots of the loop at the end of the run.
         stability: The judgement.
         text: Explanation of the judgement.
+        at_limit: True if the run would have needed more than `MAX_RUN_TICKS` ticks.
     """
 
     scenario: Scenario
@@ -135,6 +136,7 @@ class JudgedRun(NamedTuple):
     roots: LoopRoots
     stability: Stability
     text: str
+    at_limit: bool = False
 
     @property
     def diverged(self) -> bool:
@@ -176,6 +178,7 @@ def run_bench_task(item: BenchRunItem) -> BenchRun:
         text=judged.text,
         length_s=judged.scenario.duration_s,
         to_s=item.to_s,
+        at_limit=judged.at_limit,
     )
     if judged.diverged:
         # Errors and efforts of a run that ended early cannot be compared with those of others.
@@ -246,7 +249,7 @@ def lengthen_run(judged: JudgedRun, twins: int | None) -> JudgedRun:
         f"{MAX_RUN_TICKS} ticks, but {TIME_CONSTANTS:g} of its slowest time constants are "
         f"{required_s:.4g} s"
     )
-    return judged._replace(text=f"{judged.text}; {limit_text}")
+    return judged._replace(text=f"{judged.text}; {limit_text}", at_limit=True)
 
 
 def compute_longest_s(scenario: Scenario) -> float:
@@ -637,7 +640,7 @@ def _estimate_impedance(
     }
     (hand,) = TASKS[item.cell.task].settings[f"sites.{USER}.hands"]
     hand_to_pose = {**hand, "to_rad": pose_rad.tolist()}
-    no_wall: Settings = {f"sites.{SLAVE}.environment": []}
+    no_wall: dict[str, Any] = {f"sites.{SLAVE}.environment": []}
     in_contact = _run_window(item, {f"sites.{USER}.hands": [hand, shaking]}, window_s)
     free_hands = {f"sites.{USER}.hands": [hand_to_pose]}
     free_shaken_hands = {f"sites.{USER}.hands": [hand_to_pose, shaking]}
@@ -656,9 +659,9 @@ def _run_window(
     Args:
         item: The run.
         settings: Overrides of its scenario.
-        window_s: Start and end of the window, in s. The run ends with the window.
+        window_s: Start and end of the window, in s. The run ends just after the window.
     """
-    variant = _run_variant(item, settings, window_s[1])
+    variant = _run_variant(item, settings, window_s[1] + STIFFNESS_WINDOW_S)
     return None if variant is None else _measure_tip(*variant, window_s)
 
 
