@@ -167,7 +167,7 @@ def rest_in_contact(K: float, settings: Any) -> tuple[Array, Array]:
 
 
 def test_stiffness_at_the_hand_is_that_of_statics() -> None:
-    """Two springs and the wall of P+d, which is at rest 2 s after contact with these gains."""
+    """Two springs and the wall of P+d, which is nearly at rest 2 s after contact."""
     (cell,) = asked(tasks=["contact"], links=["rtt8"]).cells
     ends = []
     for settings in (SHORTER_REACH, TASKS["contact"].settings):
@@ -175,8 +175,31 @@ def test_stiffness_at_the_hand_is_that_of_statics() -> None:
         tip, jacobian = reach(q)
         ends.append((tip[0], np.linalg.solve(jacobian.T, torque)[0]))
     (near_m, near_n), (far_m, far_n) = ends
-    run = run_bench_task(BenchRunItem(with_gains(cell, K=60.0, d=12.0), 1))
-    assert run.stiffness_n_m == pytest.approx((far_n - near_n) / (far_m - near_m), rel=1e-2)
+    run = run_bench_task(BenchRunItem(with_gains(cell, K=60.0, d=6.0), 1))
+    assert run.stiffness_n_m == pytest.approx((far_n - near_n) / (far_m - near_m), rel=5e-2)
+
+
+def test_stiffness_is_that_of_the_logs_two_seconds_after_contact() -> None:
+    (cell,) = asked(tasks=["contact"], links=["rtt8"]).cells
+    cell = with_gains(cell, K=60.0, d=6.0)
+    built, ends = cell.build(1), []
+    for settings in (SHORTER_REACH, TASKS["contact"].settings):
+        overrides = [*built.overrides, *format_settings(settings)]
+        log = trilat_net.simulate(load_tuning_scenario(built.source, overrides).scenario)
+        user, slave = log["m1"], log["s"]
+        slave_m = np.cos(slave.q[:, 0]) + np.cos(slave.q.sum(axis=1))
+        touch_s = slave.t_s[slave_m > 1.3376933693863516][0]
+        window = (user.t_s > touch_s + 1.8995) & (user.t_s < touch_s + 2.0995)
+        tips = [reach(q) for q in user.q[window]]
+        hand = 0.5 * user.qd[window] - user.tau_x[window]
+        forces = [
+            np.linalg.solve(jacobian.T, torque)[0]
+            for (_, jacobian), torque in zip(tips, hand, strict=True)
+        ]
+        ends.append((np.mean([tip[0] for tip, _ in tips]), np.mean(forces)))
+    (near_m, near_n), (far_m, far_n) = ends
+    run = run_bench_task(BenchRunItem(cell, 1))
+    assert run.stiffness_n_m == pytest.approx((far_n - near_n) / (far_m - near_m), rel=1e-6)
 
 
 def test_impedance_in_free_motion_is_that_of_two_coupled_arms() -> None:
@@ -184,7 +207,8 @@ def test_impedance_in_free_motion_is_that_of_two_coupled_arms() -> None:
     (cell,) = asked(tasks=["contact"], links=["rtt8"]).cells
     K, d, s = 60.0, 12.0, 2j * np.pi
     q, _ = rest_in_contact(K, TASKS["contact"].settings)
-    M = cell.build(1).scenario.arms["m1"].inertia(q)
+    cosine = np.cos(q[1])
+    M = np.array([[3.0 + 2.0 * cosine, 1.0 + cosine], [1.0 + cosine, 1.0]])
     one = np.eye(2)
     coupling = K * np.exp(-4e-3 * s)
     slave = M * s**2 + (d * s + K) * one

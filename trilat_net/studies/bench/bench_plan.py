@@ -262,8 +262,8 @@ The tuning also runs it without the wall, as free motion.
 _OTHER_TUNING_TASKS = {("three", "sync"): "free"}
 """Laws that are tuned in another task, by the form of the suite and the name of the law.
 
-Under gravity the arms of `sync` rest at q = 0 only. The wall keeps the slave away from it, so in
-`contact` no gains come to rest.
+Under gravity the arms of `sync` rest at q = 0 only. The wall keeps the slave away from it, so
+no gains come to rest in `contact`.
 """
 
 
