@@ -327,13 +327,13 @@ class Impedance(ControlLaw):
             target[n] = run.q[n, 0] + offset
             reference += shares[:, n, np.newaxis] * target[n]
 
-        law: Any = run.laws[slave]
+        slave_law: Any = run.laws[slave]
         start = run.q[slave, 0]
         reference_rate = np.gradient(reference, period_s, axis=0)
-        spring = np.array(law.K) * (reference - start)
-        damper = np.array(law.B) * reference_rate
+        spring = np.array(slave_law.K) * (reference - start)
+        damper = np.array(slave_law.B) * reference_rate
         force = run.outside_nm[slave] + spring + damper
-        target[slave] = start + move_impedance(law, force, period_s)
+        target[slave] = start + move_impedance(slave_law, force, period_s)
         return target
 
     @classmethod

@@ -484,8 +484,7 @@ def _is_text(statement: ast.stmt) -> bool:
     """Returns True for a docstring, and for a method that only computes texts for the user."""
     if isinstance(statement, ast.FunctionDef):
         return statement.name in _TEXTS_OF_LAWS
-    is_expression = isinstance(statement, ast.Expr)
-    return is_expression and isinstance(statement.value, ast.Constant)
+    return isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
 
 
 @cache

@@ -593,7 +593,7 @@ def _measure_tip(
     torque = _compute_hand_torque(scenario, USER, record)
     J_transposed = np.swapaxes(tip.J, 1, 2)
     torque_columns = torque[:, :, np.newaxis]
-    force = np.linalg.solve(J_transposed, torque_columns)
+    force = np.linalg.solve(J_transposed, torque_columns).astype(np.float64)
     return _TipMotion(
         q=record.q,
         position_m=tip.position[:, 0],
