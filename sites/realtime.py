@@ -89,7 +89,7 @@ def _set_affinity(cpu: int | None) -> str:
 
 
 def _call_libc(setting: str, function: str, *arguments: int) -> str:
-    """Makes a real-time setting by a call of a function of the C library.
+    """Applies a real-time setting by calling a function of the C library.
 
     The function must return 0 on success.
 

@@ -203,13 +203,15 @@ class TwinGrowth(NamedTuple):
 
     @property
     def grows(self) -> bool:
-        """True if small pushes of the run grow, that is, if the run is unstable.
+        """True if small disturbances of the run grow, that is, if the run is unstable.
 
-        Arms that follow each other form a group. The pushes of a group grow if at least half of
-        them grow all the time from `from_s` to `to_s`. They also grow if the same joint grows
-        all the time after at least two pushes, and is the fastest joint after one of them: a
-        joint that does not act on the others shows only in the pushes that move it. If network
-        delays are random, the pushes must grow by a factor of two, to exclude chance.
+        A push is a small disturbance in a repetition of the run. Arms that follow each other
+        form a group. The disturbances of a group grow if the effects of at least half of its
+        pushes grow throughout, from `from_s` to `to_s`. They also grow if the motion of the
+        same joint grows throughout after at least two pushes, and is the fastest motion after
+        one of them: a joint that does not act on the others moves only after the pushes that
+        reach it. If network delays are random, the effects must grow by a factor of two, to
+        exclude chance.
         """
         least_factor = DOUBLES if self.links_random else 1.0
         grown = []

@@ -382,7 +382,7 @@ class _HeldHands(NamedTuple):
     """The end effectors of the masters, and the measured operators that may hold them.
 
     Attributes:
-        hands: For each master, the operators of whom any may hold it.
+        hands: For each master, the operators that may hold its end effector.
         places: For each master, the matrix from the velocities at all ports to the velocity of
             its end effector, shape (n, p).
     """

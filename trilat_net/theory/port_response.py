@@ -121,7 +121,7 @@ class PoleAtZero(NamedTuple):
 
     @property
     def passive(self) -> bool:
-        """True if a passive system may behave like this at zero frequency.
+        """True if the response at zero frequency is compatible with a passive system.
 
         A passive system never supplies more energy than it received. If its response has a pole
         at zero, the pole is simple. Its residue is a symmetric matrix without negative

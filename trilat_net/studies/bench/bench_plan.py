@@ -423,7 +423,7 @@ class TunedGains(msgspec.Struct, frozen=True):
 
 
 def format_settings(settings: Settings) -> list[str]:
-    """Converts overrides to texts KEY=VALUE, as the command line accepts them.
+    """Converts overrides to strings KEY=VALUE, in the form that the command line accepts.
 
     Args:
         settings: Values by key of the scenario.
