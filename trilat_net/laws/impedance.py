@@ -17,6 +17,7 @@ sends f_j = alpha_j tau_h to master j, so each master feels the environment's fo
 proportion to its share of the lead. Masters send zeros.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from itertools import combinations, product
 from typing import Any, ClassVar
@@ -518,14 +519,39 @@ def move_impedance(law: Any, force: Array, period_s: float) -> Array:
     Returns:
         The position at the K times, shape (K, n), in rad.
     """
-    # Imported here, because SciPy costs half a second and a session does not need it.
-    from scipy.signal import cont2discrete, lfilter
-
     joints = force.shape[1]
     gains = [np.broadcast_to(gain, joints) for gain in (law.M, law.B, law.K)]
     position = np.empty_like(force)
     for joint in range(joints):
         M, B, K = (float(gain[joint]) for gain in gains)
-        numerator, denominator, _ = cont2discrete(([1.0], [M, B, K]), period_s, method="zoh")
-        position[:, joint] = lfilter(numerator.ravel(), denominator, force[:, joint])
+        # The state is position, velocity and the force, which is constant over a period.
+        rates = np.array([[0.0, 1.0, 0.0], [-K / M, -B / M, 1.0 / M], [0.0, 0.0, 0.0]])
+        step = _exponentiate(rates * period_s)
+        state = np.zeros(3)
+        for k, held_force in enumerate(force[:, joint].tolist()):
+            position[k, joint] = state[0]
+            state[2] = held_force
+            state = step @ state
     return position
+
+
+def _exponentiate(matrix: Array) -> Array:
+    """Computes the exponential of a small matrix by scaling and squaring of its power series.
+
+    Source: Moler and Van Loan, "Nineteen dubious ways to compute the exponential of a matrix",
+    SIAM Review 45, 2003. SciPy is not imported for it, because a session does not need SciPy.
+
+    Args:
+        matrix: The matrix, shape (n, n).
+    """
+    size = float(np.abs(matrix).sum(axis=1).max())
+    halvings = max(0, math.ceil(math.log2(size)) + 1) if size > 0.0 else 0
+    scaled = matrix / 2.0**halvings
+    exponential = np.eye(len(matrix))
+    term = np.eye(len(matrix))
+    for n in range(1, 19):  # the norm is at most 1/2, so that the 18th term is below 1e-21
+        term = term @ scaled / n
+        exponential = exponential + term
+    for _ in range(halvings):
+        exponential = exponential @ exponential
+    return exponential
