@@ -134,7 +134,7 @@ def find_delay_period(links: Sequence[LinkBase], rates_hz: Sequence[int]) -> Del
         The period. It has no values if a delay is random, or follows a trace that ends.
     """
     for link in links:
-        if link.random or link.measured or _is_ending_trace(link):
+        if link.random or link.measured or is_ending_trace(link):
             return DelayPeriod(None, None)
     cycles = [cycle for cycle in map(_find_cycle, links) if cycle is not None]
     true_period = _find_common_period(cycles, math.gcd(*rates_hz))
@@ -144,8 +144,12 @@ def find_delay_period(links: Sequence[LinkBase], rates_hz: Sequence[int]) -> Del
     return DelayPeriod(true_s, _find_near_period_s(cycles, rates_hz))
 
 
-def _is_ending_trace(link: LinkBase) -> bool:
-    """Returns True if a link plays a delay trace that does not repeat."""
+def is_ending_trace(link: LinkBase) -> bool:
+    """Returns True if a link plays a delay trace that does not start again at its end.
+
+    Args:
+        link: Delay model of the link.
+    """
     model = link.to_core_model()
     return model.kind == DelayKind.TRACE and model.at_end == TraceEnd.HOLD
 

@@ -20,7 +20,7 @@ Invariant:
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import permutations
 from typing import NamedTuple
 
@@ -30,7 +30,6 @@ import numpy as np
 from ..analysis.run_end import SETTLED_SPEED_RAD_S, RunTrace, trace_log
 from ..analysis.stability_decision import LoopRoots
 from ..analysis.timeline import list_effective_commands, recorded_end_s
-from ..core.delay import DelayKind, TraceEnd
 from ..core.ticks import BUCKETS_PER_S
 from ..core.vectors import Array
 from ..errors import ScenarioError
@@ -40,7 +39,7 @@ from ..log.site_log import SiteLog
 from ..scenario import Scenario
 from ..scenario.delay_models import LinkBase
 from ..scenario.delay_models.kernel_delays import ConstantDelay
-from ..scenario.delay_period import find_final_link
+from ..scenario.delay_period import find_final_link, is_ending_trace
 from ..scenario.imported_code import ImportedLaw
 from .characteristic_roots import Spectrum, compute_delay_spectrum
 from .equilibrium import follow_equilibrium, pad_rows, settle_memories
@@ -210,17 +209,11 @@ def _end_traces(scenario: Scenario) -> Scenario:
     for name in scenario.links:
         link = find_final_link(scenario, name)
         points = link.points
-        if not _is_ending_trace(link) or points is None or not points[-1, 0] <= end_us:
+        if not is_ending_trace(link) or points is None or not points[-1, 0] <= end_us:
             continue
         links[name] = ConstantDelay(delay_ms=1e-3 * float(points[-1, 1]))
         timeline = [change for change in timeline if change.link != name]
     return msgspec.structs.replace(scenario, links=links, timeline=tuple(timeline))
-
-
-def _is_ending_trace(link: LinkBase) -> bool:
-    """Returns True if a link plays a delay trace that does not start again at its end."""
-    model = link.to_core_model()
-    return model.kind == DelayKind.TRACE and model.at_end == TraceEnd.HOLD
 
 
 def _fix_delays(scenario: Scenario, sites: Sequence[SiteLog]) -> _FixedDelays:
@@ -236,7 +229,7 @@ def _fix_delays(scenario: Scenario, sites: Sequence[SiteLog]) -> _FixedDelays:
     has_unknown_delay = {}
     for name in scenario.links:
         link = find_final_link(scenario, name)
-        has_unknown_delay[name] = link.random or link.measured or _is_ending_trace(link)
+        has_unknown_delay[name] = link.random or link.measured or is_ending_trace(link)
     if not any(has_unknown_delay.values()):
         return _FixedDelays(scenario, None, {})
 
@@ -295,12 +288,8 @@ def _choose_end_state(
         Estimates, shape (N, P).
     """
     angles = []
-    for name, buckets in zip(scenario.names, trace.buckets, strict=True):
-        joints = scenario.layout(name).joints
-        columns = buckets.shape[1] // 3
-        q = buckets[:, 2 * columns : 2 * columns + joints]
-        speed = buckets[-BUCKETS_PER_S:, columns : 2 * columns].max()
-        if speed <= SETTLED_SPEED_RAD_S:
+    for q, speeds in _iterate_motions(scenario, trace):
+        if speeds[-BUCKETS_PER_S:].max() <= SETTLED_SPEED_RAD_S:
             angles.append(q[-1])
         else:
             last_quarter = slice(3 * len(q) // 4, len(q))
@@ -310,12 +299,25 @@ def _choose_end_state(
 
 def _find_last_angles(scenario: Scenario, trace: RunTrace) -> Array:
     """Returns the last recorded joint angles of all sites, shape (N, n), in rad."""
-    angles = []
+    return pad_rows([q[-1] for q, _ in _iterate_motions(scenario, trace)])
+
+
+def _iterate_motions(scenario: Scenario, trace: RunTrace) -> Iterator[tuple[Array, Array]]:
+    """Yields the joint angles and the largest speeds of each site, in intervals of 50 ms.
+
+    Args:
+        scenario: Scenario of the run.
+        trace: The reduced data of the run, whose columns `RunTrace` describes.
+
+    Yields:
+        Last angles of the intervals, shape (K, n), in rad, and largest speeds, in rad/s.
+    """
     for name, buckets in zip(scenario.names, trace.buckets, strict=True):
         joints = scenario.layout(name).joints
         columns = buckets.shape[1] // 3
-        angles.append(buckets[-1, 2 * columns : 2 * columns + joints])
-    return pad_rows(angles)
+        q = buckets[:, 2 * columns : 2 * columns + joints]
+        speeds = buckets[:, columns : 2 * columns]
+        yield q, speeds
 
 
 def _find_state_in_wall(
