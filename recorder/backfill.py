@@ -31,9 +31,7 @@ GRACE_NS = 50_000_000
 SILENT_NS = 1_000_000_000
 """Time without messages after which the newest messages of a site are requested, in ns.
 
-For slow
-
-sites it is three tick periods.
+For slow sites it is three tick periods.
 """
 ANSWER_NS = (300_000_000, 3_000_000_000)
 """Shortest and longest timeout of a request, in ns. It doubles after each request without a
@@ -108,6 +106,16 @@ class GapRepair:
         # Time at which the last new message arrived.
         self._progress_ns = now_ns
         self._ended_ns: int | None = None
+
+    @property
+    def is_active(self) -> bool:
+        """True if messages are missing that the site may still have, or a reply is awaited."""
+        return self._open is not None or self._due_ns is not None
+
+    @property
+    def progress_ns(self) -> int:
+        """Time at which the last missing message arrived, on the monotonic clock, in ns."""
+        return self._progress_ns
 
     def probe(self) -> None:
         """Makes `poll` request the newest messages of every channel of the site.

@@ -37,13 +37,22 @@ from trilat_net.scenario import Scenario, embedded_names_reader, parse_embedded
 from .session_recording import RecorderReport, Recording
 from .site_reception import InboundQueue
 
+NICE = -5
+"""Nice value that is requested, so that a busy machine does not delay the recorder for seconds.
+
+Sites have a higher priority, because their ticks are due within a millisecond.
+"""
 POLL_NS = 10_000_000
-"""Pause between two polls while the recorder waits for the session, in ns."""
+"""Pause between two polls in ns, while the recorder waits for the session or for missing
+messages.
+"""
 END_S = 10
-"""Longest time after a signal to get the messages that sites still have, in s. Sites keep their
-messages for that long.
+"""Time without any missing message after which the recorder ends, once a signal has told it to,
+in s. Sites keep their messages for that long.
 """
 END_NS = END_S * 1_000_000_000
+LONGEST_END_NS = 60_000_000_000
+"""Longest time after a signal to get the messages that sites still have, in ns."""
 FLUSH_NS = 65_000_000
 """Period with which the messages are written and flushed, in ns.
 
@@ -241,11 +250,12 @@ class Recorder:
             if ending_ns is None and self._is_ending():
                 ending_ns = now_ns
                 self._say(
-                    f"recorder: asks for the records that are missing, {END_S} s at most; "
-                    "Ctrl-C a second time ends it at once"
+                    "recorder: asks for the records that are missing, until none comes for "
+                    f"{END_S} s; Ctrl-C a second time ends it at once"
                 )
             if ending_ns is not None:
-                has_waited = now_ns - ending_ns > END_NS
+                unrepaired_ns = now_ns - max(ending_ns, recording.repaired_ns)
+                has_waited = unrepaired_ns > END_NS or now_ns - ending_ns > LONGEST_END_NS
                 if has_waited or recording.is_up_to_date(ending_ns, now_ns):
                     return
 
@@ -256,7 +266,26 @@ class Recorder:
             written_ns = self._clock.monotonic_ns()
             recording.flush()
             report.note_flush(self._clock.monotonic_ns() - written_ns)
-            self._clock.sleep_until(now_ns + FLUSH_NS)
+            self._repair_until(recording, now_ns + FLUSH_NS)
+
+    def _repair_until(self, recording: Recording, until_ns: int) -> None:
+        """Waits until a given time. Meanwhile missing messages are requested and written.
+
+        A site replies with few messages at a time, so as not to delay its ticks. If the next
+        request waited for the next flush, a recorder that was delayed on a busy machine would
+        never catch up.
+
+        Args:
+            recording: The recording.
+            until_ns: End of the wait on the monotonic clock, in ns.
+        """
+        while recording.is_repairing:
+            now_ns = self._clock.monotonic_ns()
+            if now_ns + POLL_NS >= until_ns:
+                break
+            self._clock.sleep_until(now_ns + POLL_NS)
+            recording.write(self._queue, self._clock.monotonic_ns())
+        self._clock.sleep_until(until_ns)
 
 
 def record_session(
@@ -322,11 +351,13 @@ def record_session(
             is_ending=interrupt.is_requested,
         )
         process.freeze_gc()  # a pause of the collector would delay the next flush
+        process.raise_priority(NICE)
         epoch = recorder.join(join_timeout_s)
         if epoch is None:
             say("recorder: ended before the session began; nothing was written")
             return interrupt.exit_code
         recording = recorder.record(epoch)
+        process.raise_priority(0)
         say("\n".join(recording.render_summary()))
         if not interrupt.is_requested():
             with suppress(KeyboardInterrupt), interrupt.raising():

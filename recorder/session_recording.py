@@ -195,6 +195,16 @@ class Recording:
                 self._stored_sites.add(name)
                 self._publish_stored(site, now_ns)
 
+    @property
+    def is_repairing(self) -> bool:
+        """True if messages are missing that a site may still have."""
+        return any(repair.is_active for repair in self._repairs.values())
+
+    @property
+    def repaired_ns(self) -> int:
+        """Time at which a site last sent a missing message, on the monotonic clock, in ns."""
+        return max(repair.progress_ns for repair in self._repairs.values())
+
     def _repair_gaps(self, name: str, repair: GapRepair, now_ns: int) -> None:
         """Writes messages that a site sent again on request, and requests further missing ones.
 

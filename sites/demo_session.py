@@ -476,7 +476,7 @@ def _end_all(
     """
     announce = partial(
         say,
-        "the sites keep their last records until the recorder has them, 10 s at most; "
+        "the sites keep their last records until the recorder has them; "
         "Ctrl-C a second time ends it at once",
     )
     _end_group(

@@ -969,8 +969,8 @@ class RunningSite:
             if is_long and not is_announced:
                 is_announced = True
                 parts.say(
-                    "keeps its last records until the recorder has them, "
-                    f"{LINGER_NS // NS_PER_S} s at most; Ctrl-C a second time ends it at once"
+                    "keeps its last records until the recorder has them, or has asked for none "
+                    f"for {LINGER_NS // NS_PER_S} s; Ctrl-C a second time ends it at once"
                 )
             clock.sleep_until(clock.monotonic_ns() + POLL_NS)
 

@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from recorder import site_reception as tap_module
-from recorder.record_process import Recorder
+from recorder.record_process import FLUSH_NS, POLL_NS, Recorder
 from recorder.session_recording import AWAY_NS, LAST_NS, RECONNECT_NS, SETTLE_NS
 from recorder.site_reception import EVENT_BYTES
 from tests.net.local_bus import LocalNetwork
@@ -333,22 +333,32 @@ def test_what_still_waits_at_the_end_is_written() -> None:
     assert log.accounts["dropped: stranger"] == "1"
 
 
+def start_recorder(
+    network: LocalNetwork, clock: RelayClock, folder: Path, stop_ns: int
+) -> Recorder:
+    """A recorder that has met site m, and is asked to stop at a time."""
+    recorder = Recorder(
+        bus=network.join(),
+        clock=clock,
+        session=SESSION,
+        boot=BOOTS[topics.RECORDER],
+        storage=LogStorage(folder / "run.mcap"),
+        stopped=lambda: clock.monotonic_ns() > stop_ns,
+        say=str,
+    )
+    recorder._joining.membership.others["m"] = told("m")
+    return recorder
+
+
 def recorder_alone(folder: Path, relay: Relay, stop_ns: int) -> None:
     """A recorder whose session begins, and whose sites then say nothing; it is asked to stop at a time."""
     network = LocalNetwork()
 
     def run(clock: RelayClock) -> None:
-        own = (
-            network.join(),
-            clock,
-            SESSION,
-            BOOTS[topics.RECORDER],
-            LogStorage(folder / "run.mcap"),
-        )
-        recorder = Recorder(*own, lambda: clock.monotonic_ns() > stop_ns, str)
+        recorder = start_recorder(network, clock, folder, stop_ns)
         met = recorder._joining.membership.others
-        met["x"] = msgspec.structs.replace(told("m"), member="x", boot=5, scenario="garbage")
-        met["m"] = told("m")
+        stranger = msgspec.structs.replace(told("m"), member="x", boot=5, scenario="garbage")
+        recorder._joining.membership.others = {"x": stranger, **met}
         recorder.record(EPOCH)
 
     def publish(clock: RelayClock) -> None:
@@ -368,6 +378,33 @@ def test_a_recorder_that_is_asked_to_stop_finishes_its_file(tmp_path: Path) -> N
     assert log.complete
     assert 30 <= len(log["m"]) < TICKS
     assert verify(log).agreed
+
+
+def test_a_recorder_that_was_behind_catches_up(tmp_path: Path) -> None:
+    """It asks again as soon as an answer is there, and not only when it writes to the file."""
+    network, relay = LocalNetwork(), Relay()
+    ended_ns = MONO_NS + 50 * MS
+    grace_ns, answer_ns = 50 * MS, 2 * POLL_NS
+    stop_ns = ended_ns + grace_ns + TICKS * answer_ns + 2 * FLUSH_NS
+    memory = Memory(network, "m", chunk=1)
+    memory.made["state"] = states("m")
+    memory.made["link"] = [statistics("m")]
+
+    def publish(clock: RelayClock) -> None:
+        send = network.join().publisher(topics.key(SESSION, "m", topics.EVENT))
+        clock.sleep_until(ended_ns)
+        send(end("m"))
+        while clock.monotonic_ns() < stop_ns:
+            clock.sleep_until(clock.monotonic_ns() + MS)
+            memory.answer()
+
+    relay.add(
+        "recorder",
+        lambda clock: start_recorder(network, clock, tmp_path, stop_ns).record(EPOCH),
+    )
+    relay.add("m", publish)
+    relay.run()
+    assert len(open_log(tmp_path / "run.mcap")["m"]) == TICKS
 
 
 def test_scenario_is_that_of_member_and_not_of_stranger(tmp_path: Path) -> None:
