@@ -89,3 +89,23 @@ class Forces:
                 - self.own * now.tau_x[i]
             )
             now.tau[i] += self.B * (now.qd_des[i] - now.qd[i])
+
+
+@trilat_net.compiled
+class JointPD(PD):
+    """`p_d` with gains of each joint."""
+
+    def __init__(
+        self,
+        facts: LawContext,
+        K: list[float],
+        d: list[float],
+    ) -> None:
+        self.K = list(K)
+        self.d = list(d)
+        assert len(self.K) == len(self.d) == facts.joints
+
+    def torque(self, now: LawInput) -> None:
+        for i in range(now.joints):
+            pull = self.K[i] * (now.q_des[i] - now.q[i])
+            now.tau[i] = now.gravity[i] + pull - self.d[i] * now.qd[i]

@@ -1,5 +1,6 @@
 """Virtual runs as arrays, each made once per test session."""
 
+import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -10,7 +11,9 @@ from numpy.typing import NDArray
 
 from trilat_net.execution import virtual
 from trilat_net.execution.fused import FusedRun
+from trilat_net.log.log_reader import Log, open_log
 from trilat_net.scenario import Scenario, load_scenario
+from trilat_net.scenario.run_changes import LinkTables, resolve_change, to_core_change
 
 Array = NDArray[np.float64]
 
@@ -88,3 +91,25 @@ def _run(name: str, overrides: tuple[tuple[str, Any], ...]) -> Run:
 def run(name: str, overrides: Mapping[str, Any] | None = None) -> Run:
     """A shipped scenario in virtual time; the same call returns the same run."""
     return _run(name, tuple(sorted((overrides or {}).items())))
+
+
+def simulate_with_commands(
+    scenario: Scenario, site: str, *requests: tuple[float, dict[str, Any]]
+) -> Log:
+    """Returns the log of a run in virtual time in which a site gets commands.
+
+    Args:
+        scenario: The scenario of the run.
+        site: Name of the site.
+        requests: Times of the commands, in s, and the commands as `trilat set` sends them.
+    """
+    schedule: dict[int, list[Any]] = {}
+    for at_s, request in requests:
+        tables = LinkTables(scenario.links, ())
+        change = resolve_change(scenario, tables, request, round(at_s * 1e9))
+        tick = round(at_s * scenario.sites[site].rate_hz)
+        schedule.setdefault(tick, []).append(to_core_change(scenario, change))
+    stream = io.BytesIO()
+    virtual.write_virtual_log(scenario, stream, commands={site: schedule})
+    stream.seek(0)
+    return open_log(stream)

@@ -1,6 +1,5 @@
 """The final loop of a run and its roots (docs/linear.md; docs/certificate.md, "End of the run")."""
 
-import io
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -11,14 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import trilat_net as tn
+from tests.virtual_runs import simulate_with_commands
 from trilat_net.analysis.run_end import classify_log_end
 from trilat_net.analysis.timeline import list_effective_commands
-from trilat_net.execution import virtual
 from trilat_net.execution.fused import FusedRun
-from trilat_net.log.log_reader import Log, open_log
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.delay_period import find_final_delay_period
-from trilat_net.scenario.run_changes import LinkTables, resolve_change, to_core_change
 from trilat_net.theory.loop_roots import find_log_roots, find_run_roots, resolve_final_scenario
 from trilat_net.theory.run_certificate import certify_run
 
@@ -147,20 +144,6 @@ def test_log_and_fused_run_have_the_same_roots() -> None:
     assert find_run_roots(scenario, run) == find_log_roots(tn.simulate(scenario))
 
 
-def commanded(scenario: Scenario, *requests: tuple[float, dict[str, Any]]) -> Log:
-    """A run in virtual time in which site s gets commands at some times."""
-    schedule: dict[int, list[Any]] = {}
-    for at_s, request in requests:
-        tables = LinkTables(scenario.links, ())
-        change = resolve_change(scenario, tables, request, round(at_s * 1e9))
-        tick = round(at_s * scenario.sites["s"].rate_hz)
-        schedule.setdefault(tick, []).append(to_core_change(scenario, change))
-    stream = io.BytesIO()
-    virtual.write_virtual_log(scenario, stream, commands={"s": schedule})
-    stream.seek(0)
-    return open_log(stream)
-
-
 SLOWER = {"link": "m->s", "to": {"model": "constant", "delay_ms": 300.0}}
 SAME = {"link": "m->s", "to": {"model": "constant", "delay_ms": 200.0}}
 
@@ -169,7 +152,7 @@ def test_command_that_changes_nothing_changes_nothing() -> None:
     """From 200 ms to 200 ms, and the same factors again."""
     scenario = pair(**{"link.delay_ms": 200.0, "duration_s": 14.0})
     same_shares = {"dominance": "s", "to": dict(scenario.dominance["s"]), "ramp_s": 0.0}
-    log = commanded(scenario, (9.0, SAME), (9.5, same_shares))
+    log = simulate_with_commands(scenario, "s", (9.0, SAME), (9.5, same_shares))
     plain = tn.simulate(scenario)
     assert log.changes("s")
     assert list_effective_commands(log) == []
@@ -180,13 +163,13 @@ def test_command_that_changes_nothing_changes_nothing() -> None:
 
 def test_roots_are_of_the_loop_after_the_last_command() -> None:
     scenario = pair(**{"link.delay_ms": 200.0, "duration_s": 14.0})
-    log = commanded(scenario, (3.0, SLOWER))
+    log = simulate_with_commands(scenario, "s", (3.0, SLOWER))
     final = resolve_final_scenario(log)
     assert [change.link for change in final.timeline] == ["m->s"]
     slower = pair(**{"link.delay_ms": 200.0, "links.m->s": SLOWER["to"], "duration_s": 14.0})
     expected = find_log_roots(tn.simulate(slower)).rate_per_s
     assert find_log_roots(log).rate_per_s == pytest.approx(expected, abs=1e-5)
-    back = commanded(scenario, (3.0, SLOWER), (5.0, SAME))
+    back = simulate_with_commands(scenario, "s", (3.0, SLOWER), (5.0, SAME))
     assert len(list_effective_commands(back)) == 2
     unchanged = find_log_roots(tn.simulate(scenario)).rate_per_s
     assert find_log_roots(back).rate_per_s == pytest.approx(unchanged, abs=1e-5)

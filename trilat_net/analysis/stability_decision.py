@@ -253,12 +253,15 @@ def _pushes_excuse_end(run: RunFindings) -> bool:
 
     They do if all of them die away, or if the run seems to grow although no push grows and the
     energy function V did not rise. They also do if the judged part of the run is shorter than
-    the period of its delays, so that it may show a beat.
+    the period of its delays, so that it may show a beat, or if no push grows clearly and the
+    judged part has few bursts of lost samples, so that it may show the last of them.
     """
     if not run.has_pushes:
         return False
     assert run.twins is not None
     if run.twins.trend is EnvelopeTrend.DECAYS or run.twins.hides_period:
+        return True
+    if run.twins.has_few_bursts and not run.twins.grows:
         return True
     end_grows = run.end.behaviour is EndBehaviour.GROWS
     return end_grows and run.twins.trend is not EnvelopeTrend.GROWS and not run.rises
@@ -308,6 +311,8 @@ def _explain_open(run: RunFindings) -> str:
         return f"no proof exists, and there are no {run.twins.text}"
     if run.end.stability is Stability.SETTLED:
         return run.twins.text
+    if run.twins.has_few_bursts:
+        return f"{run.end.text}; {run.twins.burst_text}"
     return run.end.text
 
 

@@ -50,7 +50,11 @@ from ..execution.twins import (
 from ..log.log_reader import Log, open_log
 from ..results import Result, finite_or_none
 from ..scenario import Scenario
-from ..scenario.delay_period import find_final_delay_period, find_final_link
+from ..scenario.delay_period import (
+    find_burst_interval_s,
+    find_final_delay_period,
+    find_final_link,
+)
 from .envelope_trend import EnvelopeFit, EnvelopeTrend, fit_envelopes
 from .run_end import RunEnd, find_coupled_sites
 
@@ -78,6 +82,8 @@ _AMPLITUDE_FLOOR = 1e-300
 """Smallest amplitude in a fit. The amplitudes are scaled and have no unit."""
 SAME_SCALED = math.log(1.1)
 """Largest difference of the logarithms of two scaled twins that count as equal: 10 %."""
+LEAST_BURSTS = 100
+"""Number of bursts of loss from which on their mean effect decides how a run ends."""
 MOST_LOG = 700.0
 """Largest argument of the exponential function that certainly does not overflow."""
 
@@ -171,6 +177,8 @@ class TwinGrowth(NamedTuple):
             chance.
         delay_period_s: Time after which delays that vary, and the ticks of all sites, repeat,
             in s. None if delays are constant, random, or never repeat.
+        burst_interval_s: Mean time from one burst of lost samples to the next one, in s. None
+            if no link loses samples in bursts.
         twins: The twins themselves, for figures. None if there are none.
     """
 
@@ -182,6 +190,7 @@ class TwinGrowth(NamedTuple):
     same_platform: bool = True
     links_random: bool = False
     delay_period_s: float | None = None
+    burst_interval_s: float | None = None
     twins: Twins | None = None
 
     @property
@@ -251,6 +260,25 @@ class TwinGrowth(NamedTuple):
         """
         judged_s = self.to_s - self.from_s
         return self.delay_period_s is not None and self.delay_period_s > judged_s
+
+    @property
+    def has_few_bursts(self) -> bool:
+        """True if samples are lost in bursts, too few of which are in the judged part.
+
+        The last bursts then decide whether the arms still move at the end.
+        """
+        if self.burst_interval_s is None:
+            return False
+        return self.to_s - self.from_s < LEAST_BURSTS * self.burst_interval_s
+
+    @property
+    def burst_text(self) -> str:
+        """A sentence for a judged part with few bursts of lost samples."""
+        assert self.burst_interval_s is not None
+        return (
+            f"samples are lost in bursts, one in {self.burst_interval_s:.3g} s, and the twins "
+            f"were judged over {self.to_s - self.from_s:.4g} s"
+        )
 
     @property
     def period_text(self) -> str:
@@ -465,6 +493,7 @@ def judge_twins(
         same_platform=twins.same,
         links_random=scenario.links_random,
         delay_period_s=period_s,
+        burst_interval_s=find_burst_interval_s(scenario),
         twins=twins,
     )
 

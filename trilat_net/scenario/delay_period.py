@@ -177,3 +177,30 @@ def find_final_delay_period(scenario: Scenario) -> DelayPeriod:
     links = [find_final_link(scenario, name) for name in scenario.links]
     rates_hz = [scenario.sites[name].rate_hz for name in scenario.names]
     return find_delay_period(links, rates_hz)
+
+
+def find_burst_interval_s(scenario: Scenario) -> float | None:
+    """Finds the mean time from one burst of lost samples to the next one, in s.
+
+    Bursts follow the Gilbert-Elliott model: a sample that arrives may be followed by a burst,
+    in which a share `loss_bad` of the samples is lost. If a sample leaves a burst with the
+    probability r, the mean burst has 1 / r samples, which are `loss` / `loss_bad` of all.
+
+    Args:
+        scenario: Description of the experiment.
+
+    Returns:
+        The longest of these times of all links that are in force at the end of the scenario.
+        None if no link loses samples in bursts.
+    """
+    intervals_s = []
+    for name in scenario.links:
+        link = find_final_link(scenario, name)
+        if link.loss_burst <= 1.0 or not 0.0 < link.loss < link.loss_bad:
+            continue
+        leave = 1.0 - (1.0 - 1.0 / link.loss_burst) / link.loss_bad
+        samples_per_burst = 1.0 / leave
+        samples_between = samples_per_burst * link.loss_bad / link.loss
+        sender = name.partition("->")[0]
+        intervals_s.append(samples_between / scenario.sites[sender].rate_hz)
+    return max(intervals_s, default=None)

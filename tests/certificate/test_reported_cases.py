@@ -1,0 +1,470 @@
+"""Verdicts that were once wrong: each kind of run with other numbers, and its mirror image.
+
+Every kind has three variants. For runs that were wrongly called stable, the mirror image is a
+stable run that must be called stable or settled; for runs that were wrongly called unstable it
+is an unstable one. A test checks the word and what it rests on.
+
+The tables state the true rate at which the slowest motion grows, in 1/s. Where the loop is
+linear, `SampledLoop.compute_rates` computes it with NumPy alone. Otherwise a run of eight times
+the length shows whether the motion lasts.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+import trilat_net as tn
+from trilat_net.analysis.certificate.stability_certificate import Certificate
+from trilat_net.analysis.run_end import Stability
+from trilat_net.analysis.timeline import list_effective_commands
+from trilat_net.scenario import Scenario
+from trilat_net.scenario.code_consent import allow_own_code
+
+from ..virtual_runs import simulate_with_commands
+from .sampled_loops import SampledLoop, burst, constant, sine
+
+PAIR = ((0.0, 1.0), (1.0, 0.0))
+THREE = ((0.0, 0.5, 0.5), (0.5, 0.0, 0.5), (0.5, 0.5, 0.0))
+UNEQUAL = ((0.0, 0.2, 0.8), (0.5, 0.0, 0.5), (0.8, 0.2, 0.0))
+TWO_PAIRS = (
+    (0.0, 1.0, 0.0, 0.0),
+    (1.0, 0.0, 0.0, 0.0),
+    (0.0, 0.0, 0.0, 1.0),
+    (0.0, 0.0, 1.0, 0.0),
+)
+PAIR_AND_THREE = (
+    (0.0, 1.0, 0.0, 0.0, 0.0),
+    (1.0, 0.0, 0.0, 0.0, 0.0),
+    (0.0, 0.0, 0.0, 0.5, 0.5),
+    (0.0, 0.0, 0.5, 0.0, 0.5),
+    (0.0, 0.0, 0.5, 0.5, 0.0),
+)
+LONGER = 8
+"""Length of the run that shows the truth, in lengths of the judged run."""
+
+
+class Case(NamedTuple):
+    """A run whose loop is linear.
+
+    Attributes:
+        loop: The loop.
+        rate_per_s: True rate of its slowest motion, in 1/s.
+        duration_s: Duration of the run, in s.
+        apart_rad: Distance of the start poses of two successive sites, in rad.
+    """
+
+    loop: SampledLoop
+    rate_per_s: float
+    duration_s: float
+    apart_rad: float = 0.02
+
+    @property
+    def word(self) -> Stability:
+        """The word that is right for the run."""
+        return Stability.NOT_STABLE if self.rate_per_s > 0.0 else Stability.STABLE
+
+
+def certify_case(case: Case) -> Certificate:
+    """Returns the certificate of the run of a case."""
+    return tn.certify(tn.simulate(case.loop.write_scenario(case.duration_s, case.apart_rad)))
+
+
+def assert_roots_decide(found: Certificate, rate_per_s: float) -> None:
+    """Asserts that a verdict rests on exact roots with a rate, and that it is right.
+
+    Args:
+        found: The certificate of a run.
+        rate_per_s: True rate of the slowest motion, in 1/s.
+    """
+    assert found.roots is not None
+    assert found.roots.exact
+    assert found.roots.rate_per_s == pytest.approx(rate_per_s, abs=5e-5)
+    if rate_per_s > 0.0:
+        assert found.stability is Stability.NOT_STABLE
+        assert found.decision.rests_on.startswith("exact roots, fastest growing +")
+        assert found.roots.text in found.reasons
+    else:
+        assert found.stability is Stability.STABLE
+        assert found.decision.rests_on.startswith("exact roots, slowest -")
+        assert found.reasons == ()
+
+
+@pytest.mark.parametrize(
+    "loop",
+    [
+        SampledLoop(PAIR, sine(180.0, 150.0, 0.7), 10.0, 1.5, (2.9,), 200),
+        SampledLoop(THREE, burst(50.0, 450.0, 1.0, 1.5), 9.0, 2.0, (), 100, "digital"),
+    ],
+)
+def test_linear_loop_moves_as_the_run_does(loop: SampledLoop) -> None:
+    """The recursion that states the truth gives the angles of the simulated run."""
+    delay = loop.find_delay(0, 1)
+    period_s = 1e-6 * (delay.period_us or 0)
+    log = tn.simulate(loop.write_scenario(2.0 * period_s + 0.1, 0.1))
+    ticks = round(period_s * loop.rate_hz)
+    first = np.stack([log[name].q[0] for name in loop.names])
+    for periods in (1, 2):
+        expected = loop.compute_angles(first, periods)
+        found = np.stack([log[name].q[periods * ticks] for name in loop.names])
+        np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+# Row 1: a joint that grows slowly beside one that decays fast from a larger distance.
+
+SLOW_JOINT = {
+    "two pairs": (
+        SampledLoop(
+            TWO_PAIRS,
+            {
+                (0, 1): constant(100.0),
+                (1, 0): constant(100.0),
+                (2, 3): constant(30.0),
+                (3, 2): constant(30.0),
+            },
+            [[25.0, 25.0]] * 2 + [[5.0, 90.0]] * 2,
+            [[8.0, 8.0]] * 2 + [[-0.21, 2.944]] * 2,
+            (5.0, 1.0),
+            100,
+        ),
+        20.0,
+        0.0300,
+    ),
+    "a pair and three": (
+        SampledLoop(
+            PAIR_AND_THREE,
+            constant(40.0),
+            [[25.0, 25.0]] * 2 + [[6.0, 60.0]] * 3,
+            [[8.0, 8.0]] * 2 + [[-0.519, 1.789]] * 3,
+            (6.0, 2.0),
+            100,
+        ),
+        16.0,
+        0.0399,
+    ),
+    "a longer run": (
+        SampledLoop(
+            TWO_PAIRS,
+            constant(80.0),
+            [[25.0, 25.0]] * 2 + [[12.0, 50.0]] * 2,
+            [[8.0, 8.0]] * 2 + [[0.7759, 4.405]] * 2,
+            (2.5, 1.5),
+            100,
+        ),
+        24.0,
+        0.0221,
+    ),
+}
+
+
+def write_hidden_joint(loop: SampledLoop, duration_s: float) -> Scenario:
+    """Returns the run of two groups under a user's law; only joint 2 of the second starts apart."""
+    starts = {"sites.c.q0_rad": [0.1, 0.1], "sites.d.q0_rad": [0.1, 0.3]}
+    if len(loop.names) == 5:
+        starts["sites.e.q0_rad"] = [0.1, 0.2]
+    law = {"law": "tests.own_laws:JointPD"}
+    return allow_own_code(loop.write_scenario(duration_s, law=law, **starts))
+
+
+@pytest.mark.parametrize("name", SLOW_JOINT)
+def test_growing_joint_is_found_beside_a_decaying_one(name: str) -> None:
+    loop, duration_s, rate_per_s = SLOW_JOINT[name]
+    assert loop.compute_rates(1)[0] == pytest.approx(rate_per_s, abs=1e-4)
+    log = tn.simulate(write_hidden_joint(loop, duration_s))
+    found = tn.certify(log, own_laws=True)
+    assert found.end.stability is Stability.SETTLED
+    assert_roots_decide(found, rate_per_s)
+
+    # The pushes show the growth too, without the roots.
+    assert found.twins is not None
+    worst = found.twins.worst
+    assert worst is not None
+    assert worst.joint in {f"{site} joint 1" for site in "cde"}
+    assert worst.rate_per_s == pytest.approx(rate_per_s, rel=0.15)
+    by_pushes = replace(found, roots=None).decision
+    assert by_pushes.stability in (Stability.NOT_STABLE, Stability.OPEN)
+    assert found.twins.text in (by_pushes.rests_on, *by_pushes.reasons)
+
+    forbidden = tn.certify(log)
+    assert forbidden.stability is Stability.OPEN
+    assert "the imported control laws may not run" in forbidden.reasons[0]
+
+
+def test_two_decaying_joints_are_settled() -> None:
+    loop, duration_s, _ = SLOW_JOINT["two pairs"]
+    damped = loop._replace(d=[[8.0, 8.0]] * 2 + [[2.0, 2.944]] * 2)
+    assert damped.compute_rates(1)[0] == pytest.approx(-0.1511, abs=1e-4)
+    found = tn.certify(tn.simulate(write_hidden_joint(damped, duration_s)), own_laws=True)
+    assert found.stability is Stability.SETTLED
+    assert found.decision.rests_on.startswith("10 pushes over 20 s, all of which died away")
+
+
+# Row 2: two sinusoidal delays whose common period is much longer than the run.
+
+
+def two_sines(first_s: float, second_s: float) -> dict[tuple[int, int], Any]:
+    """Returns delays of a pair that swing about 200 ms by 195 ms with two periods."""
+    return {(0, 1): sine(200.0, 195.0, first_s), (1, 0): sine(200.0, 195.0, second_s, np.pi)}
+
+
+def three_sines() -> dict[tuple[int, int], Any]:
+    """Returns delays of three sites that swing with periods of 1.2 s and 1.22 s."""
+    early = sine(200.0, 190.0, 1.2)
+    late = sine(200.0, 190.0, 1.22, np.pi)
+    last = sine(200.0, 190.0, 1.22)
+    return {
+        (0, 1): early,
+        (0, 2): early,
+        (1, 0): late,
+        (1, 2): late,
+        (2, 0): early,
+        (2, 1): last,
+    }
+
+
+COMMON_PERIODS = [
+    Case(SampledLoop(PAIR, two_sines(1.3, 1.31), 9.0, 2.107, (2.9,), 100), 0.00972, 40.0),
+    Case(SampledLoop(PAIR, two_sines(0.9, 0.91), 6.0, 0.9867, (), 100), 0.00898, 30.0, 0.01),
+    Case(SampledLoop(THREE, three_sines(), 10.0, 0.8836, (2.9,), 100), 0.01063, 30.0),
+    Case(SampledLoop(PAIR, two_sines(1.3, 1.31), 9.0, 2.248, (2.9,), 100), -0.01258, 40.0),
+    Case(SampledLoop(PAIR, two_sines(0.9, 0.91), 6.0, 1.038, (), 100), -0.01332, 30.0, 0.01),
+    Case(SampledLoop(THREE, three_sines(), 10.0, 1.021, (2.9,), 100), -0.01199, 30.0),
+]
+
+
+@pytest.mark.parametrize("case", COMMON_PERIODS)
+def test_two_sinusoids_are_judged_over_their_common_period(case: Case) -> None:
+    assert case.loop.compute_rates(1)[0] == pytest.approx(case.rate_per_s, abs=1e-5)
+    found = certify_case(case)
+    assert_roots_decide(found, case.rate_per_s)
+    assert found.twins is not None
+    assert found.twins.hides_period
+    assert found.roots is not None
+    assert f"over the period of {found.twins.delay_period_s:.6g} s" in found.roots.text
+
+
+# Row 3: looped traces of delays, of which a run shows little more than one period.
+
+ONE_LATE_LINK = {(0, 1): burst(60.0, 500.0, 21.0, 24.0), (1, 0): constant(60.0)}
+LATE_PAIR = burst(80.0, 380.0, 11.5, 13.0)
+LATE_THREE = burst(50.0, 450.0, 14.0, 16.0)
+LOOPED_TRACES = [
+    Case(SampledLoop(PAIR, LATE_PAIR, 12.0, 1.028, (2.2,), 100), 0.03493, 18.0),
+    Case(SampledLoop(THREE, LATE_THREE, 9.0, 0.2637, (), 100), 0.03445, 22.0),
+    Case(SampledLoop(PAIR, ONE_LATE_LINK, 8.0, 0.6092, (), 100, "digital"), 0.03559, 33.0),
+    Case(SampledLoop(PAIR, ONE_LATE_LINK, 8.0, 0.7565, (), 100, "digital"), -0.03561, 33.0),
+]
+ENDS_LATE = [
+    Case(SampledLoop(PAIR, LATE_PAIR, 12.0, 1.348, (2.2,), 100), -0.03513, 18.0),
+    Case(SampledLoop(THREE, LATE_THREE, 9.0, 0.4053, (), 100), -0.03441, 22.0),
+]
+"""Runs that decay, and that end after the burst of a period with a bounded oscillation."""
+
+
+@pytest.mark.parametrize("case", LOOPED_TRACES)
+def test_looped_trace_is_judged_over_its_period(case: Case) -> None:
+    assert case.loop.compute_rates(1)[0] == pytest.approx(case.rate_per_s, abs=1e-5)
+    found = certify_case(case)
+    assert_roots_decide(found, case.rate_per_s)
+    scenario = case.loop.write_scenario(case.duration_s, case.apart_rad)
+    for duration_s in (0.5 * case.duration_s, 3.0 * case.duration_s):
+        verdict = tn.linear(scenario, {"duration_s": duration_s}, ports=False).verdict
+        assert verdict == ("unstable" if case.rate_per_s > 0.0 else "stable")
+
+
+# Row 4: commands that change nothing.
+
+
+class CommandedCase(NamedTuple):
+    """A run with commands.
+
+    Attributes:
+        loop: The loop at the end of the run.
+        rate_per_s: True rate of its slowest motion, in 1/s.
+        duration_s: Duration of the run, in s.
+        apart_rad: Distance of the start poses of two successive sites, in rad.
+        law: Keys of the control law beside the gains.
+        commands: Times, in s, and commands to site b.
+        starts_ms: Delay at the start, in ms. That of the loop if None.
+    """
+
+    loop: SampledLoop
+    rate_per_s: float
+    duration_s: float
+    apart_rad: float
+    law: Mapping[str, Any]
+    commands: tuple[tuple[float, dict[str, Any]], ...]
+    starts_ms: float | None = None
+
+
+def set_delay(delay_ms: float, link: str = "a->b") -> dict[str, Any]:
+    """Returns the command that gives a link a constant delay."""
+    return {"link": link, "to": {"model": "constant", "delay_ms": delay_ms}}
+
+
+SATURATED = SampledLoop(PAIR, constant(250.0), 16.0, 3.37, (2.0,), 100)
+SATURATED_THREE = SampledLoop(THREE, constant(200.0), 20.0, 1.718, (2.9,), 100)
+PLANAR = SampledLoop(PAIR, constant(220.0), 12.0, 2.192, (), 100)
+SAME_250 = ((6.0, set_delay(250.0)),)
+SAME_THREE = (
+    (5.0, set_delay(200.0)),
+    (8.0, {"dominance": "b", "to": {"a": 0.5, "c": 0.5}, "ramp_s": 0.0}),
+)
+SAME_PLANAR = (
+    (3.0, set_delay(220.0)),
+    (4.0, {"dominance": "b", "to": {"a": 1.0}, "ramp_s": 1.0}),
+)
+LIMIT = {"law": "saturated_pd", "P": 1.5}
+LOW_LIMIT = {"law": "saturated_pd", "P": 1.0}
+IDLE_COMMANDS = [
+    CommandedCase(SATURATED, 0.02267, 16.0, -4.0, LIMIT, SAME_250),
+    CommandedCase(SATURATED_THREE, 0.02513, 14.0, -1.5, LOW_LIMIT, SAME_THREE),
+    CommandedCase(PLANAR, 0.02509, 14.0, -0.02, {}, SAME_PLANAR),
+    CommandedCase(SATURATED._replace(d=3.626), -0.02976, 16.0, -4.0, LIMIT, SAME_250),
+    CommandedCase(
+        SATURATED_THREE._replace(d=2.058), -0.02996, 24.0, -1.5, LOW_LIMIT, SAME_THREE
+    ),
+    CommandedCase(PLANAR._replace(d=2.329), -0.0296, 14.0, -0.02, {}, SAME_PLANAR),
+]
+
+
+@pytest.mark.parametrize("case", IDLE_COMMANDS)
+def test_command_without_effect_leaves_the_roots(case: CommandedCase) -> None:
+    assert case.loop.compute_rates(1)[0] == pytest.approx(case.rate_per_s, abs=1e-5)
+    scenario = case.loop.write_scenario(case.duration_s, case.apart_rad, case.law)
+    log = simulate_with_commands(scenario, "b", *case.commands)
+    assert len(log.changes("b")) == len(case.commands)
+    assert list_effective_commands(log) == []
+    found = tn.certify(log)
+    assert_roots_decide(found, case.rate_per_s)
+    assert tn.certify(tn.simulate(scenario)).decision == found.decision
+
+
+def test_command_with_effect_decides_by_the_roots_after_it() -> None:
+    stable = SATURATED._replace(d=3.626)
+    later = stable._replace(delays={(0, 1): constant(250.0), (1, 0): constant(300.0)})
+    rate_per_s = later.compute_rates(1)[0]
+    assert (stable.compute_rates(1)[0], rate_per_s) == pytest.approx(
+        (-0.02976, 0.02222), abs=1e-5
+    )
+    scenario = stable.write_scenario(16.0, -0.02)
+    log = simulate_with_commands(scenario, "b", (6.0, set_delay(300.0)))
+    assert_roots_decide(tn.certify(log), rate_per_s)
+
+
+# Row 5: a user's law that may not run.
+
+ONE_SLIDES = [
+    (UNEQUAL, sine(180.0, 175.0, 1.6), [6.0, 30.0], (1.5, 1.4), (0.5312, 1.554), 20.0),
+    (PAIR, constant(150.0), [11.0, 20.0], (1.5, 0.8), (1.401, 2.175), 16.0),
+    (PAIR, burst(60.0, 420.0, 3.0, 4.0), [11.0, 15.0], (0.5, 1.5), (0.9598, 1.776), 24.0),
+]
+"""Shares, delay, stiffness, masses, damping of joint 1 that lacks and that suffices, duration."""
+LACKING_RATES = (0.0499, 0.0400, 0.0498)
+ENOUGH_RATES = (-0.1202, -0.1200, -0.1201)
+
+
+def simulate_own_law(number: int, *, damped: bool, apart_rad: float) -> tuple[SampledLoop, Any]:
+    """Returns the loop and the log of a run under a user's law.
+
+    Args:
+        number: Index of the run in `ONE_SLIDES`.
+        damped: True if the damping of joint 1 suffices.
+        apart_rad: Distance of the start poses of two successive sites, in rad.
+    """
+    shares, delay, K, masses, damping, duration_s = ONE_SLIDES[number]
+    sites = len(shares)
+    gains = [[damping[damped], 9.0]] * sites
+    loop = SampledLoop(shares, delay, [K] * sites, gains, masses, 100)
+    law = {"law": "tests.own_laws:JointPD"}
+    return loop, tn.simulate(allow_own_code(loop.write_scenario(duration_s, apart_rad, law)))
+
+
+@pytest.mark.parametrize("number", range(3))
+def test_own_law_that_grows_is_never_stable(number: int) -> None:
+    loop, log = simulate_own_law(number, damped=False, apart_rad=1e-4)
+    rate_per_s = LACKING_RATES[number]
+    assert loop.compute_rates(1)[0] == pytest.approx(rate_per_s, abs=1e-4)
+    forbidden = tn.certify(log)
+    assert forbidden.roots is not None
+    assert forbidden.roots.verdict == ""
+    assert "may not run" in forbidden.roots.text
+    assert forbidden.stability in (Stability.NOT_STABLE, Stability.OPEN)
+    assert_roots_decide(tn.certify(log, own_laws=True), rate_per_s)
+
+
+@pytest.mark.parametrize("number", range(3))
+def test_own_law_that_decays_is_settled_with_permission(number: int) -> None:
+    loop, log = simulate_own_law(number, damped=True, apart_rad=0.02)
+    assert loop.compute_rates(1)[0] == pytest.approx(ENOUGH_RATES[number], abs=1e-4)
+    forbidden = tn.certify(log)
+    assert forbidden.stability is Stability.OPEN
+    assert "the imported control laws may not run" in forbidden.reasons[0]
+    found = tn.certify(log, own_laws=True)
+    assert found.stability is Stability.SETTLED
+    assert "all of which died away; its roots are not exact" in found.decision.rests_on
+
+
+# Row 6: beats and bursts in runs that decay.
+
+BEAT = SampledLoop(
+    PAIR,
+    {(0, 1): sine(200.0, 195.0, 1.2), (1, 0): sine(200.0, 195.0, 1.26)},
+    10.0,
+    2.33,
+    (2.5,),
+    100,
+)
+LONG_BEAT = SampledLoop(
+    PAIR,
+    {(0, 1): sine(200.0, 195.0, 4.9), (1, 0): sine(200.0, 150.0, 1.21)},
+    10.0,
+    1.942,
+    (2.9,),
+    100,
+)
+DECAYING_BEATS = [
+    *ENDS_LATE,
+    Case(BEAT, -0.02003, 32.0, -0.5),
+    Case(LONG_BEAT, -0.01489, 60.0, -0.5),
+]
+
+
+@pytest.mark.parametrize("case", DECAYING_BEATS)
+def test_decaying_beat_is_stable_however_its_record_ends(case: Case) -> None:
+    assert case.loop.compute_rates(1)[0] == pytest.approx(case.rate_per_s, abs=1e-5)
+    found = certify_case(case)
+    assert found.end.stability is Stability.NOT_STABLE
+    assert_roots_decide(found, case.rate_per_s)
+
+
+def test_growing_beat_is_not_stable() -> None:
+    loop = BEAT._replace(d=2.0)
+    rate_per_s = loop.compute_rates(1)[0]
+    assert rate_per_s > 0.01
+    assert_roots_decide(certify_case(Case(loop, rate_per_s, 32.0)), rate_per_s)
+
+
+# Row 7: motions that decay so slowly that the run shows no decay.
+
+SLOW_MOTIONS = [
+    Case(SampledLoop(THREE, constant(160.0), 12.0, 0.8953, (), 100), -0.00120, 40.0),
+    Case(SampledLoop(PAIR, constant(240.0), 9.0, 1.946, (), 100, "digital"), -0.00084, 30.0),
+    Case(SampledLoop(PAIR, constant(130.0), 15.0, 1.866, (1.7,), 200), -0.00142, 40.0),
+]
+SLOW_GROWTH = [
+    Case(SampledLoop(THREE, constant(160.0), 12.0, 0.8899, (), 100), 0.00132, 40.0, 0.005),
+    Case(SampledLoop(PAIR, constant(240.0), 9.0, 1.941, (), 100, "digital"), 0.00119, 30.0),
+    Case(SampledLoop(PAIR, constant(130.0), 15.0, 1.854, (1.7,), 200), 0.00188, 40.0),
+]
+
+
+@pytest.mark.parametrize("case", [*SLOW_MOTIONS, *SLOW_GROWTH])
+def test_motion_near_the_edge_is_judged_by_its_roots(case: Case) -> None:
+    assert case.loop.compute_rates(1)[0] == pytest.approx(case.rate_per_s, abs=1e-5)
+    found = certify_case(case)
+    assert found.end.stability is Stability.NOT_STABLE
+    assert "bounded oscillation" in found.end.text
+    assert_roots_decide(found, case.rate_per_s)
