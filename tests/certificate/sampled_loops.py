@@ -230,16 +230,46 @@ class SampledLoop(NamedTuple):
         Returns:
             Angles, shape (N, n), in rad.
         """
+        state = self._follow(first, first, periods)
+        return state[-3]
+
+    def compute_velocities(self, first: Array, before: Array, ticks: int) -> Array:
+        """Computes the joint velocities after some ticks, with constant delays.
+
+        Args:
+            first: Angles at the first tick, at rest, shape (N, n), in rad.
+            before: Angles that the peers see until the first sample arrives, in the same form.
+            ticks: Number of ticks.
+
+        Returns:
+            Velocities, shape (N, n), in rad/s.
+        """
+        return self._follow(first, before, ticks)[-2]
+
+    def _follow(self, first: Array, before: Array, periods: int) -> Array:
+        """Returns the state after whole periods of the delays.
+
+        Args:
+            first: Angles at the first tick, at rest, shape (N, n), in rad.
+            before: Angles at earlier ticks.
+            periods: Number of periods.
+
+        Returns:
+            Angles of the last ticks, velocities, and torques of the last tick, shape
+            (rows, N, n).
+        """
         ticks = self._count_period()
         ages = {link: self._find_ages(link, ticks) for link in self.list_links()}
         matrix = self._build_period_matrix(ticks, ages)
         kept = len(matrix) // first.size - 2
-        K = np.array(_spread(self.K, len(self.shares)), dtype=float).reshape(len(first), -1)
-        first_torque = K * (np.array(self.shares) @ first - first)
-        state = np.stack([*[first] * kept, 0.0 * first, first_torque]).ravel()
-        for _ in range(periods):
-            state = matrix @ state
-        return state.reshape(kept + 2, *first.shape)[kept - 1]
+        sites = len(self.shares)
+        K = np.array(_spread(self.K, sites), dtype=float).reshape(sites, -1)
+        # The first tick uses its own torque as that of the tick before it.
+        first_torque = K * (np.array(self.shares) @ before - first)
+        earlier = [before] * (kept - 1)
+        state = np.stack([*earlier, first, 0.0 * first, first_torque])
+        flat = np.linalg.matrix_power(matrix, periods) @ state.ravel()
+        return flat.reshape(state.shape)
 
     def _count_period(self) -> int:
         """Returns the number of ticks after which all delays repeat."""

@@ -49,6 +49,22 @@ def _find_cycle(link: LinkBase) -> Fraction | None:
     return None
 
 
+def find_link_period_s(link: LinkBase) -> float | None:
+    """Returns the period of a link's delay, in s.
+
+    Args:
+        link: Delay model of the link.
+
+    Returns:
+        The period. None if the delay is constant, random or measured, or follows a trace that
+        ends.
+    """
+    if is_ending_trace(link):
+        return None
+    cycle = _find_cycle(link)
+    return None if cycle is None else float(cycle)
+
+
 def _find_common_period(cycles: Iterable[Fraction], common_hz: int) -> Fraction:
     """Returns the shortest time that contains a whole number of ticks and of all cycles, in s.
 

@@ -34,7 +34,7 @@ from ..files import find_page
 from ..laws.conditions import LinearForm, LinearSituation
 from ..scenario import Scenario
 from ..scenario.delay_models import LinkBase
-from ..scenario.delay_period import find_final_link
+from ..scenario.delay_period import MAX_PERIOD_TICKS, find_final_link, find_link_period_s
 from ..scenario.imported_code import ImportedLaw
 from ..scenario.sample_uses import draw_used_samples
 from ..scenario.validate import refuse_external_arms
@@ -240,8 +240,9 @@ def derive_operating_conditions(
         links[i, j] = link, link_key(scenario.seed, f"{peer}->{site}")
         age = compute_effective_delay(scenario, peer, site, link)
         age_s[i, j] = age.mean_s
+        rate_hz = max(scenario.sites[site].rate_hz, scenario.sites[peer].rate_hz)
         # times of ticks are whole ns, so that constant ages differ by less than this
-        if age.most_s > age.least_s + 1e-8:
+        if age.most_s > age.least_s + 1e-8 or _has_long_period(link, rate_hz):
             varying.append(age)
 
     if varying:
@@ -378,6 +379,17 @@ def _find_final_link(scenario: Scenario, name: str, notes: list[str]) -> LinkBas
     return link
 
 
+def _has_long_period(link: LinkBase, rate_hz: int) -> bool:
+    """Returns True if the delay of a link repeats only after too many ticks to compute them.
+
+    Args:
+        link: Delay model of the link.
+        rate_hz: Ticks per second.
+    """
+    period_s = find_link_period_s(link)
+    return period_s is not None and period_s * rate_hz > MAX_PERIOD_TICKS
+
+
 def compute_effective_delay(
     scenario: Scenario,
     peer: str,
@@ -385,6 +397,9 @@ def compute_effective_delay(
     link: LinkBase,
 ) -> EffectiveDelay:
     """Computes the age of a peer's samples at the ticks of a site that use them.
+
+    The ages are those of the run. If the delay repeats after a longer time, they are those of a
+    whole period, because the loop goes on after the run.
 
     Args:
         scenario: The experiment.
@@ -411,6 +426,11 @@ def compute_effective_delay(
     if is_constant:
         # ages repeat, so that two seconds beyond the delay show them all
         duration_s = min(duration_s, 2.0 + 2e-6 * model.location)
+    period_s = find_link_period_s(link)
+    if period_s is not None and not _has_long_period(link, max(site_hz, peer_hz)):
+        # ages are complete when the samples of a whole period have arrived
+        longest_s = 2e-3 * sum(link.moments())
+        duration_s = max(duration_s, period_s + longest_s)
     used = draw_used_samples(
         link=link,
         key=link_key(scenario.seed, f"{peer}->{site}"),
