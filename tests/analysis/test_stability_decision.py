@@ -122,6 +122,18 @@ def test_end_that_is_not_stable_stands_unless_pushes_contradict_it(
     assert decide(end=bad, twins=beat).stability is Stability.OPEN
 
 
+def test_few_bursts_of_loss_do_not_decide_unless_pushes_grow() -> None:
+    bad = end(EndBehaviour.BOUNDED)
+    steady = pushed(EnvelopeTrend.STEADY, 0.01, burst_interval_s=3.0)
+    decision = decide(end=bad, twins=steady)
+    assert decision.stability is Stability.OPEN
+    assert "one in 3 s" in decision.reasons[0]
+    frequent = steady._replace(burst_interval_s=0.05)
+    assert decide(end=bad, twins=frequent).stability is Stability.NOT_STABLE
+    growing = GROWING._replace(burst_interval_s=3.0)
+    assert decide(end=bad, twins=growing).stability is Stability.NOT_STABLE
+
+
 def test_operator_who_acts_leaves_a_run_open() -> None:
     acting = end(operator_acts=True, reasons=("an operator acts",))
     for roots in (None, STABLE_ROOTS, UNSTABLE_ROOTS):

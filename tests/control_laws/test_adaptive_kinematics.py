@@ -175,6 +175,20 @@ def test_weight_of_errata_10_is_not_symmetric_and_may_be_singular() -> None:
     assert abs(np.linalg.det(weight + delay_s * np.eye(2))) < 1e-9
 
 
+@pytest.mark.parametrize(
+    ("lengths", "pose"),
+    [((0.3, 2.0), (0.4, 0.3)), ((2.5, 0.4), (-1.0, 0.25)), ((1.6, 0.5), (2.0, -0.2))],
+)
+def test_wrong_lengths_make_the_weight_indefinite_near_a_straight_elbow(
+    lengths: tuple[float, float], pose: tuple[float, float]
+) -> None:
+    """A motion exists that the weight counts as negative; of true lengths it is the identity."""
+    weight = estimated_over_true(lengths, pose)
+    assert np.abs(weight - weight.T).max() > 0.1
+    assert np.linalg.eigvalsh(0.5 * (weight + weight.T)).min() < 0.0
+    assert estimated_over_true((1.0, 1.0), pose) == pytest.approx(np.eye(2))
+
+
 @pytest.mark.long
 def test_errors_vanish_although_the_weight_of_errata_10_is_indefinite() -> None:
     """An end effector of finite reach cannot move at one velocity for ever: e and qd go to zero."""

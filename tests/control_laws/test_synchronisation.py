@@ -85,6 +85,43 @@ def test_under_gravity_arms_that_start_low_end_hanging(start: tuple[float, float
     assert abs(last["qd"]).max() < 1e-3
 
 
+OTHER_GAINS: dict[str, tuple[str, dict[str, float], float, tuple[float, float]]] = {
+    "three sites": ("abc", {"Lambda": 2.0, "K": 5.0, "Gamma": 1.0}, 80.0, (-1.6, 0.05)),
+    "a longer delay": ("ab", {"Lambda": 0.5, "K": 4.0, "Gamma": 2.0}, 300.0, (-1.7, 0.1)),
+    "slow learning": ("abc", {"Lambda": 1.0, "K": 3.0, "Gamma": 0.5}, 200.0, (-1.55, 0.0)),
+}
+
+
+@pytest.mark.parametrize("height", ["low", "high"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "a longer delay",
+        *(
+            pytest.param(name, marks=pytest.mark.long)
+            for name in ("three sites", "slow learning")
+        ),
+    ],
+)
+def test_start_decides_between_hanging_and_zero_for_other_gains(name: str, height: str) -> None:
+    sites, gains, delay_ms, low = OTHER_GAINS[name]
+    start = low if height == "low" else (0.8, 0.3)
+    share = 1.0 / (len(sites) - 1)
+    scenario = unit_scenario(
+        {site: {"q0_rad": list(start)} for site in sites},
+        {"law": "sync", "theta_hat0": 0.0, **gains},
+        arm={},
+        link={"model": "constant", "delay_ms": delay_ms},
+        dominance={site: {peer: share for peer in sites if peer != site} for site in sites},
+        duration_s=100.0,
+    )
+    (last,) = last_rows(scenario, 100.0)
+    first_joint_rad = -0.5 * np.pi if height == "low" else 0.0
+    assert last["q"][:, 0] == pytest.approx(first_joint_rad, abs=5e-3)
+    assert last["q"][:, 1] == pytest.approx(0.0, abs=5e-3)
+    assert "at q = 0 or hanging" in describe_law_conditions(scenario)[0]
+
+
 @pytest.mark.long
 def test_the_papers_law_keeps_its_pose_under_gravity() -> None:
     assert ends("adaptive", (0.6, -0.5), 9.81, 200.0)[0] == pytest.approx(-0.047162, rel=1e-3)

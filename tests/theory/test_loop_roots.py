@@ -15,7 +15,7 @@ from trilat_net.analysis.run_end import classify_log_end
 from trilat_net.analysis.timeline import list_effective_commands
 from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.scenario.delay_period import find_final_delay_period
+from trilat_net.scenario.delay_period import find_burst_interval_s, find_final_delay_period
 from trilat_net.theory.loop_roots import find_log_roots, find_run_roots, resolve_final_scenario
 from trilat_net.theory.run_certificate import certify_run
 
@@ -98,6 +98,31 @@ def test_common_period_is_the_least_common_multiple(periods: list[int], rate_hz:
 )
 def test_random_delays_have_no_period(link: dict[str, Any]) -> None:
     assert find_final_delay_period(pair(link=link)).true_s is None
+
+
+def test_mean_time_between_bursts_is_that_of_the_losses() -> None:
+    """Bursts of 20 samples that lose one sample in five begin every 100 samples."""
+    rng = np.random.default_rng(4)
+    for burst, loss, share in ((20.0, 0.2, 1.0), (8.0, 0.1, 0.95)):
+        link = {
+            "model": "constant",
+            "delay_ms": 20.0,
+            "loss": loss,
+            "loss_burst": burst,
+            "loss_bad": share,
+        }
+        scenario = pair(link=link)
+        leave = 1.0 - (1.0 - 1.0 / burst) / share
+        enter = leave * loss / (share - loss)
+        bad = False
+        starts = 0
+        samples = 200_000
+        for draw in rng.random(samples):
+            starts += not bad and draw < enter
+            bad = draw >= leave if bad else draw < enter
+        expected_s = samples / starts / scenario.sites["m"].rate_hz
+        assert find_burst_interval_s(scenario) == pytest.approx(expected_s, rel=0.05)
+    assert find_burst_interval_s(pair()) is None
 
 
 def test_two_sinusoids_have_the_growth_of_their_common_period() -> None:

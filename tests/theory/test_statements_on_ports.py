@@ -169,6 +169,25 @@ def test_a_heavy_slave_asks_for_more_than_its_limits_of_low_and_high_frequencies
             assert bool(criterion(network).below) is fails
 
 
+@pytest.mark.parametrize(
+    ("K", "M_s", "d_s", "T"),
+    [(60.0, 0.2, 6.0, 0.01), (300.0, 0.1, 9.0, 3e-3), (90.0, 0.6, 12.0, 0.02)],
+)
+def test_heavy_slaves_need_the_largest_value_over_frequencies(
+    K: float, M_s: float, d_s: float, T: float
+) -> None:
+    """Errata 15: at least 5 % more than both limits, and no more than the sufficient bound."""
+    assert d_s**2 < 4.0 * K * M_s
+    edge = float(reflection_damping(reflection_frequencies(K, d_s, T), K, M_s, d_s, T).max())
+    slow, fast = (2.0 * K * T + d_s) ** 2 / (4.0 * d_s), K * M_s / d_s
+    assert edge > 1.05 * max(slow, fast)
+    assert edge <= max(slow, K * (2.0 * M_s + T * d_s) ** 2 / (4.0 * M_s * d_s))
+    wires = (Wire(0, 1, 0.0, 0.0, T, 1.0), Wire(1, 0, K, 0.0, T))
+    for part, fails in ((0.99, True), (1.01, False)):
+        network = Network((0.5 * M_s, M_s), (part * edge, d_s), (0.0, 0.0), wires)
+        assert bool(criterion(network).below) is fails
+
+
 def test_no_light_slave_asks_for_more_than_the_formula_of_low_frequencies() -> None:
     """Errata 15: d_s^2 >= 4 K M_s. A heavy slave stays within the larger one of two formulas."""
     rng = np.random.default_rng(15)
