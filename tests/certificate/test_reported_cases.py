@@ -501,7 +501,7 @@ def test_last_burst_of_loss_does_not_decide(seed: int) -> None:
     found = tn.certify(tn.simulate(write_lossy(LOSSY, 30.0, seed)))
     assert found.end.stability is Stability.NOT_STABLE
     assert found.stability is Stability.OPEN
-    assert "samples are lost in bursts, one in 3 s" in found.reasons[0]
+    assert "has 5 bursts of lost samples, too few" in found.reasons[0]
 
 
 def test_growth_over_bursts_of_loss_is_not_stable() -> None:

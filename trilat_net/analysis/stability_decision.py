@@ -42,6 +42,8 @@ RATE_AGREEMENT_SHARE = 0.25
 """Largest difference between the rates of a push and of the slowest root, as a share."""
 RATE_AGREEMENT_PER_S = 2e-4
 """Difference of these rates that always confirms the root, in 1/s."""
+LEAST_BURSTS = 100.0
+"""Number of bursts of lost samples from which on their mean effect decides how a run ends."""
 _FALLING = (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY)
 _UNTREND_ENDS = (EndBehaviour.HARDLY, EndBehaviour.UNDECIDED)
 
@@ -261,7 +263,7 @@ def _pushes_excuse_end(run: RunFindings) -> bool:
     assert run.twins is not None
     if run.twins.trend is EnvelopeTrend.DECAYS or run.twins.hides_period:
         return True
-    if run.twins.has_few_bursts and not run.twins.grows:
+    if run.twins.judged_bursts < LEAST_BURSTS and not run.twins.grows:
         return True
     end_grows = run.end.behaviour is EndBehaviour.GROWS
     return end_grows and run.twins.trend is not EnvelopeTrend.GROWS and not run.rises
@@ -311,8 +313,9 @@ def _explain_open(run: RunFindings) -> str:
         return f"no proof exists, and there are no {run.twins.text}"
     if run.end.stability is Stability.SETTLED:
         return run.twins.text
-    if run.twins.has_few_bursts:
-        return f"{run.end.text}; {run.twins.burst_text}"
+    if run.twins.judged_bursts < LEAST_BURSTS:
+        bursts = f"{run.twins.judged_bursts:.2g} bursts of lost samples"
+        return f"{run.end.text}; the judged part has {bursts}, too few for an average"
     return run.end.text
 
 

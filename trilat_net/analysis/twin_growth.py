@@ -82,8 +82,6 @@ _AMPLITUDE_FLOOR = 1e-300
 """Smallest amplitude in a fit. The amplitudes are scaled and have no unit."""
 SAME_SCALED = math.log(1.1)
 """Largest difference of the logarithms of two scaled twins that count as equal: 10 %."""
-LEAST_BURSTS = 100
-"""Number of bursts of loss from which on their mean effect decides how a run ends."""
 MOST_LOG = 700.0
 """Largest argument of the exponential function that certainly does not overflow."""
 
@@ -262,23 +260,15 @@ class TwinGrowth(NamedTuple):
         return self.delay_period_s is not None and self.delay_period_s > judged_s
 
     @property
-    def has_few_bursts(self) -> bool:
-        """True if samples are lost in bursts, too few of which are in the judged part.
+    def judged_bursts(self) -> float:
+        """Mean number of bursts of lost samples in the judged part of the run.
 
-        The last bursts then decide whether the arms still move at the end.
+        That of the link with the fewest bursts counts. Infinite if no link loses samples in
+        bursts.
         """
         if self.burst_interval_s is None:
-            return False
-        return self.to_s - self.from_s < LEAST_BURSTS * self.burst_interval_s
-
-    @property
-    def burst_text(self) -> str:
-        """A sentence for a judged part with few bursts of lost samples."""
-        assert self.burst_interval_s is not None
-        return (
-            f"samples are lost in bursts, one in {self.burst_interval_s:.3g} s, and the twins "
-            f"were judged over {self.to_s - self.from_s:.4g} s"
-        )
+            return math.inf
+        return (self.to_s - self.from_s) / self.burst_interval_s
 
     @property
     def period_text(self) -> str:
