@@ -169,7 +169,13 @@ def write_hidden_joint(loop: SampledLoop, duration_s: float) -> Scenario:
     return allow_own_code(loop.write_scenario(duration_s, law=law, **starts))
 
 
-@pytest.mark.parametrize("name", SLOW_JOINT)
+@pytest.mark.parametrize(
+    "name",
+    [
+        "two pairs",
+        *(pytest.param(name, marks=pytest.mark.long) for name in [*SLOW_JOINT][1:]),
+    ],
+)
 def test_growing_joint_is_found_beside_a_decaying_one(name: str) -> None:
     loop, duration_s, rate_per_s = SLOW_JOINT[name]
     assert loop.compute_rates(1)[0] == pytest.approx(rate_per_s, abs=1e-4)
@@ -391,7 +397,7 @@ def simulate_own_law(number: int, *, damped: bool, apart_rad: float) -> tuple[Sa
     return loop, tn.simulate(allow_own_code(loop.write_scenario(duration_s, apart_rad, law)))
 
 
-@pytest.mark.parametrize("number", range(3))
+@pytest.mark.parametrize("number", [0, 1, pytest.param(2, marks=pytest.mark.long)])
 def test_own_law_that_grows_is_never_stable(number: int) -> None:
     loop, log = simulate_own_law(number, damped=False, apart_rad=1e-4)
     rate_per_s = LACKING_RATES[number]
@@ -404,7 +410,7 @@ def test_own_law_that_grows_is_never_stable(number: int) -> None:
     assert_roots_decide(tn.certify(log, own_laws=True), rate_per_s)
 
 
-@pytest.mark.parametrize("number", range(3))
+@pytest.mark.parametrize("number", [0, 1, pytest.param(2, marks=pytest.mark.long)])
 def test_own_law_that_decays_is_settled_with_permission(number: int) -> None:
     loop, log = simulate_own_law(number, damped=True, apart_rad=0.02)
     assert loop.compute_rates(1)[0] == pytest.approx(ENOUGH_RATES[number], abs=1e-4)
@@ -437,7 +443,7 @@ LONG_BEAT = SampledLoop(
 DECAYING_BEATS = [
     *ENDS_LATE,
     Case(BEAT, -0.02003, 32.0, -0.5),
-    Case(LONG_BEAT, -0.01489, 60.0, -0.5),
+    pytest.param(Case(LONG_BEAT, -0.01489, 60.0, -0.5), marks=pytest.mark.long),
 ]
 
 

@@ -49,7 +49,11 @@ def write_tdpa(
     return unit_scenario(sites, law, link=link, rate_hz=200, duration_s=12.0, **more)
 
 
-TDPA_RUNS = [(200.0, 60.0, 6.0), (120.0, 50.0, 6.0), (350.0, 30.0, 4.0)]
+TDPA_RUNS = [
+    (200.0, 60.0, 6.0),
+    pytest.param(120.0, 50.0, 6.0, marks=pytest.mark.long),
+    pytest.param(350.0, 30.0, 4.0, marks=pytest.mark.long),
+]
 """Delay in ms, stiffness and damping."""
 
 
@@ -117,7 +121,10 @@ def write_sliding(loop: SampledLoop, duration_s: float) -> Scenario:
     return loop.write_scenario(duration_s, 0.1, **controls)
 
 
-@pytest.mark.parametrize("loop", SLIDING)
+@pytest.mark.parametrize(
+    "loop",
+    [SLIDING[0], *(pytest.param(loop, marks=pytest.mark.long) for loop in SLIDING[1:])],
+)
 def test_theorem_covers_prismatic_joints(loop: SampledLoop) -> None:
     """M, C and G of sliding joints are constant, so that every step of the proof holds."""
     found = tn.certify(tn.simulate(write_sliding(loop, 20.0)))
