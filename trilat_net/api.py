@@ -261,7 +261,7 @@ def report(
 
 
 def linear(
-    scenario: AnyScenario,
+    scenario: AnyScenario | Log,
     set: Overrides = (),  # noqa: A002 - the command's --set, by its name
     *,
     pose: Sequence[float] | None = None,
@@ -280,7 +280,8 @@ def linear(
 
     Args:
         scenario: The scenario, which describes the experiment: the name of a shipped scenario,
-            a path, a TOML text, its tables, or a `Scenario`.
+            a path, a TOML text, its tables, or a `Scenario`. Or a log, whose loop is analysed
+            as it was at the end of its run, after all commands.
         set: Settings that replace those of the scenario, as in `{"control.d": 0.9}`.
         pose: Joint angles of all sites, in rad. By default those at the end of a run.
         roots: Number of characteristic roots, the exponents of the loop's motions, that are
@@ -306,8 +307,9 @@ def linear(
         raise UsageError(
             f"a pose must consist of angles in rad, as in (0.1, 0.3), but is {pose!r}"
         ) from None
+    is_log = isinstance(scenario, Log) and not set
     return analyse_linear_loop(
-        load_scenario(scenario, set),
+        scenario if is_log else load_scenario(scenario, set),
         pose=angles,
         roots=roots,
         over=over,

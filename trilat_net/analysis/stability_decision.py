@@ -22,6 +22,8 @@ Invariant:
     - Exact roots in the left half-plane exclude the word "not stable", except for a run that
       left its limits.
     - A decision states what it rests on.
+    - Twins never change a decision that `is_decided_by_roots` announces, so that a command may
+      save them.
 """
 
 import math
@@ -153,11 +155,12 @@ def decide_stability(run: RunFindings) -> StabilityDecision:
     Args:
         run: Everything that is known about the run.
     """
-    end = run.end
-    if end.behaviour is EndBehaviour.DIVERGED:
-        return StabilityDecision(Stability.NOT_STABLE, end.text, (end.text,))
-
     reasons = _list_reasons(run)
+    decision = _decide_by_roots(run, reasons)
+    if decision is not None:
+        return decision
+
+    end = run.end
     refutation = _find_refutation(run)
     if refutation:
         stability = Stability.OPEN if end.operator_acts else Stability.NOT_STABLE
@@ -168,10 +171,56 @@ def decide_stability(run: RunFindings) -> StabilityDecision:
         return StabilityDecision(Stability.STABLE, "; ".join(proofs))
     looks_unstable = end.stability is Stability.NOT_STABLE
     if looks_unstable and not run.has_stable_roots and not _pushes_excuse_end(run):
-        return StabilityDecision(Stability.NOT_STABLE, f"the end of the run: {end.text}")
+        # The frequency of an oscillation is known only if all records are.
+        end_text = end._replace(frequency_hz=None).text
+        return StabilityDecision(Stability.NOT_STABLE, f"the end of the run: {end_text}")
     if not reasons and _has_settled(run):
         return StabilityDecision(Stability.SETTLED, _describe_pushes(run))
     return StabilityDecision(Stability.OPEN, "", reasons or (_explain_open(run),))
+
+
+def is_decided_by_roots(run: RunFindings) -> bool:
+    """Returns True if twins cannot change the decision, so that they need not be executed.
+
+    This is so if the run diverged, or if its exact roots and its end agree.
+
+    Args:
+        run: What is known about the run without twins.
+    """
+    return _decide_by_roots(run, _list_reasons(run)) is not None
+
+
+def _decide_by_roots(run: RunFindings, reasons: tuple[str, ...]) -> StabilityDecision | None:
+    """Decides about a run by its end and its exact roots alone.
+
+    Args:
+        run: Everything that is known about the run.
+        reasons: Sentences that prevent a stable run.
+
+    Returns:
+        The decision. None if twins may change it.
+    """
+    end = run.end
+    if end.behaviour is EndBehaviour.DIVERGED:
+        return StabilityDecision(Stability.NOT_STABLE, end.text, (end.text,))
+    roots = run.roots
+    if roots is None or not roots.exact:
+        return None
+
+    is_near_rest = roots.distance_rad <= NEAR_REST_RAD
+    looks_unstable = end.stability is Stability.NOT_STABLE
+    if roots.is_refutation and (is_near_rest or looks_unstable):
+        stability = Stability.OPEN if end.operator_acts else Stability.NOT_STABLE
+        return StabilityDecision(stability, roots.describe_as_basis(), reasons)
+    if not roots.is_proof:
+        return None
+    if reasons:
+        return StabilityDecision(Stability.OPEN, "", reasons)
+    # Pushes of a run that rests where its loop is stable die away in the end, even if they
+    # still grow in the transient before the rest.
+    if is_near_rest and end.behaviour is EndBehaviour.CONVERGED:
+        return StabilityDecision(Stability.STABLE, "; ".join(run.all_proofs))
+    return None
 
 
 def _list_reasons(run: RunFindings) -> tuple[str, ...]:

@@ -56,7 +56,7 @@ from ..scenario.delay_period import (
     find_final_link,
 )
 from .envelope_trend import EnvelopeFit, EnvelopeTrend, fit_envelopes
-from .run_end import RunEnd, find_coupled_sites
+from .run_end import RunEnd, classify_log_end, find_coupled_sites
 
 LEAST_LEFT_S = 5.0
 """Shortest departure from a rest position that counts, in s."""
@@ -882,7 +882,8 @@ def twin(
         at_s: Time of the pushes, in s.
         push: Sizes by target, with one twin per push. A target is a joint's angle,
             `{"m1.q1": 1e-6}`, its speed, `m1.qd1`, an estimate, `m1.theta1`, or many of them
-            in a random direction, `m1.q` or `q`. By default the pushes are those of `certify`.
+            in a random direction, `m1.q` or `q`. By default the pushes are those of `certify`,
+            and at 0 s their growth is judged as it judges them.
         delta: Sizes of a single push, as in "1e-9:1e-3", with one twin per decade.
 
     Raises:
@@ -902,6 +903,10 @@ def twin(
         names = ", ".join(target for target, _ in targets)
         raise UsageError(f"--delta sweeps the size of one push, not of {names}")
 
+    # Without options the twins are those of a certificate, and so is the part that is judged.
+    is_of_certificate = not targets and not delta and at_s == 0.0
+    counts_from_s = at_s
+    quiet_from_s = math.inf
     sizes = []
     if delta:
         target, _ = next(iter(targets), ("q", 0.0))
@@ -912,11 +917,17 @@ def twin(
         ]
     elif targets:
         pushes = [parse_push(scenario, target, size, at_s) for target, size in targets]
+    elif is_of_certificate:
+        pushes = choose_pushes(scenario)
+        end = classify_log_end(log)
+        counts_from_s = end.counts_from_s
+        quiet_from_s = end.quiet_from_s
     else:
         pushes = [
             default._replace(at_s=at_s, again=False) for default in choose_pushes(scenario)
         ]
-    growth = judge_twins(scenario, run_twins(log, pushes, own_laws=True), at_s, math.inf)
+    twins = run_twins(log, pushes, own_laws=True)
+    growth = judge_twins(scenario, twins, counts_from_s, quiet_from_s)
     linear = _find_linear_sizes(scenario, growth, sizes) if delta else None
     return PushedTwins(log, at_s, growth, linear)
 

@@ -373,6 +373,16 @@ def find_equilibrium(scenario: Scenario, pose: tuple[float, ...] | None = None) 
         rest = _find_at_run_end(scenario, conditions)
     else:
         rest = _build_at_pose(pose, conditions)
+    return add_limit_notes(conditions, rest)
+
+
+def add_limit_notes(conditions: OperatingConditions, rest: Equilibrium) -> Equilibrium:
+    """Returns an equilibrium with remarks on effects that its linear loop misses.
+
+    Args:
+        conditions: The sites, gains and delays of the loop.
+        rest: The equilibrium.
+    """
     return rest._replace(notes=tuple(_describe_limits(conditions, rest)))
 
 

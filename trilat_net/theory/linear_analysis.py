@@ -6,10 +6,12 @@ computed for the sampled loop, whose controllers compute once per tick (period o
 loop), and for its continuous approximation. The analysis also contains the delay margin and, if
 requested, the settings at the edge of stability and what operators feel.
 
-For a recorded run, the equilibrium is the last pose, with the last parameter estimates. Delays
-and operators are as at the end of the run. If delays are random or measured, the sampled loop
-uses the delays that occurred in the last quarter of the run. The continuous loop uses their
-means. The recorded run is not executed again, except to see whether small pushes grow.
+Without a given pose, the loop is the one whose roots a stability certificate states: that of
+`loop_roots`, at the rest nearest to the end of a run. If delays are random or measured, the
+sampled loop uses the delays that occurred in the last quarter of the run, and the continuous
+loop uses their means. For a log, the loop is that after all commands, and the recorded run is
+not executed again. For a scenario, its run is simulated. Only if this run diverges, or if there
+is no rest near its end, the equilibrium is predicted, or that of a longer run.
 
 Invariant:
     - The verdict is based on the sampled loop, at any tick rates and delays. If a control law
@@ -20,12 +22,14 @@ Invariant:
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..core.vectors import Array
-from ..errors import UsageError
+from ..errors import ScenarioError, UsageError
+from ..execution.fused import FusedRun
+from ..log.log_reader import Log
 from ..results import Result
 from ..scenario import Scenario, load_scenario
 from ..scenario.describe import (
@@ -35,10 +39,11 @@ from ..scenario.describe import (
 )
 from .characteristic_roots import CharacteristicRoot, Spectrum, compute_delay_spectrum
 from .delay_margin import DelayMargin, find_delay_margin
-from .equilibrium import find_equilibrium
-from .floquet import compute_sampled_spectrum
+from .equilibrium import add_limit_notes, find_equilibrium
+from .floquet import SamplesInUse, compute_sampled_spectrum
 from .linear_edge import EdgeScan, iterate_linear_edges, parse_edge_range
 from .linear_loop import LinearLoop, compute_shared_poses, linearise_loop
+from .loop_roots import find_log_loop, find_run_loop, resolve_final_scenario
 from .numeric_law import NumericLaw
 from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
 from .port_analysis import PortAnalysis, analyse_ports, ports_to_json
@@ -236,8 +241,54 @@ class LinearAnalysis(Result):
         return nearest
 
 
+class _AnalysedLoop(NamedTuple):
+    """The loop that is analysed.
+
+    Attributes:
+        scenario: The scenario.
+        conditions: The numbers from which the loop is built.
+        rest: The equilibrium.
+        uses: The samples in use in every tick. None if the scenario determines them.
+    """
+
+    scenario: Scenario
+    conditions: OperatingConditions
+    rest: Equilibrium
+    uses: SamplesInUse | None = None
+
+
+def _find_end_loop(scenario: Scenario, log: Log | None) -> _AnalysedLoop:
+    """Returns the loop at the end of a run, whose roots a stability certificate states.
+
+    If it does not exist, the equilibrium is that of a longer run, or a prediction.
+
+    Args:
+        scenario: The scenario of the run.
+        log: The log of the run. None to simulate the run.
+    """
+    conditions = derive_operating_conditions(scenario)
+    try:
+        if log is not None:
+            scenario = resolve_final_scenario(log)
+            end = find_log_loop(log, own_laws=True)
+        else:
+            run = FusedRun(scenario)
+            run.advance_to(scenario.duration_s)
+            end = find_run_loop(scenario, run)
+    except ScenarioError:
+        return _AnalysedLoop(scenario, conditions, find_equilibrium(scenario))
+
+    if not end.has_mean_ages:
+        conditions = end.conditions
+    else:
+        # The remarks on delays that vary stay, although the loop has only their means.
+        conditions = conditions._replace(age_s=end.conditions.age_s)
+    rest = add_limit_notes(conditions, end.rest)
+    return _AnalysedLoop(scenario, conditions, rest, end.uses)
+
+
 def analyse_linear_loop(
-    source: str | Path | Scenario,
+    source: str | Path | Scenario | Log,
     overrides: Mapping[str, Any] | Sequence[str] = (),
     *,
     pose: tuple[float, ...] | None = None,
@@ -251,9 +302,10 @@ def analyse_linear_loop(
     The control loop is linearised about a pose in which all arms rest.
 
     Args:
-        source: A scenario (description of an experiment), its file, or the name of a shipped
+        source: A scenario (description of an experiment), its file, the name of a shipped
+            scenario, or the log of a run.
+        overrides: Settings of the scenario that are replaced. A log then counts only as its
             scenario.
-        overrides: Settings of the scenario that are replaced.
         pose: Pose of rest that all arms share, in rad. None for the pose at the end of a run.
         roots: Number of characteristic roots to compute.
         over: Ranges of settings in which to search the values where stability changes, such as
@@ -270,8 +322,15 @@ def analyse_linear_loop(
         raise UsageError(f"--roots is a number of roots, 1 to {MAX_ROOTS}, not {roots}")
 
     scenario = load_scenario(source, overrides)
-    conditions = derive_operating_conditions(scenario)
-    rest = find_equilibrium(scenario, pose)
+    if pose is None:
+        log = source if isinstance(source, Log) and not overrides else None
+        analysed = _find_end_loop(scenario, log)
+    else:
+        conditions = derive_operating_conditions(scenario)
+        analysed = _AnalysedLoop(scenario, conditions, find_equilibrium(scenario, pose))
+    scenario = analysed.scenario
+    conditions = analysed.conditions
+    rest = analysed.rest
     loop = linearise_loop(conditions, rest)
 
     analysis = LinearAnalysis(
@@ -280,7 +339,7 @@ def analyse_linear_loop(
         rest=rest,
         loop=loop,
         continuous=compute_delay_spectrum(loop, roots),
-        sampled=compute_sampled_spectrum(conditions, rest, roots),
+        sampled=compute_sampled_spectrum(conditions, rest, roots, analysed.uses),
         margin=find_delay_margin(loop),
     )
 

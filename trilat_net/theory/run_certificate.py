@@ -10,21 +10,26 @@ Invariant:
 """
 
 from dataclasses import replace
+from typing import NamedTuple
+
+import msgspec
 
 from ..analysis.certificate.stability_certificate import Certificate, certify
-from ..analysis.run_end import RunEnd
+from ..analysis.run_end import RunEnd, RunTrace, classify_run_end
 from ..analysis.stability_decision import (
     LoopRoots,
     RunFindings,
     StabilityDecision,
     decide_stability,
+    is_decided_by_roots,
 )
-from ..analysis.twin_growth import TwinGrowth, measure_twins
+from ..analysis.twin_growth import TwinGrowth, measure_twins, measure_virtual_twins
+from ..execution.fused import FusedRun
 from ..log.accounting import MIN_COVERAGE
 from ..log.log_reader import Log
 from ..scenario import Scenario
 from ..scenario.describe import describe_law_conditions, list_law_proofs
-from .loop_roots import find_log_roots, resolve_final_scenario
+from .loop_roots import find_log_roots, find_run_roots, resolve_final_scenario
 
 
 def certify_run(
@@ -64,24 +69,48 @@ def certify_run(
     )
 
 
-def decide_virtual_run(
-    scenario: Scenario,
-    end: RunEnd,
-    roots: LoopRoots,
-    twins: TwinGrowth | None = None,
-) -> StabilityDecision:
-    """Decides whether a simulated run is stable, as its certificate would.
+class VirtualJudgement(NamedTuple):
+    """Judgement of a simulated run without a log.
 
-    Args:
-        scenario: Scenario of the run, with the duration of the run.
+    Attributes:
         end: How the motion ends.
         roots: Roots of the loop at the end of the run.
-        twins: How small pushes in repeated runs develop. None if no run was repeated.
+        twins: How small pushes in repeated runs develop. None if the roots decide without them.
+        decision: The decision.
     """
+
+    end: RunEnd
+    roots: LoopRoots
+    twins: TwinGrowth | None
+    decision: StabilityDecision
+
+
+def judge_virtual_run(
+    scenario: Scenario, run: FusedRun, end: RunEnd | None = None
+) -> VirtualJudgement:
+    """Judges a simulated run as its certificate would, without a log.
+
+    Twins, one for every joint, are executed only if they may change the decision.
+
+    Args:
+        scenario: Scenario of the run. Its duration may be shorter than that of the run.
+        run: The run in the fused loop.
+        end: How the motion ends. None to find it from the run.
+    """
+    ended = scenario
+    if run.diverged_s is None:
+        ended = msgspec.structs.replace(scenario, duration_s=run.ran_s)
+    if end is None:
+        trace = RunTrace(run.buckets, run.tau_x, run.diverged_s)
+        end = classify_run_end(ended, trace)
     findings = RunFindings(
         end=end,
-        twins=twins,
-        roots=roots,
-        proofs=list_law_proofs(scenario),
+        roots=find_run_roots(ended, run),
+        proofs=list_law_proofs(ended),
     )
-    return decide_stability(findings)
+    twins = None
+    if not is_decided_by_roots(findings):
+        twins = measure_virtual_twins(ended, end, run.ran_s)
+        findings = findings._replace(twins=twins)
+    assert findings.roots is not None
+    return VirtualJudgement(end, findings.roots, twins, decide_stability(findings))

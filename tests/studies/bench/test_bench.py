@@ -343,12 +343,12 @@ def test_length_follows_the_slowest_time_constant(
     judged = judged_run(rate_per_s)
     monkeypatch.setattr(
         bench_run,
-        "_judge",
-        lambda scenario, to_s, _: judged._replace(
+        "judge_bench_run",
+        lambda scenario, to_s: judged._replace(
             scenario=msgspec.structs.replace(scenario, duration_s=to_s)
         ),
     )
-    longer = lengthen_run(judged, 1)
+    longer = lengthen_run(judged)
     assert longer.scenario.duration_s == length_s
     assert words in longer.text
 
@@ -357,7 +357,7 @@ def test_a_decided_run_at_rest_is_long_enough() -> None:
     fit = EnvelopeFit(EnvelopeTrend.DECAYS, -0.02)
     end = RunEnd(EndBehaviour.CONVERGED, fit, fit, 0.0, 0.0)
     judged = judged_run(-0.001, end=end, stability=Stability.SETTLED)
-    assert lengthen_run(judged, 1) is judged
+    assert lengthen_run(judged) is judged
 
 
 def test_a_longer_run_refutes_or_confirms() -> None:

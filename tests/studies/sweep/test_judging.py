@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 import trilat_net
-from trilat_net.analysis.run_end import EndBehaviour, Stability, classify_log_end
+from trilat_net.analysis.run_end import EndBehaviour, Stability
 from trilat_net.execution import virtual
 from trilat_net.execution.fused import FusedRun
 from trilat_net.log.log_reader import open_log
@@ -18,7 +18,7 @@ from trilat_net.studies.sweep.sweep_cell import (
     CellClass,
     CellResult,
     classify_cell,
-    classify_end,
+    classify_decision,
     is_conclusive,
 )
 from trilat_net.theory.run_certificate import certify_run
@@ -48,9 +48,11 @@ def test_the_word_and_the_numbers_are_those_of_a_log(run: str) -> None:
     virtual.write_virtual_log(scenario, stream)
     stream.seek(0)
     log = open_log(stream)
-    found, expected = judged(scenario), classify_log_end(log)
+    found, certificate = judged(scenario), certify_run(log)
+    expected = certificate.end
     assert found.motion is expected.behaviour
-    assert found.verdict is classify_end(expected)
+    assert found.verdict is classify_decision(certificate.stability, expected.behaviour)
+    assert found.stability == certificate.stability
     assert (found.end_error_rad, found.end_speed_rad_s) == (
         expected.end_error_rad,
         expected.end_speed_rad_s,

@@ -1,7 +1,8 @@
 """Executes the runs of the benchmark suite: judges and measures each run, and stores it.
 
-A run is judged by its end (`analysis.run_end`) and by its twins (`analysis.twin_growth`). A
-twin is a repetition of the run with a small disturbance, which shows whether disturbances grow.
+A run is judged as its stability certificate would judge it (`theory.run_certificate`): by its
+end, by the characteristic roots of its loop, and by its twins where they matter. A twin is a
+repetition of the run with a small disturbance, which shows whether disturbances grow.
 A run is made longer if its judgement needs more time: it then lasts for `TIME_CONSTANTS` of its
 slowest time constants. A run that is not stable is repeated over twice its length. Errors,
 efforts and forces are measured over the time of the task only, from the same records that
@@ -32,15 +33,14 @@ from ...analysis.run_end import THROWN_RAD, EndBehaviour, RunEnd, Stability
 from ...analysis.site_signals import SETTLED_ERROR_RAD
 from ...analysis.stability_decision import LoopRoots
 from ...analysis.torque_sources import list_walls, wall_force
-from ...analysis.twin_growth import TwinGrowth, measure_virtual_twins
+from ...analysis.twin_growth import TwinGrowth
 from ...core.ticks import NS_PER_S
 from ...core.vectors import Array
 from ...errors import UsageError
 from ...files import make_results_folder, refuse_link, write_whole
 from ...scenario import Scenario
 from ...scenario.operators.kernel_operators import ViscousEnvironment
-from ...theory.loop_roots import find_run_roots
-from ...theory.run_certificate import decide_virtual_run
+from ...theory.run_certificate import judge_virtual_run
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
 from ..measure_run import RecordBatch, run_whole
 from ..study_folder import RunJournal, StudyFolder, build_resume_hint, describe_program
@@ -115,28 +115,31 @@ class BenchRunItem(NamedTuple):
 class JudgedRun(NamedTuple):
     """A run of the suite with all of its records, and the judgement whether it is stable.
 
-    The judgement takes twins into account: repeated runs with a small disturbance, which show
-    whether disturbances grow.
+    The judgement takes twins into account where they matter: repeated runs with a small
+    disturbance, which show whether disturbances grow.
 
     Attributes:
         scenario: Scenario of the run. Its duration is that of the run.
         records: All records of the run, by site.
         end: Analysis of the end of the run.
-        twins: Growth of the small disturbances of the twins.
+        twins: Growth of the small disturbances of the twins. None if the roots decide without
+            them.
         roots: Characteristic roots of the loop at the end of the run.
         stability: The judgement.
         text: Explanation of the judgement.
         at_limit: True if the run would have needed more than `MAX_RUN_TICKS` ticks.
+        rests_on: What the judgement rests on, as in the stability certificate.
     """
 
     scenario: Scenario
     records: dict[str, RecordBatch]
     end: RunEnd
-    twins: TwinGrowth
+    twins: TwinGrowth | None
     roots: LoopRoots
     stability: Stability
     text: str
     at_limit: bool = False
+    rests_on: str = ""
 
     @property
     def diverged(self) -> bool:
@@ -158,14 +161,12 @@ def run_bench_task(item: BenchRunItem) -> BenchRun:
     """
     cell = item.cell
     scenario = cell.build(item.seed).scenario
-    # Each joint is pushed in the run of the first seed, and all joints together in the others.
-    twins = None if item.seed == cell.seeds[0] else 1
     is_repeated = item.to_s > 0.0
     if is_repeated:
-        judged = _judge(scenario, item.to_s, twins)
+        judged = judge_bench_run(scenario, item.to_s)
     else:
-        judged = _judge(scenario, scenario.duration_s, twins)
-        judged = lengthen_run(judged, twins)
+        judged = judge_bench_run(scenario, scenario.duration_s)
+        judged = lengthen_run(judged)
 
     run = BenchRun(
         name=cell.name,
@@ -191,33 +192,30 @@ def run_bench_task(item: BenchRunItem) -> BenchRun:
     return run
 
 
-def _judge(scenario: Scenario, length_s: float, twins: int | None) -> JudgedRun:
-    """Executes a scenario and its twins, and judges the run.
+def judge_bench_run(scenario: Scenario, length_s: float) -> JudgedRun:
+    """Executes a scenario, and judges the run as its certificate would.
 
     Args:
         scenario: The scenario. Its own duration is ignored.
         length_s: Duration of the run, in s.
-        twins: Number of twins. None for one per joint.
     """
     scenario = msgspec.structs.replace(scenario, duration_s=length_s)
     records, end, run = run_whole(scenario)
-    growth = TwinGrowth("the run diverged")
-    if end.diverged_at_s is None:
-        growth = measure_virtual_twins(scenario, end, length_s, twins)
-    roots = find_run_roots(scenario, run)
-    decision = decide_virtual_run(scenario, end, roots, growth)
+    judged = judge_virtual_run(scenario, run, end)
+    decision = judged.decision
     return JudgedRun(
         scenario=scenario,
         records=records,
         end=end,
-        twins=growth,
-        roots=roots,
+        twins=judged.twins,
+        roots=judged.roots,
         stability=decision.stability,
         text="; ".join(decision.reasons) or decision.rests_on or end.text,
+        rests_on=decision.rests_on,
     )
 
 
-def lengthen_run(judged: JudgedRun, twins: int | None) -> JudgedRun:
+def lengthen_run(judged: JudgedRun) -> JudgedRun:
     """Repeats a run over a longer time if its judgement needs more time.
 
     A run that is stable or settled, and whose arms are at rest at its end, is long enough. Any
@@ -225,7 +223,6 @@ def lengthen_run(judged: JudgedRun, twins: int | None) -> JudgedRun:
 
     Args:
         judged: The run.
-        twins: Number of twins of a repeated run. None for one per joint.
 
     Returns:
         The longer run, or the same run if it is long enough.
@@ -241,7 +238,7 @@ def lengthen_run(judged: JudgedRun, twins: int | None) -> JudgedRun:
     limit_s = compute_longest_s(judged.scenario)
     longer_s = float(math.ceil(min(required_s, limit_s)))
     if longer_s > length_s:
-        judged = _judge(judged.scenario, longer_s, twins)
+        judged = judge_bench_run(judged.scenario, longer_s)
     if required_s <= limit_s or judged.diverged:
         return judged
     limit_text = (
@@ -273,7 +270,8 @@ def _find_slowest_s(judged: JudgedRun) -> float:
         return -1.0 / root_per_s if root_per_s < 0.0 else 0.0
     end = judged.end
     rates_per_s = [end.error.rate_per_s, end.speed.rate_per_s]
-    rates_per_s += [push.rate_per_s for push in judged.twins.pushes if push.factor > 0.0]
+    pushes = () if judged.twins is None else judged.twins.pushes
+    rates_per_s += [push.rate_per_s for push in pushes if push.factor > 0.0]
     # A rate below 0 means decay. Its time constant is the inverse.
     time_constants_s = [-1.0 / rate for rate in rates_per_s if rate < 0.0]
     return max(time_constants_s, default=0.0)

@@ -24,7 +24,7 @@ from ...errors import LogError, UsageError
 from ...log.log_reader import open_log
 from ...reporting.result_text import TextTable
 from ...scenario import Scenario, parse_scenario
-from .sweep_cell import CellClass, classify_end
+from .sweep_cell import CellClass, classify_decision
 from .sweep_plan import label_axis
 from .sweep_results import ResultRow
 
@@ -185,7 +185,7 @@ def confirm_cell(row: ResultRow, run: SessionRunner) -> ConfirmedCell:
             text = "; ".join(problems)
         else:
             text = end.text
-            live = classify_end(end)
+            live = classify_decision(end.stability, end.behaviour)
     log = path if path.exists() else None
     return ConfirmedCell(row=row, virtual=virtual, live=live, text=text, log=log)
 

@@ -7,8 +7,8 @@ again.
 
 Invariant:
     - A result is a function of the cell's scenario and of the longest allowed duration.
-    - A log of the same run gets the same class, because the class uses the same numbers as the
-      judgement of a log.
+    - A log of the same run gets the same decision, because a cell is judged by
+      `run_certificate.judge_virtual_run`, and its roots are those of `loop_roots`.
     - To save space, a run stores only how the text of its scenario differs from the text of the
       sweep's scenario. The stored difference restores every text exactly.
 """
@@ -19,19 +19,16 @@ from enum import StrEnum
 from itertools import chain
 
 import msgspec
-import numpy as np
 
-from ...analysis.envelope_trend import FLOOR_RAD, EnvelopeTrend
-from ...analysis.run_end import EndBehaviour, RunEnd, RunTrace, Stability, classify_run_end
+from ...analysis.run_end import EndBehaviour, RunTrace, Stability, classify_run_end
 from ...analysis.site_signals import SETTLED_ERROR_RAD
-from ...analysis.twin_growth import TwinGrowth, measure_virtual_twins
+from ...analysis.twin_growth import measure_virtual_twins
 from ...execution.fused import FusedRun, RunTotals, check_fusable
 from ...results import finite_or_none
 from ...scenario import Scenario, parse_scenario
 from ...scenario.validate import refuse_live_only
-from ...theory.characteristic_roots import STABILITY_EDGE_PER_S
-from ...theory.linear_edge import find_contact_growth
 from ...theory.loop_roots import find_run_roots
+from ...theory.run_certificate import judge_virtual_run
 
 
 class CellClass(StrEnum):
@@ -53,21 +50,24 @@ class CellClass(StrEnum):
         return self is CellClass.CONVERGED
 
 
-def classify_end(end: RunEnd) -> CellClass:
-    """Returns the class of a run of a sweep, given the judgement of its end.
+def classify_decision(stability: Stability, behaviour: EndBehaviour) -> CellClass:
+    """Returns the class of a run of a sweep, given the decision whether the run is stable.
 
-    A run that is not stable counts as diverged unless it stays bounded. Thus a run that drifts
-    or grows counts as diverged, too.
+    A run that is stable or settled counts as converged. A run that is not stable counts as
+    diverged if it left its limits, drifts or grows, and otherwise as bounded.
 
     Args:
-        end: Judgement of the end of the run.
+        stability: The decision.
+        behaviour: How the run ends.
     """
-    if end.stability is Stability.SETTLED:
+    if stability in (Stability.STABLE, Stability.SETTLED):
         return CellClass.CONVERGED
-    if end.stability is not Stability.NOT_STABLE:
+    if stability is not Stability.NOT_STABLE:
         return CellClass.UNDECIDED
-    bounded = end.behaviour is EndBehaviour.BOUNDED
-    return CellClass.BOUNDED if bounded else CellClass.DIVERGED
+    return CellClass.DIVERGED if behaviour in _DIVERGING else CellClass.BOUNDED
+
+
+_DIVERGING = (EndBehaviour.DIVERGED, EndBehaviour.DRIFTS, EndBehaviour.GROWS)
 
 
 class CellResult(msgspec.Struct, frozen=True):
@@ -100,6 +100,9 @@ class CellResult(msgspec.Struct, frozen=True):
         reasons: Reasons why the run is undecided, as a string.
         exponent_per_s: Growth exponent of the run's twins over the scenario's duration, in 1/s,
             see `measure_exponent`. None without twins, or if no twin moved.
+        stability: The decision whether the run is stable, as in the stability certificate.
+            Empty in results of older versions.
+        rests_on: What the decision rests on, likewise.
     """
 
     verdict: CellClass
@@ -119,6 +122,8 @@ class CellResult(msgspec.Struct, frozen=True):
     walls_j: float | None = None
     reasons: str = ""
     exponent_per_s: float | None = None
+    stability: str = ""
+    rests_on: str = ""
 
 
 TWINS_OF_A_CELL = 4
@@ -149,17 +154,12 @@ def classify_cell(text: str, longest_s: float) -> CellResult:
     """Runs a cell in virtual time and classifies the end of the run.
 
     While a longer run might have another class (see `is_conclusive`), the duration is doubled
-    and the same run continues. If this is still so at `longest_s`, the class of the stability
-    certificate applies, with two exceptions:
+    and the same run continues, at most up to `longest_s`. The decision of the stability
+    certificate about the whole run then gives the class, see `classify_decision`.
 
-    - A slow trend in a run with random links is undecided. The error of such a run wanders, so
-      that a slow trend may be chance.
-    - A run that looks stable although a joint still moves is undecided, unless the small pushes
-      of its twins decay.
-
-    A run whose small motions grow in contact with a sampled wall is not extended and is not
-    stable. Such chatter may end after minutes, once the estimates of the law have drifted, but
-    this does not make the cell stable.
+    A run that chatters at a sampled wall, where its small motions grow, is not extended. Such
+    chatter may end after minutes, once the estimates of the law have drifted, but this does not
+    make the cell stable.
 
     Args:
         text: Canonical text of the cell's scenario. Its `duration_s` is the first duration.
@@ -168,41 +168,29 @@ def classify_cell(text: str, longest_s: float) -> CellResult:
     """
     scenario = parse_scenario(text)
     run = FusedRun(scenario, SETTLED_ERROR_RAD)
-    growth_per_s = _advance_in_contact(scenario, run)
+    run.advance_to(scenario.duration_s)
     totals = run.totals
     extended = 0
     outcome = _build_result(run, scenario, totals, extended)
 
-    has_chatter = growth_per_s > 0.0
-    if has_chatter:
-        diverged = outcome.verdict is CellClass.DIVERGED
-        verdict = CellClass.DIVERGED if diverged else CellClass.BOUNDED
-        reason = f"in contact with a sampled wall small motions grow by {growth_per_s:+.3g} /s"
-        return msgspec.structs.replace(outcome, verdict=verdict, reasons=reason)
-
     end_s = scenario.duration_s
+    if end_s < longest_s and _chatters(scenario, run):
+        longest_s = end_s
     while not is_conclusive(outcome) and end_s < longest_s:
         end_s = min(2.0 * end_s, longest_s)
         extended += 1
         run.advance_to(end_s)
         outcome = _build_result(run, scenario, totals, extended)
 
-    undecided = CellClass.UNDECIDED
-    roots = find_run_roots(scenario, run)
-    if roots.is_refutation and outcome.verdict is not CellClass.DIVERGED:
-        return msgspec.structs.replace(outcome, verdict=CellClass.BOUNDED, reasons=roots.text)
-    if roots.is_proof and outcome.verdict is CellClass.BOUNDED:
-        return msgspec.structs.replace(outcome, verdict=undecided, reasons=roots.text)
-    if roots.is_proof and outcome.verdict is CellClass.CONVERGED:
-        return outcome
-    has_trend = outcome.motion in (EndBehaviour.GROWS, EndBehaviour.DECAYS)
-    if scenario.links_random and has_trend and not _has_pronounced_trend(outcome):
-        return msgspec.structs.replace(outcome, verdict=undecided)
-    if outcome.verdict is CellClass.CONVERGED and _is_still_moving(run):
-        twins = _measure_twins(scenario, run)
-        if twins.trend not in (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY):
-            return msgspec.structs.replace(outcome, verdict=undecided, reasons=twins.text)
-    return outcome
+    judged = judge_virtual_run(scenario, run)
+    decision = judged.decision
+    return msgspec.structs.replace(
+        outcome,
+        verdict=classify_decision(decision.stability, judged.end.behaviour),
+        reasons="; ".join(decision.reasons),
+        stability=decision.stability.value,
+        rests_on=decision.rests_on,
+    )
 
 
 def measure_exponent(scenario: Scenario) -> float | None:
@@ -221,56 +209,26 @@ def measure_exponent(scenario: Scenario) -> float | None:
     """
     run = FusedRun(scenario, SETTLED_ERROR_RAD)
     run.advance_to(scenario.duration_s)
-    twins = _measure_twins(scenario, run)
+    end = classify_run_end(scenario, RunTrace(run.buckets, run.tau_x, run.diverged_s))
+    twins = measure_virtual_twins(scenario, end, run.ran_s, TWINS_OF_A_CELL)
     rates_per_s = [push.rate_per_s for push in twins.pushes]
     return max(filter(math.isfinite, rates_per_s), default=None)
 
 
-def _measure_twins(scenario: Scenario, run: FusedRun) -> TwinGrowth:
-    """Measures how small pushes to a run grow, up to the time that the run has reached."""
-    end = classify_run_end(scenario, RunTrace(run.buckets, run.tau_x, run.diverged_s))
-    return measure_virtual_twins(scenario, end, run.ran_s, TWINS_OF_A_CELL)
+def _chatters(scenario: Scenario, run: FusedRun) -> bool:
+    """Returns True if small motions of a run grow in contact with a sampled wall.
 
+    The force of a sampled wall is computed once per tick and held. Such a wall can generate
+    energy.
 
-def _is_still_moving(run: FusedRun) -> bool:
-    """Returns True if the speed of a joint did not halve over the second half of a run.
-
-    The largest speeds of the first and of the last quarter of this half are compared. Speeds
-    below the rounding floor count as standing still.
-    """
-    for maxima in run.buckets:
-        joints = maxima.shape[1] // 3  # the columns are errors, speeds and angles
-        second_half = len(maxima) // 2
-        speeds = maxima[second_half:, joints : 2 * joints]
-        quarter = len(speeds) // 4
-        first = speeds[:quarter].max(axis=0)
-        last = speeds[-quarter:].max(axis=0)
-        if (last > np.maximum(0.5 * first, FLOOR_RAD)).any():
-            return True
-    return False
-
-
-def _advance_in_contact(scenario: Scenario, run: FusedRun) -> float:
-    """Runs a scenario to its duration, and checks the contact with sampled walls.
-
-    A sampled wall is one whose force is computed once per tick and held. Such a wall can
-    generate energy. Small motions in contact then grow (chatter), see `find_contact_growth`.
-
-    Returns:
-        Growth rate of small motions in contact, in 1/s. It is 0 if they do not grow, and if no
-        sampled wall is touched in the last quarter of the run.
+    Args:
+        scenario: Scenario of the run.
+        run: The run, up to the duration of the scenario.
     """
     environments = chain.from_iterable(spec.environment for spec in scenario.sites.values())
-    has_sampled_wall = any(environment.actor.sampled for environment in environments)
-    if not has_sampled_wall:
-        run.advance_to(scenario.duration_s)
-        return 0.0
-    states = run.run_and_sample(scenario.duration_s)
-    if run.diverged_s is not None:
-        return 0.0
-
-    growth_per_s = find_contact_growth(scenario, *states)
-    return growth_per_s if growth_per_s > STABILITY_EDGE_PER_S else 0.0
+    if not any(environment.actor.sampled for environment in environments):
+        return False
+    return find_run_roots(scenario, run).is_refutation
 
 
 def is_conclusive(outcome: CellResult) -> bool:
@@ -334,7 +292,7 @@ def _build_result(
     """
     end = classify_run_end(scenario, RunTrace(run.buckets, run.tau_x, run.diverged_s))
     return CellResult(
-        verdict=classify_end(end),
+        verdict=classify_decision(end.stability, end.behaviour),
         motion=end.behaviour,
         ran_s=run.ran_s,
         extended=extended,
