@@ -50,6 +50,8 @@ SAME_ROOT_TOLERANCE = 1e-8
 """Largest difference of two guesses of the same root, relative to 1 + abs(s)."""
 STABILITY_EDGE_PER_S = 1e-6
 """Largest distance from the imaginary axis of a root that counts as on the axis, in 1/s."""
+EDGE_DEVIATIONS = 2.0
+"""Standard deviations within which a root of random delays counts as zero."""
 ROOT_RESIDUAL_TOLERANCE = 1e-12
 """Largest residual of a root, relative to the norms of the terms of Delta."""
 _MAX_NEWTON_STEPS = 30
@@ -371,7 +373,8 @@ class Spectrum(NamedTuple):
         rightmost_per_s = -math.inf
         if self.roots:
             rightmost_per_s = self.roots[0].s.real
-        edge_per_s = max(STABILITY_EDGE_PER_S, self.deviation_per_s or 0.0)
+        uncertainty_per_s = EDGE_DEVIATIONS * (self.deviation_per_s or 0.0)
+        edge_per_s = max(STABILITY_EDGE_PER_S, uncertainty_per_s)
         if rightmost_per_s > edge_per_s:
             return "unstable"
         if rightmost_per_s >= -edge_per_s or self.drifting:

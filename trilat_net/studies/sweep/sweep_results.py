@@ -256,8 +256,8 @@ def _list_result_columns(plan: SweepPlan) -> dict[str, type]:
     # All fields of a result are numbers, except those whose types are corrected below.
     number_columns = (*plan.metrics, *CellResult.__struct_fields__)
     column_types |= dict.fromkeys(number_columns, float)
-    text_columns = ("verdict", "motion", "reasons", "scenario_sha256", "command")
-    column_types |= dict.fromkeys(text_columns, str)
+    text_columns = ("verdict", "motion", "reasons", "stability", "rests_on", "scenario_sha256")
+    column_types |= dict.fromkeys((*text_columns, "command"), str)
     return column_types | {"extended": int}
 
 
