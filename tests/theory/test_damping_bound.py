@@ -16,6 +16,8 @@ from trilat_net.laws.conditions import (
     StabilityCondition,
     judge_position_exchange,
 )
+from trilat_net.scenario import load_scenario
+from trilat_net.scenario.describe import describe_law_conditions, list_law_proofs
 from trilat_net.studies.sweep.stability_map import evaluate_criterion
 from trilat_net.theory import analyse_linear_loop
 from trilat_net.theory.characteristic_roots import compute_delay_spectrum
@@ -315,3 +317,17 @@ def test_slopes_up_to_k_alone_are_not_enough() -> None:
         slopes = slopes_of_tanh(np.array(poses), K, 5.0)
         spectrum = compute_delay_spectrum(sloped(slopes, 0.6 * K * 0.1).loop, 2)
         assert spectrum.verdict != "unstable"
+
+
+def test_springs_between_end_effectors_have_no_known_bound() -> None:
+    """Their stiffness belongs to x, y and z, and their damping to the joints."""
+    scenario = load_scenario(
+        "two_sites",
+        {
+            "control": {"law": "p_d", "K": 12.0, "d": 4.0},
+            "task": {"space": "position", "axes": ["x", "y"]},
+        },
+    )
+    (condition,) = describe_law_conditions(scenario)
+    assert "is undecided: known for joints that follow joints" in condition
+    assert list_law_proofs(scenario) == []

@@ -63,6 +63,7 @@ class LawSituation(NamedTuple):
         hands: Per site the operators and environments that react to the motion of its arm. None
             instead of them if the reaction of one is not a spring and a damper per joint. ()
             instead of all sites if nothing is known.
+        in_task_space: True if end effectors follow each other, instead of joints.
     """
 
     site: int
@@ -75,6 +76,7 @@ class LawSituation(NamedTuple):
     gravity_nm: tuple[float, ...] = ()
     hold_s: float = 0.0
     hands: tuple[tuple[ArmLoad, ...] | None, ...] = ()
+    in_task_space: bool = False
 
     @property
     def longest_s(self) -> float:
@@ -161,10 +163,13 @@ def judge_position_exchange(
         damping: Name of the law's attribute with d.
 
     Returns:
-        The condition. It is undecided for delays that vary, for several tick rates, and if the
-        sites have different laws.
+        The condition. It is undecided for delays that vary, for several tick rates, in task
+        space, and if the sites have different laws.
     """
     laws = situation.laws
+    if situation.in_task_space:
+        # The stiffness belongs to coordinates of the end effector, and the damping to joints.
+        return StabilityCondition(None, "known for joints that follow joints")
     hold_s = situation.hold_s
     K = np.array([getattr(law, stiffness, [np.nan]) for law in laws])
     d = np.array([getattr(law, damping, [np.nan]) for law in laws])

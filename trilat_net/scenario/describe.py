@@ -167,6 +167,7 @@ def _list_situations(scenario: Scenario) -> Iterator[tuple[str, LawSettings, Law
             gravity_nm=scenario.arms[name].largest_gravity(site.arm.g_m_s2),
             hold_s=hold_s,
             hands=hands,
+            in_task_space=scenario.layout(name).task,
         )
         yield name, scenario.controls[n], situation
 
