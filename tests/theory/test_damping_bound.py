@@ -326,6 +326,8 @@ def test_springs_between_end_effectors_have_no_known_bound() -> None:
         {
             "control": {"law": "p_d", "K": 12.0, "d": 4.0},
             "task": {"space": "position", "axes": ["x", "y"]},
+            "sites.m.q0_rad": [0.2, 1.4],
+            "sites.s.q0_rad": [0.3, 1.3],
         },
     )
     (condition,) = describe_law_conditions(scenario)
