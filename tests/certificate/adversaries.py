@@ -23,8 +23,7 @@ import numpy as np
 
 import trilat_net
 from trilat_net.analysis.certificate.premises import explain_no_functional
-from trilat_net.analysis.run_end import RunEnd, RunTrace, Stability, classify_run_end
-from trilat_net.analysis.twin_growth import measure_virtual_twins
+from trilat_net.analysis.run_end import Stability
 from trilat_net.core.ticks import BUCKETS_PER_S, NS_PER_S
 from trilat_net.core.two_link_arm import JOINTS
 from trilat_net.core.vectors import Array
@@ -35,13 +34,11 @@ from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.studies.sweep.sweep_cell import classify_cell
 from trilat_net.theory.equilibrium import extend_scenario, follow_equilibrium
 from trilat_net.theory.linear_edge import find_contact_growth, find_rightmost_root
-from trilat_net.theory.loop_roots import find_run_roots
 from trilat_net.theory.operating_point import (
     Equilibrium,
     derive_operating_conditions,
-    is_constant_link,
 )
-from trilat_net.theory.run_certificate import decide_virtual_run
+from trilat_net.theory.run_certificate import judge_virtual_run
 
 from .drawn_loops import (
     SAMPLED,
@@ -734,33 +731,16 @@ def say_of(log: Log) -> str:
     return str(trilat_net.certify(log).stability)
 
 
-class RunInMemory:
-    """A compiled run, from whose end the same is said as from its log."""
-
-    def __init__(self, scenario: Scenario) -> None:
-        self.scenario = scenario
-        self.run = FusedRun(scenario)
-        self.run.advance_to(scenario.duration_s)
-
-    def find_end(self) -> RunEnd:
-        """The judgement of its end."""
-        run = self.run
-        return classify_run_end(self.scenario, RunTrace(run.buckets, run.tau_x, run.diverged_s))
-
-
 def say_of_run(scenario: Scenario) -> str:
     """The word of `trilat certify` on a scenario's run, and no log is made where none is needed.
 
-    V, if the law has one, takes all records, and so do ages that vary.
+    V, if the law has one, takes all records.
     """
-    varies = not all(map(is_constant_link, scenario.links.values()))
-    if varies or not explain_no_functional(scenario):
+    if not explain_no_functional(scenario):
         return say_of(trilat_net.simulate(scenario))
-    whole = RunInMemory(scenario)
-    end = whole.find_end()
-    twins = measure_virtual_twins(scenario, end, scenario.duration_s)
-    roots = find_run_roots(scenario, whole.run)
-    return str(decide_virtual_run(scenario, end, roots, twins).stability)
+    run = FusedRun(scenario)
+    run.advance_to(scenario.duration_s)
+    return str(judge_virtual_run(scenario, run).decision.stability)
 
 
 def say_of_sweep(scenario: Scenario) -> str:

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from tests.certificate.adversaries import RunInMemory
 from tests.core.chain_references import Array, ChainState, chain_references
 from trilat_net.analysis.run_end import Stability
 from trilat_net.scenario import Scenario, load_scenario
+from trilat_net.studies.measure_run import run_whole
 from trilat_net.studies.sweep.sweep_cell import CellClass, classify_cell
 from trilat_net.theory import iterate_linear_edges
 from trilat_net.theory.equilibrium import find_equilibrium
@@ -74,7 +74,7 @@ def say(K: float) -> CellClass:
 
 def end_alone(K: float) -> Stability:
     """What the motion of the run shows by itself."""
-    return RunInMemory(windup(K)).find_end().stability
+    return run_whole(windup(K)).end.stability
 
 
 @pytest.mark.long

@@ -10,8 +10,9 @@ from tests.cli.running import trilat
 from trilat_net.analysis.run_end import classify_log_end
 from trilat_net.log.log_reader import open_log
 from trilat_net.studies.sweep import prepare_sweep_folder, run_sweep
-from trilat_net.studies.sweep.sweep_cell import classify_end
+from trilat_net.studies.sweep.sweep_cell import classify_decision
 from trilat_net.studies.sweep.sweep_results import SweepResults, build_reproduce_command
+from trilat_net.theory.run_certificate import certify_run
 
 from .quick import SHORT, asked
 
@@ -42,7 +43,9 @@ def test_command_of_cell_makes_its_numbers_bit_for_bit(
         seen = classify_log_end(log)
         assert seen.end_error_rad == outcome.end_error_rad
         assert seen.end_speed_rad_s == outcome.end_speed_rad_s
-        assert classify_end(seen) is outcome.verdict
+        stability = certify_run(log).stability
+        assert outcome.stability == stability
+        assert classify_decision(stability, seen.behaviour) is outcome.verdict
         peak = max(float(np.abs(log[name].e).max()) for name in log.sites)
         assert peak == outcome.peak_error_rad
         ended_s = max(float(log[name].t_s[-1]) for name in log.sites)
