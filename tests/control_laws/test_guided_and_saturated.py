@@ -129,6 +129,14 @@ def test_users_share_authority_and_feel_no_environment() -> None:
     assert "authority at s holds: it follows and closes no loop" in told
 
 
+def test_a_single_user_closes_no_loop() -> None:
+    law = {"law": "authority", "K": 100.0, "d": 20.0}
+    followers = {name: {"control": {"leads": False}} for name in TRIO[1:]}
+    scenario = three(law, (0.75, 0.25), {TRIO[0]: {}, **followers})
+    told = " ".join(describe_law_conditions(scenario))
+    assert f"authority at {TRIO[0]} holds: nobody follows anybody" in told
+
+
 @pytest.mark.long
 def test_impedances_give_way_as_they_are_set() -> None:
     push = {"kind": "recorded", "points": [[0.0, 0.0, 0.0], [1.0, 3.0, 3.0], [100.0, 3.0, 3.0]]}

@@ -170,6 +170,9 @@ def judge_position_exchange(
     if situation.in_task_space:
         # The stiffness belongs to coordinates of the end effector, and the damping to joints.
         return StabilityCondition(None, "known for joints that follow joints")
+    if not situation.alpha.any():
+        text = "nobody follows anybody, which closes no loop: stable at every delay and d > 0"
+        return StabilityCondition(True, text)
     hold_s = situation.hold_s
     K = np.array([getattr(law, stiffness, [np.nan]) for law in laws])
     d = np.array([getattr(law, damping, [np.nan]) for law in laws])
