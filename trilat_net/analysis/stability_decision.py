@@ -190,6 +190,25 @@ def is_decided_by_roots(run: RunFindings) -> bool:
     return _decide_by_roots(run, _list_reasons(run)) is not None
 
 
+def _list_reasons(run: RunFindings) -> tuple[str, ...]:
+    """Returns the sentences that prevent a stable or settled run, in the order of the text."""
+    reasons = [*run.end.reasons]
+    reasons += [f"no record of {site}" for site in run.end.missing_sites]
+    twins = run.twins
+    if twins is not None and twins.hides_period and not run.all_proofs:
+        reasons.append(twins.period_text)
+    reasons += run.doubts
+    roots = run.roots
+    if roots is not None and roots.verdict == "unstable":
+        # Twins repeat the recorded ticks. Roots that are not exact do not count if the twins
+        # exclude growth at their rate.
+        excluded_per_s = math.inf if twins is None else twins.excluded_rate_per_s
+        is_excluded = roots.rate_per_s is not None and roots.rate_per_s > excluded_per_s
+        if roots.exact or not is_excluded:
+            reasons.append(roots.text)
+    return tuple(reasons)
+
+
 def _decide_by_roots(run: RunFindings, reasons: tuple[str, ...]) -> StabilityDecision | None:
     """Decides about a run by its end and its exact roots alone.
 
@@ -223,52 +242,26 @@ def _decide_by_roots(run: RunFindings, reasons: tuple[str, ...]) -> StabilityDec
     return None
 
 
-def _list_reasons(run: RunFindings) -> tuple[str, ...]:
-    """Returns the sentences that prevent a stable or settled run, in the order of the text."""
-    reasons = [*run.end.reasons]
-    reasons += [f"no record of {site}" for site in run.end.missing_sites]
-    twins = run.twins
-    if twins is not None and twins.hides_period and not run.all_proofs:
-        reasons.append(twins.period_text)
-    reasons += run.doubts
-    roots = run.roots
-    if roots is not None and roots.verdict == "unstable":
-        # Twins repeat the recorded ticks. Roots that are not exact do not count if the twins
-        # exclude growth at their rate.
-        excluded_per_s = math.inf if twins is None else twins.excluded_rate_per_s
-        is_excluded = roots.rate_per_s is not None and roots.rate_per_s > excluded_per_s
-        if roots.exact or not is_excluded:
-            reasons.append(roots.text)
-    return tuple(reasons)
-
-
 def _find_refutation(run: RunFindings) -> str:
     """Returns the evidence that small motions grow. Empty if there is none.
 
-    The growth of pushes is no evidence if the run slows down, because the run then approaches
-    its twins, or if exact roots are stable.
+    Unstable exact roots of a distant rest are evidence if the run is shorter than the period of
+    its delays, because such a run cannot show by itself where it ends. The growth of pushes is
+    no evidence if the run slows down, because the run then approaches its twins, or if exact
+    roots are stable.
     """
     end = run.end
-    if run.roots is not None and run.roots.is_refutation and _is_near_rest(run):
-        return run.roots.describe_as_basis()
-    if run.twins is None or not run.twins.pushes or run.has_stable_roots:
-        return ""
     twins = run.twins
+    if twins is None:
+        return ""
+    if run.roots is not None and run.roots.is_refutation and twins.hides_period:
+        return run.roots.describe_as_basis()
+    if not twins.pushes or run.has_stable_roots:
+        return ""
     is_slowing = end.speed.trend in _FALLING and end.end_speed_rad_s > FLOOR_RAD
     departs = twins.departure is not None and end.behaviour is not EndBehaviour.COASTS
     grows = twins.grows and not is_slowing and not twins.hides_period
     return twins.text if grows or departs else ""
-
-
-def _is_near_rest(run: RunFindings) -> bool:
-    """Returns True if the final rest of a run is that of its roots.
-
-    This is so if the run ended near that rest. A run that is shorter than the period of its
-    delays cannot show by itself where it ends, so that the roots decide.
-    """
-    assert run.roots is not None
-    hides_period = run.twins is not None and run.twins.hides_period
-    return hides_period or run.roots.distance_rad <= NEAR_REST_RAD
 
 
 def _agrees_with_proof(run: RunFindings) -> bool:
