@@ -79,17 +79,17 @@ class LoopRoots(NamedTuple):
         """True if the roots prove that small motions about the final pose die away."""
         return self.exact and self.verdict == "stable"
 
-    @property
-    def is_refutation(self) -> bool:
-        """True if the roots prove that small motions about the final pose grow."""
-        return self.exact and self.verdict == "unstable"
-
     def describe_as_basis(self) -> str:
         """Returns the roots as the basis of a decision, for example "exact roots"."""
         if self.rate_per_s is None:
             return "exact roots"
         decisive = "fastest growing" if self.is_refutation else "slowest"
         return f"exact roots, {decisive} {self.rate_per_s:+.3g} /s"
+
+    @property
+    def is_refutation(self) -> bool:
+        """True if the roots prove that small motions about the final pose grow."""
+        return self.exact and self.verdict == "unstable"
 
 
 class StabilityDecision(NamedTuple):
