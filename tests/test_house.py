@@ -67,9 +67,10 @@ def test_a_module_name_is_used_once() -> None:
 def test_a_reader_walks_straight_from_certify_to_its_judgement() -> None:
     """`python -m tests.reading_walk` prints the walk, and says how it is counted."""
     found = reading_walk.walk_to_judgement()
-    # of these, `stability_decision` has a third: it weighs the end, the twins and the proofs
+    # Of these, `stability_decision` has a third: it weighs the end, the twins and the proofs,
+    # and decides by the roots first, so that commands may save the twins.
     assert len(found.stays) <= 83
-    assert len(found.returns) <= 28
+    assert len(found.returns) <= 29
 
 
 @pytest.mark.push

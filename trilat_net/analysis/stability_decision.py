@@ -133,11 +133,6 @@ class RunFindings(NamedTuple):
         return self.twins is not None and bool(self.twins.pushes)
 
     @property
-    def has_stable_roots(self) -> bool:
-        """True if exact roots prove that small motions about the final pose die away."""
-        return self.roots is not None and self.roots.is_proof
-
-    @property
     def all_proofs(self) -> list[str]:
         """Phrases that name the proofs for this loop, exact roots last."""
         proofs = list(self.proofs)
@@ -145,6 +140,11 @@ class RunFindings(NamedTuple):
             assert self.roots is not None
             proofs.append(self.roots.describe_as_basis())
         return proofs
+
+    @property
+    def has_stable_roots(self) -> bool:
+        """True if exact roots prove that small motions about the final pose die away."""
+        return self.roots is not None and self.roots.is_proof
 
 
 def decide_stability(run: RunFindings) -> StabilityDecision:
