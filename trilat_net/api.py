@@ -307,9 +307,11 @@ def linear(
         raise UsageError(
             f"a pose must consist of angles in rad, as in (0.1, 0.3), but is {pose!r}"
         ) from None
-    is_log = isinstance(scenario, Log) and not set
+    source: Scenario | Log = load_scenario(scenario, set)
+    if isinstance(scenario, Log) and not set:
+        source = scenario
     return analyse_linear_loop(
-        scenario if is_log else load_scenario(scenario, set),
+        source,
         pose=angles,
         roots=roots,
         over=over,

@@ -528,7 +528,15 @@ def _record_motions(scenario: Scenario) -> list[_SiteMotion]:
                 theta_hat=rows[:, columns["theta_hat"]],
             )
             batches[n].append(batch)
-    return [_SiteMotion(*map(np.concatenate, zip(*parts, strict=True))) for parts in batches]
+    return [
+        _SiteMotion(
+            t_s=np.concatenate([part.t_s for part in parts]),
+            q=np.concatenate([part.q for part in parts]),
+            qd=np.concatenate([part.qd for part in parts]),
+            theta_hat=np.concatenate([part.theta_hat for part in parts]),
+        )
+        for parts in batches
+    ]
 
 
 def _has_sampled_wall(scenario: Scenario) -> bool:
