@@ -5,10 +5,14 @@ pass. `draw_experiment` makes any number of further ones from a seed, many at an
 truth is what the linear loop's rightmost root says, and a run eight times as long; no judgement changes it,
 so that of the first seeds is kept in `TRUTHS`, with the digest of each scenario.
 
+`hidden_loops` draws a third kind, whose growth is hidden, and `linear_truth` tells theirs without a line of
+the program.
+
     python -m tests.certificate.adversaries
     python -m tests.certificate.adversaries --find-truths
 
-The first prints the table of docs/certificate.md, the second finds the truths anew.
+The first prints the table of docs/certificate.md, of the two thousand experiments of `ALL`; the second finds the stored
+truths anew.
 """
 
 import argparse
@@ -43,13 +47,19 @@ from trilat_net.theory.run_certificate import judge_virtual_run
 from .drawn_loops import (
     SAMPLED,
     STIFFNESS,
+    WIDE_FROM,
     Drawn,
     draw_experiment,
     experiment,
     p_d,
     swinging,
 )
+from .hidden_loops import NEAR_PER_S, draw_hidden, write_scenario
 
+HIDDEN = range(1000)
+"""Seeds of `hidden_loops` that the table has."""
+DRAWN = (*range(600), *range(WIDE_FROM, WIDE_FROM + 400))
+"""Seeds of `drawn_loops` that it has."""
 LONGER = 8.0
 """The run that knows the truth is so many times as long."""
 SEEN = 1e-6
@@ -767,6 +777,16 @@ def judge_experiment(seed: int, *, stored: bool = True) -> Judged:
     return Judged(drawn, truth, say_of_run(drawn.scenario), say_of_sweep(drawn.scenario))
 
 
+def judge_hidden(seed: int) -> Judged:
+    """What is said of a loop that hides its growth, with its law allowed to run."""
+    hidden, rate_per_s = draw_hidden(seed)
+    drawn = Drawn(hidden.kind, write_scenario(hidden), has="hidden")
+    truth = Truth(rate_per_s > 0.0, rate_per_s, abs(rate_per_s) < NEAR_PER_S)
+    log = trilat_net.simulate(drawn.scenario)
+    found = trilat_net.certify(log, own_laws=hidden.own_law)
+    return Judged(drawn, truth, str(found.stability))
+
+
 def read_truth(seed: int, drawn: Drawn) -> Truth:
     """The truth of a seed, as it was stored for this very scenario."""
     digest, unstable, root_per_s, near = _read_rows()[seed]
@@ -835,37 +855,62 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description="What is said of random experiments whose truth is known."
     )
-    parser.add_argument("--seeds", type=int, default=SEEDS)
-    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--seeds", type=int, help="only so many of each kind")
+    parser.add_argument("--jobs", type=int, help="processes")
     parser.add_argument(
         "--find-truths", action="store_true", help="write those of truths.csv anew"
     )
     asked = parser.parse_args()
-    seeds = range(asked.first, asked.first + asked.seeds)
-    with ProcessPoolExecutor(mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(asked.jobs, mp_context=get_context("spawn")) as pool:
         if asked.find_truths:
-            lines = TRUTHS.read_text().splitlines()
-            for n, row in enumerate(pool.map(write_truth, seeds, chunksize=8), 1 + seeds.start):
-                lines[n : n + 1] = [row]
-                if n % 100 == 0 or n == seeds.stop:
-                    TRUTHS.write_text("\n".join([*lines, ""]))
+            _write_truths(pool.map(write_truth, range(count_stored()), chunksize=8))
             return
-        judged = list(pool.map(judge_experiment, seeds, chunksize=8))
+        drawn, hidden = DRAWN[: asked.seeds], HIDDEN[: asked.seeds]
+        judged = [
+            *pool.map(judge_by_certify, drawn, chunksize=8),
+            *pool.map(judge_hidden, hidden, chunksize=8),
+        ]
+    print_table(judged)
+    for seed, one in zip((*drawn, *hidden), judged, strict=True):
+        found = tally([one])
+        if found.false_ok or found.false_alarm:
+            print(f"seed {seed}: {one.drawn.kind}, {one.truth}: {one.certified}")
+
+
+def judge_by_certify(seed: int) -> Judged:
+    """What `certify` alone says of the experiment of a seed."""
+    drawn = draw_experiment(seed)
+    return Judged(drawn, read_truth(seed, drawn), say_of_run(drawn.scenario))
+
+
+def _write_truths(rows: Iterable[str]) -> None:
+    """Writes rows of truths as they are found, a hundred at a time."""
+    lines = TRUTHS.read_text().splitlines()
+    for n, row in enumerate(rows, 1):
+        lines[n : n + 1] = [row]
+        if n % 100 == 0 or n == len(lines) - 1:
+            TRUTHS.write_text("\n".join([*lines, ""]))
+
+
+def print_table(judged: list[Judged]) -> None:
+    """Prints a row per kind, and one of all; and how often an error may happen that did not."""
+    columns = "runs | unstable | near an edge | false ok | false alarms | settled | open"
+    print(f"| experiments | {columns} |")
+    print("|---|" + " --: |" * len(Tally._fields))
+    kinds = sorted({(one.drawn.has == "hidden", one.drawn.kind) for one in judged})
+    for hides, kind in kinds:
+        found = [
+            one
+            for one in judged
+            if (one.drawn.has == "hidden", one.drawn.kind) == (hides, kind)
+        ]
+        print(f"| {kind} | " + " | ".join(map(str, tally(found))) + " |")
+    total = tally(judged)
+    print("| all | " + " | ".join(map(str, total)) + " |")
     print(
-        "| experiments | runs | unstable | near an edge | false ok | false alarms | settled | open |"
+        f"{total.false_ok} of {total.unstable} unstable runs are called stable: with 95 % confidence "
+        f"fewer than {3.0 / max(total.unstable, 1):.2%} are, by the rule of three"
     )
-    print("|---|---|---|---|---|---|---|---|")
-    kinds = sorted({one.drawn.kind for one in judged})
-    for by in ("certified", "swept"):
-        for kind in (*kinds, ""):
-            found = [one for one in judged if kind in ("", one.drawn.kind)]
-            name = kind or f"all, {by}"
-            if kind == "" or by == "certified":
-                print("| " + " | ".join([name, *map(str, tally(found, by))]) + " |")
-    for seed, one in zip(seeds, judged, strict=True):
-        for by in ("certified", "swept"):
-            if any(tally([one], by)[3:5]):
-                print(f"seed {seed}: {one.drawn.kind}, {one.truth}, {by}: {getattr(one, by)}")
 
 
 if __name__ == "__main__":

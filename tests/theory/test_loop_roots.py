@@ -198,3 +198,26 @@ def test_roots_are_of_the_loop_after_the_last_command() -> None:
     assert len(list_effective_commands(back)) == 2
     unchanged = find_log_roots(tn.simulate(scenario)).rate_per_s
     assert find_log_roots(back).rate_per_s == pytest.approx(unchanged, abs=1e-5)
+
+
+def test_a_run_shorter_than_a_trace_has_the_roots_of_the_whole_trace(tmp_path: Path) -> None:
+    """The delays are constant in the run, and long in the last tenth of the period."""
+    link = looped_trace(tmp_path, 20.0)
+    short, whole = (
+        find_log_roots(tn.simulate(pair(link=link, duration_s=seconds)))
+        for seconds in (10.0, 45.0)
+    )
+    assert short.exact
+    assert short.rate_per_s == pytest.approx(whole.rate_per_s, rel=0.02)
+
+
+def test_the_theorem_proves_nothing_for_delays_that_change_after_the_run(
+    tmp_path: Path,
+) -> None:
+    link = looped_trace(tmp_path, 60.0)
+    law = {"duration_s": 20.0}
+    lasting = certify_run(tn.simulate(load_scenario("free", {**law, "link.delay_ms": 60.0})))
+    changing = certify_run(tn.simulate(load_scenario("free", {**law, "link": link})))
+    assert lasting.has_lasting_delays
+    assert not changing.has_lasting_delays
+    assert not any("theorem" in proof for proof in changing.proofs)

@@ -12,7 +12,8 @@ quarter of the records.
 
 Invariant:
     - Roots are called exact only if every delay is constant or repeats after the analysed
-      period, and if the loop is analysed with its ticks, the periods of its controllers.
+      period, if the loop is analysed with its ticks, the periods of its controllers, and if
+      their rightmost one has the same sign at the last pose and at the rest next to it.
     - A command that leaves a link or a dominance factor as it was changes nothing.
     - The code of imported control laws is executed only with permission. Without it, such a
       loop has no roots. With it, unstable roots count as exact and stable ones do not: the law
@@ -55,6 +56,10 @@ from .operating_point import (
     derive_operating_conditions,
 )
 
+_SAME_POSE_RAD = 1e-6
+"""Poses that differ by less have the same roots, in rad."""
+_ZERO_SHARE = 0.1
+"""A root at the last pose counts as zero below this share of the rightmost root at the rest."""
 _ROOTS = 2
 """Number of rightmost roots that are computed at the end of a run."""
 _BATCH_RECORDS = 4096
@@ -75,6 +80,8 @@ class EndLoop(NamedTuple):
             quarter of the run.
         distance_rad: Largest difference between the last angle of a joint and its angle at
             the rest, in rad.
+        last_pose: The last pose of the run. None if it is the rest. Arms that nobody holds may
+            rest anywhere in between.
     """
 
     scenario: Scenario
@@ -83,6 +90,7 @@ class EndLoop(NamedTuple):
     uses: SamplesInUse | None
     has_mean_ages: bool
     distance_rad: float
+    last_pose: Equilibrium | None = None
 
     def compute_sampled_roots(self, count: int) -> Spectrum | None:
         """Computes the rightmost roots of the loop with its ticks.
@@ -289,13 +297,15 @@ def _build_end_loop(
     end = Equilibrium(state.q, state.estimates, state.how, 0.0)
     rest = follow_equilibrium(final.scenario, settle_memories(conditions, end))
     last_q = _find_last_angles(final.scenario, trace)
+    distance_rad = float(np.abs(last_q - rest.q).max())
     return EndLoop(
         scenario=final.scenario,
         conditions=conditions,
         rest=rest,
         uses=final.uses,
         has_mean_ages=bool(final.mean_age_s),
-        distance_rad=float(np.abs(last_q - rest.q).max()),
+        distance_rad=distance_rad,
+        last_pose=None if distance_rad <= _SAME_POSE_RAD else rest._replace(q=last_q),
     )
 
 
@@ -312,6 +322,10 @@ def _compute_roots(loop: EndLoop) -> LoopRoots:
         # differences of a user's law show growth, but may miss what happens beyond a threshold
         is_proof_possible = not has_imported_law or sampled.verdict == "unstable"
         exact = sampled.is_exact and is_proof_possible
+        if exact and loop.last_pose is not None:
+            # The arms still move, and it is not known where in between they will rest.
+            last_roots = loop._replace(rest=loop.last_pose).compute_sampled_roots(_ROOTS)
+            exact = _has_same_sign(sampled, last_roots)
         roots = _describe_roots(sampled, sampled.basis, exact=exact)
         return roots._replace(distance_rad=loop.distance_rad)
     continuous = compute_delay_spectrum(linearise_loop(loop.conditions, loop.rest), _ROOTS)
@@ -319,6 +333,23 @@ def _compute_roots(loop: EndLoop) -> LoopRoots:
     if loop.conditions.varying or loop.has_mean_ages:
         basis += ", of the mean ages"
     return _describe_roots(continuous, basis, exact=False)
+
+
+def _has_same_sign(at_rest: Spectrum, at_last_pose: Spectrum | None) -> bool:
+    """Returns True if the rightmost roots at a rest and at the last pose have the same sign.
+
+    At a pose that is no rest, the roots at zero are slightly off. Therefore a root below a
+    tenth of the one at the rest counts as zero.
+
+    Args:
+        at_rest: The roots at the rest next to the end of a run.
+        at_last_pose: The roots at its last pose. None if they could not be computed.
+    """
+    if at_last_pose is None or at_rest.rightmost is None or at_last_pose.rightmost is None:
+        return at_last_pose is not None
+    rate_per_s = at_rest.rightmost.s.real
+    grows_at_last = at_last_pose.rightmost.s.real > _ZERO_SHARE * abs(rate_per_s)
+    return grows_at_last == (rate_per_s > 0.0)
 
 
 def _describe_roots(spectrum: Spectrum, basis: str, *, exact: bool) -> LoopRoots:

@@ -34,7 +34,12 @@ from ..files import find_page
 from ..laws.conditions import LinearForm, LinearSituation
 from ..scenario import Scenario
 from ..scenario.delay_models import LinkBase
-from ..scenario.delay_period import MAX_PERIOD_TICKS, find_final_link, find_link_period_s
+from ..scenario.delay_period import (
+    MAX_PERIOD_TICKS,
+    find_final_link,
+    find_link_period_s,
+    is_ending_trace,
+)
 from ..scenario.imported_code import ImportedLaw
 from ..scenario.sample_uses import draw_used_samples
 from ..scenario.validate import refuse_external_arms
@@ -74,6 +79,14 @@ class EffectiveDelay(NamedTuple):
     mean_s: float
     least_s: float
     most_s: float
+
+    @property
+    def varies(self) -> bool:
+        """True if the age is not constant.
+
+        Times of ticks are whole nanoseconds, so that constant ages differ a little.
+        """
+        return self.most_s > self.least_s + 1e-8
 
 
 class OperatingConditions(NamedTuple):
@@ -241,8 +254,7 @@ def derive_operating_conditions(
         age = compute_effective_delay(scenario, peer, site, link)
         age_s[i, j] = age.mean_s
         rate_hz = max(scenario.sites[site].rate_hz, scenario.sites[peer].rate_hz)
-        # times of ticks are whole ns, so that constant ages differ by less than this
-        if age.most_s > age.least_s + 1e-8 or _has_long_period(link, rate_hz):
+        if age.varies or _has_long_period(link, rate_hz):
             varying.append(age)
 
     if varying:
@@ -454,6 +466,35 @@ def compute_effective_delay(
         least_s=float(ages_s.min()),
         most_s=float(ages_s.max()),
     )
+
+
+def has_lasting_delays(scenario: Scenario) -> bool:
+    """Returns True if delays that are constant in a run stay so after its end.
+
+    They do not if a sinusoid or a trace has other delays later. The ages of samples count, so
+    that a play-out buffer may hide such delays. Random and measured delays are ignored: only
+    records show them.
+
+    Args:
+        scenario: The experiment, with the duration of the run.
+    """
+    for i, j in permutations(range(len(scenario.names)), 2):
+        if not scenario.alpha[i, j] and not scenario.timeline:
+            continue
+        site, peer = scenario.names[i], scenario.names[j]
+        link = find_final_link(scenario, f"{peer}->{site}")
+        points = link.points
+        if is_ending_trace(link) and points is not None:
+            if points[-1, 0] > 1e6 * scenario.duration_s:
+                return False
+            continue
+        if find_link_period_s(link) is None or link.random:
+            continue
+        rate_hz = max(scenario.sites[site].rate_hz, scenario.sites[peer].rate_hz)
+        age = compute_effective_delay(scenario, peer, site, link)
+        if age.varies or _has_long_period(link, rate_hz):
+            return False
+    return True
 
 
 def _find_final_dominance(

@@ -30,6 +30,7 @@ from ..log.log_reader import Log
 from ..scenario import Scenario
 from ..scenario.describe import describe_law_conditions, list_law_proofs
 from .loop_roots import find_log_roots, find_run_roots, resolve_final_scenario
+from .operating_point import has_lasting_delays
 
 
 def certify_run(
@@ -66,6 +67,7 @@ def certify_run(
         twins=growth,
         law_proofs=tuple(list_law_proofs(final_scenario)),
         law_conditions=tuple(describe_law_conditions(final_scenario)),
+        has_lasting_delays=has_lasting_delays(final_scenario),
     )
 
 

@@ -154,6 +154,7 @@ class Certificate(Result):
         law_proofs: Phrases that name the stability conditions of control laws that hold at
             every site and prove that small motions die away. Empty if there are none.
         law_conditions: Sentences on the stability conditions of the control laws of the run.
+        has_lasting_delays: True if delays that are constant in the run stay so after it.
     """
 
     premises: list[Premise]
@@ -169,6 +170,7 @@ class Certificate(Result):
     twins: TwinGrowth | None = None
     law_proofs: tuple[str, ...] = ()
     law_conditions: tuple[str, ...] = ()
+    has_lasting_delays: bool = True
 
     @property
     def has_functional(self) -> bool:
@@ -209,12 +211,14 @@ class Certificate(Result):
     def proofs(self) -> tuple[str, ...]:
         """Phrases that name the proofs for this loop, apart from its characteristic roots.
 
-        The stability theorem is a proof if all of its premises hold and V did not rise. The
-        stability condition of a control law is a proof if it holds at every site.
+        The stability theorem is a proof if all of its premises hold, also after the run, and V
+        did not rise. The stability condition of a control law is a proof if it holds at every
+        site.
         """
         covered = self.verdict.finding is StabilityFinding.COVERED
         all_hold = all(premise.holds is True for premise in self.premises)
-        theorem = ("the theorem, all of whose premises hold",) if covered and all_hold else ()
+        is_proof = covered and all_hold and self.has_lasting_delays
+        theorem = ("the theorem, all of whose premises hold",) if is_proof else ()
         return (*theorem, *self.law_proofs)
 
     @property

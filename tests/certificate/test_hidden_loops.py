@@ -1,0 +1,53 @@
+"""Loops that hide their growth: what is said of them, and that their truth is the program's own motion."""
+
+import numpy as np
+import pytest
+
+import trilat_net
+from tests.certificate.adversaries import HIDDEN, judge_hidden, tally
+from tests.certificate.hidden_loops import KINDS, draw_hidden, write_scenario
+
+PUSH = range(2 * len(KINDS))
+BLOCK = 100
+
+
+@pytest.mark.parametrize(
+    "seeds",
+    [
+        PUSH,
+        *(
+            pytest.param(HIDDEN[n : n + BLOCK], marks=pytest.mark.long)
+            for n in range(0, len(HIDDEN), BLOCK)
+        ),
+    ],
+    ids=str,
+)
+@pytest.mark.push
+def test_hidden_growth_does_not_fool_it(seeds: range) -> None:
+    """None that grows is called stable, at most one in a hundred that decays is condemned."""
+    found = tally(map(judge_hidden, seeds))
+    assert found.false_ok == 0
+    assert found.false_alarm <= max(1, 0.01 * found.runs)
+    assert found.unstable >= 0.3 * found.runs
+
+
+@pytest.mark.parametrize("seed", [5, 12, 26])
+def test_a_law_without_permission_proves_nothing(seed: int) -> None:
+    hidden, _ = draw_hidden(seed)
+    assert hidden.own_law
+    log = trilat_net.simulate(write_scenario(hidden))
+    assert trilat_net.certify(log).stability in ("open", "not stable")
+
+
+@pytest.mark.parametrize("seed", [4, 9, 10, 14])
+def test_small_motions_grow_as_the_truth_says(seed: int) -> None:
+    """A run from next to the rest has the rate of `linear_truth`, which knows nothing of the program."""
+    hidden, rate_per_s = draw_hidden(seed)
+    apart = 1e-7 * np.random.default_rng(1).standard_normal(hidden.starts_rad.shape)
+    near = hidden._replace(starts_rad=hidden.pose_rad + apart, duration_s=60.0, earlier=None)
+    log = trilat_net.simulate(write_scenario(near))
+    speeds = np.abs(np.hstack([log[name].qd for name in log.sites])).max(axis=1)
+    windows = np.log(speeds[: len(speeds) // 400 * 400].reshape(-1, 400).max(axis=1))
+    late = windows[len(windows) // 3 :]
+    slope = np.polyfit(4.0 * np.arange(len(late)), late, 1)[0]
+    assert slope == pytest.approx(rate_per_s, rel=0.1, abs=0.01)
