@@ -26,7 +26,7 @@ class CompiledPD(PD):
     """The same, compiled."""
 
 
-class JointPD:
+class DampedJointsPD:
     """`p_d` of a planar arm, with a damping of its own for each joint."""
 
     remembers: tuple[str, ...] = ()

@@ -24,7 +24,7 @@ RANDOM_SPAN_S = 4000.0
 """The same of links that lose samples, whose rate is a mean over what is drawn."""
 EDGE_SPAN_S = 400.0
 """Length of the simulations that look for an edge, which need not be exact."""
-OWN_LAW = "tests.own_laws:JointPD"
+OWN_LAW = "tests.own_laws:DampedJointsPD"
 LEAST_PER_S, LEAST_RANDOM_PER_S = 2e-3, 5e-3
 """Slower growth or decay is not drawn; the second of links that lose samples, whose rate is an estimate."""
 MOST_PER_S = 1.5
