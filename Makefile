@@ -8,7 +8,7 @@ LOCKED := --quiet --require-hashes --only-binary :all: -r
 # uv takes a quarter of pip's time; pip does what uv cannot, as where only its own settings name a package index
 INSTALL = @$(BIN)/uv pip install --python $(BIN)/python $(LOCKED) $< || $(PIP) $(LOCKED) $<
 
-.PHONY: help demo play setup extras test pytest sessions containers push-set lint platforms test-long faults docs bench suite-gains suite lock clean
+.PHONY: help demo play setup extras test pytest sessions containers push-set lint platforms test-long faults docs media bench suite-gains suite lock clean
 
 help:
 	@echo "make demo    run the paper's experiment live, 20 s, and look at what it made"
@@ -21,6 +21,7 @@ help:
 	@echo "make push-set     measure anew which tests make test leaves to make test-long"
 	@echo "make faults       docs/faults.md: two thousand sessions in which things go wrong, and the matrix of faults"
 	@echo "make docs         the documentation as a site, with search, offline: build/site/html/index.html"
+	@echo "make media        the moving picture of README.md, from the log of a simulated run"
 	@echo "make bench   the figures of docs/benchmarks.md, measured on this machine"
 	@echo "make suite-gains  docs/bench.md: tunes the gains that are out of date; entered again, it continues"
 	@echo "make suite        docs/bench.md: the whole suite of control laws; entered again, it continues"
@@ -109,6 +110,9 @@ docs: $(VENV)/docs.stamp
 	$(BIN)/python docs/site/make_pages.py
 	cd build/site && ../../$(BIN)/zensical build --strict -f zensical.toml
 	@echo "open build/site/html/index.html in a browser; it needs no server and no network"
+
+media: setup
+	$(BIN)/python docs/media/make_media.py
 
 bench: $(VENV)/dev.stamp
 	$(BIN)/python -m benchmarks

@@ -26,7 +26,7 @@ BESIDE = ("CHANGELOG.md", "SECURITY.md", "LICENSE")
 def main() -> None:
     """Gathers all pages, and the settings of Zensical beside them."""
     shutil.rmtree(SITE, ignore_errors=True)
-    shutil.copytree(ROOT / "docs", PAGES, ignore=shutil.ignore_patterns("site"))
+    shutil.copytree(ROOT / "docs", PAGES, ignore=shutil.ignore_patterns("site", "media"))
     for name in BESIDE:
         write(name if name.endswith(".md") else f"{name}.md", read_beside_docs(name))
     write("index.md", read_beside_docs("README.md"))

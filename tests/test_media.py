@@ -1,0 +1,44 @@
+"""The moving picture of the README: its bytes are those of its run, and it loads nothing."""
+
+import re
+import runpy
+from pathlib import Path
+from types import SimpleNamespace
+from xml.etree import ElementTree
+
+import pytest
+
+import trilat_net as tn
+
+ROOT = Path(__file__).parents[1]
+MEDIA = SimpleNamespace(**runpy.run_path(str(ROOT / "docs" / "media" / "make_media.py")))
+PICTURE = (MEDIA.PICTURES / MEDIA.PICTURE).read_text(encoding="utf-8")
+LARGEST_BYTES = 1_500_000
+
+
+@pytest.mark.long
+def test_the_picture_is_that_of_its_run() -> None:
+    assert MEDIA.draw_film(tn.simulate(MEDIA.SCENARIO)) == PICTURE
+
+
+def test_the_picture_loads_nothing() -> None:
+    assert len(PICTURE) < LARGEST_BYTES
+    assert set(re.findall(r"https?://[^\"' )]+", PICTURE)) == {"http://www.w3.org/2000/svg"}
+    assert not re.search(r"href|url\(|<script|@import", PICTURE)
+
+
+def test_every_motion_lasts_as_long_as_the_run() -> None:
+    duration_s = tn.load_scenario(MEDIA.SCENARIO).duration_s
+    frames = round(duration_s * MEDIA.FRAMES_PER_S) + 1
+    animated = [
+        element
+        for element in ElementTree.fromstring(PICTURE).iter()
+        if element.tag.partition("}")[2].startswith("animate")
+    ]
+    counts = {
+        len(element.attrib["values"].split(";"))
+        for element in animated
+        if element.attrib["dur"] == f"{duration_s:g}s" and "calcMode" not in element.attrib
+    }
+    assert len(animated) > 30
+    assert counts == {frames}
