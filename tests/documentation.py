@@ -77,6 +77,7 @@ def read_commands(text: str) -> Iterator[tuple[list[str], list[str]]]:
 
 ELSEWHERE = {
     "README.md": ".ci/readme",
+    "docs/commands.md": ".ci/readme",
     "docs/bench.md: trilat bench --small": "tests/cli/test_benches.py",
     "docs/code-that-runs.md: trilat verify": "tests/cli/test_code_from_logs.py",
     "docs/code-that-runs.md: log = tn.open_log": "tests/cli/test_code_from_logs.py",

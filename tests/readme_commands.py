@@ -1,7 +1,12 @@
-"""The commands of the README's table, with real arguments: `.ci/readme` runs them after `make setup` alone.
+"""The commands of the tables of README.md and docs/commands.md, with real arguments.
+
+`.ci/readme` runs them after `make setup` alone.
 
 Invariant:
-- Every command that the table names stands here or in a fenced block of the README (`list_missing_commands`).
+- Every command that the table of docs/commands.md names stands here or in a fenced block of one of the
+  pages (`list_missing_commands`).
+- Every command of the README's table stands here as it stands there, apart from names of logs and from
+  options that follow (`list_unlike_commands`).
 - A chain runs one command after another; chains run side by side and share no file but those that
   `FIRST` made.
 - What would go on until somebody ends it is bounded by its own options, or interrupted (`LiveSession`).
@@ -15,6 +20,8 @@ from typing import NamedTuple
 from .documentation import find_blocks, read_commands
 
 ROOT = Path(__file__).parents[1]
+PAGES = ("README.md", "docs/commands.md")
+"""Pages whose blocks and tables `.ci/readme` runs."""
 
 FIRST = [
     "trilat sim two_sites --duration 20 -o sim.mcap",
@@ -38,6 +45,8 @@ CHAINS = [
         "trilat compare sim.mcap kd5.mcap",
         "trilat report sim.mcap",
         "trilat figure sim.mcap --with kd5.mcap -o figures",
+        "trilat sim training -o training.mcap",
+        "trilat report training.mcap",
     ],
     [
         "trilat log info sim.mcap",
@@ -72,9 +81,11 @@ CHAINS = [
         "trilat sweep free --over link.delay_ms=20,100 --set link.model=uniform --duration 1 --longest 1 "
         "--jobs 1 -o swept",
         "trilat sweep swept --cell 0",
-        "trilat sweep p_d_margin --over link.delay_ms=100,200 --over control.d=0.5,1.5 --duration 1 "
-        "--longest 1 --jobs 1 --map -o mapped",
+        "trilat sweep p_d_margin --over link.delay_ms=0:1600:200 --map --over control.d=0.5,1.5 "
+        "--duration 1 --longest 1 --jobs 1 -o mapped",
         "trilat bench --task free --law p_d --link rtt68 --seeds 1 --jobs 1 -o suite",
+        "trilat experiment new two-people.toml --pair",
+        "trilat experiment check two-people.toml",
         "trilat experiment new reaching.toml",
         SHORTEN,
         "trilat experiment check reaching.toml",
@@ -132,8 +143,8 @@ def list_all() -> list[str]:
 
 
 def read_table_commands() -> set[str]:
-    """The commands that the README's table names, as in "log info", and groups as a whole, as in "keys"."""
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    """The commands that the table of docs/commands.md names, as in "log info", and whole groups, as in "keys"."""
+    text = (ROOT / "docs/commands.md").read_text(encoding="utf-8")
     table = text.partition("| command | what it does |")[2].partition("\n\n")[0]
     named: set[str] = set()
     for row in table.splitlines()[2:]:
@@ -158,8 +169,9 @@ def list_missing_commands(commands: set[str]) -> set[str]:
         commands: all commands of the program, as in "log info".
     """
     run = [shlex.split(command)[1:] for command in list_all() if command.startswith("trilat ")]
-    for block in find_blocks("README.md"):
-        run += [words[1:] for words, _ in read_commands(block.text) if words[0] == "trilat"]
+    for page in PAGES:
+        for block in find_blocks(page):
+            run += [words[1:] for words, _ in read_commands(block.text) if words[0] == "trilat"]
     done = {f"{words[0]} {word}" for words in run for word in words[1:]} | {
         words[0] for words in run
     }
@@ -174,3 +186,27 @@ def list_missing_commands(commands: set[str]) -> set[str]:
         if one in named or any(one.startswith(f"{name} ") for name in named)
     }
     return {one for one in wanted if one not in done}
+
+
+def read_wishes() -> list[tuple[str, list[str]]]:
+    """Returns the rows of the README's table: what somebody wants, and the commands for it."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    table = text.partition("| I want to … | command |")[2].partition("\n\n")[0]
+    rows = re.findall(r"^\| (.+?) \| `(.+)` \|$", table, re.MULTILINE)
+    return [(wish, commands.split(" && ")) for wish, commands in rows]
+
+
+def list_unlike_commands() -> list[str]:
+    """Returns the commands of the README's table that no command of this file begins with."""
+    run = [_drop_log_names(command) for command in list_all()]
+    return [
+        command
+        for _, commands in read_wishes()
+        for command in commands
+        if not any(f"{one} ".startswith(f"{_drop_log_names(command)} ") for one in run)
+    ]
+
+
+def _drop_log_names(command: str) -> str:
+    """Returns a command in which every log has the same name."""
+    return re.sub(r"\S+\.mcap", "run.mcap", command)

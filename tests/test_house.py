@@ -2,7 +2,6 @@
 
 import re
 from collections import defaultdict
-from pathlib import Path
 
 import pytest
 
@@ -124,7 +123,19 @@ def test_the_tour_names_what_exists() -> None:
 
 def test_the_tour_is_short() -> None:
     assert TOUR.count("\n") <= 120
-    assert (Path(house.ROOT) / "README.md").read_text(encoding="utf-8").count("\n") < 100
+
+
+def test_the_readme_is_short() -> None:
+    """The first 40 lines must hold what a newcomer needs: a picture, the purpose, the paper and two commands."""
+    text = (house.ROOT / "README.md").read_text(encoding="utf-8")
+    first_screen = "\n".join(text.splitlines()[:40])
+    assert text.count("\n") <= 90
+    assert len(text.split()) <= 1100
+    assert len(re.findall(r"(?<!`)`[^`\n]+`", text)) <= 20
+    assert first_screen.partition("![")[0].split() == ["#", "trilat-net"]
+    assert {"docs/references.md", "make demo", "make play"} <= set(
+        re.findall(r"docs/references\.md|make demo|make play", first_screen)
+    )
 
 
 def test_examples_import_the_interface_alone() -> None:

@@ -433,7 +433,7 @@ PAGES: dict[str, dict[str, Make]] = {
             sum(one.scenario.duration_s for one in shipped_trials())
         ],
     },
-    "README.md": {
+    "docs/overview.md": {
         "{} scenarios show one": lambda: [len(SHIPPED)],
         "seeded: {} delay models": lambda: [len(DELAY_MODELS)],
     },

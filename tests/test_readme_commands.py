@@ -1,9 +1,15 @@
-"""The list of commands that `.ci/readme` runs covers the README's table."""
+"""The list of commands that `.ci/readme` runs covers the tables of README.md and docs/commands.md."""
 
 import shlex
 
 from tests.golden.surface import all_options
-from tests.readme_commands import list_all, list_missing_commands, read_table_commands
+from tests.readme_commands import (
+    list_all,
+    list_missing_commands,
+    list_unlike_commands,
+    read_table_commands,
+    read_wishes,
+)
 
 
 def list_commands() -> set[str]:
@@ -15,6 +21,11 @@ def list_commands() -> set[str]:
 def test_every_command_of_the_table_is_run() -> None:
     assert len(read_table_commands()) > 40
     assert list_missing_commands(list_commands()) == set()
+
+
+def test_every_command_of_the_readme_is_run() -> None:
+    assert len(read_wishes()) == 8
+    assert list_unlike_commands() == []
 
 
 def test_the_table_names_nearly_every_command() -> None:

@@ -1,4 +1,5 @@
 import re
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
@@ -6,7 +7,19 @@ from typer.testing import CliRunner
 from tests.golden.surface import all_options
 from trilat_net.cli import app
 
+ROOT = Path(__file__).parents[2]
+PANELS = {
+    "Start here": "demo live sim",
+    "Analyse a log": "report verify certify metrics figure compare log twin rerun replay",
+    "Study": "sweep tune linear bench experiment test",
+    "Control a running session": "watch stop enable reset set ping",
+    "Machines and bridges": "site record hand router keys ros2 doctor",
+    "Make your own": "new scenario trace identify",
+}
+"""The panels of `trilat --help`, and their commands in order."""
+
 NAMES = [name.removeprefix("trilat ") for name in list(all_options())[1:]]
+GROUPS = [name for name in NAMES if any(other.startswith(f"{name} ") for other in NAMES)]
 COMMANDS = [
     name.split() for name in NAMES if not any(other.startswith(f"{name} ") for other in NAMES)
 ]
@@ -45,3 +58,36 @@ def test_every_command_has_help_with_example_and_explains_its_options(
 
 def test_the_main_help_names_what_to_begin_with() -> None:
     assert "trilat demo paper" in printed("--help")
+
+
+def test_the_main_help_has_six_panels() -> None:
+    panels: dict[str, list[str]] = {}
+    for line in printed("--help").splitlines():
+        if title := re.match(r"╭─ (.+?) ─+╮", line):
+            panels[title[1]] = []
+        elif command := re.match(r"│ ([a-z]\S*) ", line):
+            panels[list(panels)[-1]].append(command[1])
+    assert panels.pop("Options") == []
+    assert panels == {title: names.split() for title, names in PANELS.items()}
+    assert {name for names in panels.values() for name in names} == {
+        name.split()[0] for name in NAMES
+    }
+
+
+@pytest.mark.parametrize("name", sorted({name.split()[0] for name in NAMES}))
+def test_a_purpose_fits_on_one_line_of_the_main_help(name: str) -> None:
+    (line,) = re.findall(rf"^│ {name} +(.+?) +│$", printed("--help"), re.MULTILINE)
+    assert len(line) <= 64
+    assert re.fullmatch(r"[A-Z].*[.?]", line)
+    assert ". " not in line
+
+
+@pytest.mark.parametrize("command", [*map(" ".join, COMMANDS), *GROUPS])
+def test_a_help_ends_with_an_example_and_a_page(command: str) -> None:
+    *_, example, page = (
+        line for line in printed(*command.split(), "-h").splitlines() if line.strip()
+    )
+    assert example.split()[0] == "Example:"
+    named = re.fullmatch(r" Docs: (docs/\S+\.md) *", page)
+    assert named is not None, page
+    assert (ROOT / named[1]).is_file()

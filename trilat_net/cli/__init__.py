@@ -41,7 +41,7 @@ class _Commands(TyperGroup):
 
     def list_commands(self, ctx: Any) -> list[str]:
         """Returns the names of all commands in the order of the help."""
-        positions = {name: n for n, name in enumerate(_FIRST_COMMANDS)}
+        positions = {name: n for n, name in enumerate(_PANEL_OF)}
         end = len(positions)
         return sorted(super().list_commands(ctx), key=lambda name: positions.get(name, end))
 
@@ -63,9 +63,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
-    help="Dual-user teleoperation: runs sessions over a network, simulates them in virtual "
-    "time, and repeats them from their logs.",
-    epilog="Start with: trilat demo paper",
+    help="Two people, one remote arm, and a network with delays: live, simulated, or again "
+    "from the log.",
+    epilog="Start with: trilat demo paper\n\nDocs: docs/first-hour.md, docs/commands.md",
 )
 
 
@@ -88,23 +88,59 @@ def _main(
     """Declares the options of `trilat` itself, which have their own functions."""
 
 
-_FIRST_COMMANDS = (
-    "demo", "live", "site", "hand", "record", "ping", "watch", "stop", "enable", "reset",
-    "doctor", "router", "ros2", "sim", "verify", "certify", "twin", "metrics", "compare",
-    "figure", "report", "replay", "rerun", "log", "test", "sweep", "bench", "linear", "tune",
-)  # fmt: skip
-"""The commands that the help lists first, in this order. The others follow."""
+_OWN_PANEL = "Make your own"
+_PANELS = {
+    "Start here": ("demo", "live", "sim"),
+    "Analyse a log": (
+        "report", "verify", "certify", "metrics", "figure", "compare", "log", "twin", "rerun",
+        "replay",
+    ),
+    "Study": ("sweep", "tune", "linear", "bench", "experiment", "test"),
+    "Control a running session": ("watch", "stop", "enable", "reset", "set", "ping"),
+    "Machines and bridges": (
+        "site", "record", "hand", "router", "keys", "ros2", "doctor",
+    ),
+    _OWN_PANEL: ("new", "scenario", "trace", "identify"),
+}  # fmt: skip
+"""The commands and groups of each panel of the help, in the order of the help.
+
+A command that no panel names is in the last panel.
+"""
+_PANEL_OF = {name: panel for panel, names in _PANELS.items() for name in names}
 _GROUPS: dict[str, dict[str, Any]] = {
-    "log": {"help": "Inspects, checks, signs, recovers, exports or views a log."},
-    "scenario": {"help": "Lists, shows, checks and creates scenarios."},
-    "new": {"help": "Creates a control law, a hand or a plant of your own, with a test."},
-    "identify": {"help": "Identifies the dynamics of the hand that holds an arm."},
-    "trace": {"help": "Imports delays that another program measured."},
-    "experiment": {
-        "help": "Runs experiments with participants, from the protocol to the tables."
+    "log": {
+        "help": "Inspects, checks, signs, recovers, exports or views a log.",
+        "epilog": "Example: trilat log info run.mcap\n\nDocs: docs/log-tools.md",
     },
-    "set": {"callback": options.expand_option_tuples(sessions.set_command)},
-    "keys": {"help": "Creates keys that authenticate members of a session or sign logs."},
+    "scenario": {
+        "help": "Lists, shows, checks and creates scenarios.",
+        "epilog": "Example: trilat scenario show paper\n\nDocs: docs/commands.md",
+    },
+    "new": {
+        "help": "Creates your own control law, hand or plant, with a test.",
+        "epilog": "Example: trilat new law mylaw.py\n\nDocs: docs/own-controller.md",
+    },
+    "identify": {
+        "help": "Identifies the dynamics of the hand that holds an arm.",
+        "epilog": "Example: trilat identify hand run.mcap --site m1\n\nDocs: docs/ports.md",
+    },
+    "trace": {
+        "help": "Imports delays that another program measured.",
+        "epilog": "Example: trilat trace import irtt run.json.gz\n\nDocs: docs/links.md",
+    },
+    "experiment": {
+        "help": "Runs studies with people, from the protocol to the tables.",
+        "epilog": "Example: trilat experiment new reaching.toml\n\nDocs: docs/experiments.md",
+    },
+    "set": {
+        "callback": options.expand_option_tuples(sessions.set_command),
+        "epilog": "Example: trilat set --session paper link 'm1->s' --delay 350ms\n\n"
+        "Docs: docs/links.md",
+    },
+    "keys": {
+        "help": "Creates keys that encrypt a session or sign logs.",
+        "epilog": "Example: trilat keys pair lab\n\nDocs: docs/network.md",
+    },
 }
 _GROUP_OPTIONS = {"set": "--session paper "}
 """Options of a group that its examples need before the name of the command."""
@@ -126,8 +162,15 @@ def _add_command(group: typer.Typer, command_line: str, run: Any) -> None:
     paragraphs = inspect.cleandoc(text).split("\n\n")
     text = "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
     name = command_line.split()[-1]
-    declare = group.command(name, help=text, epilog="\n\n".join(examples))
+    epilog = "\n\n".join([*examples, f"Docs: {run.page}"])
+    panel = _find_panel(command_line) if group is app else None
+    declare = group.command(name, help=text, epilog=epilog, rich_help_panel=panel)
     declare(options.expand_option_tuples(run))
+
+
+def _find_panel(name: str) -> str:
+    """Returns the panel of the help that lists a command or a group of commands."""
+    return _PANEL_OF.get(name, _OWN_PANEL)
 
 
 def _add_commands() -> None:
@@ -154,7 +197,7 @@ def _add_commands() -> None:
             else:
                 _add_command(app, command, run)
     for name, group in groups.items():
-        app.add_typer(group, name=name)
+        app.add_typer(group, name=name, rich_help_panel=_find_panel(name))
 
 
 _add_commands()

@@ -20,7 +20,7 @@ from . import options
 from .options import value
 
 
-@options.command("")
+@options.command("", page="docs/commands.md")
 def scenario_list_command(as_json: options.JsonOption = False) -> None:
     """Lists the shipped scenarios."""
     from ..scenario import list_shipped, load_scenario
@@ -46,7 +46,7 @@ def scenario_list_command(as_json: options.JsonOption = False) -> None:
     return terminal.print_table(TextTable(columns, rows, align="lrrl"))
 
 
-@options.command("paper --set control.Kd=5")
+@options.command("paper --set control.Kd=5", page="docs/laws.md")
 def scenario_show_command(
     name: options.ScenarioArgument,
     duration: options.DurationOption = None,
@@ -62,7 +62,7 @@ def scenario_show_command(
         terminal.print_note(note)
 
 
-@options.command("mine.toml")
+@options.command("mine.toml", page="docs/arms.md")
 def scenario_check_command(
     file: options.ScenarioArgument,
     overrides: options.SetOption = None,
@@ -82,7 +82,7 @@ def scenario_check_command(
     return None
 
 
-@options.command("mine.toml")
+@options.command("mine.toml", page="docs/links.md")
 def scenario_new_command(
     file: Annotated[Path, typer.Argument(help="File to write.")],
     force: options.ForceOption = False,
@@ -116,7 +116,7 @@ def _print_skeleton(kind: str, written: list[Path], key: str, check: str) -> Non
     terminal.print_texts([f"  trilat {check} {file.stem}.mcap", f"  pytest {test.name}"])
 
 
-@options.command("mylaw.py")
+@options.command("mylaw.py", page="docs/own-controller.md")
 def new_law_command(
     file: Annotated[Path, typer.Argument(help="File to write, for example mylaw.py.")],
     force: options.ForceOption = False,
@@ -127,7 +127,7 @@ def new_law_command(
     _print_skeleton("law", new_law(file, force=force), "control.law={}", "certify")
 
 
-@options.command("myhand.py")
+@options.command("myhand.py", page="docs/policies.md")
 def new_hand_command(
     file: Annotated[Path, typer.Argument(help="File to write, for example myhand.py.")],
     force: options.ForceOption = False,
@@ -139,7 +139,7 @@ def new_hand_command(
     _print_skeleton("hand", new_hand(file, force=force), key, "report")
 
 
-@options.command("myplant.py")
+@options.command("myplant.py", page="docs/policies.md")
 def new_plant_command(
     file: Annotated[Path, typer.Argument(help="File to write, for example myplant.py.")],
     force: options.ForceOption = False,
@@ -150,7 +150,9 @@ def new_plant_command(
     _print_skeleton("plant", new_plant(file, force=force), "sites.s.plant={}", "verify")
 
 
-@options.command("irtt run.json.gz", "csv drive.txt --way half -o drive.csv")
+@options.command(
+    "irtt run.json.gz", "csv drive.txt --way half -o drive.csv", page="docs/links.md"
+)
 def trace_import_command(
     form: Annotated[
         str, typer.Argument(help="Format of FILE: irtt, ping or csv.", metavar="FORM")
@@ -195,7 +197,7 @@ def trace_import_command(
     terminal.print_line(f"{path}: use it with --set link.model=trace --set link.file={path}")
 
 
-@options.command("keys m1 m2 s recorder operator --host 192.0.2.1")
+@options.command("keys m1 m2 s recorder operator --host 192.0.2.1", page="docs/network.md")
 def keys_new_command(
     folder: Annotated[
         Path, typer.Argument(help="Folder to create for the keys.", metavar="DIR")
@@ -232,7 +234,7 @@ def keys_new_command(
     )
 
 
-@options.command("keys", "keys m1 recorder --days 90")
+@options.command("keys", "keys m1 recorder --days 90", page="docs/network.md")
 def keys_renew_command(
     folder: Annotated[
         Path, typer.Argument(help="Folder that `trilat keys new` created.", metavar="DIR")
@@ -258,7 +260,7 @@ def keys_renew_command(
         terminal.print_line(f"{member_folder}: valid for {count_nouns(days, 'day')} from now")
 
 
-@options.command("lab")
+@options.command("lab", page="docs/log.md")
 def keys_pair_command(
     name: Annotated[
         Path,
@@ -279,7 +281,7 @@ def keys_pair_command(
     terminal.print_text(f"{public}: checks, as in: trilat log check run.mcap --key {public}")
 
 
-@options.command("keys/m1")
+@options.command("keys/m1", page="docs/network.md")
 def keys_info_command(
     folder: Annotated[Path, typer.Argument(help="Folder of one member's keys.", metavar="DIR")],
     as_json: options.JsonOption = False,

@@ -23,7 +23,7 @@ _LOSSY_EXIT_CODE = 3
 """Exit code of `trilat log recover` if a part of the log was lost."""
 
 
-@options.command("run.mcap")
+@options.command("run.mcap", page="docs/log-tools.md")
 def log_info_command(files: options.LogsArgument, as_json: options.JsonOption = False) -> None:
     """Prints the contents of a log: session, sites, links and channels, and missing records."""
     from ..analysis.file_overview import info
@@ -36,7 +36,7 @@ def log_info_command(files: options.LogsArgument, as_json: options.JsonOption = 
             terminal.warn_if_unfinished(path)
 
 
-@options.command("run.mcap", "run.mcap --key lab.pub")
+@options.command("run.mcap", "run.mcap --key lab.pub", page="docs/log.md")
 def log_check_command(
     files: options.LogsArgument,
     key: Annotated[
@@ -69,7 +69,7 @@ def log_check_command(
     raise typer.Exit(check.exit_code)
 
 
-@options.command("run.mcap --key lab.key")
+@options.command("run.mcap --key lab.key", page="docs/log.md")
 def log_sign_command(
     file: options.LogArgument,
     key: Annotated[
@@ -93,7 +93,7 @@ def log_sign_command(
         terminal.print_text(f"{signature}: signs {file}")
 
 
-@options.command("run.mcap.active")
+@options.command("run.mcap.active", page="docs/log.md")
 def log_recover_command(
     file: options.LogArgument,
     output: Annotated[
@@ -122,7 +122,7 @@ def log_recover_command(
         raise typer.Exit(_LOSSY_EXIT_CODE)
 
 
-@options.command("run.mcap --to parquet")
+@options.command("run.mcap --to parquet", page="docs/log-tools.md")
 def log_export_command(
     files: options.LogsArgument,
     form: Annotated[str, options.value("--to", "|".join(list_export_formats()))],
@@ -174,7 +174,7 @@ def log_export_command(
         terminal.print_text(f"{exporter.path}: {summary}")
 
 
-@options.command("run.mcap")
+@options.command("run.mcap", page="docs/log-tools.md")
 def log_view_command(
     files: options.LogsArgument,
     full: Annotated[

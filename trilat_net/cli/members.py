@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from ..scenario import Scenario
 
 
-@options.command("m1 --scenario paper")
+@options.command("m1 --scenario paper", page="docs/network.md")
 def site_command(
     name: Annotated[str, typer.Argument(autocompletion=options.complete_sites)],
     scenario: Annotated[
@@ -59,11 +59,12 @@ def site_command(
     seed: options.SeedOption = None,
     overrides: options.SetOption = None,
 ) -> None:
-    """Runs one site of a session as its own process, for separate terminals or machines.
+    """Runs one site of a session as a process of its own.
 
-    Without endpoints, the sites of a session find each other on this machine: each site listens
-    on a loopback port derived from the names of the session and the site, and connects to the
-    sites that precede it in the scenario.
+    Use it in separate terminals or on separate machines. Without endpoints, the sites of a
+    session find each other on this machine: each site listens on a loopback port derived from
+    the names of the session and the site, and connects to the sites that precede it in the
+    scenario.
 
     Options:
         name: Name of the site in the scenario.
@@ -105,7 +106,11 @@ def site_command(
     raise typer.Exit(run_site(chosen, name, site_options, terminal.print_line))
 
 
-@options.command("m2 --scenario my_run.toml", "m1 --session play --device haply_inverse3")
+@options.command(
+    "m2 --scenario my_run.toml",
+    "m1 --session play --device haply_inverse3",
+    page="docs/devices.md",
+)
 def hand_command(
     context: typer.Context,
     name: Annotated[str, typer.Argument(autocompletion=options.complete_sites)],
@@ -123,11 +128,12 @@ def hand_command(
     *,
     reach: options.Reach,
 ) -> None:
-    """Runs a hand, which acts as the user of a site: your own class, or a device that you hold.
+    """Runs your program, or a device that you hold, as a user.
 
-    The class (kind = "own", process = true) runs in this process: it reads the state of the
-    site and decides how to move the arm, and the site applies each decision after the hand's
-    delay_ms. A device (kind = "live") leads an arm of a session that is already running.
+    A hand acts as the user of a site. A class of your own (kind = "own", process = true) runs
+    in this process: it reads the state of the site and decides how to move the arm, and the
+    site applies each decision after the hand's delay_ms. A device (kind = "live") leads an arm
+    of a session that is already running.
 
     Options:
         name: Name of the site in the scenario.
@@ -240,7 +246,7 @@ def _check_without(scenario: "Scenario", name: str, without: list[str]) -> tuple
     return tuple(without)
 
 
-@options.command("--session paper -o run.mcap --split-duration 600")
+@options.command("--session paper -o run.mcap --split-duration 600", page="docs/recording.md")
 def record_command(
     session: Annotated[str, value("--session", "ID", "Session to record.")],
     *,
@@ -262,11 +268,12 @@ def record_command(
     force: options.ForceOption = False,
     png: options.PngOption = False,
 ) -> None:
-    """Records a session into an MCAP log, from its start until its end or Ctrl-C.
+    """Records a session into an MCAP log.
 
-    Without endpoints, the recorder connects to the loopback port of the first site and asks for
-    the other sites. If the log is split, its parts are named FILE-001.mcap and so on. The name
-    of a file ends in .active until the file is finished.
+    The recording lasts from the start of the session until its end or Ctrl-C. Without
+    endpoints, the recorder connects to the loopback port of the first site and asks for the
+    other sites. If the log is split, its parts are named FILE-001.mcap and so on. The name of a
+    file ends in .active until the file is finished.
 
     Options:
         output: File of the log; default: SESSION.mcap, or runs/SESSION-N/run.mcap if --conclude
@@ -387,7 +394,7 @@ def _conclude(parts: list[Path], *, png: bool) -> None:
             raise RunFailed(f"{parts[0]}: {event.text}")
 
 
-@options.command("run.mcap --rate 2 --start 5")
+@options.command("run.mcap --rate 2 --start 5", page="docs/log-tools.md")
 def replay_command(
     files: Annotated[list[Path], typer.Argument(metavar="FILE...")],
     rate: Annotated[str, value("--rate", "X")] = "1",
@@ -415,11 +422,12 @@ def replay_command(
     insecure: options.InsecureOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Publishes a log over Zenoh with its original timing, as a separate session.
+    """Publishes a log on the network with its original timing.
 
-    To recorders, viewers and `trilat ping`, the replay looks like a running session. It answers
-    for the recorded sites, and publishes their messages byte for byte. Without endpoints, the
-    replay listens on the loopback port of the first site of the replayed session.
+    The log appears as a separate session. To recorders, viewers and `trilat ping`, the replay
+    looks like a running session. It answers for the recorded sites, and publishes their
+    messages byte for byte. Without endpoints, the replay listens on the loopback port of the
+    first site of the replayed session.
 
     Options:
         files: An MCAP log, or all parts of a log in order.
@@ -693,7 +701,7 @@ ANY_ADDRESS = "tls/0.0.0.0:7447"
 """Default endpoint of a router with keys, whose connections are encrypted."""
 
 
-@options.command("--keys keys/router")
+@options.command("--keys keys/router", page="docs/network.md")
 def router_command(
     listen: Annotated[
         list[str] | None,
@@ -716,11 +724,12 @@ def router_command(
         ),
     ] = None,
 ) -> None:
-    """Connects sites that cannot reach each other directly, for example behind NAT.
+    """Connects sites that cannot reach each other directly.
 
-    Start the sites and the recorder with --router, in any order. The router runs until Ctrl-C,
-    and a session continues after its router is restarted. Routers that are connected to each
-    other with --connect act as one router.
+    Use a router for sites behind NAT, for example. Start the sites and the recorder with
+    --router, in any order. The router runs until Ctrl-C, and a session continues after its
+    router is restarted. Routers that are connected to each other with --connect act as one
+    router.
     """
     from ..net.connection import (
         open_bus,
@@ -777,7 +786,11 @@ def _print_router_line(text: str) -> None:
     terminal.print_line(f"router: {text}")
 
 
-@options.command("--session paper", "--session paper --ros tcp/192.0.2.7:7447 --domain 3")
+@options.command(
+    "--session paper",
+    "--session paper --ros tcp/192.0.2.7:7447 --domain 3",
+    page="docs/ros2.md",
+)
 def ros2_command(
     session: Annotated[str, value("--session", "ID", "Session to bridge.")],
     ros: options.RosRouterOption = None,
@@ -791,11 +804,12 @@ def ros2_command(
     *,
     reach: options.Reach,
 ) -> None:
-    """Bridges a session to ROS 2: ROS programs can hold arms, ROS robots can serve as arms.
+    """Connects a session to ROS 2.
 
-    ROS must use RMW_IMPLEMENTATION=rmw_zenoh_cpp, and its Zenoh router must run. This machine
-    needs no ROS installation. The bridge waits for the router, and ends with the session.
-    docs/ros2.md lists all topics and services.
+    ROS programs can hold arms, and ROS robots can serve as arms. ROS must use
+    RMW_IMPLEMENTATION=rmw_zenoh_cpp, and its Zenoh router must run. This machine needs no ROS
+    installation. The bridge waits for the router, and ends with the session. docs/ros2.md lists
+    all topics and services.
 
     Options:
         distro: ROS 2 distribution whose message format the bridge writes.

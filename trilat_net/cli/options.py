@@ -98,7 +98,7 @@ _OPTION_ENTRY = re.compile(r"^    (\w+): (.+(?:\n {8}.+)*)", re.MULTILINE)
 """An entry in the section `Options` of a docstring after `inspect.cleandoc`."""
 
 
-def command(*examples: str) -> Callable[[Runs], Runs]:
+def command(*examples: str, page: str) -> Callable[[Runs], Runs]:
     """Returns a decorator that declares a function as a command of the program.
 
     The docstring of the function is the help of the command. The help of options that is too
@@ -107,6 +107,7 @@ def command(*examples: str) -> Callable[[Runs], Runs]:
 
     Args:
         examples: Arguments of the examples that the help shows.
+        page: Page of the documentation that the help names, as in "docs/links.md".
     """
 
     def declare(run: Runs) -> Runs:
@@ -119,9 +120,11 @@ def command(*examples: str) -> Callable[[Runs], Runs]:
             run: Function that executes the command.
 
         Returns:
-            The same function, with the examples in its attribute `examples`.
+            The same function, with the examples and the page in its attributes `examples`
+            and `page`.
         """
         run.examples = examples  # type: ignore[attr-defined]
+        run.page = page  # type: ignore[attr-defined]
         docstring = inspect.getdoc(run) or ""
         command_help, _, option_entries = docstring.partition("\n\nOptions:\n")
         run.__doc__ = command_help or None

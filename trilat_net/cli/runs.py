@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from ..log.log_reader import Log
 
 
-@options.command("free -o free.mcap --set link.delay_ms=400")
+@options.command("free -o free.mcap --set link.delay_ms=400", page="docs/first-hour.md")
 def sim_command(
     scenario: options.ScenarioArgument,
     output: Annotated[
@@ -37,7 +37,10 @@ def sim_command(
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Runs an experiment in virtual time, and writes the same kind of log as a live session."""
+    """Runs a scenario in virtual time, without a network.
+
+    It writes the same kind of log as a live session.
+    """
     from ..execution.virtual import record_virtual
     from ..log.ros2.viz_channels import parse_viz_rate
 
@@ -73,7 +76,7 @@ def sim_command(
         raise typer.Exit(1)
 
 
-@options.command("run.mcap")
+@options.command("run.mcap", page="docs/log-tools.md")
 def verify_command(
     files: options.LogsArgument,
     virtual: Annotated[bool, flag("--virtual")] = False,
@@ -83,10 +86,11 @@ def verify_command(
     min_coverage: options.MinCoverageOption = options.MIN_COVERAGE,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Executes every site again from its log, and compares every computed field of the records.
+    """Executes a log again, and compares every computed number.
 
-    A record is the stored result of a site in one control period. The numbers must agree bit
-    for bit.
+    Every site is executed again from its records, and every computed field is compared. A
+    record is the stored result of a site in one control period. The numbers must agree bit for
+    bit.
 
     Exit code 0: everything agrees, the log was not changed, and enough of every site was
     checked. 1: something differs, was changed, or is missing. 2: there is no log. 4: the
@@ -117,7 +121,7 @@ Accepted = StrEnum("Accepted", ["SETTLED", "BOUNDED", "OPEN"])
 """Results besides a stable run for which `--accept` gives the exit code 0."""
 
 
-@options.command("run.mcap")
+@options.command("run.mcap", page="docs/certificate.md")
 def certify_command(
     files: options.LogsArgument,
     accept: Annotated[
@@ -158,13 +162,13 @@ def certify_command(
     laws: options.LawFiles,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Judges whether a run is stable, settled, not stable or open, and says what that rests on.
+    """Judges whether a run was stable, and says why.
 
-    The command prints the energy function V of the stability proof with its energy balance, the
-    conditions of the proof (premises), and the roots of the linearised loop at the final pose.
-    It executes the run again together with twins, which are repetitions with a small push. The
-    code of imported control laws runs only with --law or --own-laws. docs/certificate.md
-    defines every term and every key of the JSON.
+    The verdict is stable, settled, not stable or open. The command prints the energy function V
+    of the stability proof with its energy balance, the conditions of the proof (premises), and
+    the roots of the linearised loop at the final pose. It executes the run again together with
+    twins, which are repetitions with a small push. The code of imported control laws runs only
+    with --law or --own-laws. docs/certificate.md defines every term and every key of the JSON.
 
     Stable: a proof exists for this loop. Settled: the run came to rest and every push died
     away, but nothing proves more. Exit code 0: stable. 1: settled, not stable (bounded
@@ -193,7 +197,11 @@ _PUSH_HELP = (
 )
 
 
-@options.command("run.mcap --at 12 --push m1.q1=1e-6 -o twin.png", "run.mcap --delta 1e-9:1e-3")
+@options.command(
+    "run.mcap --at 12 --push m1.q1=1e-6 -o twin.png",
+    "run.mcap --delta 1e-9:1e-3",
+    page="docs/certificate.md",
+)
 def twin_command(
     files: options.LogsArgument,
     at_s: Annotated[float, value("--at", "S", "Time of the push, s.")] = 0.0,
@@ -217,7 +225,7 @@ def twin_command(
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Executes a run again with small pushes, and shows whether these disturbances grow.
+    """Repeats a run with a small push: does the push die away?
 
     A repetition with a push is called a twin. Each twin uses the recorded arrivals of messages,
     delays, hands and changes of the run. The difference from the run is simulated in full,
@@ -234,7 +242,7 @@ def twin_command(
     )
 
 
-@options.command("run.mcap --site m1 --json > m1.json")
+@options.command("run.mcap --site m1 --json > m1.json", page="docs/ports.md")
 def identify_hand_command(
     file: options.LogsArgument,
     site: Annotated[
@@ -255,7 +263,7 @@ def identify_hand_command(
     terminal.print_result(identify_hand(log, site), as_json=as_json)
 
 
-@options.command("run.mcap")
+@options.command("run.mcap", page="docs/metrics.md")
 def metrics_command(file: options.LogsArgument, as_json: options.JsonOption = False) -> None:
     """Computes all metrics that apply to a run.
 
@@ -270,7 +278,9 @@ def metrics_command(file: options.LogsArgument, as_json: options.JsonOption = Fa
     terminal.print_result(compute_log_metrics(log), as_json=as_json)
 
 
-@options.command("run.mcap positions settling --width 3.5 --format pdf --out paper")
+@options.command(
+    "run.mcap positions settling --width 3.5 --format pdf --out paper", page="docs/commands.md"
+)
 def figure_command(
     file: options.LogArgument,
     names: Annotated[
@@ -290,9 +300,9 @@ def figure_command(
     as_json: Annotated[bool, flag("--json", "Print the list or the paths as JSON.")] = False,
     force: options.ForceOption = False,
 ) -> None:
-    """Draws figures of a log for a paper, as PDF, PNG or SVG files with text of 8 pt.
+    """Draws figures of a log for a paper, as PDF, PNG or SVG.
 
-    The same log always gives the same bytes.
+    Text in the figures is 8 pt high. The same log always gives the same bytes.
 
     Options:
         names: Names of the figures (see --list); default: all figures for which FILE has data.
@@ -370,7 +380,7 @@ def _list_figures(log: "Log", *, as_json: bool) -> None:
             )
 
 
-@options.command("run.mcap -o report")
+@options.command("run.mcap -o report", page="docs/first-hour.md")
 def report_command(
     files: options.LogsArgument,
     folder: Annotated[
@@ -386,7 +396,10 @@ def report_command(
     png: options.PngOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Writes a report of a log: a web page and a summary, and with --png also its figures."""
+    """Writes a web page about a log: arms, charts and verdict.
+
+    A summary is written beside the page, and with --png also the figures.
+    """
     from ..files import make_results_folder, refuse_link
     from ..reporting.conclude import conclude
 
@@ -402,7 +415,7 @@ def report_command(
     raise typer.Exit(conclusion.exit_code)
 
 
-@options.command("run.mcap --replace s --set control.Kd=5 -o kd5.mcap")
+@options.command("run.mcap --replace s --set control.Kd=5 -o kd5.mcap", page="docs/rerun.md")
 def rerun_command(
     files: options.LogsArgument,
     replace: Annotated[
@@ -426,10 +439,11 @@ def rerun_command(
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Executes sites of a log again with changed settings, and compares the results.
+    """Computes what a run would have been with other settings.
 
-    Without --closed-loop, only the sites that --replace names are executed again. The other
-    sites repeat what was recorded, and do not react.
+    The results are compared with those of the log. Without --closed-loop, only the sites that
+    --replace names are executed again. The other sites repeat what was recorded, and do not
+    react.
     """
     from ..execution.rerun import rerun
     from ..files import refuse_existing
@@ -466,7 +480,7 @@ LinearFigure = StrEnum("LinearFigure", ["ROOTS", "IMPEDANCE", "PASSIVITY"])
 """Figures that `trilat linear` can draw."""
 
 
-@options.command("p_d_margin --set control.d=0.9 --over control.d=0.1:3")
+@options.command("p_d_margin --set control.d=0.9 --over control.d=0.1:3", page="docs/linear.md")
 def linear_command(
     scenario: options.ScenarioArgument,
     overrides: options.SetOption = None,
@@ -507,13 +521,13 @@ def linear_command(
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Linearises the loop about its equilibrium, and analyses the stability of small motions.
+    """Analyses small motions: roots, delay margin, passivity.
 
-    The command computes the characteristic roots, the largest delay for which the loop is
-    stable, and the stability limits along scenario keys (edges of stability, docs/linear.md).
-    For the arms without operators and environments, it computes passivity, Llewellyn's
-    criterion of absolute stability, and the impedances that operators feel (docs/ports.md). The
-    exit code is 0 for every verdict.
+    The loop is linearised about its equilibrium. The command computes the characteristic roots,
+    the largest delay for which the loop is stable, and the stability limits along scenario keys
+    (edges of stability, docs/linear.md). For the arms without operators and environments, it
+    computes passivity, Llewellyn's criterion of absolute stability, and the impedances that
+    operators feel (docs/ports.md). The exit code is 0 for every verdict.
     """
     options.check_picture(picture, force=force)
     from ..studies.hand_impedance import read_hands

@@ -28,13 +28,13 @@ if TYPE_CHECKING:
     from ..scenario import Scenario
 
 
-@options.command("paper --duration 10 --set control.Kd=5")
+@options.command("paper --duration 10 --set control.Kd=5", page="docs/commands.md")
 def demo_command(
     scenario: options.ScenarioArgument = "paper", *, run: options.RunOptions
 ) -> None:
-    """Runs a scenario live over Zenoh, then verifies its log and writes a report.
+    """Runs a scenario live, verifies its log and writes a report.
 
-    Each site runs in its own process, and so does the recorder.
+    Each site runs in its own process, and so does the recorder; they communicate over Zenoh.
     """
     run_and_report(run.load(scenario), run)
 
@@ -107,7 +107,7 @@ def run_and_report(
         raise typer.Exit(outcome.exit_code)
 
 
-@options.command("play", "--session paper")
+@options.command("play", "--session paper", page="docs/live-page.md")
 def live_command(
     context: typer.Context,
     scenario: options.ScenarioArgument = "play",
@@ -117,7 +117,7 @@ def live_command(
     serving: options.PageServing,
     run: options.RunOptions,
 ) -> None:
-    """Runs a scenario live, with a web page that shows the session and lets you lead the arms.
+    """Runs a scenario live on a web page, where you lead the arms.
 
     A button on the page or Ctrl-C ends the session; then its log is verified and a report is
     written. With --session, the page shows a session that is already running, and leaves it
@@ -178,7 +178,7 @@ _START_OPTIONS = {
 _check_count = options.check_range(5, 10_000, "a number")
 
 
-@options.command("--session paper")
+@options.command("--session paper", page="docs/network.md")
 def ping_command(
     context: typer.Context,
     session: Annotated[str, value("--session", "ID", "Session to measure.")] = "paper",
@@ -210,11 +210,12 @@ def ping_command(
     clock_offset: options.ClockOffsetOption = 0.0,
     clock_drift: options.ClockDriftOption = 0.0,
 ) -> None:
-    """Shows round-trip time, clock offset and jitter between this machine and every member.
+    """Measures delay and clock offset to each member of a session.
 
-    The session may still be waiting for members. If it is running, the delays that its sites
-    measure on their links are shown too. Without endpoints, the command connects to the
-    loopback port of the first site and asks for the other sites.
+    The command shows the round-trip time, the clock offset and the jitter between this machine
+    and every member. The session may still be waiting for members. If it is running, the delays
+    that its sites measure on their links are shown too. Without endpoints, the command connects
+    to the loopback port of the first site and asks for the other sites.
 
     With --benchmark no session is needed: the command measures whether the network is good
     enough for a scenario, using the delay margin that `trilat linear` computes. To measure the
@@ -436,7 +437,7 @@ def _run_far_end(
         raise typer.Exit(interrupt.exit_code)
 
 
-@options.command("--session paper")
+@options.command("--session paper", page="docs/live-page.md")
 def watch_command(
     session: Annotated[str, value("--session", "ID", "Session to watch.")],
     *,
@@ -446,12 +447,13 @@ def watch_command(
     reach: options.Reach,
     timeout: options.AnswerOption = 10.0,
 ) -> None:
-    """Shows a running session in a terminal, until the session ends or you press Ctrl-C.
+    """Shows a running session in the terminal.
 
-    Each site has a line with its joint angles, the size |e| of its synchronisation error, its
-    torque and mode, the age of the newest sample of each peer, and the holder of the arm. The
-    line above the sites shows V, the energy function of the stability proof. Without endpoints,
-    the command connects to the loopback port of the first site and asks for the other sites.
+    The command ends with the session or with Ctrl-C. Each site has a line with its joint
+    angles, the size |e| of its synchronisation error, its torque and mode, the age of the
+    newest sample of each peer, and the holder of the arm. The line above the sites shows V, the
+    energy function of the stability proof. Without endpoints, the command connects to the
+    loopback port of the first site and asks for the other sites.
     """
     from live.terminal_watch import show_in_terminal, watch_session
 
@@ -491,7 +493,7 @@ def _connect(session: str, reach: options.Reach, *, stops: bool = False) -> "Run
     return RunningSession(options.check_session_name(session), connection)
 
 
-@options.command("--session paper s", "--session paper --end")
+@options.command("--session paper s", "--session paper --end", page="docs/live-page.md")
 def stop_command(
     session: SessionOption,
     sites: SitesArgument = None,
@@ -501,12 +503,12 @@ def stop_command(
     *,
     reach: options.Reach,
 ) -> None:
-    """Stops arms at once while the session continues: the arms come to rest where they are.
+    """Stops arms at once; the session goes on.
 
-    The arms stay stopped until you run `trilat enable`. With --end, all sites end their run at
-    the same time instead. Without endpoints, the command reaches the sites on this machine at
-    the addresses that they have stored in files. If there are none, it connects to the loopback
-    port of the first site and asks for the other sites.
+    The arms come to rest where they are, and stay there until you run `trilat enable`.
+    With --end, all sites end their run at the same time instead. Without endpoints, the command
+    reaches the sites on this machine at the addresses that they have stored in files. If there
+    are none, it connects to the loopback port of the first site and asks for the other sites.
     """
     if end and sites:
         raise UsageError("--end ends the whole session: do not name a site")
@@ -515,15 +517,18 @@ def stop_command(
     terminal.print_texts(replies)
 
 
-@options.command("--session paper s")
+@options.command("--session paper s", page="docs/live-page.md")
 def enable_command(
     session: SessionOption, sites: SitesArgument = None, *, reach: options.Reach
 ) -> None:
-    """Enables stopped arms: they wait for the other arms, align with them, and follow them."""
+    """Lets stopped arms follow the other arms again.
+
+    Each arm first waits for the other arms and aligns with them.
+    """
     terminal.print_texts(_connect(session, reach).enable(*(sites or ())))
 
 
-@options.command("--session paper s")
+@options.command("--session paper s", page="docs/external-arm.md")
 def reset_command(
     session: SessionOption,
     sites: Annotated[
@@ -532,7 +537,7 @@ def reset_command(
     *,
     reach: options.Reach,
 ) -> None:
-    """Clears the faults of sites, except faults whose cause persists.
+    """Clears the faults of sites whose cause is gone.
 
     The sites then wait for the other sites. Each arm aligns with the other arms before it
     follows them.
@@ -615,7 +620,7 @@ def set_command(
     *,
     reach: options.Reach,
 ) -> None:
-    """Changes a link, or a row of the dominance matrix, while a session runs.
+    """Changes a link, or who leads, while a session runs.
 
     Without endpoints, it asks the first site, on its loopback port, for the other sites.
     """
@@ -624,7 +629,7 @@ def set_command(
     context.obj = name, reach.resolve()
 
 
-@options.command("'m1->s' --delay 350ms --loss 5%")
+@options.command("'m1->s' --delay 350ms --loss 5%", page="docs/links.md")
 def set_link_command(
     context: typer.Context,
     name: Annotated[
@@ -666,7 +671,7 @@ def set_link_command(
     _send_change(context, receiver, {"link": name, "to": table})
 
 
-@options.command("s m1=0.9 m2=0.1")
+@options.command("s m1=0.9 m2=0.1", page="docs/first-hour.md")
 def set_dominance_command(
     context: typer.Context,
     site: Annotated[str, typer.Argument(help="Site whose dominance row changes.")],
@@ -715,7 +720,9 @@ def _send_change(context: typer.Context, site: str, change: dict[str, Any]) -> N
     terminal.print_text(reply.text)
 
 
-@options.command("--keys keys/m1 --listen tls/0.0.0.0:7447", "--session paper")
+@options.command(
+    "--keys keys/m1 --listen tls/0.0.0.0:7447", "--session paper", page="docs/network.md"
+)
 def doctor_command(
     *,
     ways: options.MemberOptions,
@@ -728,10 +735,11 @@ def doctor_command(
     ] = Path("runs"),
     as_json: options.JsonOption = False,
 ) -> None:
-    """Checks this machine: keys, endpoints, clocks, real-time privileges, disk and processors.
+    """Checks whether this machine is ready for a live session.
 
-    Use the options of the site, recorder or router that will run on this machine. The exit code
-    is 1 if a check fails.
+    It checks keys, endpoints, clocks, real-time privileges, disk and processors. Use the
+    options of the site, recorder or router that will run on this machine. The exit code is 1 if
+    a check fails.
     """
     from sites.doctor import examine_machine
 

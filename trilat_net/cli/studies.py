@@ -42,7 +42,7 @@ MAX_SEEDS = 100_000
 """Largest number of seeds that --seeds may name."""
 
 
-@options.command("jitter --seeds 1..20 --junit out.xml")
+@options.command("jitter --seeds 1..20 --junit out.xml", page="docs/lab.md")
 def test_command(
     scenarios: Annotated[
         list[str] | None,
@@ -77,10 +77,11 @@ def test_command(
     overrides: options.SetOption = None,
     as_json: options.JsonOption = False,
 ) -> None:
-    r"""Runs scenarios, checks the expectations in their \[expect] sections, and prints margins.
+    r"""Checks scenarios against their own expectations.
 
-    A margin is the distance of a measured value from its expected bound. For each failure, the
-    command that repeats the run is printed.
+    Each scenario is run, the expectations in its section \[expect] are checked, and margins are
+    printed. A margin is the distance of a measured value from its expected bound. For each
+    failure, the command that repeats the run is printed.
     """
     from ..files import write_whole
     from ..studies.executor import check_workers
@@ -345,7 +346,9 @@ def _run_tuning(
 _option = partial(value, rich_help_panel="Tune laws")
 
 
-@options.command("a.mcap b.mcap", "--tune free --law adaptive,p_d")
+@options.command(
+    "a.mcap b.mcap", "--tune free --law adaptive,p_d", page="docs/fair-comparison.md"
+)
 def compare_command(
     context: typer.Context,
     files: Annotated[list[Path] | None, typer.Argument(metavar="FILE FILE...")] = None,
@@ -364,10 +367,11 @@ def compare_command(
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Compares logs and shows how their experiments differ, or compares tuned control laws.
+    """Compares logs, or tuned control laws, side by side.
 
-    All control laws are tuned by the same procedure. The results are not ranked, because small
-    errors can also mean that an arm hangs freely, or that no operator moves it.
+    For logs, the command also shows how their experiments differ. All control laws are tuned by
+    the same procedure. The results are not ranked, because small errors can also mean that an
+    arm hangs freely, or that no operator moves it.
 
     Options:
         files: Two or more MCAP logs.
@@ -411,7 +415,9 @@ def compare_command(
 
 
 @options.command(
-    "--arm arm6.urdf --delay 40ms --figure gains.png", "--arm my.urdf --delay measured:run.mcap"
+    "--arm arm6.urdf --delay 40ms --figure gains.png",
+    "--arm my.urdf --delay measured:run.mcap",
+    page="docs/arms.md",
 )
 def tune_command(
     arm: Annotated[
@@ -448,12 +454,12 @@ def tune_command(
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Finds the largest gains for an arm on links with a delay, and tests them in simulation.
+    """Finds the largest gains for an arm on links with a delay.
 
-    The gains keep a margin to the stability limit. Two or three such arms follow one another
-    over links with that delay in both directions (docs/arms.md). Paste the last line of the
-    output into a scenario. Exit code 0: all simulated runs behave as the linear loop predicts.
-    1: at least one run does not.
+    The gains keep a margin to the stability limit, and are tested in simulation. Two or three
+    such arms follow one another over links with that delay in both directions (docs/arms.md).
+    Paste the last line of the output into a scenario. Exit code 0: all simulated runs behave as
+    the linear loop predicts. 1: at least one run does not.
 
     Options:
         delay: One-way delay of the links, for example 40ms. The delays can also come from a
@@ -594,7 +600,7 @@ def _run_bench(
         raise
 
 
-@options.command("--small", "--study round-trips --law wave,smith")
+@options.command("--small", "--study round-trips --law wave,smith", page="docs/bench.md")
 def bench_command(
     study: Annotated[
         str, value("--study", "full|small|round-trips", "Part of the suite to run.")
@@ -621,7 +627,7 @@ def bench_command(
     on: options.OnOption = None,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Runs control laws on the same tasks over the same links, and tabulates the results.
+    """Compares control laws on the same tasks and links.
 
     The tables show stability, energy, errors, effort and stiffness. The gains of all laws were
     tuned by the same procedure. Finished runs are kept; use the same command again to continue
@@ -696,7 +702,7 @@ ProtocolArgument = Annotated[
 FolderArgument = Annotated[Path, typer.Argument(help="Folder of an experiment.", metavar="DIR")]
 
 
-@options.command("reaching.toml", "two-people.toml --pair")
+@options.command("reaching.toml", "two-people.toml --pair", page="docs/experiments.md")
 def experiment_new_command(
     file: Annotated[
         Path, typer.Argument(help="Protocol to write (a TOML file).", metavar="FILE")
@@ -714,7 +720,7 @@ def experiment_new_command(
     terminal.print_text(f"{file}: a protocol; run it with: trilat experiment run {file}")
 
 
-@options.command("reaching.toml")
+@options.command("reaching.toml", page="docs/experiments.md")
 def experiment_check_command(
     file: ProtocolArgument, as_json: options.JsonOption = False
 ) -> None:
@@ -724,7 +730,12 @@ def experiment_check_command(
     terminal.print_result(check_experiment(file), as_json=as_json)
 
 
-@options.command("reaching.toml", "two-people.toml --live", "runs/experiment-reaching-001")
+@options.command(
+    "reaching.toml",
+    "two-people.toml --live",
+    "runs/experiment-reaching-001",
+    page="docs/experiments.md",
+)
 def experiment_run_command(
     file: Annotated[
         Path, typer.Argument(help="A protocol, or the folder of an experiment to continue.")
@@ -774,7 +785,7 @@ def experiment_run_command(
         raise typer.Exit(exit_code)
 
 
-@options.command("runs/experiment-reaching-001")
+@options.command("runs/experiment-reaching-001", page="docs/experiments.md")
 def experiment_analyse_command(
     folder: FolderArgument,
     out: Annotated[Path | None, value("--out -o", "DIR")] = None,
@@ -798,7 +809,7 @@ def experiment_analyse_command(
     terminal.print_paths([] if as_json else analysis.paths)
 
 
-@options.command("0.8 --participants 16")
+@options.command("0.8 --participants 16", page="docs/experiments.md")
 def experiment_power_command(
     effect: Annotated[
         float, typer.Argument(help="Cohen's d_z of a paired comparison.", min=0.01, max=10.0)
@@ -826,7 +837,7 @@ def experiment_power_command(
     terminal.print_result(power, as_json=as_json)
 
 
-@options.command("runs/experiment-reaching-001")
+@options.command("runs/experiment-reaching-001", page="docs/experiments.md")
 def experiment_status_command(
     folder: FolderArgument, as_json: options.JsonOption = False
 ) -> None:

@@ -308,6 +308,7 @@ def _print_cell_commands(path: Path, number: int, *, as_json: bool) -> None:
     "p_d_margin --over link.delay_ms=0:1600:50 --over control.d=0.2:3:0.1",
     "p_d_margin --over link.delay_ms=100,200,400 --margin control.d=0.2:3",
     "runs/sweep-p_d_margin-001 --cell 17",
+    page="docs/sweep.md",
 )
 def sweep_command(
     context: typer.Context,
@@ -341,11 +342,11 @@ def sweep_command(
     confirm: Annotated[int | None, _option("--confirm", metavar="K", min=1)] = None,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Runs a scenario over a grid of scenario keys in virtual time, and judges its stability.
+    """Maps where a scenario is stable, over a grid of settings.
 
-    All cores are used. Finished runs are kept even if the sweep is interrupted. To continue it,
-    use --resume, or the same command with the same -o. A cell is one combination of values in
-    the grid.
+    Every run is simulated in virtual time. All cores are used. Finished runs are kept even if
+    the sweep is interrupted. To continue it, use --resume, or the same command with the same
+    -o. A cell is one combination of values in the grid.
 
     Options:
         scenario: Name of a shipped scenario, path of a TOML file, or folder (or results.csv) of
