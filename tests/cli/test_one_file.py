@@ -76,6 +76,7 @@ def test_file_beside_others_is_command_and_its_study(tmp_path: Path) -> None:
     drop(tmp_path, "cli", "lag.py", STUDY)
     found = look(LOOK, tmp_path)
     assert "Measures how far the slave lags, seed by seed." in found["listed"]
+    assert "lag" in found["listed"].partition("─ Make your own ─")[2]
     assert "Example: trilat lag paper --seeds 3" in found["help"]
     assert found["first"]["made"] == 2
     assert found["again"]["made"] == 1  # the journal has the others

@@ -20,7 +20,7 @@ from . import options
 from .options import value
 
 
-@options.command("", page="docs/commands.md")
+@options.command("")
 def scenario_list_command(as_json: options.JsonOption = False) -> None:
     """Lists the shipped scenarios."""
     from ..scenario import list_shipped, load_scenario

@@ -98,7 +98,7 @@ _OPTION_ENTRY = re.compile(r"^    (\w+): (.+(?:\n {8}.+)*)", re.MULTILINE)
 """An entry in the section `Options` of a docstring after `inspect.cleandoc`."""
 
 
-def command(*examples: str, page: str) -> Callable[[Runs], Runs]:
+def command(*examples: str, page: str = "docs/commands.md") -> Callable[[Runs], Runs]:
     """Returns a decorator that declares a function as a command of the program.
 
     The docstring of the function is the help of the command. The help of options that is too

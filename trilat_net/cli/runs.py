@@ -278,9 +278,7 @@ def metrics_command(file: options.LogsArgument, as_json: options.JsonOption = Fa
     terminal.print_result(compute_log_metrics(log), as_json=as_json)
 
 
-@options.command(
-    "run.mcap positions settling --width 3.5 --format pdf --out paper", page="docs/commands.md"
-)
+@options.command("run.mcap positions settling --width 3.5 --format pdf --out paper")
 def figure_command(
     file: options.LogArgument,
     names: Annotated[

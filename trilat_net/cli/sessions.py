@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from ..scenario import Scenario
 
 
-@options.command("paper --duration 10 --set control.Kd=5", page="docs/commands.md")
+@options.command("paper --duration 10 --set control.Kd=5")
 def demo_command(
     scenario: options.ScenarioArgument = "paper", *, run: options.RunOptions
 ) -> None:
