@@ -1,7 +1,10 @@
 import re
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import pytest
+import typer.main
 from typer.testing import CliRunner
 
 from tests.golden.surface import all_options
@@ -25,6 +28,7 @@ COMMANDS = [
 ]
 
 
+@cache
 def printed(*arguments: str) -> str:
     result = CliRunner().invoke(
         app, list(arguments), env={"NO_COLOR": "1", "TERM": "dumb", "COLUMNS": "200"}
@@ -91,3 +95,13 @@ def test_a_help_ends_with_an_example_and_a_page(command: str) -> None:
     named = re.fullmatch(r" Docs: (docs/\S+\.md) *", page)
     assert named is not None, page
     assert (ROOT / named[1]).is_file()
+
+
+@pytest.mark.parametrize("command", [*map(" ".join, COMMANDS), *GROUPS])
+def test_a_help_starts_with_one_sentence(command: str) -> None:
+    found: Any = typer.main.get_command(app)
+    for word in command.split():
+        found = found.commands[word]
+    purpose = found.help.split("\n\n")[0]
+    assert re.fullmatch(r"[A-Z][^\n]*[.?]", purpose)
+    assert not re.search(r"[.?] [A-Z]", purpose)
