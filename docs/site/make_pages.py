@@ -60,7 +60,7 @@ def read_beside_docs(name: str) -> str:
 
 
 def list_commands() -> str:
-    """Returns the help of every command, as Typer writes it."""
+    """Returns the help of every command, as Typer writes it, with links to the pages that it names."""
     run = [
         sys.executable,
         "-m",
@@ -73,7 +73,8 @@ def list_commands() -> str:
         "--title",
         "Commands",
     ]
-    return subprocess.run(run, check=True, capture_output=True, text=True, cwd=ROOT).stdout
+    text = subprocess.run(run, check=True, capture_output=True, text=True, cwd=ROOT).stdout
+    return re.sub(r"(^Docs: |, )docs/(\S+\.md)", r"\1[\2](../\2)", text, flags=re.MULTILINE)
 
 
 def list_functions() -> str:
