@@ -49,7 +49,7 @@ POINTS_KEPT = 1200
 ENERGY_PERIOD_S = 0.025
 """Smallest time between two points of the energies, in s."""
 COLOURS = 6
-"""Number of colours for sites in `page.css`."""
+"""Number of colours for sites in `theme.css`."""
 MAX_FRAME_S = 0.5
 """Longest time whose records a frame evaluates, in s."""
 _MIN_SINGULAR_SHARE = 0.05

@@ -84,6 +84,7 @@ def test_it_serves_its_own_files_and_no_others(server: PageServer) -> None:
         "painter3d.js",
         "three.module.min.js",
         "uPlot.iife.min.js",
+        "theme.css",
         "page.css",
         "three-LICENSE",
     ):

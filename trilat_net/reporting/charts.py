@@ -73,6 +73,10 @@ _BOX_INSTANTS = 60
 """Number of instants at which the box around the motion of the arms is measured."""
 _CHAIN_INSTANTS = 400
 """Largest number of instants for which the page has the joint positions of a chain."""
+_MAXIMA = 400
+"""Number of intervals of a line of maxima."""
+_LEAST_DRAWN = 1e-6
+"""Smallest drawn maximum. A logarithmic axis needs a positive number."""
 PICTURE_SIDE = 4.0
 """Longer side of a picture of a chain, in the unit of the line widths of the page."""
 
@@ -145,7 +149,11 @@ class ChartBuilder:
         log = self._log
         charts: list[Chart] = []
         missing: dict[str, list[str]] = {}
-        candidates = [*self._build_motion_charts(), *self._build_timing_charts()]
+        candidates = [
+            *self._build_overview_charts(),
+            *self._build_motion_charts(),
+            *self._build_timing_charts(),
+        ]
         for chart in candidates:
             if chart.series:
                 charts.append(chart)
@@ -178,6 +186,56 @@ class ChartBuilder:
             bounds_m=[self.units_per_m * bound for bound in self.bounds_m],
         )
         return PageCharts(data, missing)
+
+    def _build_overview_charts(self) -> Iterator[TimeChart]:
+        """Yields the two charts of the first screen: the error and the delay of each site.
+
+        A site has a single line in each: the largest error of its joints, and the age of the
+        oldest sample that its controller used.
+        """
+        log = self._log
+        yield self._make_chart(
+            section="overview",
+            title="largest error |e| of each site",
+            unit=site_signals.shared_unit(log),
+            series=self._add_maxima(lambda site: np.abs(site_signals.joint_errors(log[site]))),
+            lines=[self._draw_limit(site_signals.SETTLED_ERROR_RAD)],
+            log=True,
+        )
+        yield self._make_chart(
+            section="overview",
+            title="delay that each controller experienced",
+            unit="ms",
+            series=self._add_maxima(lambda site: site_signals.sample_ages_ms(log, site)),
+            zero=True,
+            margin=0.05,
+        )
+
+    def _add_maxima(self, read_values: Callable[[str], Array]) -> list[TableSeries]:
+        """Adds a line per site with the largest values of a signal in short intervals.
+
+        Within an interval, the line is constant. A line of the values themselves would be a
+        broad band wherever they oscillate.
+
+        Args:
+            read_values: Function that returns the values of a site, given its name, with a row
+                for each record.
+        """
+        series = []
+        for site in self._log.sites:
+            values = read_values(site)
+            known = np.where(np.isnan(values), -np.inf, values)
+            largest = known.max(axis=1, initial=-np.inf)
+            records = self._log[site]
+            interval = np.floor(records.t_s * (_MAXIMA / self._end_s)).astype(np.int64)
+            starts = np.flatnonzero(np.diff(interval, prepend=-1))
+            maxima = largest
+            if len(starts):
+                lengths = np.diff(np.append(starts, len(interval)))
+                maxima = np.repeat(np.maximum.reduceat(largest, starts), lengths)
+            drawn = np.where(np.isfinite(maxima), np.maximum(maxima, _LEAST_DRAWN), np.nan)
+            series.append(self._make_series(site, self._add_records(site, drawn[:, None]), 0))
+        return series
 
     def _build_motion_charts(self) -> Iterator[TimeChart]:
         """Yields the charts of torques, positions, errors, estimates and displacements.

@@ -10,7 +10,7 @@
   const clock = document.querySelector("#arms output");
   const button = document.querySelector("#arms button");
   const [left, right, bottom, top] = page.bounds_m;
-  row.style.gridTemplateColumns = `repeat(${page.arms.length}, 1fr)`;
+  row.style.gridTemplateColumns = `repeat(${page.arms.length}, minmax(0, 1fr))`;
   const element = (parent, name, attributes) => {
     const made = document.createElementNS(SVG, name);
     Object.entries(attributes).forEach(([key, value]) => made.setAttribute(key, value));
@@ -89,15 +89,16 @@
     started = null;
     button.textContent = "play";
   }
-  button.addEventListener("click", () => {
-    if (started !== null) return stop();
+  function play() {
     const from = (slider.value / 1000) * page.end_s;
     started = performance.now() - 1000 * (from >= 0.999 * page.end_s ? 0 : from);
     button.textContent = "stop";
     requestAnimationFrame(frame);
-  });
+  }
+  button.addEventListener("click", () => (started === null ? play() : stop()));
   slider.addEventListener("input", () => { stop(); show((slider.value / 1000) * page.end_s); });
 
-  window.trilat.show = show;
+  window.trilat.show = (time) => { if (started === null) show(time); };
   show(0);
+  if (!matchMedia("(prefers-reduced-motion: reduce)").matches) play();
 })();

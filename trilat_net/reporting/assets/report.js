@@ -15,12 +15,12 @@
   const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
   const isDark = () => darkQuery.matches && !printing;
   const colour = (index) => {
-    if (index === "limit") return isDark() ? "#a0a7b3" : "#444444";
+    if (index === "limit") return css("--soft");
     const palette = isDark() ? page.colours.dark : page.colours.light;
     return palette[index % palette.length];
   };
-  const ink = () => (isDark() ? "#e8eaed" : "#1c1e21");
-  const grid = () => (isDark() ? "#33383f" : "#e3e5e9");
+  const ink = () => css("--ink");
+  const grid = () => css("--line");
   const dashOf = (series) => {
     if (series.dash) return [5, 3];
     const round = Math.floor(series.colour / page.colours.light.length);
@@ -134,10 +134,16 @@
     return [aligned.length > 1 ? uPlot.join(aligned, modes) : aligned[0], [...parts.values()].flat()];
   }
 
-  const rungs = (u, index, min, max) => [-3, -2, -1, 0, 1, 2, 3, 4, 5, 6].flatMap((power) =>
-    [1, 2, 5].map((step) => step * 10 ** power).filter((value) => value >= min && value <= max));
+  // Labels of a logarithmic axis: powers of ten, and 2 and 5 times these where there is room.
+  const rungs = (u, index, min, max) => {
+    const steps = max / min > 300 ? [1] : [1, 2, 5];
+    const powers = Array.from({ length: 20 }, (_, n) => n - 9);
+    const values = powers.flatMap((power) => steps.map((step) => step * 10 ** power));
+    return values.filter((value) => value >= min && value <= max);
+  };
+  const rungLabels = (u, splits) => splits.map((value) => (value == null ? "" : `${Number(value.toPrecision(1))}`));
 
-  const tall = (box) => (box.closest(".small") ? 110 : 210);
+  const tall = (box) => (box.closest(".small") ? 110 : 165);
 
   function timeChart(chart, box) {
     const [data, order] = timeData(chart);
@@ -168,7 +174,7 @@
           value: (u, v) => number(v, chart.unit),
         })),
       ],
-      axes: [axis("time (s)", { size: 30 }), axis(`${chart.unit}`, { size: 52, ...(box.closest(".small") ? { space: 16 } : {}), ...(chart.log ? { splits: rungs, values: undefined } : {}) })],
+      axes: [axis("time (s)", { size: 30 }), axis(`${chart.unit}`, { size: 52, ...(box.closest(".small") ? { space: 16 } : {}), ...(chart.log ? { splits: rungs, values: rungLabels } : {}) })],
       hooks: {
         drawAxes: [marks(chart), ...(chart.links ? [] : [horizontals(lines)])],
         draw: chart.links ? [horizontals(lines)] : [],
@@ -205,7 +211,7 @@
     };
     const decades = (u, splits) => splits.map((v) => (Number.isInteger(Math.log10(v)) ? v.toLocaleString("en") : ""));
     return new uPlot({
-      width: box.clientWidth, height: 210, padding: [8, 16, 0, 0],
+      width: box.clientWidth, height: tall(box), padding: [8, 16, 0, 0],
       scales: {
         x: { time: false, ...log, range: [1, chart.edges[chart.edges.length - 1]] },
         y: { ...log, range: [0.7, top * 1.6] },
@@ -227,7 +233,7 @@
 
   function distribution(chart, box) {
     return new uPlot({
-      width: box.clientWidth, height: 210, padding: [8, 16, 0, 0],
+      width: box.clientWidth, height: tall(box), padding: [8, 16, 0, 0],
       scales: { x: { time: false, distr: chart.log ? 3 : 1 }, y: { range: [0, 104] } },
       cursor: { drag: { x: false, y: false }, points: { size: 6 } },
       series: [
@@ -237,7 +243,7 @@
           points: { show: false }, value: (u, v) => number(v, "%"),
         })),
       ],
-      axes: [axis(`${chart.unit}; dashed: the delay of the samples`, { size: 30, ...(chart.log ? { splits: rungs, values: undefined } : {}) }), axis("cumulative (%)", { size: 52 })],
+      axes: [axis(`${chart.unit}; dashed: the delay of the samples`, { size: 30, ...(chart.log ? { splits: rungs, values: rungLabels } : {}) }), axis("cumulative (%)", { size: 52 })],
     }, [floats(chart.x), ...chart.series.map((series) => floats(series.values))], box);
   }
 
@@ -252,20 +258,45 @@
     return box;
   });
 
+  // A chart in a folded part of the page has no width yet. It is built once its part is unfolded.
+  function buildVisible() {
+    page.charts.forEach((chart, n) => {
+      if (!plots[n] && boxes[n].clientWidth) plots[n] = BUILDERS[chart.kind](chart, boxes[n]);
+    });
+  }
+
   function build() {
     plots.forEach((plot) => plot.destroy());
+    plots = [];
     timePlots = [];
-    plots = page.charts.map((chart, n) => BUILDERS[chart.kind](chart, boxes[n]));
+    buildVisible();
+  }
+
+  function resize() {
+    plots.forEach((plot, n) => {
+      if (boxes[n].clientWidth) plot.setSize({ width: boxes[n].clientWidth, height: tall(boxes[n]) });
+    });
   }
 
   window.trilat = { page, tables, plots: () => timePlots, show: () => {} }; // the arms join in
   build();
+  document.addEventListener("toggle", buildVisible, true); // this event does not bubble
   let pending = 0;
   addEventListener("resize", () => {
     clearTimeout(pending);
-    pending = setTimeout(() => plots.forEach((plot, n) => plot.setSize({ width: boxes[n].clientWidth, height: tall(boxes[n]) })), 120);
+    pending = setTimeout(resize, 120);
   });
   darkQuery.addEventListener("change", build);
-  addEventListener("beforeprint", () => { printing = true; build(); });
-  addEventListener("afterprint", () => { printing = false; build(); });
+  let unfolded = [];
+  addEventListener("beforeprint", () => {
+    printing = true;
+    unfolded = [...document.querySelectorAll("details:not([open])")].filter((part) => part.querySelector("figure"));
+    unfolded.forEach((part) => { part.open = true; });
+    build();
+  });
+  addEventListener("afterprint", () => {
+    printing = false;
+    unfolded.forEach((part) => { part.open = false; });
+    build();
+  });
 })();

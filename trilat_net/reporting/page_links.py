@@ -1,0 +1,181 @@
+"""Renders the section of a report's page about communication: delays, losses and clocks.
+
+A link is the directed connection from one site to another, and a site is a process that
+controls one robot arm. A sample is the state that a site publishes in a tick of its control
+loop. The age of a sample is the time since it was sent. It is the delay that the controller of
+the receiver experiences.
+
+Invariant:
+    - A sentence with the main numbers precedes the tables, and each table has a legend.
+    - Empty tables are left out.
+"""
+
+from html import escape
+
+from ..errors import count_nouns
+from ..log.log_reader import Log
+from ..results import JsonObject
+from .page_html import (
+    format_cell,
+    label_link,
+    render_details,
+    render_legend,
+    render_section,
+    render_table,
+    to_percent,
+)
+from .style import typeset
+
+_MOST_OPEN_ROWS = 6
+"""Largest number of links whose ages are not folded."""
+_AGE_COLUMNS = {
+    "link": "",
+    "stated delay": "delay model of the scenario, and its changes",
+    "in use, mean (ms)": "mean age of the samples in use, over all ticks",
+    "deviation": "standard deviation of this age",
+    "p50": "median of this age",
+    "p99": "age that 99 % of the ticks do not exceed",
+    "min": "least age",
+    "max": "largest age",
+    "nothing new (% of ticks)": "share of the ticks in which no new sample came into use",
+    "longest silence (ms)": "longest time between two new samples",
+}
+_AGE_KEYS = ("mean", "deviation", "p50", "p99", "min", "max")
+_SAMPLE_COLUMNS = {
+    "sent": ("sent", "samples that the sender published"),
+    "missing": ("missing on the way", "samples that the network did not deliver"),
+    "lost": ("lost by the model", "samples that the delay model lost"),
+    "late": ("late", "samples that arrived after the model's delay had passed"),
+    "superseded": ("superseded", "never used, because a newer sample came into use before"),
+    "duplicate": ("duplicates", "samples that arrived twice"),
+    "copies": ("of the model", "duplicates that the delay model made"),
+}
+"""Header and meaning of each count of a link, by its key in the summary."""
+_LOSS_COLUMNS = {
+    "lost in all (%)": "share of the samples that could not come into use",
+    "in a row": "mean number of samples that were lost together",
+}
+_ONE_WAY_COLUMNS = {
+    "one way, min (µs)": "least measured time from sender to receiver",
+    "p50": "median of this time",
+    "p99": "time that 99 % of the samples do not exceed",
+    "max": "largest time",
+    "known to, p50 (µs)": "median of the error bound of these times",
+}
+_CLOCK_COLUMNS = {
+    "offset_us": ("ahead at the end (µs)", "clock of the sender minus that of the receiver"),
+    "offset_first_us": ("at the start", "the same difference at the start"),
+    "drift_ppm": ("drift (ppm)", "rate of the difference"),
+    "drift_bound_ppm": ("known to (ppm)", "error bound of the drift"),
+    "bound_us": ("offset known to, end (µs)", "error bound of the difference at the end"),
+    "bound_p50_us": ("p50", "median of this bound"),
+    "bound_max_us": ("max", "largest value of this bound"),
+    "rtt_min_us": ("round trip, min (µs)", "shortest time to the peer and back"),
+    "faults": ("faults", "samples that arrived before they were sent"),
+}
+"""Header and meaning of each number of a sender's clock, by its key in the summary."""
+
+
+def render_links(log: Log, facts: JsonObject, charts: str = "") -> str:
+    """Renders the section about the links: a sentence, and the tables of ages, samples, clocks.
+
+    Args:
+        log: Log of the run.
+        facts: Numbers of the run, from `summarise_run`.
+        charts: HTML of the charts about the links. Empty for none.
+    """
+    rows = _list_age_rows(log, facts)
+    ages = render_table(_AGE_COLUMNS, rows, text_columns=[1]) + render_legend(_AGE_COLUMNS)
+    heading = "Age of the samples in use, by link"
+    body = render_details(heading, ages, is_open=len(rows) <= _MOST_OPEN_ROWS)
+    body += render_details("Samples sent, lost and superseded", _render_samples(log, facts))
+    clocks = _render_clocks(log, facts)
+    if clocks:
+        body += render_details("Clocks of the senders, as the receivers saw them", clocks)
+    return render_section("Links", _summarise_links(facts), body + charts, "links")
+
+
+def _summarise_links(facts: JsonObject) -> str:
+    """Returns a sentence about the stated delays, the ages in use, and the losses."""
+    links: dict[str, JsonObject] = facts["links"]
+    models = {model["link"] for link in links.values() for model in link["stated"]}
+    stated = f"{count_nouns(len(links), 'link')} with {len(models)} different delay models"
+    if len(models) == 1:
+        stated = f"Every link has the delay model “{typeset(*models)}”"
+    ages_ms = [link["age_ms"] for link in links.values() if link["age_ms"]["max"] is not None]
+    if not ages_ms:
+        return f"{stated}; no sample came into use."
+    least_ms = format_cell(min(age["min"] for age in ages_ms))
+    most_ms = format_cell(max(age["max"] for age in ages_ms))
+    used = f"the controllers used samples that were {least_ms} to {most_ms} ms old"
+    if least_ms == most_ms:
+        used = f"the controllers used samples that were {most_ms} ms old"
+    losses = {name: link["loss"] for name, link in links.items() if link["loss"]}
+    if not losses:
+        return f"{stated}; {used}, and no sample was lost."
+    worst = max(losses, key=lambda name: losses[name])
+    share = format_cell(to_percent(losses[worst]))
+    return f"{stated}; {used}, and up to {share} % were lost (on {typeset(worst)})."
+
+
+def _list_age_rows(log: Log, facts: JsonObject) -> list[list[str]]:
+    """Returns the rows with each link's stated delay and the actual ages of its samples.
+
+    The scenario may change the delay of a link during the run. Then the cell lists all stated
+    delays, each with the time from which it applied.
+    """
+    rows = []
+    for name, link in facts["links"].items():
+        first, *later = link["stated"]
+        models = [first["link"]]
+        models += [f"from {change['from_s']:g} s: {change['link']}" for change in later]
+        stated = "<br>".join(escape(typeset(model)) for model in models)
+
+        values = [link["age_ms"][key] for key in _AGE_KEYS]
+        values += [to_percent(link["ticks_without_new"]), link["silence_ms"]]
+        rows.append([label_link(log, name), stated, *map(format_cell, values)])
+    return rows
+
+
+def _render_samples(log: Log, facts: JsonObject) -> str:
+    """Returns the table that counts the delivered and the lost samples of each link.
+
+    The columns with measured one-way delays are added only if at least one link has them.
+    """
+    links: dict[str, JsonObject] = facts["links"]
+    is_measured = any(link["one_way_us"] for link in links.values())
+    columns = {"link": "", **dict(_SAMPLE_COLUMNS.values()), **_LOSS_COLUMNS}
+    if is_measured:
+        columns |= _ONE_WAY_COLUMNS
+    rows = []
+    for name, link in links.items():
+        counts: JsonObject = link["samples"] or {}
+        values = [counts.get(key) for key in _SAMPLE_COLUMNS]
+        values += [to_percent(link["loss"]), link["burst"]]
+        if is_measured:
+            one_way_us = link["one_way_us"] or {}
+            clock = link["clock"] or {}
+            values += [one_way_us.get(key) for key in ("min", "p50", "p99", "max")]
+            values.append(clock.get("bound_p50_us"))
+        rows.append([label_link(log, name), *map(format_cell, values)])
+    return render_table(columns, rows) + render_legend(columns)
+
+
+def _render_clocks(log: Log, facts: JsonObject) -> str:
+    """Returns the table that compares the clock of each sender with that of the receiver.
+
+    Returns:
+        HTML of the table. Empty if all sites read the same clock.
+    """
+    rows = []
+    for name, link in facts["links"].items():
+        clock: JsonObject = link["clock"] or {}
+        # Two sites that read the same clock know its offset exactly: it is zero.
+        is_other_clock = clock and (clock["bound_max_us"] or clock["offset_us"])
+        if is_other_clock:
+            cells = [format_cell(clock[key]) for key in _CLOCK_COLUMNS]
+            rows.append([label_link(log, name), *cells])
+    if not rows:
+        return ""
+    columns = {"clock of the sender": "", **dict(_CLOCK_COLUMNS.values())}
+    return render_table(columns, rows) + render_legend(columns)

@@ -1,0 +1,147 @@
+"""Renders the section of a report's page that says where a run comes from.
+
+It contains the description of the scenario (the experiment), the facts about the recording, the
+commands that check and repeat the run, the assumptions, and the versions of the software.
+
+Invariant:
+    - Everything in this section is folded, except the commands.
+"""
+
+from datetime import UTC, datetime
+from html import escape
+from pathlib import Path
+
+from ..log.accounting import describe_unknown_ends
+from ..log.log_reader import Log
+from ..results import JsonObject
+from ..scenario import Scenario, list_shipped, load_scenario
+from ..scenario.describe import list_arm_notes
+from .page_html import render_code, render_details, render_facts, render_section, render_text
+from .page_timeline import describe_dominance
+
+def render_origin(log: Log, facts: JsonObject, licence: str) -> str:
+    """Renders the section with the commands, the scenario, the assumptions and the versions.
+
+    Args:
+        log: Log of the run.
+        facts: Numbers of the run, from `summarise_run`.
+        licence: Licence of the plotting library in the page.
+    """
+    scenario = log.scenario
+    name, hint = _find_scenario_argument(scenario)
+    body = render_code(_list_commands(log, name))
+    body += render_details("What this scenario is about", _render_description(scenario))
+    body += render_details(f"The resolved scenario, {hint}", render_code(scenario.text))
+    body += render_details("What is assumed", _render_assumptions(scenario))
+    body += render_details("The recording", render_facts(_list_recording_facts(log, facts)))
+    body += render_details("Versions of the software", render_facts(_list_versions(log)))
+    body += render_details("Licence of the plotting library", render_code(licence))
+    intro = "These commands check the log, simulate its run again, and run its scenario."
+    return render_section("Do this again", intro, body, "origin")
+
+
+def summarise_origin(log: Log) -> str:
+    """Returns the name, length and origin of a run in one line, for the head of the page.
+
+    Args:
+        log: Log of the run.
+    """
+    scenario = log.scenario
+    driver = _describe_driver(log)
+    length = f"{scenario.duration_s:g} s"
+    return f"{scenario.name} · {length} · {driver} · seed {scenario.seed}"
+
+
+def _render_description(scenario: Scenario) -> str:
+    """Returns the description of a scenario as paragraphs, with text in backticks as code."""
+    paragraphs = scenario.about.strip().split("\n\n")
+    html = "".join(f"<p>{render_text(paragraph)}</p>" for paragraph in paragraphs if paragraph)
+    return html or "<p>The scenario has no description.</p>"
+
+
+def _render_assumptions(scenario: Scenario) -> str:
+    """Returns the list of assumptions that the scenario declares, and the notes on its arms."""
+    texts = [*scenario.assumed, *list_arm_notes(scenario)]
+    if not texts:
+        return "<p>Nothing is declared as assumed.</p>"
+    items = "".join(f"<li>{escape(text)}</li>" for text in texts)
+    return f"<ul>{items}</ul>"
+
+
+def _list_recording_facts(log: Log, facts: JsonObject) -> list[tuple[str, str]]:
+    """Returns the facts about the recording, such as its length and its missing records."""
+    scenario = log.scenario
+    records = f"{facts['records']}, {facts['missing']} missing"
+    if not log.complete:
+        records += "; the file was not finished"
+    if log.unknown_ends:
+        records += f"; {describe_unknown_ends(log.unknown_ends)}"
+    return [
+        ("scenario", f"{scenario.name}, sha256 {scenario.sha256[:16]}"),
+        ("driven by", _describe_driver(log)),
+        ("length", f"{scenario.duration_s:g} s; scheme {scenario.scheme}"),
+        ("records", records),
+        ("dominance", describe_dominance(scenario)),
+        ("diverged", "yes" if facts["diverged"] else "no"),
+    ]
+
+
+def _describe_driver(log: Log) -> str:
+    """Returns how the run was executed: in virtual time, as a rerun, or as a live session."""
+    session = log.session
+    if log.driver == "virtual":
+        return "simulated in virtual time"
+    if log.driver == "rerun":
+        source = session.get("rerun_of", "") or "a log"
+        sites = session.get("rerun_executed", "").replace(" ", ", ")
+        return f"rerun of {source}: {sites} executed afresh"
+    epoch_s = int(session.get("epoch_unix_ns", "0")) // 10**9
+    epoch = datetime.fromtimestamp(epoch_s, UTC)
+    return f"live, session {session.get('session', '')}, epoch {epoch:%Y-%m-%d %H:%M:%S} UTC"
+
+
+def _find_scenario_argument(scenario: Scenario) -> tuple[str, str]:
+    """Returns how a command names the scenario, and where the scenario comes from.
+
+    If the scenario is shipped with this program, its name is enough. Otherwise the reader must
+    save the text of the scenario as a file first.
+    """
+    has_shipped_name = scenario.name in list_shipped()
+    if has_shipped_name and load_scenario(scenario.name).sha256 == scenario.sha256:
+        return scenario.name, "as shipped"
+    return f"./{scenario.name}.toml", f"to be saved as {scenario.name}.toml"
+
+
+def _list_commands(log: Log, scenario: str) -> str:
+    """Returns the commands that verify and repeat the run, a line each.
+
+    Args:
+        log: Log of the run.
+        scenario: Name or path of the scenario.
+    """
+    file_name = Path(log.source).name
+    if not file_name.endswith(".mcap"):
+        file_name = "FILE"  # the log was not read from a file
+    return (
+        f"trilat verify {file_name}\ntrilat verify --virtual {file_name}\ntrilat sim {scenario}"
+    )
+
+
+def _list_versions(log: Log) -> list[tuple[str, str]]:
+    """Returns the software and the machine that recorded the log."""
+    session = log.session
+    commit = session.get("commit", "unknown")
+    if session.get("commit_dirty") == "true":
+        commit += " with changes"
+    platform = session.get("platform", "unknown")
+    python = session.get("python", "unknown")
+    facts = [
+        ("commit", commit),
+        ("fingerprint of arithmetic", session.get("fingerprint", "unknown")),
+        ("platform", f"{platform}, {python}"),
+    ]
+    prefix = "version_"
+    for key, version in session.items():
+        if key.startswith(prefix):
+            facts.append((key.removeprefix(prefix), version))
+    return facts

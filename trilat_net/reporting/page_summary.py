@@ -1,0 +1,349 @@
+"""Renders the first lines of a report: the judgement of the run, its key numbers and its checks.
+
+A report is a web page about a recorded run of several robot arms. A site is a process that
+controls one arm. Its error e is the difference between its motion and the motion that it
+should follow. The first lines let a reader decide within seconds whether the run needs a closer
+look.
+
+Invariant:
+    - The judgement never stands alone beside a number that seems to contradict it. A sentence
+      says which number it is, and why both are true.
+    - A check that failed is named in the first lines, and unfolded.
+    - Every text that comes from a log is escaped.
+"""
+
+from collections.abc import Sequence
+from html import escape
+from typing import NamedTuple
+
+import numpy as np
+
+from ..analysis.certificate.stability_certificate import Certificate
+from ..analysis.run_end import FORCE_NM, EndBehaviour, Stability
+from ..analysis.site_signals import (
+    SETTLED_ERROR_RAD,
+    joint_errors,
+    largest_magnitude,
+    shared_unit,
+)
+from ..analysis.timeline import RaisedAlarm, list_alarms
+from ..errors import count_nouns
+from ..log.findings import Finding
+from ..log.log_reader import Log
+from ..results import JsonObject
+from .page_html import NO_NUMBER, format_cell, join_words, render_details
+from .result_text import escape_text
+
+_MAX_ALARMS = 8
+"""Largest number of alarms at the top of the page."""
+_SEVERE_ALARMS = ("FAULT", "STOPPED")
+"""Words of the alarms of sites that can no longer move."""
+
+_MEANINGS = {
+    Stability.STABLE: "a proof holds for this loop, and the run agrees with it",
+    Stability.SETTLED: "the arms came to rest and every small push died away, without a proof",
+    Stability.NOT_STABLE: "the motion does not come to rest",
+    Stability.OPEN: "nothing decides whether this loop is stable",
+}
+"""What each judgement means, as a clause."""
+_MARKS = {
+    Stability.STABLE: "good",
+    Stability.SETTLED: "good",
+    Stability.NOT_STABLE: "bad",
+    Stability.OPEN: "warn",
+}
+"""Style of each judgement."""
+_ENDS = {
+    EndBehaviour.CONVERGED: "the arms were at rest, and agreed",
+    EndBehaviour.DECAYS: "the motion was dying away",
+    EndBehaviour.HARDLY: "the motion was hardly dying away",
+    EndBehaviour.UNDECIDED: "the motion showed no trend, so that a longer record is needed",
+    EndBehaviour.COASTS: "an arm coasted, because nobody holds it",
+    EndBehaviour.BOUNDED: "the arms oscillated between limits",
+    EndBehaviour.DRIFTS: "an arm drifted",
+    EndBehaviour.GROWS: "the motion grew",
+    EndBehaviour.DIVERGED: "a joint had exceeded its limit of speed",
+}
+"""How the arms moved at the end of a run, as a clause in the past tense."""
+
+
+def render_verdict(log: Log, certificate: Certificate, findings: Sequence[Finding]) -> str:
+    """Renders the judgement whether the run was stable, with what the judgement rests on.
+
+    Args:
+        log: Log of the run.
+        certificate: The judgement, with its reasons.
+        findings: Results of the checks of the log. The judgement is in doubt if one failed.
+    """
+    word = certificate.stability.value
+    css_class = _MARKS[certificate.stability]
+    sentences = [_explain_end(log, certificate)]
+    if any(finding.judged and not finding.passed for finding in findings):
+        css_class = "bad" if css_class == "bad" else "warn"
+        sentences.append("The log failed a check, so that the judgement may be wrong.")
+    chip = f'<strong class="chip {css_class}">{escape(word.capitalize())}</strong>'
+    text = escape(describe_basis(certificate))
+    more = escape(" ".join(sentences))
+    return f'<div id="verdict" class="{css_class}"><p>{chip} {text}</p><p>{more}</p></div>'
+
+
+def describe_basis(certificate: Certificate) -> str:
+    """Returns a sentence that says what a judgement means, and what it rests on.
+
+    Args:
+        certificate: The judgement, with its reasons.
+    """
+    decision = certificate.decision
+    meaning = _MEANINGS[decision.stability]
+    if decision.stability is Stability.STABLE:
+        basis = decision.rests_on.replace("; ", ", and ")
+        return f"{meaning}; this rests on {basis}."
+    if decision.stability is not Stability.OPEN:
+        return f"{meaning}; this rests on {decision.rests_on}."
+    reason, *others = [text for text in (decision.rests_on, *decision.reasons) if text]
+    more = f" ({count_nouns(len(others), 'more reason')} below)" if others else ""
+    return f"{meaning}: {reason}{more}."
+
+
+def _explain_end(log: Log, certificate: Certificate) -> str:
+    """Returns how the record ends, and why that does not contradict the judgement.
+
+    The judgement is about the loop: whether disturbances of its motion die away. The record may
+    end with errors that stay, or with motion that has not yet died away.
+    """
+    end = certificate.end
+    stability = certificate.stability
+    is_stable = stability in (Stability.STABLE, Stability.SETTLED)
+    remains = end.end_error_rad > SETTLED_ERROR_RAD
+    has_converged = end.behaviour is EndBehaviour.CONVERGED
+    if has_converged and remains:
+        clause = "the arms were at rest, with errors that stay"
+    else:
+        clause = _ENDS[end.behaviour]
+    text = f"When the record ends, {clause}."
+    if end.behaviour is EndBehaviour.DIVERGED:
+        text = f"The record ends soon after {clause}."
+
+    if is_stable and end.stability is Stability.NOT_STABLE:
+        return f"{text} The proof and the pushes show that such motion dies away."
+    if is_stable and remains:
+        cause = _explain_remaining_error(log)
+        return f"{text} Stable means that disturbances die away, not that errors vanish{cause}."
+    looks_calm = end.stability is Stability.SETTLED and not remains
+    if stability is Stability.NOT_STABLE and looks_calm:
+        return f"{text} This motion is small, but grows from small disturbances."
+    return text
+
+
+def _explain_remaining_error(log: Log) -> str:
+    """Returns which sites hands or walls still push at the end, as a clause. Empty if none."""
+    pushed = []
+    for site in log.sites:
+        records = log[site]
+        if len(records) and np.abs(records.tau_x[-1]).max() > FORCE_NM:
+            pushed.append(site)
+    if not pushed:
+        return ""
+    return f": hands or walls still push {join_words(pushed)}"
+
+
+class _KeyNumber(NamedTuple):
+    """A number of the first lines.
+
+    Attributes:
+        name: Name of the quantity.
+        value: The number with its unit.
+        detail: Where and when the number was measured, or what it includes.
+    """
+
+    name: str
+    value: str
+    detail: str
+
+
+def render_key_numbers(log: Log, facts: JsonObject) -> str:
+    """Renders the numbers that describe the run best: its errors and the delay in use.
+
+    Args:
+        log: Log of the run.
+        facts: Numbers of the run, from `summarise_run`.
+    """
+    numbers = [
+        _find_largest_error(log),
+        _describe_last_error(log, facts),
+        _describe_settling(log, facts),
+        _describe_delay(facts),
+    ]
+    items = ""
+    for number in numbers:
+        name = f"<dt>{escape(number.name)}</dt>"
+        detail = f'<dd class="soft">{escape(number.detail)}</dd>'
+        items += f"<div>{name}<dd>{escape(number.value)}</dd>{detail}</div>"
+    return f'<dl id="numbers">{items}</dl>'
+
+
+class ErrorPeak(NamedTuple):
+    """The largest error of a run.
+
+    Attributes:
+        error: The error, in the unit that the sites share.
+        site: Name of the site.
+        t_s: Time of the record, in s.
+    """
+
+    error: float
+    site: str
+    t_s: float
+
+
+def find_error_peak(log: Log) -> ErrorPeak | None:
+    """Finds the largest |e| of a run, of all sites and joints.
+
+    Args:
+        log: Log of the run.
+
+    Returns:
+        The first record with this error. None if no record has a finite error.
+    """
+    peaks = []
+    for site in log.sites:
+        errors = largest_magnitude(joint_errors(log[site]))
+        if np.isfinite(errors).any():
+            row = int(np.nanargmax(errors))
+            peaks.append(ErrorPeak(float(errors[row]), site, float(log[site].t_s[row])))
+    return max(peaks, key=lambda peak: peak.error, default=None)
+
+
+def _find_largest_error(log: Log) -> _KeyNumber:
+    """Returns the largest error of the run, with its site and its time."""
+    peak = find_error_peak(log)
+    if peak is None:
+        return _KeyNumber("Largest error", NO_NUMBER, "no record")
+    value = f"{peak.error:.3g} {shared_unit(log)}"
+    return _KeyNumber("Largest error", value, f"of {peak.site}, at {peak.t_s:.2f} s")
+
+
+def _describe_last_error(log: Log, facts: JsonObject) -> _KeyNumber:
+    """Returns the largest error of the last second."""
+    name = "Error at the end"
+    error = facts["max_error_end_rad"]
+    if error is None:
+        return _KeyNumber(name, NO_NUMBER, "no record")
+    return _KeyNumber(name, f"{error:.3g} {shared_unit(log)}", "largest in the last second")
+
+
+def _describe_settling(log: Log, facts: JsonObject) -> _KeyNumber:
+    """Returns the time from which all errors stay below the limit of a settled site."""
+    name = f"All errors below {facts['settle_below_rad']:g} {shared_unit(log)}"
+    if facts["settle_s"] is None:
+        return _KeyNumber(name, "not at the end", "a measure of following, not of stability")
+    if facts["settle_s"] == 0.0:
+        return _KeyNumber(name, "always", "of every site and joint")
+    return _KeyNumber(name, f"from {facts['settle_s']:.2f} s on", "of every site and joint")
+
+
+def _describe_delay(facts: JsonObject) -> _KeyNumber:
+    """Returns the mean age of the samples that the controllers used, and its range."""
+    ages_ms = [link["age_ms"] for link in facts["links"].values()]
+    means_ms = [age["mean"] for age in ages_ms if age["mean"] is not None]
+    if not means_ms:
+        return _KeyNumber("Delay in use", NO_NUMBER, "no sample was used")
+    mean_ms = format_cell(float(np.mean(means_ms)))
+    least_ms = format_cell(min(age["min"] for age in ages_ms if age["min"] is not None))
+    most_ms = format_cell(max(age["max"] for age in ages_ms if age["max"] is not None))
+    links = count_nouns(len(means_ms), "link")
+    detail = f"mean of {links}; {least_ms} to {most_ms} ms"
+    if least_ms == most_ms:
+        detail = f"on {links}, always"
+    return _KeyNumber("Delay in use", f"{mean_ms} ms", detail)
+
+
+def render_alarms(log: Log) -> str:
+    """Renders the alarms of a run as a list in large type.
+
+    Faults and stops are the severe alarms. If there are any, only these are listed, because
+    other alarms usually follow from them. At most `_MAX_ALARMS` alarms are listed, and the rest
+    is counted.
+
+    Args:
+        log: Log of the run.
+
+    Returns:
+        HTML of the list. Empty if there were no alarms.
+    """
+    alarms = list_alarms(log)
+    if not alarms:
+        return ""
+    severe = [alarm for alarm in alarms if alarm.word in _SEVERE_ALARMS]
+    candidates = severe if severe else alarms
+    listed = candidates[:_MAX_ALARMS]
+
+    items = "".join(_render_alarm(alarm) for alarm in listed)
+    not_listed = len(alarms) - len(listed)
+    if not_listed:
+        items += f"<li class='mild'>and {not_listed} more: see what happened, below</li>"
+    return f'<ul class="alarms">{items}</ul>'
+
+
+def _render_alarm(alarm: RaisedAlarm) -> str:
+    """Returns an alarm as a list item: its site, kind, time and reason."""
+    css_class = "" if alarm.word in _SEVERE_ALARMS else "mild"
+    period = f"{alarm.from_s:.3f} s to {alarm.to_s:.3f} s"
+    heading = f"<strong>{escape(alarm.site)} {alarm.word}</strong>"
+    return f'<li class="{css_class}">{heading}{period}: {escape(alarm.reason)}</li>'
+
+
+def render_checks(findings: Sequence[Finding], facts: JsonObject) -> str:
+    """Renders the results of the checks of the log as one line, which unfolds into a list.
+
+    Args:
+        findings: Results of the checks. A check that failed may also be one that could not be
+            judged, for example because the code of a user's law may not run here.
+        facts: Numbers of the run, from `summarise_run`.
+
+    Returns:
+        HTML of the line. Empty if nothing was checked.
+    """
+    if not findings:
+        return ""
+    items = ""
+    for finding in findings:
+        css_class = "passed" if finding.passed else "failed"
+        mark = "✓ ok"
+        if not finding.passed:
+            mark = "✗ failed" if finding.judged else "not judged"
+        text = f"{escape(finding.check)}: {escape_text(finding.text)}"
+        items += f'<li class="{css_class}"><b>{mark}</b>{text}</li>'
+    failed = [finding.check for finding in findings if finding.judged and not finding.passed]
+    withheld = [finding.check for finding in findings if not finding.judged]
+    summary = f"✓ {_summarise_checks(findings, facts)}"
+    if failed:
+        summary = f"✗ Failed: {', '.join(failed)}"
+    elif withheld:
+        summary = f"? Not judged: {', '.join(withheld)}"
+    verdicts = f'<ul class="verdicts">{items}</ul>'
+    return f'<div id="checks">{render_details(summary, verdicts, is_open=bool(failed))}</div>'
+
+
+def _summarise_checks(findings: Sequence[Finding], facts: JsonObject) -> str:
+    """Returns a sentence about checks that all passed.
+
+    A result with a remark, such as ticks that a site did not execute, is quoted in full.
+    """
+    parts = []
+    for finding in findings:
+        has_remark = ";" in finding.text
+        if finding.check == "records":
+            missing = facts["missing"]
+            records = "all records present"
+            parts.append(f"{missing} records missing" if missing else records)
+        elif finding.check == "executed again" and not has_remark:
+            is_exact = "bit for bit" in finding.text
+            parts.append(f"executed again {'bit for bit' if is_exact else 'to 1e-9'}")
+        elif finding.check == "executed again":
+            parts.append(f"executed again: {finding.text}")
+    others = len(findings) - len(parts)
+    if others:
+        parts.append(f"{count_nouns(others, 'other check')} passed")
+    text = "; ".join(parts)
+    return f"{text[:1].upper()}{text[1:]}."
