@@ -194,19 +194,23 @@ class ChartBuilder:
         oldest sample that its controller used.
         """
         log = self._log
+        limit = self._draw_limit(site_signals.SETTLED_ERROR_RAD)
+        stated = [line for site in log.sites for line in self._list_stated_delays(site)]
+        has_one_delay = len({line.value for line in stated}) == 1
         yield self._make_chart(
             section="overview",
-            title="largest error |e| of each site",
+            title=f"Largest error |e| of each site; dashed: {limit.value:g}",
             unit=site_signals.shared_unit(log),
             series=self._add_maxima(lambda site: np.abs(site_signals.joint_errors(log[site]))),
-            lines=[self._draw_limit(site_signals.SETTLED_ERROR_RAD)],
+            lines=[limit],
             log=True,
         )
         yield self._make_chart(
             section="overview",
-            title="delay that each controller experienced",
+            title=f"Delay that each controller experienced{'; dashed: stated' * has_one_delay}",
             unit="ms",
             series=self._add_maxima(lambda site: site_signals.sample_ages_ms(log, site)),
+            lines=[self._draw_limit(stated[0].value)] if has_one_delay else [],
             zero=True,
             margin=0.05,
         )

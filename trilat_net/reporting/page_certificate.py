@@ -22,6 +22,7 @@ from .figures.certificate_energy import draw_functional, draw_observed_energy
 from .figures.twin_differences import draw_twins
 from .page_html import (
     render_details,
+    render_folds,
     render_note,
     render_scrolling,
     render_section,
@@ -52,18 +53,22 @@ def render_certificate(log: Log, certificate: Certificate) -> str:
         css_class = _SENTENCE_CLASSES[line.mark]
         items += f'<li class="{css_class}"><b>{mark}</b>{escape(line.text)}</li>'
     body = f'<ul class="verdicts">{items}</ul>'
+    folds = []
     if certificate.premises:
-        body += render_details("Premises of the theorem", _render_premises(certificate))
+        premises = _render_premises(certificate)
+        folds.append(render_details("Premises of the theorem", premises))
     if certificate.balance is not None:
         energies = list_energies(certificate.balance)
         rows = [(escape(name), f"{energy_j:.4g}") for name, energy_j in energies]
         table = render_table({"energy": "", "J": "energy over the whole run"}, rows)
-        body += render_details("Energy balance", table + render_note(_BALANCE_NOTE))
+        note = render_note(_BALANCE_NOTE)
+        folds.append(render_details("Energy balance", table + note))
     figures = _draw_certificate(log, certificate)
     if figures:
         pictures = "".join(_render_picture(title, figure) for title, figure in figures)
         names = ", ".join(title for title, _ in figures)
-        body += render_details(f"Figures: {names}", pictures)
+        folds.append(render_details(f"Figures: {names}", pictures))
+    body += render_folds(folds)
     intro = (
         "What speaks for (✓) and against (✗) stability, and what decides nothing (?), as "
         "`trilat certify --all` prints it."

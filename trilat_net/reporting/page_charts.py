@@ -25,6 +25,8 @@ _TEXTS: dict[str, dict[str, list[str]]] = tomllib.loads(
     (resources.files("trilat_net.reporting") / "assets" / "report.toml").read_text("utf-8")
 )
 """Heading and note of each section of charts, by place of the page and section."""
+_OPEN_SECTIONS = ("torques", "errors", "positions")
+"""Sections of charts that may be unfolded at first."""
 _MOST_OPEN_CHARTS = 10
 """Largest number of charts of a place that are unfolded at first."""
 _MOST_HALF_CHARTS = 2
@@ -38,8 +40,8 @@ _ARM_PLAYER = """<div id="arms" class="screen">
 <input type="range" min="0" max="1000" value="0" step="1"
 aria-label="time"><output>0.000 s</output></div>
 </div>
-<p class="note screen">Solid: the arm; dashed: the reference of Eq. (6), where its peers lead it.
-The arms follow the slider, and the pointer in any chart.</p>
+<p class="note screen">Solid: the arm; dashed: the reference of Eq. (6), to which its peers lead
+it. The arms follow the slider, and the pointer in any chart.</p>
 """
 
 
@@ -87,18 +89,20 @@ def render_chart_groups(
     lacking: list[str] = []
     unfolded = 0
     for section, (heading, note) in _TEXTS[place].items():
+        name = f"{heading[0].lower()}{heading[1:]}"
         count = sum(chart.section == section for chart in charts)
         if count:
             is_small = has_chains and section == "estimates"
             text = _TEXTS["notes"]["chain_estimates"] if is_small else note
-            is_open = place == "paper" and unfolded + count <= _MOST_OPEN_CHARTS
+            fits = unfolded + count <= _MOST_OPEN_CHARTS
+            is_open = section in _OPEN_SECTIONS and fits
             unfolded += count if is_open else 0
             html += _render_group(section, heading, text, count, is_open, is_small)
             lacking += [f"{title} ({_NO_VALUE})" for title in missing.get(section, ())]
         elif absence_reasons.get(section):
-            lacking.append(f"{heading.lower()} ({absence_reasons[section]})")
+            lacking.append(f"{name} ({absence_reasons[section]})")
         elif section in missing:
-            lacking.append(f"{heading.lower()} ({_NO_VALUE})")
+            lacking.append(f"{name} ({_NO_VALUE})")
 
     groups = f'<div class="groups">{html}</div>' if html else ""
     if lacking and place != "loops":  # the section of the loops says itself what is missing
@@ -122,6 +126,6 @@ def _render_group(
     width = "half" if count <= _MOST_HALF_CHARTS else "whole"
     css_class = "charts small" if is_small else "charts"
     attribute = " open" if is_open else ""
-    summary = f"<summary>{escape(heading)}</summary>{render_note(note)}"
+    summary = f'<summary>{escape(heading)} <span class="note">{escape(note)}</span></summary>'
     container = f'<div class="{css_class}" data-section="{section}"></div>'
     return f'<details class="group {width}"{attribute}>{summary}{container}</details>'

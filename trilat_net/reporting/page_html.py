@@ -55,6 +55,15 @@ def render_details(summary: str, body: str, *, is_open: bool = False) -> str:
     return f"<details{attribute}><summary>{escape(summary)}</summary>{body}</details>"
 
 
+def render_folds(folds: Iterable[str]) -> str:
+    """Renders parts that unfold, side by side while they are folded.
+
+    Args:
+        folds: HTML of each part, from `render_details`. Empty for a part that does not exist.
+    """
+    return f'<div class="folds">{"".join(folds)}</div>'
+
+
 def render_note(text: str) -> str:
     """Renders a string as a paragraph in small type."""
     return f'<p class="note">{escape(text)}</p>'
@@ -107,7 +116,8 @@ def render_table(
 def render_legend(columns: Mapping[str, str]) -> str:
     """Renders the meanings of a table's columns as a line, for screens without a pointer."""
     items = [f"{header}: {meaning}" for header, meaning in columns.items() if meaning]
-    return render_note("; ".join(items) + ".") if items else ""
+    text = escape("; ".join(items))
+    return f'<p class="note legend">{text}.</p>' if items else ""
 
 
 def render_scrolling(html: str, label: str) -> str:

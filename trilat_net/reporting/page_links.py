@@ -19,6 +19,7 @@ from .page_html import (
     format_cell,
     label_link,
     render_details,
+    render_folds,
     render_legend,
     render_section,
     render_table,
@@ -26,8 +27,6 @@ from .page_html import (
 )
 from .style import typeset
 
-_MOST_OPEN_ROWS = 6
-"""Largest number of links whose ages are not folded."""
 _AGE_COLUMNS = {
     "link": "",
     "stated delay": "delay model of the scenario, and its changes",
@@ -87,12 +86,15 @@ def render_links(log: Log, facts: JsonObject, charts: str = "") -> str:
     rows = _list_age_rows(log, facts)
     ages = render_table(_AGE_COLUMNS, rows, text_columns=[1]) + render_legend(_AGE_COLUMNS)
     heading = "Age of the samples in use, by link"
-    body = render_details(heading, ages, is_open=len(rows) <= _MOST_OPEN_ROWS)
-    body += render_details("Samples sent, lost and superseded", _render_samples(log, facts))
+    folds = [
+        render_details(heading, ages),
+        render_details("Samples sent, lost and superseded", _render_samples(log, facts)),
+    ]
     clocks = _render_clocks(log, facts)
     if clocks:
-        body += render_details("Clocks of the senders, as the receivers saw them", clocks)
-    return render_section("Links", _summarise_links(facts), body + charts, "links")
+        folds.append(render_details("Clocks of the senders, seen by the receivers", clocks))
+    body = render_folds(folds) + charts
+    return render_section("Links", _summarise_links(facts), body, "links")
 
 
 def _summarise_links(facts: JsonObject) -> str:

@@ -16,8 +16,16 @@ from ..log.log_reader import Log
 from ..results import JsonObject
 from ..scenario import Scenario, list_shipped, load_scenario
 from ..scenario.describe import list_arm_notes
-from .page_html import render_code, render_details, render_facts, render_section, render_text
+from .page_html import (
+    render_code,
+    render_details,
+    render_facts,
+    render_folds,
+    render_section,
+    render_text,
+)
 from .page_timeline import describe_dominance
+
 
 def render_origin(log: Log, facts: JsonObject, licence: str) -> str:
     """Renders the section with the commands, the scenario, the assumptions and the versions.
@@ -29,13 +37,16 @@ def render_origin(log: Log, facts: JsonObject, licence: str) -> str:
     """
     scenario = log.scenario
     name, hint = _find_scenario_argument(scenario)
-    body = render_code(_list_commands(log, name))
-    body += render_details("What this scenario is about", _render_description(scenario))
-    body += render_details(f"The resolved scenario, {hint}", render_code(scenario.text))
-    body += render_details("What is assumed", _render_assumptions(scenario))
-    body += render_details("The recording", render_facts(_list_recording_facts(log, facts)))
-    body += render_details("Versions of the software", render_facts(_list_versions(log)))
-    body += render_details("Licence of the plotting library", render_code(licence))
+    recording = _list_recording_facts(log, facts)
+    folds = [
+        render_details("What this scenario is about", _render_description(scenario)),
+        render_details("What is assumed", _render_assumptions(scenario)),
+        render_details(f"The resolved scenario, {hint}", render_code(scenario.text)),
+        render_details("The recording", render_facts(recording)),
+        render_details("Versions of the software", render_facts(_list_versions(log))),
+        render_details("Licence of the plotting library", render_code(licence)),
+    ]
+    body = render_code(_list_commands(log, name)) + render_folds(folds)
     intro = "These commands check the log, simulate its run again, and run its scenario."
     return render_section("Do this again", intro, body, "origin")
 

@@ -18,6 +18,7 @@ from .page_html import (
     format_numbers,
     label_site,
     render_details,
+    render_folds,
     render_legend,
     render_section,
     render_table,
@@ -73,10 +74,11 @@ def render_sites(log: Log, facts: JsonObject) -> str:
 
     table = render_table(columns, rows) + render_legend(columns)
     is_open = len(rows) <= _MOST_OPEN_ROWS
-    body = render_details("Errors and torques, by site", table, is_open=is_open)
+    errors = render_details("Errors and torques, by site", table, is_open=is_open)
     angles = render_table(_ANGLE_COLUMNS, angle_rows, text_columns=(1, 2))
     angles += render_legend(_ANGLE_COLUMNS)
-    body += render_details("Where the arms ended, and how far operators moved them", angles)
+    summary = "Where the arms ended, and how far operators moved them"
+    body = render_folds([errors, render_details(summary, angles)])
     intro = "How well each site followed its peers, and how hard its controller worked."
     return render_section("Sites", intro, body, "sites")
 

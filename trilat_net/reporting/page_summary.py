@@ -1,4 +1,4 @@
-"""Renders the first lines of a report: the judgement of the run, its key numbers and its checks.
+"""Renders the first lines of a report: the judgement of the run, its checks and key numbers.
 
 A report is a web page about a recorded run of several robot arms. A site is a process that
 controls one arm. Its error e is the difference between its motion and the motion that it
@@ -40,12 +40,12 @@ _SEVERE_ALARMS = ("FAULT", "STOPPED")
 """Words of the alarms of sites that can no longer move."""
 
 _MEANINGS = {
-    Stability.STABLE: "a proof holds for this loop, and the run agrees with it",
-    Stability.SETTLED: "the arms came to rest and every small push died away, without a proof",
-    Stability.NOT_STABLE: "the motion does not come to rest",
-    Stability.OPEN: "nothing decides whether this loop is stable",
+    Stability.STABLE: "A proof holds for this loop, and the run agrees with it",
+    Stability.SETTLED: "Small pushes died away and the arms came to rest, but no proof exists",
+    Stability.NOT_STABLE: "The motion of this loop does not come to rest",
+    Stability.OPEN: "Nothing decides whether this loop is stable",
 }
-"""What each judgement means, as a clause."""
+"""What each judgement means."""
 _MARKS = {
     Stability.STABLE: "good",
     Stability.SETTLED: "good",
@@ -54,7 +54,7 @@ _MARKS = {
 }
 """Style of each judgement."""
 _ENDS = {
-    EndBehaviour.CONVERGED: "the arms were at rest, and agreed",
+    EndBehaviour.CONVERGED: "the arms were at rest and agreed",
     EndBehaviour.DECAYS: "the motion was dying away",
     EndBehaviour.HARDLY: "the motion was hardly dying away",
     EndBehaviour.UNDECIDED: "the motion showed no trend, so that a longer record is needed",
@@ -94,12 +94,14 @@ def describe_basis(certificate: Certificate) -> str:
         certificate: The judgement, with its reasons.
     """
     decision = certificate.decision
+    if certificate.end.behaviour is EndBehaviour.DIVERGED:
+        return f"The run {decision.rests_on}."
     meaning = _MEANINGS[decision.stability]
     if decision.stability is Stability.STABLE:
         basis = decision.rests_on.replace("; ", ", and ")
-        return f"{meaning}; this rests on {basis}."
+        return f"{meaning}: {basis}."
     if decision.stability is not Stability.OPEN:
-        return f"{meaning}; this rests on {decision.rests_on}."
+        return f"{meaning}: {decision.rests_on}."
     reason, *others = [text for text in (decision.rests_on, *decision.reasons) if text]
     more = f" ({count_nouns(len(others), 'more reason')} below)" if others else ""
     return f"{meaning}: {reason}{more}."
@@ -120,7 +122,7 @@ def _explain_end(log: Log, certificate: Certificate) -> str:
         clause = "the arms were at rest, with errors that stay"
     else:
         clause = _ENDS[end.behaviour]
-    text = f"When the record ends, {clause}."
+    text = f"At the end of the record, {clause}."
     if end.behaviour is EndBehaviour.DIVERGED:
         text = f"The record ends soon after {clause}."
 

@@ -20,7 +20,6 @@ from ..analysis.site_signals import shared_unit, sites_with_operator
 from ..analysis.timeline import (
     find_mode_intervals,
     list_alarms,
-    list_changes,
     recorded_end_s,
 )
 from ..core.vectors import Array
@@ -28,7 +27,7 @@ from ..errors import count_nouns
 from ..log.log_reader import Log
 from ..results import JsonObject
 from ..scenario import Scenario
-from .page_html import render_details, render_section, render_swatch
+from .page_html import join_words, render_details, render_section, render_swatch
 from .page_summary import find_error_peak
 from .style import typeset
 
@@ -37,18 +36,18 @@ MAX_SHOWN = 8
 _MAX_MOMENTS = 400
 """Largest number of moments on the page. summary.json has all modes and changes."""
 _MAX_PUSHES = 3
-"""Largest number of pushes of a site that have a sentence each. More pushes share a sentence."""
+"""Largest number of pushes of a site with a sentence each. More pushes share a sentence."""
 _PAUSE_S = 0.2
 """Shortest pause between two pushes, in s. Shorter pauses do not divide a push."""
 _LEAST_PUSH_NM = 1e-3
 """Torque below which nobody pushes, in N m."""
 _DID = {
-    "hold": "held its position",
+    "hold": "held still",
     "brake": "braked",
-    "return": "returned to its peers",
-    "waiting": "waited for its peers",
-    "fault": "was in fault",
-    "stopped": "was stopped",
+    "return": "returned to following",
+    "waiting": "waited for the other sites",
+    "fault": "stopped with a fault",
+    "stopped": "stood by order",
 }
 """What a site did in each mode, in the past tense. Other modes have the words of records."""
 
@@ -169,7 +168,8 @@ def _list_pushes(log: Log) -> Iterator[RunMoment]:
         for start_s, end_s in spans:
             inside = (records.t_s >= start_s) & (records.t_s <= end_s)
             largest = f"with at most {torques[inside].max():.3g} N m"
-            text = f"{subject} pushes {site} until {end_s:.3f} s, {largest}."
+            until = "to the end" if end_s >= records.t_s[-1] else f"until {end_s:.3f} s"
+            text = f"{subject} pushes {site} {until}, {largest}."
             yield RunMoment(start_s, text, site)
 
 
@@ -204,13 +204,21 @@ def _name_pusher(log: Log, site: str) -> str:
 def _list_modes(log: Log) -> Iterator[RunMoment]:
     """Yields when sites did not follow their peers, with the reason if there was an alarm."""
     reasons = {(alarm.site, alarm.from_s): alarm for alarm in list_alarms(log)}
+    sites: dict[tuple[float, str], list[str]] = {}
+    bad_sites = set()
     for site in log.sites:
         for mode, from_s, to_s in find_mode_intervals(log[site]):
-            did = _DID.get(mode, mode)
             alarm = reasons.get((site, from_s))
             reason = "" if alarm is None else f" ({alarm.word}: {alarm.reason})"
-            text = f"{site} {did} until {to_s:.3f} s{reason}."
-            yield RunMoment(from_s, text, site, is_bad=alarm is not None)
+            text = f"{_DID.get(mode, mode)} until {to_s:.3f} s{reason}"
+            # Sites that do the same at the same time share a sentence.
+            sites.setdefault((from_s, text), []).append(site)
+            if alarm is not None:
+                bad_sites.add((from_s, text))
+    for (from_s, text), names in sites.items():
+        site = names[0] if len(names) == 1 else ""
+        sentence = f"{join_words(names)} {text}."
+        yield RunMoment(from_s, sentence, site, is_bad=(from_s, text) in bad_sites)
 
 
 def _list_errors(log: Log, facts: JsonObject) -> Iterator[RunMoment]:

@@ -141,9 +141,9 @@
     const values = powers.flatMap((power) => steps.map((step) => step * 10 ** power));
     return values.filter((value) => value >= min && value <= max);
   };
-  const rungLabels = (u, splits) => splits.map((value) => (value == null ? "" : `${Number(value.toPrecision(1))}`));
+  const rungLabels = (u, splits) => splits.map((value) => (value == null ? "" : value < 0.001 ? value.toExponential(0) : `${Number(value.toPrecision(1))}`));
 
-  const tall = (box) => (box.closest(".small") ? 110 : 165);
+  const tall = (box) => (box.closest(".small") ? 110 : box.closest("#overview") ? 165 : 130);
 
   function timeChart(chart, box) {
     const [data, order] = timeData(chart);
@@ -174,7 +174,7 @@
           value: (u, v) => number(v, chart.unit),
         })),
       ],
-      axes: [axis("time (s)", { size: 30 }), axis(`${chart.unit}`, { size: 52, ...(box.closest(".small") ? { space: 16 } : {}), ...(chart.log ? { splits: rungs, values: rungLabels } : {}) })],
+      axes: [axis("time (s)", { size: 30 }), axis(box.closest("#overview") ? chart.unit : null, { size: box.closest("#overview") ? 52 : 46, ...(box.closest(".small") ? { space: 16 } : {}), ...(chart.log ? { splits: rungs, values: rungLabels } : {}) })],
       hooks: {
         drawAxes: [marks(chart), ...(chart.links ? [] : [horizontals(lines)])],
         draw: chart.links ? [horizontals(lines)] : [],
