@@ -49,7 +49,10 @@ class Result:
         return [row]
 
     def summary(self) -> str:
-        """Returns the text about the result that the command prints in the terminal."""
+        """Returns the text about the result that the command prints in the terminal.
+
+        Commands with the option --all print the whole text only with this option.
+        """
         return str(_texts().summarize(self))
 
     def to_frame(self) -> "pandas.DataFrame":

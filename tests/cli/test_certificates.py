@@ -30,7 +30,7 @@ d = { c = 1.0 }
 
 def test_a_stable_run_ends_with_0(tmp_path: Path) -> None:
     file = simulated(tmp_path, "free", "rate_hz=100", seconds="30")
-    printed = trilat("certify", file, cwd=tmp_path).succeeds()
+    printed = trilat("certify", file, "--all", cwd=tmp_path).succeeds()
     facts = json.loads(trilat("certify", "--json", file, cwd=tmp_path).succeeds())
     assert (facts["verdict"], facts["passed"]) == ("covered", True)
     assert (facts["stability"], facts["reasons"], facts["roots"]["verdict"]) == (

@@ -8,7 +8,7 @@ from .running import simulated, trilat
 
 def test_sites_links_and_walls_are_columns(tmp_path: Path) -> None:
     file = simulated(tmp_path, "contact", "rate_hz=200", seconds="4")
-    printed = trilat("metrics", file, cwd=tmp_path).succeeds()
+    printed = trilat("metrics", file, "--all", cwd=tmp_path).succeeds()
     lines = printed.splitlines()
     heads = [line.split() for line in lines]
     assert ["tracking", "m", "s"] in heads
@@ -31,6 +31,6 @@ def test_json_is_for_programs(tmp_path: Path) -> None:
 
 def test_who_felt_what_is_told(tmp_path: Path) -> None:
     file = simulated(tmp_path, "force_sharing", "rate_hz=100", seconds="15")
-    printed = trilat("metrics", file, cwd=tmp_path).succeeds()
+    printed = trilat("metrics", file, "--all", cwd=tmp_path).succeeds()
     (line,) = (line for line in printed.splitlines() if line.startswith("14.0 - 15.0 s"))
     assert line.split()[4:9] == ["1", "s", "5", "m1", "4.792"]

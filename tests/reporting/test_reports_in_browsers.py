@@ -34,7 +34,11 @@ PUSHED = (
 NAMES = [
     pytest.param(name, marks=() if name in PUSHED else pytest.mark.long) for name in VARIED
 ]
-SCREEN: dict[str, Any] = {"viewport": {"width": 1200, "height": 900}}
+SCREEN: dict[str, Any] = {
+    "viewport": {"width": 1440, "height": 900},
+    "reduced_motion": "reduce",
+}
+"""A desktop on which the arms stand still until somebody plays them."""
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +55,14 @@ def open_report(watched: WatchedPage, log: Log, folder: Path) -> Page:
     path.write_text(render_report(log, None, [], summarise_run(log, None)), encoding="utf-8")
     watched.page.goto(path.as_uri())
     return watched.page
+
+
+def unfold(page: Page) -> None:
+    """Opens everything that unfolds; charts are drawn once their part of the page is open."""
+    page.evaluate(
+        "document.querySelectorAll('details').forEach((part) => { part.open = true; })"
+    )
+    shows(page, "observed.charts() === trilat.page.charts.length")
 
 
 def count(page: Page, expression: str) -> int:
@@ -81,6 +93,8 @@ def test_report_draws_everything(name: str, browser: Browser, tmp_path: Path) ->
     with watched_page(browser, **SCREEN) as watched:
         page = open_report(watched, log, tmp_path)
         watched.assert_whole()
+        unfold(page)
+        watched.assert_whole()
         charts = count(page, "trilat.page.charts.length")
         assert (
             charts
@@ -104,6 +118,7 @@ def test_no_line_leads_through_a_gap(browser: Browser, tmp_path: Path) -> None:
     """Also not where the chart has ticks of other sites within the gap of one."""
     with watched_page(browser, **SCREEN) as watched:
         page = open_report(watched, VARIED["single records"](), tmp_path)
+        unfold(page)
         charts = "trilat.plots().filter((plot) => plot.series[1].label === 'm1' && plot.series.length > 2)"
         t_s, values = page.evaluate(
             f"(() => {{ const [{{ data }}] = {charts}; return [data[0], data[1]]; }})()"
@@ -200,5 +215,6 @@ def test_whole_report_with_its_certificate_is_drawn(
     shown = [certificate.balance, observed and observed.curves, twins and twins.pushes]
     with watched_page(browser, **SCREEN) as watched:
         watched.page.goto(path.as_uri())
+        unfold(watched.page)
         watched.assert_whole()
         assert watched.page.locator("img.picture").count() == sum(map(bool, shown))

@@ -17,7 +17,7 @@ from trilat_net.core.site_setup import Layout
 from trilat_net.core.ticks import LifeReason, find_alarm
 from trilat_net.net.messages import Event, LinkStats
 from trilat_net.reporting import summary_text
-from trilat_net.reporting.page import render_alarms
+from trilat_net.reporting.page_summary import render_alarms
 from trilat_net.reporting.result_text import TextTable
 from trilat_net.reporting.summary_text import (
     MOST_LINE_CHARACTERS,

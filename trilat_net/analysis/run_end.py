@@ -201,6 +201,14 @@ class RunEnd(NamedTuple):
         return "; ".join([self._behaviour_text, *self.reasons])
 
     @property
+    def phrase(self) -> str:
+        """A phrase for the behaviour at the end, which names errors that stay."""
+        has_converged = self.behaviour is EndBehaviour.CONVERGED
+        if has_converged and self.end_error_rad > SETTLED_ERROR_RAD:
+            return "at rest, with errors that stay"
+        return self.behaviour.value
+
+    @property
     def _behaviour_text(self) -> str:
         """A sentence on the behaviour, with its numbers."""
         behaviour = self.behaviour
@@ -213,9 +221,7 @@ class RunEnd(NamedTuple):
         end_speed = f"|qd| {self.end_speed_rad_s:.3g} rad/s"
         end = f"{end_error} and {end_speed} in the last second"
         if behaviour is EndBehaviour.CONVERGED:
-            if self.end_error_rad > SETTLED_ERROR_RAD:
-                return f"at rest, with errors that stay: {end}"
-            return f"converged: {end}"
+            return f"{self.phrase}: {end}"
 
         joint = f" at {self.where}" if self.where else ""
         if behaviour is EndBehaviour.BOUNDED:

@@ -356,6 +356,9 @@ OnOption = Annotated[
 FIGURE_HELP = "File for a figure of the result (.png, .svg or .pdf)."
 PngOption = Annotated[bool, flag("--png", "Write every figure as a PNG file too.")]
 JsonOption = Annotated[bool, flag("--json", "Print everything as JSON.")]
+AllOption = Annotated[
+    bool, flag("--all", "Print everything, not only the ten most important lines.")
+]
 
 
 def check_picture(path: Path | None, *, force: bool) -> None:

@@ -158,17 +158,19 @@ def certify_command(
             "Print a paragraph for a paper instead, with the numbers of the run and BibTeX.",
         ),
     ] = False,
+    everything: options.AllOption = False,
     *,
     laws: options.LawFiles,
     as_json: options.JsonOption = False,
 ) -> None:
     """Judges whether a run was stable, and says why.
 
-    The verdict is stable, settled, not stable or open. The command prints the energy function V
-    of the stability proof with its energy balance, the conditions of the proof (premises), and
-    the roots of the linearised loop at the final pose. It executes the run again together with
-    twins, which are repetitions with a small push. The code of imported control laws runs only
-    with --law or --own-laws. docs/certificate.md defines every term and every key of the JSON.
+    The verdict is stable, settled, not stable or open. The command prints it with its most
+    important reasons: the energy function V of the stability proof, its energy balance, and the
+    roots of the linearised loop at the final pose. With --all it also prints the conditions of
+    the proof (premises) and the energies. It executes the run again together with twins, which
+    are repetitions with a small push. The code of imported control laws runs only with --law or
+    --own-laws. docs/certificate.md defines every term and every key of the JSON.
 
     Stable: a proof exists for this loop. Settled: the run came to rest and every push died
     away, but nothing proves more. Exit code 0: stable. 1: settled, not stable (bounded
@@ -184,7 +186,7 @@ def certify_command(
         for line in compose_citation(log, certificate):
             terminal.print_line(line)
     else:
-        terminal.print_result(certificate, as_json=as_json)
+        terminal.print_result(certificate, as_json=as_json, brief=not everything)
     if not certificate.accepts(accept or ()):
         raise typer.Exit(1)
 
@@ -264,18 +266,24 @@ def identify_hand_command(
 
 
 @options.command("run.mcap", page="docs/metrics.md")
-def metrics_command(file: options.LogsArgument, as_json: options.JsonOption = False) -> None:
+def metrics_command(
+    file: options.LogsArgument,
+    everything: options.AllOption = False,
+    as_json: options.JsonOption = False,
+) -> None:
     """Computes all metrics that apply to a run.
 
-    The metrics cover tracking, effort, energies, force sharing, impedance, walls, learning and
-    the network. The table has a column for each site, link and wall. A dash marks a missing
-    value; if the run could have the value, the reason is given below the table. docs/metrics.md
-    has every formula.
+    The ten most important numbers are printed, each with the site, link or wall that has the
+    largest. With --all, tables cover tracking, effort, energies, force sharing, impedance,
+    walls, learning and the network, with a column for each site, link and wall. A dash marks a
+    missing value; if the run could have the value, the reason is given. docs/metrics.md has
+    every formula.
     """
     from ..analysis.metrics.log_metrics import compute_log_metrics
 
     log = terminal.open_with_progress(*file)
-    terminal.print_result(compute_log_metrics(log), as_json=as_json)
+    metrics = compute_log_metrics(log)
+    terminal.print_result(metrics, as_json=as_json, brief=not everything)
 
 
 @options.command("run.mcap positions settling --width 3.5 --format pdf --out paper")

@@ -256,13 +256,19 @@ _COMPOSERS = {
     "Rerun": "summary_text:compose_rerun",
 }
 """Functions that compose the text of results, as "module:function", by class name."""
+_BRIEF_COMPOSERS = {
+    "Certificate": "brief_text:compose_key_reasons",
+    "LogMetrics": "brief_text:compose_key_metrics",
+}
+"""Functions that compose the ten most important lines of long results, by class name."""
 
 
-def compose(result: Result) -> list[MarkedText | TextTable]:
+def compose(result: Result, *, brief: bool = False) -> list[MarkedText | TextTable]:
     """Collects the blocks of a result's text: lines and tables.
 
     Args:
         result: What a command has computed, such as the measured numbers of a run.
+        brief: True for the ten most important lines of a certificate or of metrics.
 
     Returns:
         The blocks in the order of the text. Each line is a `MarkedText`, whose mark, such as a
@@ -270,20 +276,27 @@ def compose(result: Result) -> list[MarkedText | TextTable]:
     """
     compose_blocks = getattr(result, "blocks", None)
     if compose_blocks is None:
-        compose_blocks = partial(_import_composer(result), result)
+        composers = _BRIEF_COMPOSERS if brief else _COMPOSERS
+        compose_blocks = partial(_import_composer(result, composers), result)
     blocks: Iterable[Block] = compose_blocks()
     return [MarkedText("", block) if isinstance(block, str) else block for block in blocks]
 
 
-def _import_composer(result: Result) -> Callable[[Result], Iterable[Block]]:
-    """Imports the function that composes the text of a result, see `_COMPOSERS`.
+def _import_composer(
+    result: Result, composers: Mapping[str, str]
+) -> Callable[[Result], Iterable[Block]]:
+    """Imports the function that composes the text of a result.
 
     A subclass of a listed class has the function of the listed class. Importing the module only
     when it is needed keeps other commands fast.
+
+    Args:
+        result: The result.
+        composers: Functions as "module:function", by class name, such as `_COMPOSERS`.
     """
     classes = [cls.__name__ for cls in type(result).__mro__]
-    known = next(name for name in classes if name in _COMPOSERS)
-    module_name, _, function_name = _COMPOSERS[known].partition(":")
+    known = next(name for name in classes if name in composers)
+    module_name, _, function_name = composers[known].partition(":")
     module = import_module(f"{__package__}.{module_name}")
     composer: Callable[[Result], Iterable[Block]] = getattr(module, function_name)
     return composer

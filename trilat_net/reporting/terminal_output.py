@@ -203,19 +203,20 @@ def print_table(table: "TextTable") -> None:
     console.print(table.rich())
 
 
-def print_result(result: "Result", *, as_json: bool = False) -> None:
+def print_result(result: "Result", *, as_json: bool = False, brief: bool = False) -> None:
     """Prints the result of a command, as text for people or as JSON for programs.
 
     Args:
         result: The result of a command.
         as_json: True to print the values as JSON.
+        brief: True to print only the ten most important lines of a certificate or of metrics.
     """
     if as_json:
         print_json(result.to_dict())
         return
     from .result_text import TextTable, compose
 
-    for block in compose(result):
+    for block in compose(result, brief=brief):
         if isinstance(block, TextTable):
             print_table(block)
         elif block.mark:

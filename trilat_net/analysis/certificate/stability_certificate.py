@@ -267,7 +267,7 @@ class Certificate(Result):
 
     def headline(self) -> str:
         """Returns one line for people: the judgement, and how the run ended."""
-        text = f"{self.stability}: {self.end.behaviour}"
+        text = f"{self.stability}: {self.end.phrase}"
         rests_on = self.decision.rests_on
         return f"{text}; rests on: {rests_on}" if rests_on else text
 

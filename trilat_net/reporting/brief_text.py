@@ -1,0 +1,131 @@
+"""Composes the short texts of `trilat certify` and `trilat metrics`: ten lines each.
+
+With the option --all, these commands print everything, see `certificate_text` and
+`summary_text`. A metric is a number that describes a run, and a certificate judges whether the
+run was stable. A subject is what a number describes: the run, a site (the process that runs one
+arm), a link or a wall.
+
+Invariant:
+    - A short text has at most `MOST_LINES` lines, and a further line that names --all.
+    - The lines are among those that --all prints, or the largest of the numbers that it prints.
+    - The judgement comes first, and a line that speaks against stability is never left out.
+"""
+
+from collections.abc import Iterator
+
+from ..analysis.certificate.stability_certificate import Certificate
+from ..analysis.metrics.log_metrics import LogMetrics
+from ..analysis.metrics.measures import Metric, Quantity, quantities
+from ..errors import count_nouns
+from .certificate_text import CertificateLine, describe_certificate
+from .result_text import MARKS, Block, MarkedText, TextTable
+from .terminal_output import sanitize
+
+MOST_LINES = 10
+"""Largest number of lines of a short text."""
+_KEY_METRICS = (
+    "max_error_rad",
+    "max_error_m",
+    "max_error_end_rad",
+    "max_error_end_m",
+    "settle_s",
+    "following_rms_rad",
+    "following_rms_m",
+    "peak_tau_nm",
+    "force_peak_n",
+    "sharing_off",
+    "takeover_s",
+    "age_mean_ms",
+    "age_max_ms",
+    "loss",
+    "late_max_us",
+    "missing",
+    "rms_error_rad",
+    "chatter_nm",
+    "hands_j",
+    "effort_nm2_s",
+)
+"""Keys of metrics, the most important first. The first ten that a run has are printed."""
+_MARK_RANKS = {"FAIL": 0, "open": 1, "ok": 2, "note": 3}
+"""Importance of a line of a certificate, by its mark."""
+
+
+def compose_key_reasons(certificate: Certificate) -> Iterator[Block]:
+    """Yields the judgement of a certificate and its most important reasons.
+
+    Args:
+        certificate: Judgement whether a run was stable, with its reasons.
+    """
+    lines = describe_certificate(certificate)
+    for line in _choose_lines(lines):
+        yield MarkedText(MARKS[line.mark], line.text)
+    parts = [count_nouns(len(certificate.premises), "premise")]
+    if certificate.balance is not None:
+        parts.append("the energies")
+    left_out = len(lines) - MOST_LINES
+    if left_out > 0:
+        parts.insert(0, count_nouns(left_out, "more line"))
+    yield f"--all prints {' and '.join(parts)} too"
+
+
+def _choose_lines(lines: list[CertificateLine]) -> list[CertificateLine]:
+    """Returns the judgement and the most important other lines, in their order."""
+    ranks = [_MARK_RANKS[line.mark] for line in lines]
+    ranks[0] = -1
+    by_importance = sorted(range(len(lines)), key=lambda index: (ranks[index], index))
+    chosen = sorted(by_importance[:MOST_LINES])
+    return [lines[index] for index in chosen]
+
+
+def compose_key_metrics(metrics: LogMetrics) -> Iterator[Block]:
+    """Yields a table with the ten most important numbers of a run, each with its subject.
+
+    Args:
+        metrics: All numbers of the run.
+    """
+    by_key = {quantity.key: quantity for quantity in quantities()}
+    rows = []
+    for key in _KEY_METRICS:
+        row = _make_row(metrics, by_key[key])
+        if row:
+            rows.append(row)
+    headers = (metrics.scenario, "largest", "", "of")
+    yield TextTable(headers, rows[:MOST_LINES], align="lrll")
+    yield "--all prints every number, by site, link and wall"
+
+
+def _make_row(metrics: LogMetrics, quantity: Quantity) -> list[str]:
+    """Returns the cells of a quantity: its name, its number, its unit and its subject.
+
+    Returns:
+        The cells. If the number of a subject is missing, they have the reason. Empty if the run
+        cannot have the quantity.
+    """
+    applicable = {
+        subject: metric
+        for subject, metric in metrics.values_of(quantity).items()
+        if metric.applies
+    }
+    if not applicable:
+        return []
+    run_metric = metrics.run_value(quantity)
+    if run_metric.value is None:
+        is_number_of_some = any(metric.value is not None for metric in applicable.values())
+        is_expected = quantity.key == "settle_s" or is_number_of_some
+        reason = sanitize(run_metric.why)
+        return [quantity.name, "–", quantity.unit, reason] if is_expected else []
+    subject = _name_subject(quantity, applicable)
+    return [quantity.name, f"{run_metric.value:.4g}", quantity.unit, subject]
+
+
+def _name_subject(quantity: Quantity, values: dict[str, Metric]) -> str:
+    """Returns the subject with the largest number of a quantity, or what the number sums."""
+    numbers = {subject: metric.value for subject, metric in values.items()}
+    known = {subject: value for subject, value in numbers.items() if value is not None}
+    if quantity.of == "run":
+        return "run"
+    if quantity.reduction == "sum":
+        return f"all {quantity.of}s together"
+    if len(known) > 1 and len(set(known.values())) == 1:
+        return f"every {quantity.of}"
+    return max(known, key=lambda subject: known[subject])
