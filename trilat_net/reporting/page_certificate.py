@@ -28,6 +28,7 @@ from .page_html import (
     render_section,
     render_table,
 )
+from .style import typeset
 
 _PAGE_DPI = 110
 _PREMISE_MARKS = {True: "holds", False: '<b class="bad">fails</b>', None: "undecided"}
@@ -51,7 +52,7 @@ def render_certificate(log: Log, certificate: Certificate) -> str:
     for line in grounds:
         mark = _SENTENCE_MARKS[line.mark]
         css_class = _SENTENCE_CLASSES[line.mark]
-        items += f'<li class="{css_class}"><b>{mark}</b>{escape(line.text)}</li>'
+        items += f'<li class="{css_class}"><b>{mark}</b>{escape(typeset(line.text))}</li>'
     body = f'<ul class="verdicts">{items}</ul>'
     folds = []
     if certificate.premises:

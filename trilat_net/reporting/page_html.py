@@ -128,7 +128,7 @@ def render_scrolling(html: str, label: str) -> str:
         label: Name of the region for screen readers, as plain text.
     """
     name = escape(label)
-    return f'<div class="scroll" role="region" aria-label="{name}" tabindex="0">{html}</div>'
+    return f'<div class="scroll" role="group" aria-label="{name}" tabindex="0">{html}</div>'
 
 
 def render_code(text: str) -> str:

@@ -33,6 +33,7 @@ from ..log.log_reader import Log
 from ..results import JsonObject
 from .page_html import NO_NUMBER, format_cell, join_words, render_details
 from .result_text import escape_text
+from .style import typeset
 
 _MAX_ALARMS = 8
 """Largest number of alarms at the top of the page."""
@@ -82,7 +83,7 @@ def render_verdict(log: Log, certificate: Certificate, findings: Sequence[Findin
         css_class = "bad" if css_class == "bad" else "warn"
         sentences.append("The log failed a check, so that the judgement may be wrong.")
     chip = f'<strong class="chip {css_class}">{escape(word.capitalize())}</strong>'
-    text = escape(describe_basis(certificate))
+    text = escape(typeset(describe_basis(certificate)))
     more = escape(" ".join(sentences))
     return f'<div id="verdict" class="{css_class}"><p>{chip} {text}</p><p>{more}</p></div>'
 
@@ -250,7 +251,7 @@ def _describe_delay(facts: JsonObject) -> _KeyNumber:
     means_ms = [age["mean"] for age in ages_ms if age["mean"] is not None]
     if not means_ms:
         return _KeyNumber("Delay in use", NO_NUMBER, "no sample was used")
-    mean_ms = format_cell(float(np.mean(means_ms)))
+    mean_ms = f"{float(np.mean(means_ms)):.3g}"
     least_ms = format_cell(min(age["min"] for age in ages_ms if age["min"] is not None))
     most_ms = format_cell(max(age["max"] for age in ages_ms if age["max"] is not None))
     links = count_nouns(len(means_ms), "link")

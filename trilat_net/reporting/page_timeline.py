@@ -111,7 +111,7 @@ def list_moments(log: Log, facts: JsonObject) -> list[RunMoment]:
     """
     moments = [
         RunMoment(0.0, f"The run starts; {describe_dominance(log.scenario)}."),
-        *_list_changes(facts),
+        *_list_changes(log, facts),
         *_list_pushes(log),
         *_list_modes(log),
         *_list_errors(log, facts),
@@ -136,7 +136,7 @@ def describe_dominance(scenario: Scenario) -> str:
     return "; ".join(sentences)
 
 
-def _list_changes(facts: JsonObject) -> Iterator[RunMoment]:
+def _list_changes(log: Log, facts: JsonObject) -> Iterator[RunMoment]:
     """Yields the changes of the run, numbered as in the charts."""
     for number, change in enumerate(facts["changes"], 1):
         tick = change["taken_at_tick"]
@@ -145,7 +145,11 @@ def _list_changes(facts: JsonObject) -> Iterator[RunMoment]:
         if tick is not None:
             origin = f"command, applied at tick {tick} of {change['site']}"
         sentence = change["sentence"]
-        text = f"{sentence[:1].upper()}{sentence[1:]} ({origin})."
+        subject = sentence.partition(" ")[0]
+        # The name of a site keeps its letters, also at the beginning of a sentence.
+        if subject not in log.sites:
+            sentence = f"{sentence[:1].upper()}{sentence[1:]}"
+        text = f"{sentence} ({origin})."
         yield RunMoment(change["at_s"], text, change["site"], number)
 
 
