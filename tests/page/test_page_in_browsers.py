@@ -1,38 +1,21 @@
-"""The page in a browser, for every role, by day and by night, at a desk and on a phone: what people can use.
-
-`axe-core/axe.min.js` is axe-core 4.14.1 of Deque Systems, under the Mozilla Public License 2.0.
-"""
-
-from pathlib import Path
-from typing import Any
+"""The page in a browser, for every role, by day and by night, at a desk and on a phone: what people can use."""
 
 import pytest
-from playwright.sync_api import Browser, Page
+from playwright.sync_api import Browser
 
 from tests.live.browsers import needs_browser, tip_px
 
 from .recorded_session import ROLES, SCREENS, RecordedSession, record_session
+from .whole_pages import grave_findings
 
 pytestmark = [needs_browser, pytest.mark.long]
 
-AXE = Path(__file__).parent / "axe-core" / "axe.min.js"
 SCHEMES = ("light", "dark")
 
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> RecordedSession:
     return record_session(tmp_path_factory.mktemp("session"))
-
-
-def grave_findings(page: Page) -> list[str]:
-    """What axe-core calls serious or critical, each with its first place."""
-    page.evaluate(AXE.read_text(encoding="utf-8"))
-    found: list[dict[str, Any]] = page.evaluate("axe.run().then((found) => found.violations)")
-    grave = [one for one in found if one["impact"] in ("serious", "critical")]
-    return [
-        f"{one['id']}: {one['nodes'][0]['html']}: {one['nodes'][0]['failureSummary']}"
-        for one in grave
-    ]
 
 
 @pytest.mark.parametrize("role", ROLES)

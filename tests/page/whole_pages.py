@@ -12,9 +12,11 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
-from playwright.sync_api import Browser, BrowserContext
+from playwright.sync_api import Browser, BrowserContext, Page
 
 OBSERVER = Path(__file__).with_name("observe_page.js")
+AXE = Path(__file__).parent / "axe-core" / "axe.min.js"
+"""axe-core 4.14.1 of Deque Systems, under the Mozilla Public License 2.0."""
 
 
 class WatchedPage:
@@ -59,6 +61,17 @@ class WatchedPage:
             if not any(fnmatch(name, pattern) for pattern in unsent)
         ]
         return faults
+
+
+def grave_findings(page: Page) -> list[str]:
+    """What axe-core calls serious or critical, each with its first place."""
+    page.evaluate(AXE.read_text(encoding="utf-8"))
+    found: list[dict[str, Any]] = page.evaluate("axe.run().then((found) => found.violations)")
+    grave = [one for one in found if one["impact"] in ("serious", "critical")]
+    return [
+        f"{one['id']}: {one['nodes'][0]['html']}: {one['nodes'][0]['failureSummary']}"
+        for one in grave
+    ]
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from ..analysis.certificate.stability_certificate import Certificate
 from ..analysis.metrics.log_metrics import LogMetrics
 from ..analysis.metrics.measures import Metric, Quantity, quantities
 from ..errors import count_nouns
-from .certificate_text import CertificateLine, describe_certificate
+from .certificate_text import CertificateLine, describe_certificate, select_premises
 from .result_text import MARKS, Block, MarkedText, TextTable
 from .terminal_output import sanitize
 
@@ -59,13 +59,13 @@ def compose_key_reasons(certificate: Certificate) -> Iterator[Block]:
     lines = describe_certificate(certificate)
     for line in _choose_lines(lines):
         yield MarkedText(MARKS[line.mark], line.text)
-    parts = [count_nouns(len(certificate.premises), "premise")]
+    premises = len(select_premises(certificate))
+    counts = {"more line": max(0, len(lines) - MOST_LINES), "premise": premises}
+    parts = [count_nouns(count, noun) for noun, count in counts.items() if count]
     if certificate.balance is not None:
         parts.append("the energies")
-    left_out = len(lines) - MOST_LINES
-    if left_out > 0:
-        parts.insert(0, count_nouns(left_out, "more line"))
-    yield f"--all prints {' and '.join(parts)} too"
+    if parts:
+        yield f"--all prints {' and '.join(parts)} too"
 
 
 def _choose_lines(lines: list[CertificateLine]) -> list[CertificateLine]:

@@ -56,7 +56,7 @@ def compose_certificate(certificate: Certificate) -> Iterator[Block]:
         yield MarkedText(MARKS[line.mark], line.text)
 
     observed = certificate.observed
-    premises = _select_premises(certificate)
+    premises = select_premises(certificate)
     if premises:
         yield ""
         yield _tabulate_premises(premises)
@@ -76,11 +76,14 @@ def compose_certificate(certificate: Certificate) -> Iterator[Block]:
         yield TextTable(("energy", "J"), cells, align="lr")
 
 
-def _select_premises(certificate: Certificate) -> list[Premise]:
+def select_premises(certificate: Certificate) -> list[Premise]:
     """Returns the premises that apply to the control laws of a run.
 
     The premises of the stability theorem concern its energy function V. They are left out for
     laws for which V does not exist; only the walls, and the law's own premises, remain.
+
+    Args:
+        certificate: Judgement whether a run was stable, with its reasons.
     """
     premises = list(certificate.premises)
     if not certificate.has_functional:

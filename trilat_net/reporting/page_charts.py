@@ -86,7 +86,7 @@ def render_chart_groups(
         "timing": explain_missing_loop_times(log),
     }
     html = ""
-    lacking: list[str] = []
+    lacking: dict[str, list[str]] = {}  # titles by the reason
     unfolded = 0
     for section, (heading, note) in _TEXTS[place].items():
         name = f"{heading[0].lower()}{heading[1:]}"
@@ -98,15 +98,18 @@ def render_chart_groups(
             is_open = section in _OPEN_SECTIONS and fits
             unfolded += count if is_open else 0
             html += _render_group(section, heading, text, count, is_open, is_small)
-            lacking += [f"{title} ({_NO_VALUE})" for title in missing.get(section, ())]
+            lacking.setdefault(_NO_VALUE, []).extend(missing.get(section, ()))
         elif absence_reasons.get(section):
-            lacking.append(f"{name} ({absence_reasons[section]})")
+            lacking.setdefault(absence_reasons[section], []).append(name)
         elif section in missing:
-            lacking.append(f"{name} ({_NO_VALUE})")
+            lacking.setdefault(_NO_VALUE, []).append(name)
 
     groups = f'<div class="groups">{html}</div>' if html else ""
-    if lacking and place != "loops":  # the section of the loops says itself what is missing
-        groups += render_note(f"Not on this page: {'; '.join(lacking)}.")
+    if place == "loops":  # the section of the loops says itself what is missing
+        return groups
+    for reason, titles in lacking.items():
+        if titles:
+            groups += render_note(f"Not on this page, because {reason}: {'; '.join(titles)}.")
     return groups
 
 

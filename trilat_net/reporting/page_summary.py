@@ -102,10 +102,10 @@ def describe_basis(certificate: Certificate) -> str:
         basis = decision.rests_on.replace("; ", ", and ")
         return f"{meaning}: {basis}."
     if decision.stability is not Stability.OPEN:
-        return f"{meaning}: {decision.rests_on}."
+        return f"{meaning} – {decision.rests_on}."
     reason, *others = [text for text in (decision.rests_on, *decision.reasons) if text]
     more = f" ({count_nouns(len(others), 'more reason')} below)" if others else ""
-    return f"{meaning}: {reason}{more}."
+    return f"{meaning} – {reason}{more}."
 
 
 def _explain_end(log: Log, certificate: Certificate) -> str:
@@ -115,6 +115,8 @@ def _explain_end(log: Log, certificate: Certificate) -> str:
     end with errors that stay, or with motion that has not yet died away.
     """
     end = certificate.end
+    if end.missing_sites:
+        return f"There is no record of {join_words(end.missing_sites)}."
     stability = certificate.stability
     is_stable = stability in (Stability.STABLE, Stability.SETTLED)
     remains = end.end_error_rad > SETTLED_ERROR_RAD
@@ -238,6 +240,8 @@ def _describe_last_error(log: Log, facts: JsonObject) -> _KeyNumber:
 def _describe_settling(log: Log, facts: JsonObject) -> _KeyNumber:
     """Returns the time from which all errors stay below the limit of a settled site."""
     name = f"All errors below {facts['settle_below_rad']:g} {shared_unit(log)}"
+    if facts["max_error_end_rad"] is None:
+        return _KeyNumber(name, NO_NUMBER, "no record")
     if facts["settle_s"] is None:
         return _KeyNumber(name, "not at the end", "a measure of following, not of stability")
     if facts["settle_s"] == 0.0:

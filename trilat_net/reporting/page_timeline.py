@@ -31,7 +31,7 @@ from .page_html import join_words, render_details, render_section, render_swatch
 from .page_summary import find_error_peak
 from .style import typeset
 
-MAX_SHOWN = 8
+MAX_SHOWN = 7
 """Largest number of moments that are not folded."""
 _MAX_MOMENTS = 400
 """Largest number of moments on the page. summary.json has all modes and changes."""
@@ -46,7 +46,7 @@ _DID = {
     "brake": "braked",
     "return": "returned to following",
     "waiting": "waited for the other sites",
-    "fault": "stopped with a fault",
+    "fault": "stood still with a fault",
     "stopped": "stood by order",
 }
 """What a site did in each mode, in the past tense. Other modes have the words of records."""
@@ -208,13 +208,15 @@ def _name_pusher(log: Log, site: str) -> str:
 def _list_modes(log: Log) -> Iterator[RunMoment]:
     """Yields when sites did not follow their peers, with the reason if there was an alarm."""
     reasons = {(alarm.site, alarm.from_s): alarm for alarm in list_alarms(log)}
+    end_s = recorded_end_s(log)
     sites: dict[tuple[float, str], list[str]] = {}
     bad_sites = set()
     for site in log.sites:
         for mode, from_s, to_s in find_mode_intervals(log[site]):
             alarm = reasons.get((site, from_s))
             reason = "" if alarm is None else f" ({alarm.word}: {alarm.reason})"
-            text = f"{_DID.get(mode, mode)} until {to_s:.3f} s{reason}"
+            until = "to the end" if to_s >= end_s else f"until {to_s:.3f} s"
+            text = f"{_DID.get(mode, mode)} {until}{reason}"
             # Sites that do the same at the same time share a sentence.
             sites.setdefault((from_s, text), []).append(site)
             if alarm is not None:

@@ -1,0 +1,137 @@
+"""The first lines of a report: a judgement that no number beside it contradicts."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+
+import pytest
+
+from tests.analysis import logs
+from tests.analysis.certificate import runs
+from trilat_net.analysis.certificate.stability_certificate import Certificate
+from trilat_net.analysis.file_overview import summarise_run
+from trilat_net.analysis.run_end import EndBehaviour, Stability
+from trilat_net.analysis.site_signals import SETTLED_ERROR_RAD
+from trilat_net.analysis.stability_decision import LoopRoots
+from trilat_net.log.findings import Finding
+from trilat_net.log.log_reader import Log
+from trilat_net.reporting.page_summary import (
+    describe_basis,
+    find_error_peak,
+    render_checks,
+    render_key_numbers,
+    render_verdict,
+)
+
+STABLE_ROOTS = LoopRoots("stable", -0.5, True, "this rest: stable, -0.5 /s")
+PASSED = Finding("records", "8/8 in the file; judged all 8 ticks")
+EXACT = Finding("executed again", "8/8 records identical (whole runs, bit for bit)")
+WRONG = Finding("executed again", "7/8 records identical; 1 differs", passed=False)
+
+
+@cache
+def short_log() -> Log:
+    return runs.run("paper", {"duration_s": 2.0, "rate_hz": 100}).log
+
+
+def judge(behaviour: EndBehaviour, error_rad: float, **fields: object) -> Certificate:
+    """A certificate of a run with a proof, which ends with a behaviour and an error."""
+    found = runs.run("paper", {"duration_s": 2.0, "rate_hz": 100}).certificate
+    end = found.end._replace(
+        behaviour=behaviour, end_error_rad=error_rad, reasons=(), operator_acts=False
+    )
+    return replace(found, **{"end": end, "roots": STABLE_ROOTS, **fields})
+
+
+def verdict_text(certificate: Certificate, findings: Sequence[Finding] = ()) -> str:
+    return render_verdict(short_log(), certificate, findings)
+
+
+def test_stable_run_names_its_proof() -> None:
+    certificate = judge(EndBehaviour.CONVERGED, 0.0)
+    assert certificate.stability is Stability.STABLE
+    html = verdict_text(certificate)
+    assert '<strong class="chip good">Stable</strong> A proof holds for this loop' in html
+    assert "exact roots, slowest -0.5 /s." in html
+    assert "the arms were at rest and agreed" in html
+
+
+def test_errors_that_stay_are_explained() -> None:
+    certificate = judge(EndBehaviour.CONVERGED, 2 * SETTLED_ERROR_RAD)
+    assert certificate.headline().startswith("stable: at rest, with errors that stay; ")
+    html = verdict_text(certificate)
+    assert "at rest, with errors that stay" in html
+    assert "agreed" not in html
+    assert "Stable means that disturbances die away, not that errors vanish" in html
+
+
+def test_hands_that_still_push_are_named() -> None:
+    log = logs.simulated("paper")
+    pushed = logs.rewritten(log, change=lambda row: logs.replaced(row, tau_x=[1.0, 0.0]))
+    html = render_verdict(pushed, judge(EndBehaviour.CONVERGED, 0.4), ())
+    assert "not that errors vanish: hands or walls still push m1, m2 and s." in html
+
+
+def test_calm_end_of_unstable_loop_is_explained() -> None:
+    growing = LoopRoots("unstable", 0.1, True, "this rest: unstable, +0.1 /s")
+    html = verdict_text(judge(EndBehaviour.CONVERGED, 0.0, roots=growing))
+    assert "Not stable" in html
+    assert "This motion is small, but grows from small disturbances." in html
+
+
+def test_open_run_names_its_first_reason() -> None:
+    certificate = judge(EndBehaviour.HARDLY, 0.2, roots=None)
+    assert certificate.stability is Stability.OPEN
+    text = describe_basis(certificate)
+    assert certificate.reasons[0] in text
+    assert ("more reason" in text) == (len(certificate.reasons) > 1)
+
+
+def test_failed_check_puts_judgement_in_doubt() -> None:
+    certificate = judge(EndBehaviour.CONVERGED, 0.0)
+    assert "failed a check" not in verdict_text(certificate, [PASSED, EXACT])
+    html = verdict_text(certificate, [PASSED, WRONG])
+    assert "The log failed a check" in html
+    assert 'class="chip warn"' in html
+
+
+def test_checks_that_passed_are_one_line() -> None:
+    facts = {"missing": 0}
+    html = render_checks([PASSED, EXACT, Finding("integrity")], facts)
+    summary = "✓ All records present; executed again bit for bit; 1 other check passed."
+    assert f"<details><summary>{summary}</summary>" in html
+    assert "8/8 in the file" in html
+    assert "3 records missing" in render_checks([PASSED], {"missing": 3})
+    assert render_checks([], facts) == ""
+
+
+@pytest.mark.parametrize(
+    ("finding", "words"),
+    [
+        (WRONG, "<details open><summary>✗ Failed: executed again</summary>"),
+        (
+            Finding("user law", "not allowed", passed=False, judged=False),
+            "<details><summary>? Not judged: user law</summary>",
+        ),
+    ],
+)
+def test_check_that_did_not_pass_is_named(finding: Finding, words: str) -> None:
+    assert words in render_checks([PASSED, finding], {"missing": 0})
+
+
+def test_key_numbers_say_where_and_when() -> None:
+    log = logs.simulated("paper")
+    peak = find_error_peak(log)
+    assert peak is not None
+    facts = summarise_run(log)
+    assert peak.error == max(site["max_error_rad"] for site in facts["sites"].values())
+    html = render_key_numbers(log, facts)
+    assert f"of {peak.site}, at {peak.t_s:.2f} s" in html
+    assert "<dd>200 ms</dd>" in html
+    assert "a measure of following, not of stability" in html
+
+
+def test_log_without_records_has_dashes() -> None:
+    empty = logs.rewritten(logs.simulated("paper"), lambda _: False, finished=False)
+    html = render_key_numbers(empty, summarise_run(empty))
+    assert html.count("<dd>–</dd>") == 4
