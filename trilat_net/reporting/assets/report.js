@@ -143,7 +143,7 @@
   };
   const rungLabels = (u, splits) => splits.map((value) => (value == null ? "" : value < 0.001 ? value.toExponential(0) : `${Number(value.toPrecision(1))}`));
 
-  const tall = (box) => (box.closest(".small") ? 110 : box.closest("#overview") ? 165 : 130);
+  const tall = (box) => (box.closest(".small") ? 110 : box.closest("#overview") ? 165 : 124);
 
   function timeChart(chart, box) {
     const [data, order] = timeData(chart);
