@@ -79,6 +79,12 @@ def test_calm_end_of_unstable_loop_is_explained() -> None:
     assert "This motion is small, but grows from small disturbances." in html
 
 
+def test_small_oscillation_is_not_called_settled() -> None:
+    html = verdict_text(judge(EndBehaviour.BOUNDED, 0.001, roots=None))
+    assert "Not stable" in html
+    assert "All errors were small then, but they do not die away." in html
+
+
 def test_open_run_names_its_first_reason() -> None:
     certificate = judge(EndBehaviour.HARDLY, 0.2, roots=None)
     assert certificate.stability is Stability.OPEN

@@ -133,10 +133,12 @@ def _explain_end(log: Log, certificate: Certificate) -> str:
         return f"{text} The proof and the pushes show that such motion dies away."
     if is_stable and remains:
         cause = _explain_remaining_error(log)
-        return f"{text} Stable means that disturbances die away, not that errors vanish{cause}."
-    looks_calm = end.stability is Stability.SETTLED and not remains
-    if stability is Stability.NOT_STABLE and looks_calm:
-        return f"{text} This motion is small, but grows from small disturbances."
+        meaning = f"{stability.capitalize()} means that disturbances die away"
+        return f"{text} {meaning}, not that errors vanish{cause}."
+    if stability is Stability.NOT_STABLE and not remains:
+        if end.stability is Stability.SETTLED:
+            return f"{text} This motion is small, but grows from small disturbances."
+        return f"{text} All errors were small then, but they do not die away."
     return text
 
 
