@@ -127,6 +127,8 @@ class EndBehaviour(StrEnum):
         return Stability.NOT_STABLE
 
 
+LASTING_ERRORS = "at rest, with errors that stay"
+"""Phrase for arms that came to rest although their errors exceed the limit of settled sites."""
 _MAY_DRIFT = (EndBehaviour.BOUNDED, EndBehaviour.HARDLY, EndBehaviour.UNDECIDED)
 _FALLING = (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY)
 
@@ -205,7 +207,7 @@ class RunEnd(NamedTuple):
         """A phrase for the behaviour at the end, which names errors that stay."""
         has_converged = self.behaviour is EndBehaviour.CONVERGED
         if has_converged and self.end_error_rad > SETTLED_ERROR_RAD:
-            return "at rest, with errors that stay"
+            return LASTING_ERRORS
         return self.behaviour.value
 
     @property
@@ -221,7 +223,9 @@ class RunEnd(NamedTuple):
         end_speed = f"|qd| {self.end_speed_rad_s:.3g} rad/s"
         end = f"{end_error} and {end_speed} in the last second"
         if behaviour is EndBehaviour.CONVERGED:
-            return f"{self.phrase}: {end}"
+            if self.end_error_rad > SETTLED_ERROR_RAD:
+                return f"{LASTING_ERRORS}: {end}"
+            return f"converged: {end}"
 
         joint = f" at {self.where}" if self.where else ""
         if behaviour is EndBehaviour.BOUNDED:
