@@ -317,3 +317,31 @@ def test_a_stop_at_two_hundred_instants_ends_in_rest(
     name: str, law: str, settings: dict[str, Any]
 ) -> None:
     assert_stops(run_of(name, law, settings), 200)
+
+
+@pytest.mark.parametrize("space", ["joints", "position"])
+def test_a_force_on_a_peer_moves_no_arm_at_rest(space: str) -> None:
+    """The law of the stopped arm reflects forces, but only while the arm follows its peer."""
+    axes = {} if space == "joints" else {"axes": ["x", "y"]}
+    push = {"kind": "pulse", "start_s": 3.0, "end_s": 5.0, "peak_nm": [6.0, 3.0]}
+    laws = {
+        "sites.m.control": {"law": "p_f", "K": 0.0, "k_f": 1.0},
+        "sites.s.control": {"law": "p_f", "K": 12.0, "d": 4.0, "k_f": 0.0},
+    }
+    scenario = load_scenario(
+        "two_sites",
+        {
+            "on_stale.action": "glide",
+            "task": {"space": space, **axes},
+            "duration_s": 6.0,
+            "scheme": "digital",
+            "sites.m.hands": [],
+            "sites.m.q0_rad": [0.2, 1.4],
+            "sites.s.q0_rad": [0.2, 1.4],
+            "sites.s.hands": [push],
+            **laws,
+        },
+    )
+    stopped = ordered(scenario, {"m": {2000: "stop"}})["m"]
+    assert set(stopped.mode[2500:]) == {"stopped"}
+    assert np.abs(stopped.qd[3000:]).max() < 1e-6

@@ -127,7 +127,7 @@ def test_what_cannot_be_asked_is_refused() -> None:
     with pytest.raises(UsageError, match="no site 'x' among the ports; the sites are m, s"):
         analyse_ports(scenario, rest, "x")
     for band_hz in ((1.0, 1.0), (1.0, 0.1), (0.0, 0.1)):
-        with pytest.raises(UsageError, match="from a lower to a higher frequency"):
+        with pytest.raises(UsageError, match="from a frequency above 0 Hz to a higher one"):
             analyse_ports(scenario, rest, band_hz=band_hz)
     measured = load_scenario("p_d_margin_two", {"link": {"model": "measured"}})
     with pytest.raises(ScenarioError, match="is not known beforehand"):

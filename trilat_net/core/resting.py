@@ -262,17 +262,18 @@ def put_rest_reference(site: SiteRow, q: Array, qd: Array) -> None:
     """Computes the reference of an arm at rest, in the coordinates of its control law.
 
     In joint space, the coordinates are the joint angles. The reference is the motion that
-    brings the joints to rest. The forces on other arms, which some laws reflect, are cleared,
-    so that they do not move the resting arm.
+    brings the joints to rest.
 
     In task space, the coordinates describe the pose of the end effector. Their reference is the
     present pose and its velocity, so that the law sees no error. `add_rest_torque` brings the
     joints to rest instead, by a reference of their own.
 
+    The forces on other arms, which some laws reflect, are cleared, so that they do not move the
+    resting arm.
+
     Args:
         site: State of the site (the process that runs the arm). `task` is 1 in task space, and
-            0 in joint space. In joint space, `felt` is cleared, the weighted torque on the
-            other arms in N m.
+            0 in joint space. `felt` is cleared, the weighted forces on the other arms.
         q: Receives the reference, one number per coordinate, rad or m.
         qd: Receives the velocity of the reference, rad/s or m/s.
     """
@@ -282,7 +283,7 @@ def put_rest_reference(site: SiteRow, q: Array, qd: Array) -> None:
             qd[i] = site.xd[i]
         else:
             q[i], qd[i] = _read_rest_reference(site, i)
-            site.felt[i] = 0.0
+        site.felt[i] = 0.0
 
 
 @leaf

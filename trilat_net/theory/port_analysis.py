@@ -300,7 +300,7 @@ def analyse_ports(
     low, high = band_hz
     if not 0.0 < low < high:
         raise UsageError(
-            "a band must go from a lower to a higher frequency, "
+            "a band must go from a frequency above 0 Hz to a higher one, "
             f"not from {low:g} to {high:g} Hz"
         )
 
