@@ -12,6 +12,7 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from html import escape
 from importlib import resources
+from typing import Any
 
 from ..log.log_reader import Log
 from .charts import ChartBuilder
@@ -21,10 +22,10 @@ from .figures.joint_motion import explain_absent_operator
 from .page_data import Chart
 from .page_html import render_details, render_note
 
-_TEXTS: dict[str, dict[str, list[str]]] = tomllib.loads(
+_TEXTS: dict[str, dict[str, Any]] = tomllib.loads(
     (resources.files("trilat_net.reporting") / "assets" / "report.toml").read_text("utf-8")
 )
-"""Heading and note of each section of charts, by place of the page and section."""
+"""Heading and note of each section of charts, by place and section, and other notes."""
 _OPEN_SECTIONS = ("torques", "errors", "positions")
 """Sections of charts that may be unfolded at first."""
 _MOST_OPEN_CHARTS = 10

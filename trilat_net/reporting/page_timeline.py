@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..analysis.aligned import Bools
 from ..analysis.site_signals import shared_unit, sites_with_operator
 from ..analysis.timeline import (
     find_mode_intervals,
@@ -177,7 +178,7 @@ def _list_pushes(log: Log) -> Iterator[RunMoment]:
             yield RunMoment(start_s, text, site)
 
 
-def _find_spans(t_s: Array, acts: Array) -> list[tuple[float, float]]:
+def _find_spans(t_s: Array, acts: Bools) -> list[tuple[float, float]]:
     """Returns the start and the end of each time in which a condition holds, in s.
 
     Pauses that are shorter than `_PAUSE_S` do not divide such a time.
