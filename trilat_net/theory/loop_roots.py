@@ -17,7 +17,8 @@ Invariant:
     - A command that leaves a link or a dominance factor as it was changes nothing.
     - The code of imported control laws is executed only with permission. Without it, such a
       loop has no roots. With it, unstable roots count as exact and stable ones do not: the law
-      may contain thresholds that its derivative at the pose does not show.
+      may contain thresholds that its derivative at the pose does not show. The same holds for
+      sampled walls, which may hammer although the rest beside them is stable.
 """
 
 import math
@@ -319,8 +320,10 @@ def _compute_roots(loop: EndLoop) -> LoopRoots:
     if sampled is not None:
         laws = loop.scenario.controls
         has_imported_law = any(isinstance(law, ImportedLaw) for law in laws)
-        # differences of a user's law show growth, but may miss what happens beyond a threshold
-        is_proof_possible = not has_imported_law or sampled.verdict == "unstable"
+        # Roots show growth, but may miss what happens beyond a threshold: in a user's law, or
+        # when an arm touches a sampled wall again.
+        has_threshold = has_imported_law or _has_sampled_wall(loop.scenario)
+        is_proof_possible = not has_threshold or sampled.verdict == "unstable"
         exact = sampled.is_exact and is_proof_possible
         if exact and loop.last_pose is not None:
             # The arms still move, and it is not known where in between they will rest.
