@@ -116,7 +116,7 @@ STATED: list[tuple[str, str, float, float]] = [
     ("fair-comparison.md", "at least 10 %", 10, 100 * search_space.MIN_BOX),
     ("fair-comparison.md", "more than 0.2 rad from q", 0.2, candidate.STRAYED_RAD),
     ("fair-comparison.md", "more than 0.02 rad from q", 0.02, candidate.TOGETHER_RAD),
-    ("linear.md", "faster than 1e-5 rad/s", 1e-5, run_end.EQUILIBRIUM_SPEED_RAD_S),
+    ("linear.md", "slower than 0.01 rad/s", 0.01, run_end.SETTLED_SPEED_RAD_S),
     ("linear.md", "within 1e-6/s", 1e-6, characteristic_roots.STABILITY_EDGE_PER_S),
     ("linear.md", "a scan of 24 values", 24, linear_edge.EDGE_SCAN_POINTS),
     ("links.md", "No delay is longer than 10 s", 10, delay.MAX_DELAY_US / 1e6),
@@ -208,7 +208,7 @@ STATED: list[tuple[str, str, float, float]] = [
     ("recording.md", "busy for 80 % of the time", 80, 100 * machine_load.BUSY_SHARE),
     ("linear.md", "the shorter span, at most 60 s", 60, delay_period.MAX_NEAR_PERIOD_S),
     ("linear.md", "30 s of the draws", 30, floquet.DRAWN_SPAN_S),
-    ("linear.md", "at most eight times its duration", 8, equilibrium.MAX_PROLONGATION),
+    ("linear.md", "at most eight times the duration", 8, equilibrium.MAX_PROLONGATION),
     ("linear.md", "to a residual of 1e-10", 1e-10, equilibrium.MAX_EQUILIBRIUM_RESIDUAL),
     (
         "linear.md",

@@ -230,6 +230,8 @@ KINDS: Mapping[str, Callable[[np.random.Generator], Hidden]] = {
     "bursts": _draw_bursts,
 }
 """How growth is hidden, by name; seeds take turns."""
+PUSH = range(len(KINDS))
+"""Seeds that every push judges."""
 
 
 def draw_hidden(seed: int) -> tuple[Hidden, float]:

@@ -30,7 +30,7 @@ from .adversaries import (
     under_noise,
 )
 from .drawn_loops import WIDE_FROM, Drawn, draw_experiment, experiment
-from .test_hidden_loops import PUSH as HIDDEN_PUSH
+from .hidden_loops import PUSH as HIDDEN_PUSH
 
 
 def _named(row: Row) -> str:

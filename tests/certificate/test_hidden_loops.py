@@ -5,9 +5,8 @@ import pytest
 
 import trilat_net
 from tests.certificate.adversaries import HIDDEN, judge_hidden, tally
-from tests.certificate.hidden_loops import KINDS, draw_hidden, write_scenario
+from tests.certificate.hidden_loops import PUSH, draw_hidden, write_scenario
 
-PUSH = range(2 * len(KINDS))
 BLOCK = 100
 
 

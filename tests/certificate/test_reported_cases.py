@@ -96,7 +96,10 @@ def assert_roots_decide(found: Certificate, rate_per_s: float) -> None:
 @pytest.mark.parametrize(
     "loop",
     [
-        SampledLoop(PAIR, sine(180.0, 150.0, 0.7), 10.0, 1.5, (2.9,), 200),
+        pytest.param(
+            SampledLoop(PAIR, sine(180.0, 150.0, 0.7), 10.0, 1.5, (2.9,), 200),
+            marks=pytest.mark.long,
+        ),
         SampledLoop(THREE, burst(50.0, 450.0, 1.0, 1.5), 9.0, 2.0, (), 100, "digital"),
     ],
 )

@@ -23,7 +23,7 @@ FIRST_PICTURE_PX = 700
 MOST_SCREENS = 3
 NAMES = [
     "live change",
-    "fault",
+    pytest.param("fault", marks=pytest.mark.long),
     pytest.param("six joints", marks=pytest.mark.long),
     pytest.param("no record", marks=pytest.mark.long),
 ]

@@ -345,7 +345,8 @@ def _summarise_checks(findings: Sequence[Finding], facts: JsonObject) -> str:
         if finding.check == "records":
             missing = facts["missing"]
             records = "all records present"
-            parts.append(f"{missing} records missing" if missing else records)
+            lack = f"{count_nouns(missing, 'record')} missing"
+            parts.append(lack if missing else records)
         elif finding.check == "executed again" and not has_remark:
             is_exact = "bit for bit" in finding.text
             parts.append(f"executed again {'bit for bit' if is_exact else 'to 1e-9'}")
