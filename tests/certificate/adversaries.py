@@ -27,7 +27,6 @@ import numpy as np
 
 import trilat_net
 from trilat_net.analysis.certificate.premises import explain_no_functional
-from trilat_net.analysis.run_end import Stability
 from trilat_net.core.ticks import BUCKETS_PER_S, NS_PER_S
 from trilat_net.core.two_link_arm import JOINTS
 from trilat_net.core.vectors import Array
@@ -755,10 +754,7 @@ def say_of_run(scenario: Scenario) -> str:
 
 def say_of_sweep(scenario: Scenario) -> str:
     """The word of a cell of `trilat sweep`."""
-    stable = classify_cell(scenario.text, LONGER * scenario.duration_s).verdict.stable
-    return str(
-        {True: Stability.STABLE, False: Stability.NOT_STABLE, None: Stability.OPEN}[stable]
-    )
+    return classify_cell(scenario.text, LONGER * scenario.duration_s).stability
 
 
 class Judged(NamedTuple):
