@@ -13,6 +13,8 @@ Invariant:
       because they contain the changes that were made.
     - A site has ended if its `end` event says so, never because it is silent. On a busy machine
       a running site may be silent for long, and its records are used when they arrive.
+    - A session has ended if every site has, or if the network reports that all of them have
+      left: a site that was killed says no end.
 """
 
 from collections import Counter, deque
@@ -46,6 +48,11 @@ LATE_S = 3.0
 """An observer has joined late if the first record that it receives is of a later time, in s."""
 MIN_SILENCE_NS = 2 * NS_PER_S
 """Silence after which a running site is reported as silent, in ns."""
+AWAY_NS = 15 * NS_PER_S
+"""Time after which a session has ended if the network reports that every site has left, in ns.
+
+Their links may have been cut, and may work again.
+"""
 EVENTS_KEPT = 400
 """Number of events that are kept for new pages."""
 
@@ -249,6 +256,11 @@ class SessionView:
         self.events: Tail[Event] = Tail(EVENTS_KEPT)
         self.dropped: Counter[str] = Counter()
         self._finished = False
+        self._presence = bus.presence(topics.presence_key(session, "*"))
+        # Keys of the liveliness tokens of sites that are present.
+        self._tokens: set[str] = set()
+        # Time at which the last of them disappeared. None if a site is present, or never was.
+        self._left_ns: int | None = None
         self._pictures: dict[str, PictureDelay] = {}
         self._applied_changes: set[tuple[str, str]] = set()
         self._query = MemberQuery(bus, clock, session)
@@ -264,12 +276,21 @@ class SessionView:
 
     @property
     def ended(self) -> bool:
-        """True once every site has published its end, or `finish` was called."""
+        """True once every site has published its end or has left, or `finish` was called."""
         if not self.running:
             return False
-        if self._finished:
+        if self._finished or self.has_left:
             return True
         return all(site.ended for site in self.sites.values())
+
+    @property
+    def has_left(self) -> bool:
+        """True if the network reports that every site has left, and nothing more arrives."""
+        if self._left_ns is None:
+            return False
+        arrivals_ns = [site.reception.last_received_ns or 0 for site in self.sites.values()]
+        since_ns = max(self._left_ns, *arrivals_ns)
+        return self._clock.monotonic_ns() - since_ns > AWAY_NS
 
     def finish(self) -> None:
         """Marks the session as ended.
@@ -314,6 +335,7 @@ class SessionView:
         The owner of this object must call this regularly. It never waits.
         """
         now_ns = self._clock.monotonic_ns()
+        self._note_presence(now_ns)
         if not self.running:
             self._connect_to_sites()
         if not self.running:
@@ -333,6 +355,24 @@ class SessionView:
             if site.record is not None:
                 newest_ns = max(newest_ns, site.record.t_ns)
         self.links.advance_to(newest_ns)
+
+    def _note_presence(self, now_ns: int) -> None:
+        """Notes which sites have appeared on the network or disappeared from it.
+
+        Args:
+            now_ns: Present time on the monotonic clock, in ns.
+        """
+        while (change := self._presence.poll()) is not None:
+            key, is_alive = change
+            token = topics.parse_key(key)
+            if token is None or token.member == topics.RECORDER:
+                continue
+            if is_alive:
+                self._tokens.add(key)
+                self._left_ns = None
+            elif key in self._tokens:
+                self._tokens.discard(key)
+                self._left_ns = None if self._tokens else now_ns
 
     def advance_energy(self) -> EnergyCourse | None:
         """Computes the energy of the session at the new ticks, with which stability is checked.

@@ -88,7 +88,10 @@ def watch_session(
                     clock.sleep_until(now_ns + POLL_NS)
         if stopped():
             return interrupt.exit_code
-    say(f"session {session} has ended")
+    if view.has_left:
+        say(f"session {session} has ended: all of its sites have left")
+    else:
+        say(f"session {session} has ended")
     return 0
 
 

@@ -1,10 +1,13 @@
 """When an onlooker calls a session silent, and when ended."""
 
-from live.session_view import SessionView, SiteView
+from live.session_view import AWAY_NS, SessionView, SiteView
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from trilat_net.analysis.certificate.running_energy import RecordWindow
 from trilat_net.core.ticks import NS_PER_S
+from trilat_net.net import topics
+from trilat_net.net.bus import Bus
+from trilat_net.net.membership import liveliness_token
 from trilat_net.net.messages import Event
 from trilat_net.net.wire import encode
 from trilat_net.scenario import load_scenario
@@ -30,6 +33,10 @@ class WatchedSession:
         event = Event(member=name, boot=BOOT, kind=kind, text=f"{name}: {kind}", n=n)
         self._network.join().publisher(f"trilat/t/{name}/event")(encode(event))
         self.view.poll()
+
+    def join(self) -> Bus:
+        """A connection of another member."""
+        return self._network.join()
 
     def wait(self, seconds: float) -> None:
         """Lets time pass, in which nothing arrives."""
@@ -64,3 +71,31 @@ def test_whoever_ran_the_sites_may_say_the_end() -> None:
     session.view.finish()
     assert session.view.ended
     assert session.view.session_silence_s == 60.0
+
+
+def test_a_session_whose_sites_have_all_left_has_ended() -> None:
+    """The network reports that they are gone, as after a kill; a token of a recorder is no site."""
+    session = WatchedSession()
+    site, recorder = session.join(), session.join()
+    site.announce(liveliness_token("t", "s", BOOT))
+    recorder.announce(liveliness_token("t", topics.RECORDER, BOOT))
+    session.wait(2.0 * AWAY_NS / NS_PER_S)
+    session.view.poll()
+    site.close()
+    session.view.poll()
+    assert not session.view.ended
+    session.wait(1.01 * AWAY_NS / NS_PER_S)
+    assert session.view.has_left
+    assert session.view.ended
+
+
+def test_sites_that_come_back_have_not_left() -> None:
+    session = WatchedSession()
+    for _ in range(2):
+        site = session.join()
+        site.announce(liveliness_token("t", "s", BOOT))
+        session.view.poll()
+        site.close()
+        session.wait(0.6 * AWAY_NS / NS_PER_S)
+        session.view.poll()
+    assert not session.view.ended
