@@ -14,7 +14,7 @@ Invariant:
     - A site has ended if its `end` event says so, never because it is silent. On a busy machine
       a running site may be silent for long, and its records are used when they arrive.
     - A session has ended if every site has, or if the network reports that all of them have
-      left: a site that was killed says no end.
+      left, and `AWAY_NS` have passed: a site that was killed sends no `end` event.
 """
 
 from collections import Counter, deque
@@ -24,7 +24,7 @@ from typing import Generic, TypeVar
 import msgspec
 
 from recorder.backfill import GapRepair
-from recorder.site_reception import InboundMessage, InboundQueue, SiteReception
+from recorder.site_reception import AWAY_NS, InboundMessage, InboundQueue, SiteReception
 from trilat_net.analysis.certificate.running_energy import (
     KEPT_S,
     EnergyCourse,
@@ -48,11 +48,6 @@ LATE_S = 3.0
 """An observer has joined late if the first record that it receives is of a later time, in s."""
 MIN_SILENCE_NS = 2 * NS_PER_S
 """Silence after which a running site is reported as silent, in ns."""
-AWAY_NS = 15 * NS_PER_S
-"""Time after which a session has ended if the network reports that every site has left, in ns.
-
-Their links may have been cut, and may work again.
-"""
 EVENTS_KEPT = 400
 """Number of events that are kept for new pages."""
 
@@ -285,7 +280,7 @@ class SessionView:
 
     @property
     def has_left(self) -> bool:
-        """True if the network reports that every site has left, and nothing more arrives."""
+        """True if the network has reported for `AWAY_NS` that every site has left."""
         if self._left_ns is None:
             return False
         arrivals_ns = [site.reception.last_received_ns or 0 for site in self.sites.values()]

@@ -30,7 +30,7 @@ from trilat_net.net.wire import decode, encode, split_states
 from trilat_net.scenario import Scenario
 
 from .backfill import GapRepair
-from .site_reception import InboundQueue, SiteMessage, SiteReception
+from .site_reception import AWAY_NS, InboundQueue, SiteMessage, SiteReception
 
 SETTLE_NS = 1_000_000_000
 """Time to wait for messages in transit after a site has ended and disappeared, in ns."""
@@ -42,13 +42,6 @@ HEARD_NS = 500_000_000
 """A site counts as running if one of its messages arrived within this time, in ns."""
 UNDER_WAY_NS = 100_000_000
 """Time for which messages of a site that has disappeared may have been in transit, in ns."""
-AWAY_NS = 15_000_000_000
-"""Time to wait for a site that disappeared without an "end" event, in ns.
-
-Its link may have been
-
-cut, and may work again.
-"""
 STARTS_KEPT = 4096
 """Largest number of starts of sites that are remembered before they are recorded."""
 LAST_NS = 6_000_000_000

@@ -40,6 +40,11 @@ from trilat_net.net.wire import make_decoder
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.run_changes import count_skipped_ticks
 
+AWAY_NS = 15_000_000_000
+"""Time to wait for a site that disappeared without an "end" event, in ns.
+
+Its link may have been cut, and may work again.
+"""
 CAPACITY = 60_000
 """Largest number of messages in the queue. It suffices for minutes of three sites at 1 kHz,
 which send their records in blocks.

@@ -26,22 +26,6 @@ class CompiledPD(PD):
     """The same, compiled."""
 
 
-class DampedJointsPD:
-    """`p_d` of a planar arm, with a damping of its own for each joint."""
-
-    remembers: tuple[str, ...] = ()
-
-    def __init__(
-        self, _facts: LawContext, K: float = 10.0, d1: float = 3.0, d2: float = 3.0
-    ) -> None:
-        self.K, self.d = K, (d1, d2)
-
-    def torque(self, now: LawInput) -> None:
-        for i in range(now.joints):
-            pull = self.K * (now.q_des[i] - now.q[i])
-            now.tau[i] = now.gravity[i] + pull - self.d[i] * now.qd[i]
-
-
 class PeerPD(PD):
     """`p_d`, by what each peer sent."""
 

@@ -9,7 +9,7 @@ from typing import get_args
 
 import pytest
 
-from recorder import backfill, record_process, session_recording
+from recorder import backfill, record_process, site_reception
 from recorder.play import player
 from sites import (
     change_server,
@@ -201,7 +201,7 @@ STATED: list[tuple[str, str, float, float]] = [
         100 * accounting.MIN_COVERAGE,
     ),
     ("design.md", "queue of 16 batches", 16, zenoh_config.BATCHES),
-    ("design.md", "waits 15 s for them", 15, session_recording.AWAY_NS / 1e9),
+    ("design.md", "waits 15 s for them", 15, site_reception.AWAY_NS / 1e9),
     ("recording.md", "for 10 s after its last question", 10, site_process.LINGER_NS / 1e9),
     ("recording.md", "until nothing comes for 10 s", 10, record_process.END_NS / 1e9),
     ("recording.md", "or 60 s after the signal", 60, record_process.LONGEST_END_NS / 1e9),

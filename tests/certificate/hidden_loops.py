@@ -24,7 +24,7 @@ RANDOM_SPAN_S = 4000.0
 """The same of links that lose samples, whose rate is a mean over what is drawn."""
 EDGE_SPAN_S = 400.0
 """Length of the simulations that look for an edge, which need not be exact."""
-OWN_LAW = "tests.own_laws:DampedJointsPD"
+OWN_LAW = "tests.own_laws:JointPD"
 LEAST_PER_S, LEAST_RANDOM_PER_S = 2e-3, 5e-3
 """Slower growth or decay is not drawn; the second of links that lose samples, whose rate is an estimate."""
 MOST_PER_S = 1.5
@@ -203,7 +203,7 @@ def _draw_command(rng: np.random.Generator) -> Hidden:
 
 
 def _draw_own_law(rng: np.random.Generator) -> Hidden:
-    """A law of a user's, over a link that swings or does not."""
+    """A user's own law, over a link that may swing."""
     hidden = _draw_sinusoids(rng) if rng.random() < 0.3 else _draw_symmetric(rng)
     return hidden._replace(own_law=True, duration_s=20.0)
 
@@ -276,7 +276,7 @@ def write_scenario(hidden: Hidden) -> Scenario:
         stiffness, damping = float(loop.stiffness[n, 0]), loop.damping[n].tolist()
         law: dict[str, Any] = {"law": "p_d", "K": stiffness, "d": damping}
         if hidden.own_law:
-            law = {"law": OWN_LAW, "K": stiffness, "d1": damping[0], "d2": damping[1]}
+            law = {"law": OWN_LAW, "K": [stiffness] * 2, "d": damping}
         laws[f"sites.{name}.control"] = law
         sites[name] = {
             "role": "slave" if n else "master",

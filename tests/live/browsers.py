@@ -53,6 +53,15 @@ def launch(playwright: Playwright, *, gl: bool = False) -> Browser:
     return playwright.chromium.launch(executable_path=program, env=env, args=[*QUIET, *drawing])
 
 
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    """A headless Chromium; a folder whose tests use it imports it in its `conftest.py`."""
+    with sync_playwright() as playwright:
+        launched = launch(playwright)
+        yield launched
+        launched.close()
+
+
 def chromium_pid() -> int:
     found = []
     for folder in Path("/proc").glob("[0-9]*"):

@@ -3,10 +3,9 @@
 from collections.abc import Iterator
 
 import pytest
-from playwright.sync_api import Browser, sync_playwright
 
 from live.page_server import PageServer
-from tests.live.browsers import launch
+from tests.live.browsers import browser  # noqa: F401
 from tests.net.local_bus import LocalNetwork
 from trilat_net.net.clock import SystemClock
 
@@ -16,12 +15,3 @@ def address() -> Iterator[str]:
     """The address of a page server of session `s1`, for the experimenter."""
     with PageServer(LocalNetwork().join(), SystemClock(), "s1") as server:
         yield server.address
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    """A headless Chromium."""
-    with sync_playwright() as playwright:
-        browser = launch(playwright)
-        yield browser
-        browser.close()

@@ -1,6 +1,7 @@
 """When an onlooker calls a session silent, and when ended."""
 
-from live.session_view import AWAY_NS, SessionView, SiteView
+from live.session_view import SessionView, SiteView
+from recorder.site_reception import AWAY_NS
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from trilat_net.analysis.certificate.running_energy import RecordWindow

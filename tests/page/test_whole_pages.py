@@ -1,12 +1,10 @@
 """The check of whole pages finds what it is for: each fault of a page, and none of a page without a fault."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
-from playwright.sync_api import Browser, sync_playwright
+from playwright.sync_api import Browser
 
-from tests.live.browsers import launch, needs_browser
+from tests.live.browsers import needs_browser
 from trilat_net import reporting
 
 from .whole_pages import watched_page
@@ -54,14 +52,6 @@ WHOLE = {
     "hidden": "<canvas hidden></canvas><figure style='display: none'></figure>",
     "field with a question": PARSED.replace("chart.points", '"points" in chart'),
 }
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with sync_playwright() as playwright:
-        browser = launch(playwright)
-        yield browser
-        browser.close()
 
 
 def find_faults(browser: Browser, body: str, folder: Path) -> list[str]:

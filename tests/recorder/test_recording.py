@@ -9,8 +9,8 @@ import pytest
 
 from recorder import site_reception as tap_module
 from recorder.record_process import FLUSH_NS, POLL_NS, Recorder
-from recorder.session_recording import AWAY_NS, LAST_NS, RECONNECT_NS, SETTLE_NS
-from recorder.site_reception import EVENT_BYTES
+from recorder.session_recording import LAST_NS, RECONNECT_NS, SETTLE_NS
+from recorder.site_reception import AWAY_NS, EVENT_BYTES
 from tests.net.local_bus import LocalNetwork
 from tests.sites.relay import Relay, RelayClock
 from trilat_net.core.site_step import Site

@@ -2,6 +2,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.live.browsers import browser  # noqa: F401
 from tests.log.standard_files import made
 
 

@@ -1,14 +1,13 @@
 """A report as its reader first sees it: on a desktop and on a phone, by day and by night."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page
 
 from tests.analysis import logs
-from tests.live.browsers import launch, needs_browser
+from tests.live.browsers import needs_browser
 from tests.page.whole_pages import grave_findings, watched_page
 from trilat_net import reporting
 from trilat_net.analysis.certificate.stability_certificate import certify
@@ -29,14 +28,6 @@ NAMES = [
 ]
 CHECKS = [Finding("records", "all present"), Finding("executed again", "differs", False)]
 UNFOLD = "document.querySelectorAll('details').forEach((part) => { part.open = true; })"
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with sync_playwright() as playwright:
-        browser = launch(playwright)
-        yield browser
-        browser.close()
 
 
 def measure(page: Page, expression: str) -> float:

@@ -1,14 +1,13 @@
 """Reports of every kind of run in a browser: no error, no empty frame, every line of every chart drawn."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page
 
 from tests.analysis import logs
-from tests.live.browsers import launch, needs_browser, shows
+from tests.live.browsers import needs_browser, shows
 from tests.net.waiting import until
 from tests.page.whole_pages import WatchedPage, watched_page
 from trilat_net.analysis.certificate.stability_certificate import certify
@@ -39,14 +38,6 @@ SCREEN: dict[str, Any] = {
     "reduced_motion": "reduce",
 }
 """A desktop on which the arms stand still until somebody plays them."""
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with sync_playwright() as playwright:
-        browser = launch(playwright)
-        yield browser
-        browser.close()
 
 
 def open_report(watched: WatchedPage, log: Log, folder: Path) -> Page:

@@ -1,16 +1,15 @@
 """Pages of studies in a browser: maps, the suite, experiments; pictures have colours, tables have cells."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from markdown_it import MarkdownIt
-from playwright.sync_api import Browser, sync_playwright
+from playwright.sync_api import Browser
 
 import trilat_net
-from tests.live.browsers import launch, needs_browser
+from tests.live.browsers import needs_browser
 from tests.page.whole_pages import WatchedPage, watched_page
 from trilat_net.studies.bench import plan_bench, prepare_bench_folder, run_bench
 from trilat_net.studies.bench.bench_figures import FIGURES_OF_BENCH, write_bench
@@ -37,14 +36,6 @@ COLOURED = """(image) => {
   return count;
 }"""
 """Number of the pixels of a picture that are neither white, black nor grey, as axes and letters are."""
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with sync_playwright() as playwright:
-        browser = launch(playwright)
-        yield browser
-        browser.close()
 
 
 def open_folder(watched: WatchedPage, folder: Path, html: str) -> None:
