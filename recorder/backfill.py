@@ -18,6 +18,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from trilat_net.errors import WireError
+from trilat_net.log.accounting import Account
 from trilat_net.log.log_layout import SITE_CHANNELS
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus, Inbox
@@ -217,9 +218,30 @@ class GapRepair:
                 continue
 
             first, last_missing = requested_range
-            last = min(last_missing, first + self._request_size - 1)
+            last = self._extend_over_gaps(account, last_missing, first + self._request_size - 1)
             return BackfillRequest(channel=channel, first=first, last=last)  # type: ignore[arg-type]
         return None
+
+    @staticmethod
+    def _extend_over_gaps(account: Account, last_missing: int, limit: int) -> int:
+        """Returns the last number of a request that also covers the gaps that follow closely.
+
+        On a busy machine single messages are lost, many in a second. If each of these gaps had
+        its own request, the recorder would fall further behind than the site's buffer reaches.
+        The messages between the gaps come once more and are ignored.
+
+        Args:
+            account: Account of the channel.
+            last_missing: Last number of the first gap.
+            limit: Highest number that the request may contain.
+        """
+        next_gap: tuple[int, int] | None = (limit, last_missing)
+        while next_gap is not None and next_gap[0] <= limit:
+            last_missing = next_gap[1]
+            if last_missing >= limit:
+                return limit
+            next_gap = account.find_requestable_gap(last_missing + 1)
+        return last_missing
 
     def _receive_reply(
         self, open_request: _OpenRequest, now_ns: int

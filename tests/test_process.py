@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -249,3 +250,27 @@ def test_priority_rises_but_for_the_main_thread() -> None:
     thread.join()
     assert found in ([(True, before - 1)], [(False, before)])
     assert os.getpriority(os.PRIO_PROCESS, os.getpid()) == before
+
+
+@pytest.mark.skipif(
+    not Path("/proc/self/autogroup").exists(), reason="this system has no groups of sessions"
+)
+@pytest.mark.parametrize("leads", [True, False])
+def test_priority_counts_among_sessions_for_their_leader_alone(leads: bool) -> None:
+    program = (
+        "from pathlib import Path\n"
+        "from trilat_net.process import raise_priority\n"
+        "group = Path('/proc/self/autogroup')\n"
+        "before = group.read_text().split()[-1]\n"
+        "print(before, raise_priority(-3), group.read_text().split()[-1])"
+    )
+    shell = ["sh", "-c", '"$@"; exit $?', "-"]
+    done = subprocess.run(
+        [*([] if leads else shell), sys.executable, "-c", program],
+        start_new_session=True,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    before, raised, after = done.stdout.split()
+    assert after == ("-3" if leads and raised == "True" else before)

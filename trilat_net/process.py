@@ -363,7 +363,21 @@ def raise_priority(nice: int) -> bool:
                 os.setpriority(os.PRIO_PROCESS, thread, nice)
     except OSError:
         return False
+    _raise_session_priority(nice)
     return True
+
+
+def _raise_session_priority(nice: int) -> None:
+    """Raises the priority of this process among other sessions, if it leads one (`setsid`).
+
+    Linux may share the processors among sessions first, and only then among the threads of a
+    session (`man 7 sched`, "The autogroup feature"). The nice value of a thread then has no
+    effect outside its session. If another process leads the session, for example a shell,
+    nothing changes, because its other processes would be raised too.
+    """
+    if os.getsid(0) == os.getpid():
+        with suppress(OSError):  # not permitted, or the system has no such groups
+            Path("/proc/self/autogroup").write_text(f"{nice}\n", encoding="ascii")
 
 
 def count_cores() -> int:

@@ -238,6 +238,30 @@ def test_one_request_at_a_time_asks_for_one_chunk() -> None:
     assert all(wanted.last - wanted.first < BACKFILL_MESSAGES for wanted in run.site.asked)
 
 
+def test_many_small_gaps_share_a_request() -> None:
+    """Every second record is lost: one request for each would not catch up on a busy machine."""
+    lost = {place for place, (_, channel, n) in enumerate(SENT) if channel == "state" and n % 2}
+    run = Run(Way(lost=lost))
+    answer = run.site.answer
+    run.site.answer = lambda: None  # type: ignore[method-assign]
+    run.live(2100 * MS)
+    run.site.answer = answer  # type: ignore[method-assign]
+    run.until_stored()
+    assert len(run.site.asked) <= len(lost) // 4
+    assert "missing 0" in run.desk.log().account("m")
+
+
+def test_a_gap_alone_is_asked_for_alone() -> None:
+    """Where little is lost, nothing comes twice."""
+    lost = {
+        place for place, (_, channel, n) in enumerate(SENT) if channel == "state" and n == 50
+    }
+    run = Run(Way(lost=lost))
+    run.live(2600 * MS)
+    run.until_stored()
+    assert [(wanted.first, wanted.last) for wanted in run.site.asked] == [(50, 50)]
+
+
 def test_a_silent_site_is_asked_and_its_lost_end_noticed() -> None:
     run = Run(Way(lost={n for n, (at_ns, _, _) in enumerate(SENT) if at_ns >= S}))
     run.live(3100 * MS)
