@@ -377,7 +377,7 @@ def _raise_session_priority(nice: int) -> None:
     """
     if os.getsid(0) == os.getpid():
         with suppress(OSError):  # not permitted, or the system has no such groups
-            Path("/proc/self/autogroup").write_text(f"{nice}\n", encoding="ascii")
+            Path("/proc/self/autogroup").write_text(f"{nice}\n", "ascii", newline="\n")
 
 
 def count_cores() -> int:
