@@ -22,6 +22,8 @@ torque, and h the tick. Both schemes store a number eta with eta_{k+1} = eta_k +
 - The scheme `second_order` uses the estimate eta_k + h/2 f_k and applies
   1.5 tau_k - 0.5 tau_{k-1}.
 
+The law `sync` uses the estimate eta_k + h/2 f_k in either scheme.
+
 A control law that a user wrote may have a memory, the numbers m_k that it stores at tick k. The
 memory takes the place of eta, with the rate f_k = (m_k - m_{k-1}) / h.
 
@@ -125,7 +127,9 @@ def linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian) -> SiteTickMap:
     joints = layout.joints
     h_s = 1.0 / site.rate_hz
     is_second_order = site.scheme is Scheme.SECOND_ORDER
-    uses_trapezoid = is_second_order and site.gains.law is Law.ADAPTIVE
+    # The law `sync` integrates its estimates by the trapezoid rule in either scheme.
+    has_estimates = site.gains.law is Law.ADAPTIVE
+    uses_trapezoid = has_estimates and (is_second_order or site.gains.absolute)
     motion = slice(0, layout.qd.stop)
     # the same slice of the arguments and of X
     memory = layout.estimate
