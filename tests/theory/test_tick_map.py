@@ -106,7 +106,10 @@ def test_small_deviation_goes_tick_by_tick_as_run_does(
     places = [names.index(f"{site}.q{j + 1}") for site in "ms" for j in range(2)]
     for k in range(1, 60):
         X = whole @ X
-        assert np.abs(X[places] - q[k]).max() <= 5e-4 * max(small, np.abs(q[k]).max()), k
+        size = np.abs(q[: k + 1]).max()
+        if size > 100.0 * small:
+            break  # an unstable loop: its motion is no longer small
+        assert np.abs(X[places] - q[k]).max() <= 4e-4 * size, k
 
 
 def begun(
