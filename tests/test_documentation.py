@@ -86,7 +86,7 @@ SCENARIO_OF = {
     "docs/links.md": "paper",
     "docs/ports.md": "two_sites",
     "docs/live-hands.md": "play",
-    "docs/metrics.md": "free",
+    "docs/felt-forces.md": "free",
     "docs/own-controller.md": "paper",
     "docs/policies.md": "paper",
     "docs/sweep.md": "free",
@@ -110,7 +110,7 @@ def test_settings_make_a_scenario(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     text = block.text
-    if block.page == "docs/metrics.md":  # each line is one way to push
+    if block.page == "docs/felt-forces.md":  # each line is one way to push
         for line in text.splitlines():
             hands = tomllib.loads(line)
             assert (
@@ -173,12 +173,13 @@ def list_pages(pages: set[str], pushed: set[str]) -> list[Any]:
 
 COMMAND_PAGES = {
     "docs/arms.md",
-    "docs/errata.md",
+    "docs/damping-conditions.md",
     "docs/fair-comparison.md",
     "docs/first-hour.md",
     "docs/lab.md",
     "docs/linear.md",
     "docs/links.md",
+    "docs/metrics.md",
     "docs/rerun.md",
     "docs/sweep.md",
 }
@@ -186,7 +187,7 @@ SHORTER = {
     "compare": ["--law", "p_d,adaptive", "--budget", "4", "--duration", "2", "--jobs", "1"]
 }
 """What is added to a command that else would take minutes."""
-OF_RUNS = {"docs/rerun.md": "paper"}
+OF_RUNS = {"docs/metrics.md": "paper", "docs/rerun.md": "paper"}
 """Pages whose blocks are about run.mcap, and its scenario."""
 
 
