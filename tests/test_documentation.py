@@ -79,7 +79,7 @@ def test_command_in_sentence_is_one_and_has_these_options(page: str) -> None:
 # --- settings ---------------------------------------------------------------------------------------------
 
 SCENARIO_OF = {
-    "docs/experiments.md": "paper",
+    "docs/experiment-protocol.md": "paper",
     "docs/arms.md": "six_joints",
     "docs/devices.md": "play",
     "docs/external-arm.md": "two_sites",
@@ -88,6 +88,7 @@ SCENARIO_OF = {
     "docs/live-hands.md": "play",
     "docs/felt-forces.md": "free",
     "docs/own-controller.md": "paper",
+    "docs/own-plant.md": "paper",
     "docs/policies.md": "paper",
     "docs/sweep.md": "free",
 }
@@ -117,7 +118,7 @@ def test_settings_make_a_scenario(
                 tn.load_scenario("free", {"sites.m1.hands": hands["hands"]}).sites["m1"].hands
             )
         return
-    if block.page == "docs/experiments.md":
+    if block.page == "docs/experiment-protocol.md":
         written = tn.new_experiment("p.toml").read_text(encoding="utf-8")
         (tmp_path / "p.toml").write_text(
             written.replace("[set]", text + "[set]", 1), encoding="utf-8"
@@ -131,7 +132,7 @@ def test_settings_make_a_scenario(
         return
     if block.page == "docs/own-controller.md":
         (tmp_path / "mylaws.py").write_text(find_blocks(block.page)[0].text)
-    for code in find_blocks("docs/policies.md"):
+    for code in (*find_blocks("docs/policies.md"), *find_blocks("docs/own-plant.md")):
         if named := re.match(r"# (my_\w+\.py)\n", code.text):
             (tmp_path / named[1]).write_text(code.text)
     base = tomllib.loads(
@@ -156,7 +157,7 @@ def write_own_arm(folder: Path, text: str) -> str:
 
 PUSHED_COMMAND_PAGES, PUSHED_PYTHON_PAGES = (
     {"docs/links.md"},
-    {"docs/certificate.md", "docs/policies.md"},
+    {"docs/certificate.md", "docs/own-plant.md", "docs/policies.md", "docs/train-policies.md"},
 )
 """Pages whose blocks run on every push; those of the others run in `make test-long`."""
 
@@ -244,11 +245,13 @@ PYTHON_PAGES = {
     "docs/linear.md",
     "docs/live-hands.md",
     "docs/own-controller.md",
+    "docs/own-plant.md",
     "docs/policies.md",
     "docs/ports.md",
     "docs/python.md",
     "docs/rerun.md",
     "docs/sweep.md",
+    "docs/train-policies.md",
 }
 OF_THEIR_OWN = {"docs/live-hands.md", "docs/sweep.md"}
 """Pages whose code needs a session or a sweep, which a test of their own makes."""

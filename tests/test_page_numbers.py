@@ -388,7 +388,7 @@ PAGES: dict[str, dict[str, Make]] = {
     "docs/errata-proof.md": ERRATA,
     "docs/damping-conditions.md": DAMPING,
     "docs/port-conditions.md": PORT_CONDITIONS,
-    "docs/lab.md": LAB,
+    "docs/lab-answers.md": LAB,
     "docs/laws.md": {"towards one pose: {} N m/rad": lambda: [G**2 * 1.2]},
     "docs/definitions.md": {
         "± 50 ms gives {} ms and {} ms, uniform 0 to 400 ms gives {} ms and {} ms": lambda: [

@@ -139,7 +139,7 @@ def new_hand_command(
     _print_skeleton("hand", new_hand(file, force=force), key, "report")
 
 
-@options.command("myplant.py", page="docs/policies.md")
+@options.command("myplant.py", page="docs/own-plant.md")
 def new_plant_command(
     file: Annotated[Path, typer.Argument(help="File to write, for example myplant.py.")],
     force: options.ForceOption = False,

@@ -702,7 +702,7 @@ ProtocolArgument = Annotated[
 FolderArgument = Annotated[Path, typer.Argument(help="Folder of an experiment.", metavar="DIR")]
 
 
-@options.command("reaching.toml", "two-people.toml --pair", page="docs/experiments.md")
+@options.command("reaching.toml", "two-people.toml --pair", page="docs/experiment-protocol.md")
 def experiment_new_command(
     file: Annotated[
         Path, typer.Argument(help="Protocol to write (a TOML file).", metavar="FILE")
@@ -720,7 +720,7 @@ def experiment_new_command(
     terminal.print_text(f"{file}: a protocol; run it with: trilat experiment run {file}")
 
 
-@options.command("reaching.toml", page="docs/experiments.md")
+@options.command("reaching.toml", page="docs/experiment-protocol.md")
 def experiment_check_command(
     file: ProtocolArgument, as_json: options.JsonOption = False
 ) -> None:
@@ -785,7 +785,7 @@ def experiment_run_command(
         raise typer.Exit(exit_code)
 
 
-@options.command("runs/experiment-reaching-001", page="docs/experiments.md")
+@options.command("runs/experiment-reaching-001", page="docs/experiment-analysis.md")
 def experiment_analyse_command(
     folder: FolderArgument,
     out: Annotated[Path | None, value("--out -o", "DIR")] = None,
@@ -809,7 +809,7 @@ def experiment_analyse_command(
     terminal.print_paths([] if as_json else analysis.paths)
 
 
-@options.command("0.8 --participants 16", page="docs/experiments.md")
+@options.command("0.8 --participants 16", page="docs/experiment-analysis.md")
 def experiment_power_command(
     effect: Annotated[
         float, typer.Argument(help="Cohen's d_z of a paired comparison.", min=0.01, max=10.0)

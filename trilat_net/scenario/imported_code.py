@@ -461,7 +461,7 @@ def _find_import_folder(module: str, file: Path) -> Path:
 PAGES = {
     "torque": ("law", "own-controller.md"),
     "act": ("hand", "policies.md"),
-    "step": ("plant", "policies.md"),
+    "step": ("plant", "own-plant.md"),
 }
 """For each required method: the name of such a class, and its page in the docs."""
 
