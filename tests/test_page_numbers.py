@@ -1,8 +1,8 @@
 """Numbers on the pages are what the program makes of the commands, runs and formulas beside them.
 
-A row has a page's words with `{}` for each number (and `…` for any other cell of a table), and what makes the
-numbers, in that order, or a text in which the same words stand. A number of the page must agree with the one
-that is made to six tenths of its last printed digit.
+A row has a page's words with `{}` for each number, and what makes the numbers, in that order, or a text in which
+the same words stand. A number of the page must agree with the one that is made to six tenths of its last printed
+digit.
 """
 
 import csv
@@ -454,7 +454,6 @@ CERTIFIED = (
 )
 LONG = (
     "| roots |",
-    "| … |",
     "prints its edge",
     "ones still fail",
     "rises by",
@@ -481,7 +480,7 @@ ROWS = [
 
 def numbers(words: str, text: str) -> list[str]:
     """The numbers in the one place of a text that has these words."""
-    pattern = NUMBER.join(map(re.escape, words.split("{}"))).replace("…", "[^|]*")
+    pattern = NUMBER.join(map(re.escape, words.split("{}")))
     found = re.findall(pattern, " ".join(text.split()))
     assert len(found) == 1, f"{len(found)} places"
     return [found[0]] if isinstance(found[0], str) else list(found[0])
