@@ -112,7 +112,12 @@ STATED: list[tuple[str, str, float, float]] = [
     ("live-hands.md", "from 0 to 1 within 100 ms", 100.0, live_hand.GRIP_NS / 1e6),
     ("live-hands.md", "two, at most 50 ms", 50.0, live_hand.GLIDE_NS / 1e6),
     ("tuning-procedure.md", "`--budget`, 64 per law", 64, tuning_plan.DEFAULT_BUDGET),
-    ("tuning-procedure.md", "steps of 12, 8, 5, 3 %", 3, 100 * tuning_plan.REFINEMENT_STEPS[-1]),
+    (
+        "tuning-procedure.md",
+        "steps of 12, 8, 5, 3 %",
+        3,
+        100 * tuning_plan.REFINEMENT_STEPS[-1],
+    ),
     ("tuning-procedure.md", "at least 10 %", 10, 100 * search_space.MIN_BOX),
     ("tuning-procedure.md", "more than 0.2 rad from q", 0.2, candidate.STRAYED_RAD),
     ("tuning-procedure.md", "more than 0.02 rad from q", 0.02, candidate.TOGETHER_RAD),

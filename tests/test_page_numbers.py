@@ -408,9 +408,7 @@ PAGES: dict[str, dict[str, Make]] = {
     },
     "docs/data/map-p_d-edges.csv": {
         **{
-            f" 10,{T},{{}},": lambda T=T: [
-                edge_of_p_d("p_d_margin", 0.5, T)
-            ]
+            f" 10,{T},{{}},": lambda T=T: [edge_of_p_d("p_d_margin", 0.5, T)]
             for T in (50, 100, 150, 200, 300, 400, 600, 800, 1000, 1200, 1400)
         },
         **{
