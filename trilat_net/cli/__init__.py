@@ -122,7 +122,9 @@ _GROUPS: dict[str, dict[str, Any]] = {
     },
     "identify": {
         "help": "Identifies the dynamics of the hand that holds an arm.",
-        "epilog": "Example: trilat identify hand run.mcap --site m1\n\nDocs: docs/ports.md",
+        "epilog": (
+            "Example: trilat identify hand run.mcap --site m1\n\nDocs: docs/measured-hands.md"
+        ),
     },
     "trace": {
         "help": "Imports delays that another program measured.",

@@ -244,7 +244,7 @@ def twin_command(
     )
 
 
-@options.command("run.mcap --site m1 --json > m1.json", page="docs/ports.md")
+@options.command("run.mcap --site m1 --json > m1.json", page="docs/measured-hands.md")
 def identify_hand_command(
     file: options.LogsArgument,
     site: Annotated[
@@ -256,8 +256,8 @@ def identify_hand_command(
     """Identifies the mass, damping and stiffness of the hand that holds an arm.
 
     A sum of sines must move the arm during the run, so the scenario needs an operator of kind
-    "multisine" at any site (docs/ports.md, "Measured operators"). `trilat linear --operators`
-    reads the result that --json prints.
+    "multisine" at any site (docs/measured-hands.md). `trilat linear --operators` reads the
+    result that --json prints.
     """
     from ..studies.hand_impedance import identify_hand
 

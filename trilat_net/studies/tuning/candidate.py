@@ -403,7 +403,7 @@ def _warn_fallen(log: Log, end_poses_rad: dict[str, Array]) -> list[str]:
 
 
 class CandidateScore(msgspec.Struct, frozen=True):
-    """Measured score of a candidate. docs/fair-comparison.md has the formulas.
+    """Measured score of a candidate. docs/tuning-procedure.md has the formulas.
 
     Attributes:
         outcome: Class of the candidate.
