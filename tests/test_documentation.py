@@ -181,6 +181,7 @@ COMMAND_PAGES = {
     "docs/linear.md",
     "docs/links.md",
     "docs/metrics.md",
+    "docs/ports.md",
     "docs/rerun.md",
     "docs/sweep.md",
 }
