@@ -11,7 +11,9 @@ import pytest
 import trilat_net as tn
 
 ROOT = Path(__file__).parents[1]
-MEDIA = SimpleNamespace(**runpy.run_path(str(ROOT / "docs" / "media" / "make_media.py")))
+MEDIA = SimpleNamespace(
+    **runpy.run_path(str(ROOT / "docs" / "media" / "moving_picture.py"))
+)
 PICTURE = (MEDIA.PICTURES / MEDIA.PICTURE).read_text(encoding="utf-8")
 LARGEST_BYTES = 1_500_000
 
