@@ -88,6 +88,7 @@ ELSEWHERE = {
     "docs/network.md: trilat keys renew": "tests/net/test_member_keys.py",
     "docs/external-arm.md: import trilat_net": "tests/sites/test_external_arm.py",
     "docs/first-hour.md: trilat live": "tests/live/test_live_page.py",
+    "docs/gallery.md": "tests/test_media.py",
     "docs/lab.md: trilat": "tests/test_lab.py",
     "docs/lerobot.md: $ pip install 'trilat-net[lerobot]'": "tests/cli/test_log_export.py",
     "docs/lerobot.md: $ pip install ./plugins": "tests/live/test_lerobot.py",

@@ -4,6 +4,7 @@ import re
 import runpy
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 from xml.etree import ElementTree
 
 import pytest
@@ -11,9 +12,10 @@ import pytest
 import trilat_net as tn
 
 ROOT = Path(__file__).parents[1]
-MEDIA = SimpleNamespace(
-    **runpy.run_path(str(ROOT / "docs" / "media" / "moving_picture.py"))
-)
+MEDIA = SimpleNamespace(**runpy.run_path(str(ROOT / "docs" / "media" / "moving_picture.py")))
+GALLERY = SimpleNamespace(**runpy.run_path(str(ROOT / "docs" / "media" / "make_media.py")))
+GALLERY_TEXT = GALLERY.PAGE.read_text(encoding="utf-8")
+ENTRIES = list(GALLERY.read_gallery(GALLERY_TEXT))
 PICTURE = (MEDIA.PICTURES / MEDIA.PICTURE).read_text(encoding="utf-8")
 LARGEST_BYTES = 1_500_000
 
@@ -44,3 +46,28 @@ def test_every_motion_lasts_as_long_as_the_run() -> None:
     }
     assert len(animated) > 30
     assert counts == {frames}
+
+
+def test_gallery_has_twelve_pictures_each_with_its_commands() -> None:
+    assert len(ENTRIES) + GALLERY_TEXT.count(f"```sh\n{GALLERY.MAKE_ALL}\n") == 12
+    names = [entry.path.parts[0] for entry in ENTRIES]
+    assert len(set(names)) == len(names)
+    for entry in ENTRIES:
+        assert (GALLERY.PICTURES / entry.path).is_file(), entry.title
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        pytest.param(
+            entry,
+            id=entry.path.parts[0],
+            marks=() if entry.path.parts[0] == "ports" else pytest.mark.long,
+        )
+        for entry in ENTRIES
+    ],
+)
+def test_commands_of_gallery_make_its_pictures(entry: Any, tmp_path: Path) -> None:
+    """To the byte: the same version of the program draws the same picture."""
+    made = GALLERY.make_picture(entry, tmp_path)
+    assert made.read_bytes() == (GALLERY.PICTURES / entry.path).read_bytes()

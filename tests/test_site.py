@@ -46,7 +46,7 @@ def test_every_picture_and_page_that_first_page_names_is_there() -> None:
     assert [place for place in places if not place.is_file()] == []
 
 
-def test_the_gallery_begins_with_the_paper() -> None:
+def test_the_list_of_scenarios_begins_with_the_paper() -> None:
     sections = list(MAKE.list_scenarios(pictures=False))
     assert sections[0].startswith("## paper\n")
     assert len(sections) == len(tn.list_shipped())
@@ -57,7 +57,7 @@ def test_the_gallery_begins_with_the_paper() -> None:
 def test_the_site_is_whole() -> None:
     """Zensical refuses a Markdown link or an anchor that leads nowhere; pictures in HTML it does not see."""
     subprocess.run(
-        [sys.executable, "docs/site/make_pages.py", "--no-gallery"], cwd=ROOT, check=True
+        [sys.executable, "docs/site/make_pages.py", "--no-pictures"], cwd=ROOT, check=True
     )
     build = [
         Path(sys.executable).with_name("zensical"),

@@ -1,6 +1,6 @@
 """Gathers the pages of the site in build/site: those of docs, and what is made from the program.
 
-python docs/site/make_pages.py [--no-gallery]
+python docs/site/make_pages.py [--no-pictures]
 zensical build --strict -f build/site/zensical.toml
 """
 
@@ -37,10 +37,8 @@ def main() -> None:
     write("reference/commands.md", list_commands())
     write("reference/python.md", list_functions())
     write("reference/scenario.md", show_template())
-    write(
-        "gallery.md",
-        "\n\n".join(["# Gallery", *list_scenarios(pictures="--no-gallery" not in sys.argv)]),
-    )
+    sections = list_scenarios(pictures="--no-pictures" not in sys.argv)
+    write("reference/scenarios.md", "\n\n".join(["# Shipped scenarios", *sections]))
     shutil.copy(HERE / "zensical.toml", SITE)
     (PAGES / "assets").mkdir()
     shutil.copy(HERE / "iframe-worker.js", PAGES / "assets")
@@ -111,13 +109,13 @@ def list_scenarios(*, pictures: bool) -> Iterator[str]:
         if pictures:
             write_figures(
                 tn.simulate(name),
-                PAGES / "gallery" / name,
+                PAGES / "reference" / "scenarios" / name,
                 ["overview"],
                 width_in=7.0,
                 formats=["png"],
             )
             parts.append(
-                f"![{name}: errors, speeds, torques and ages](gallery/{name}/overview.png)"
+                f"![{name}: errors, speeds, torques and ages](scenarios/{name}/overview.png)"
             )
         yield "\n\n".join(part for part in parts if part)
 
