@@ -81,7 +81,7 @@ CHAINS = [
         "trilat sweep free --over link.delay_ms=20,100 --set link.model=uniform --duration 1 --longest 1 "
         "--jobs 1 -o swept",
         "trilat sweep swept --cell 0",
-        "trilat sweep p_d_margin --over link.delay_ms=0:1600:200 --over control.d=0.5:3:0.5 --map "
+        "trilat sweep p_d_margin --over link.delay_ms=0:1600:400 --over control.d=0.5:3:0.5 --map "
         "--duration 1 --longest 1 --jobs 1 -o mapped",
         "trilat bench --task free --law p_d --link rtt68 --seeds 1 --jobs 1 -o suite",
         "trilat experiment new two-people.toml --pair",
