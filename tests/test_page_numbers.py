@@ -383,7 +383,7 @@ PAGES: dict[str, dict[str, Make]] = {
     "docs/ports.md": PORTS,
     "docs/errata.md": ERRATA,
     "docs/lab.md": LAB,
-    "docs/laws.md": {"towards one pose: {} N m/rad": lambda: [G**2 * 1.2]},
+    "docs/laws-adaptive.md": {"towards one pose: {} N m/rad": lambda: [G**2 * 1.2]},
     "docs/definitions.md": {
         "± 50 ms gives {} ms and {} ms, uniform 0 to 400 ms gives {} ms and {} ms": lambda: [
             uniform_age(order, *ends)
