@@ -9,7 +9,9 @@ from . import house
 
 PAGE = (house.ROOT / "docs" / "vocabulary.md").read_text(encoding="utf-8")
 USED = [
-    row for row in re.findall(r"^\| ([^|]+) \| ([^|]+) \|$", PAGE, re.MULTILINE) if row[0] != "word"
+    row
+    for row in re.findall(r"^\| ([^|]+) \| ([^|]+) \|$", PAGE, re.MULTILINE)
+    if row[0] != "word"
 ]
 UNUSED = {
     "node, broker": "member, router",
