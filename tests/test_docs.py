@@ -259,15 +259,15 @@ STATED: list[tuple[str, str, float, float]] = [
     ("network.md", "over all floors of 60 windows", 60, offset.WINDOWS_KEPT),
     ("network.md", "less than 500 ppm", 500, offset.DRIFT_LIMIT / 1e3),
     ("network.md", "follow a line to 1 ppm", 1, offset.WANDER / 1e3),
-    ("own-controller.md", "at most 1024 numbers", 1024, user_law.MAX_LAW_MEMORY),
-    ("own-controller.md", "three quarters of the period", 0.75, code_watchdog.SHARE),
+    ("law-interface.md", "at most 1024 numbers", 1024, user_law.MAX_LAW_MEMORY),
+    ("law-interface.md", "three quarters of the period", 0.75, code_watchdog.SHARE),
     (
-        "own-controller.md",
+        "law-interface.md",
         "at half a second of overtime",
         0.5,
         code_watchdog.OVERTIME_LIMIT_NS / 1e9,
     ),
-    ("own-controller.md", "for 50 ms at most", 50, code_watchdog.HICCUP_NS / 1e6),
+    ("law-interface.md", "for 50 ms at most", 50, code_watchdog.HICCUP_NS / 1e6),
     ("ports.md", "a circle of 0.001 1/s", 0.001, port_response.ZERO_ROOT_RADIUS_PER_S),
     ("recording.md", "it flushes every 65 ms", 65, record_process.FLUSH_NS / 1e6),
     ("recording.md", "the last 4096 events", 4096, retransmit_buffer.EVENTS_KEPT),
@@ -330,8 +330,9 @@ def test_a_test_that_a_page_names_exists(page: Path) -> None:
         assert known, name
 
 
-def test_every_operator_environment_and_law_stands_in_table_of_laws() -> None:
-    text = (ROOT / "docs/laws.md").read_text(encoding="utf-8")
+def test_every_operator_environment_and_law_stands_in_a_table() -> None:
+    pages = ("docs/laws.md", "docs/operators.md")
+    text = "".join((ROOT / page).read_text(encoding="utf-8") for page in pages)
     kinds = [
         str(one.__struct_config__.tag)
         for one in get_args(operators.Operator | operators.Environment)

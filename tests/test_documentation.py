@@ -178,6 +178,7 @@ COMMAND_PAGES = {
     "docs/fair-comparison.md",
     "docs/first-hour.md",
     "docs/lab.md",
+    "docs/laws.md",
     "docs/linear.md",
     "docs/links.md",
     "docs/metrics.md",
@@ -243,6 +244,7 @@ def test_code_of_hand_takes_hold_of_arm_and_lets_go(tmp_path: Path) -> None:
 PYTHON_PAGES = {
     "docs/certificate.md",
     "docs/first-hour.md",
+    "docs/law-interface.md",
     "docs/linear.md",
     "docs/live-hands.md",
     "docs/own-controller.md",

@@ -396,7 +396,7 @@ PAGES: dict[str, dict[str, Make]] = {
     "docs/ports.md": {
         "not passive at {}-{} Hz; least eigenvalue {} at {} Hz; {} N m s/rad more": lacking,
     },
-    "docs/laws.md": {"towards one pose: {} N m/rad": lambda: [G**2 * 1.2]},
+    "docs/laws-adaptive.md": {"towards one pose: {} N m/rad": lambda: [G**2 * 1.2]},
     "docs/definitions.md": {
         "± 50 ms gives {} ms and {} ms, uniform 0 to 400 ms gives {} ms and {} ms": lambda: [
             uniform_age(order, *ends)

@@ -14,6 +14,7 @@ from trilat_net.log.log_reader import open_log
 
 LAWS = Path(__file__).parents[1] / "laws.py"
 DOC = Path(__file__).parents[2] / "docs" / "own-controller.md"
+INTERFACE = DOC.with_name("law-interface.md")
 FAILING = ("--set", "sites.s.control.law=tests.laws:Failing", "--set", "sites.s.control.at=40")
 SHORT = ("--duration", "0.1")
 
@@ -53,7 +54,7 @@ def test_law_of_page_holds_arms_together_as_it_says(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "holding_laws.py").write_text(block("python"))
     log = tn.simulate("paper", {"control.law": "holding_laws:Spring", "control.K": 80})
-    assert tn.certify(log).stability == "stable"
+    assert tn.certify(log).stability == "open", "the law's code may not run"
     errors = np.abs(np.stack([log[name].e for name in log.scenario.names]))
     rest = np.stack([log[name].q[-1] for name in log.scenario.names])
     for said, measured in (
@@ -68,7 +69,7 @@ def test_law_of_page_holds_arms_together_as_it_says(
 def test_what_page_says_of_law_is_what_law_gets() -> None:
     from trilat_net.core.user_law import LawContext, LawInput
 
-    page = DOC.read_text(encoding="utf-8")
+    page = INTERFACE.read_text(encoding="utf-8")
     rows = dict(
         re.findall(r"^\| `(LawContext|LawInput)`, [^|]*\| (.*) \|$", page, re.MULTILINE)
     )

@@ -1,6 +1,8 @@
 """The four- and the six-channel law against their loops in the frequency domain, and runs in time."""
 
+import csv
 import io
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,6 +28,43 @@ SHARED = {  # factor: user 1 and user 2 at 0.1 and 1 Hz without and with qdd; ri
     1.0: ((0.999, 0.921, 1.0, 1.0), (0.201, 0.278, 0.201, 0.278), -5.858, (1.0, np.inf)),
 }
 USERS = [(50.0, 10.0), (50.0, 10.0), (500.0, 5.0)]
+
+
+DATA = Path(__file__).parents[2] / "docs" / "data"
+ARCHITECTURES = {
+    "ideal": ("ideal", "1"),
+    "without qdd": ("ideal", "0"),
+    "three": ("three channels", "1"),
+    "no forces": ("position error", "0"),
+}
+
+
+def rows_of(name: str) -> list[dict[str, str]]:
+    with (DATA / name).open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_tables_of_documentation_have_these_numbers() -> None:
+    four = {
+        (
+            row["architecture"],
+            row["acceleration"],
+            row["delay_each_way_ms"],
+            row["frequency_hz"],
+        ): (float(row["felt_over_wall"]))
+        for row in rows_of("four-channel.csv")
+    }
+    assert four == {
+        (*ARCHITECTURES[variant], f"{1e3 * delay_s:g}", hz): value
+        for (variant, delay_s), values in TABLE.items()
+        for hz, value in zip(("0.1", "0.5", "1", "2", "5"), values, strict=True)
+    }
+    six: dict[float, list[float]] = {}
+    for row in rows_of("six-channel.csv"):
+        felt = [float(row[f"felt_over_wall_at_{hz}_hz"]) for hz in ("0.1", "1")]
+        six.setdefault(float(row["a"]), []).extend(felt)
+        assert row["rightmost_root_1_s"] in ("", str(SHARED[float(row["a"])][2]))
+    assert six == {a: [*one, *other] for a, (one, other, *_) in SHARED.items()}
 
 
 def three_sites(a: float, driven: int, duration_s: float = 9.0, **more: Any) -> Scenario:

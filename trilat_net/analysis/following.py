@@ -7,8 +7,8 @@ follows. From e the classes compute the reference velocity of the joints, which 
 `TaskFollowing` uses an inverse of the Jacobian J that is damped near singular poses.
 
 Invariant:
-    - All functions are written with NumPy from the equations of docs/laws.md, independently of
-      the simulation.
+    - All functions are written with NumPy from the equations of docs/task-space.md,
+      independently of the simulation.
     - Directions of space in which the end effector does not follow have no effect.
     - Near a singular pose the end effector does not reach the velocity -Lambda e, where Lambda
       is a gain in 1/s. The joint velocity v then satisfies J v = -Lambda e - d y. Here d is the

@@ -155,7 +155,8 @@ def judge_position_exchange(
     (docs/damping-conditions.md, 13).
 
     A torque that is held for the period h acts h / 2 later. Therefore d is reduced by K h / 2
-    and T increased by h / 2, for arms whose least inertia is above d h / 2 (docs/laws.md).
+    and T increased by h / 2, for arms whose least inertia is above d h / 2
+    (docs/laws-springs.md).
 
     Args:
         situation: The situation of the site.

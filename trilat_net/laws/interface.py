@@ -331,7 +331,7 @@ class ControlLaw:
 
     A law may also define the methods of `LawSettings`. When Python creates the class of a law,
     it derives a second class, `Settings`, which has the gains and these methods.
-    docs/own-controller.md describes the other class variables of a law.
+    docs/law-interface.md describes the other class variables of a law.
 
     Attributes:
         Settings: Class that stores the gains of the law in a scenario, the description of an
@@ -566,7 +566,7 @@ def _check_methods(kind: Any, code: str, path: str) -> None:
     if has_memory_methods and not is_declared:
         required += ["memory", "recall"]
     missing = [name for name in required if not callable(getattr(kind, name, None))]
-    page = find_page("own-controller.md")
+    page = find_page("law-interface.md")
     if missing:
         raise ScenarioError(f"{code} has no {', '.join(missing)}; see {page}", path=path)
 

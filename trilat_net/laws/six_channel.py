@@ -53,7 +53,9 @@ class SixChannel(FourChannel):
         a = float(situation.alpha[slave, user_1])  # the slave follows user 1 with the weight a
         expected_shares = complementary_shares(a)
         if not np.allclose(situation.alpha, expected_shares):
-            text = "the shares are not those of one factor: see six_channel in docs/laws.md"
+            text = (
+                "the shares are not those of one factor: see six_channel in docs/laws-forces.md"
+            )
             return StabilityCondition(False, text)
 
         weights = complementary_weights(a)

@@ -247,7 +247,7 @@ def test_a_record_without_the_laws_memory_is_told(mem: list[float]) -> None:
 
 def test_three_places_explain_a_negative_energy_in_the_same_words() -> None:
     """The certificate, `compare --tune` and the page of the laws."""
-    page = find_page("laws.md").read_text(encoding="utf-8")
+    page = find_page("laws-tdpa.md").read_text(encoding="utf-8")
     assert NEGATIVE_ENERGY_MEANING in " ".join(page.split())
     tuned: Any = SimpleNamespace(
         found=[SimpleNamespace(space=SimpleNamespace(law=law)) for law in ("p_d", "tdpa")]

@@ -40,7 +40,7 @@ def test_a_mass_on_a_spring_swings_as_in_closed_form() -> None:
 
 
 def test_the_target_model_of_impedance_rests_as_its_page_says() -> None:
-    """docs/laws.md: K = 50, shares .75 / .25, 3 N m on user 1: user 1 .06, slave .045."""
+    """docs/data/laws-unit-arm.csv: K = 50, shares .75 / .25, 3 N m on user 1: user 1 .06, slave .045."""
     target = MASTER.target_motion(make_run(push(user_nm=3.0), [MASTER, MASTER, SLAVE], 0.2))
     assert target is not None
     assert target[:, 0, 0] == pytest.approx([0.2, 0.2, 0.2])
