@@ -84,6 +84,7 @@ SCENARIO_OF = {
     "docs/devices.md": "play",
     "docs/external-arm.md": "two_sites",
     "docs/links.md": "paper",
+    "docs/silent-peers.md": "paper",
     "docs/ports.md": "two_sites",
     "docs/live-hands.md": "play",
     "docs/metrics.md": "free",
@@ -155,7 +156,7 @@ def write_own_arm(folder: Path, text: str) -> str:
 # --- commands ---------------------------------------------------------------------------------------------
 
 PUSHED_COMMAND_PAGES, PUSHED_PYTHON_PAGES = (
-    {"docs/links.md"},
+    {"docs/delay-traces.md"},
     {"docs/certificate.md", "docs/policies.md"},
 )
 """Pages whose blocks run on every push; those of the others run in `make test-long`."""
@@ -173,12 +174,12 @@ def list_pages(pages: set[str], pushed: set[str]) -> list[Any]:
 
 COMMAND_PAGES = {
     "docs/arms.md",
+    "docs/delay-traces.md",
     "docs/errata.md",
     "docs/fair-comparison.md",
     "docs/first-hour.md",
     "docs/lab.md",
     "docs/linear.md",
-    "docs/links.md",
     "docs/rerun.md",
     "docs/sweep.md",
 }
@@ -194,7 +195,7 @@ def prepare(page: str, folder: Path) -> None:
     """Makes the files that a page takes for granted."""
     if page in OF_RUNS:
         trilat("sim", OF_RUNS[page], "-o", "run.mcap", cwd=folder).succeeds()
-    if page == "docs/links.md":
+    if page == "docs/delay-traces.md":
         irtt(folder, zipped=True)
     if page == "docs/arms.md":
         (own,) = (block for block in find_blocks(page) if block.text.startswith("name"))
