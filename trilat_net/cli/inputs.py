@@ -234,7 +234,7 @@ def keys_new_command(
     )
 
 
-@options.command("keys", "keys m1 recorder --days 90", page="docs/keys.md")
+@options.command("keys", "keys m1 recorder --days 90", page="docs/network.md")
 def keys_renew_command(
     folder: Annotated[
         Path, typer.Argument(help="Folder that `trilat keys new` created.", metavar="DIR")
