@@ -129,7 +129,7 @@ def find_evidence(row: Row, seeds: Seeds, ends: dict[str, str]) -> Evidence:
 def describe_row(evidence: Evidence) -> str:
     row = evidence.row
     gap = row.gap if evidence.holds else "**does not hold**"
-    return f"| {row.mark} {row.fault} | {row.required} | {gap or '–'} |"
+    return f"| {row.mark} {row.fault} | {row.required} | {gap} |"
 
 
 def list_evidence(evidence: Evidence) -> list[tuple[str, str, str]]:
@@ -150,10 +150,9 @@ def describe_seeds(seeds: Seeds) -> list[str]:
     each_s = seeds.took_s / len(seeds.judged)
     count, broken, most = len(seeds.judged), len(seeds.failed), max(holds, default=0)
     return [
-        f"{count} seeds, {broken} with a violation. Each is two sessions of 5 s, of which the first is "
-        f"judged and the second must give the same bytes: {each_s:.1f} s of a processor, {240 / each_s:.0f} "
-        f"sessions a minute on two. Held {len(holds)} times: at most {most} ticks after the last sample that "
-        "came into use.",
+        f"{count} seeds, {broken} with a violation. Each takes {each_s:.1f} s of a processor: two sessions of "
+        f"5 s, of which the second must give the same bytes. Held {len(holds)} times: at most {most} ticks "
+        "after the last sample that came into use.",
         "",
         describe_torques(seeds),
     ]
