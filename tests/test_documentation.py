@@ -85,6 +85,7 @@ SCENARIO_OF = {
     "docs/external-arm.md": "two_sites",
     "docs/links.md": "paper",
     "docs/measured-hands.md": "two_sites",
+    "docs/silent-peers.md": "paper",
     "docs/live-hands.md": "play",
     "docs/felt-forces.md": "free",
     "docs/own-controller.md": "paper",
@@ -155,10 +156,13 @@ def write_own_arm(folder: Path, text: str) -> str:
 
 # --- commands ---------------------------------------------------------------------------------------------
 
-PUSHED_COMMAND_PAGES, PUSHED_PYTHON_PAGES = (
-    {"docs/links.md"},
-    {"docs/certificate.md", "docs/own-plant.md", "docs/policies.md", "docs/train-policies.md"},
-)
+PUSHED_COMMAND_PAGES = {"docs/delay-traces.md"}
+PUSHED_PYTHON_PAGES = {
+    "docs/certificate.md",
+    "docs/own-plant.md",
+    "docs/policies.md",
+    "docs/train-policies.md",
+}
 """Pages whose blocks run on every push; those of the others run in `make test-long`."""
 
 
@@ -175,12 +179,12 @@ def list_pages(pages: set[str], pushed: set[str]) -> list[Any]:
 COMMAND_PAGES = {
     "docs/arms.md",
     "docs/damping-conditions.md",
+    "docs/delay-traces.md",
     "docs/fair-comparison.md",
     "docs/first-hour.md",
     "docs/lab.md",
     "docs/laws.md",
     "docs/linear.md",
-    "docs/links.md",
     "docs/metrics.md",
     "docs/ports.md",
     "docs/rerun.md",
@@ -198,7 +202,7 @@ def prepare(page: str, folder: Path) -> None:
     """Makes the files that a page takes for granted."""
     if page in OF_RUNS:
         trilat("sim", OF_RUNS[page], "-o", "run.mcap", cwd=folder).succeeds()
-    if page == "docs/links.md":
+    if page == "docs/delay-traces.md":
         irtt(folder, zipped=True)
     if page == "docs/arms.md":
         (own,) = (block for block in find_blocks(page) if block.text.startswith("name"))

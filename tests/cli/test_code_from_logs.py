@@ -205,9 +205,21 @@ def list_commands(command: Any, *words: str) -> Iterator[str]:
         yield from list_commands(inner, *words, name)
 
 
+RUN_NONE = {
+    *("metrics", "identify hand", "replay", "watch", "stop", "enable", "reset"),
+    *("log info", "log check", "log sign", "log recover", "log export"),
+    *("set link", "set dominance", "router", "ros2", "doctor"),
+    *("scenario list", "scenario show", "scenario check", "scenario new", "trace import"),
+    *("experiment new", "experiment check", "experiment power"),
+    *("experiment status", "experiment analyse"),
+    *("keys new", "keys renew", "keys pair", "keys info", "new law", "new hand", "new plant"),
+}
+"""Commands of which the page says that they run no code that a log or a scenario names."""
+
+
 @pytest.mark.push
 def test_the_page_lists_every_command() -> None:
-    """A row of `docs/code-that-runs.md` says of each command whose code it runs."""
+    """A row of `docs/code-that-runs.md` says of each command whose code it runs; the others run none."""
     page = Path(__file__).parents[2] / "docs" / "code-that-runs.md"
     rows = [
         line
@@ -223,7 +235,8 @@ def test_the_page_lists_every_command() -> None:
         for row in rows
         for words in re.findall("`([^`]+)`", row.split(" | ")[0])
     }
-    assert named == set(list_commands(typer.main.get_command(app)))
+    assert not named & RUN_NONE
+    assert named | RUN_NONE == set(list_commands(typer.main.get_command(app)))
 
 
 RUNNING_OWN: dict[str, list[str]] = {

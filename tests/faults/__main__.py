@@ -1,11 +1,16 @@
-"""Judges seeds on all cores: `python -m tests.faults`; with --write the matrix of docs/faults.md is made."""
+"""Judges seeds on all cores: `python -m tests.faults`.
+
+With --write the matrix of docs/faults.md is made, and its evidence: sessions and tests of each fault
+(docs/data/faults.csv), and how often each event came about (docs/data/fault-counts.csv).
+"""
 
 import argparse
+import csv
 import re
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -18,6 +23,8 @@ from .judged_seed import Judged, find_undisturbed_step, time_seed
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "faults.md"
+TESTS = ROOT / "docs" / "data" / "faults.csv"
+COUNTS = ROOT / "docs" / "data" / "fault-counts.csv"
 BEGIN, END = "<!-- made by python -m tests.faults --write -->", "<!-- end -->"
 
 
@@ -91,41 +98,70 @@ def run_tests(names: Sequence[str]) -> dict[str, str]:
     return {name: "failed" if bad & found else "passed" for name, found in ends.items()}
 
 
-def describe_row(row: Row, seeds: Seeds, ends: dict[str, str]) -> str:
+class Evidence(NamedTuple):
+    """What shows that a session bears a fault as required.
+
+    Attributes:
+        row: the fault.
+        sessions: how many seeds made it.
+        broken: in how many of these an invariant was violated.
+        results: by test what became of it; "not run" where nothing did.
+    """
+
+    row: Row
+    sessions: int
+    broken: int
+    results: dict[str, str]
+
+    @property
+    def holds(self) -> bool:
+        return not self.broken and set(self.results.values()) <= {"passed"}
+
+
+def find_evidence(row: Row, seeds: Seeds, ends: dict[str, str]) -> Evidence:
     sessions = [one for kind in row.kinds for one in seeds.of(kind)]
     broken = sum(bool(one.violations) for one in sessions)
-    virtual = [f"{len(sessions)} sessions, {broken} violations"] if row.kinds else []
-    cells = []
-    for tests, shown in ((row.virtual, virtual), (row.real, [])):
-        names = find_tests(tests)
-        words = [
-            f"{ends.get(name, 'not run')}: `{name.rpartition('::test_')[2] or name}`"
-            for name in names
-        ]
-        cells.append("; ".join([*shown, *words]) or "–")
-    failed = broken or any(
-        ends.get(name) != "passed" for name in find_tests((*row.virtual, *row.real))
-    )
-    state = "not ok" if failed else f"ok, gap: {row.gap}" if row.gap else "ok"
-    return f"| {row.mark} | {row.fault} | {row.required} | {cells[0]} | {cells[1]} | {state} |"
+    names = find_tests((*row.virtual, *row.real))
+    results = {name: ends.get(name, "not run") for name in names}
+    return Evidence(row, len(sessions), broken, results)
+
+
+def describe_row(evidence: Evidence) -> str:
+    row = evidence.row
+    gap = row.gap if evidence.holds else "**does not hold**"
+    return f"| {row.mark} {row.fault} | {row.required} | {gap} |"
+
+
+def list_evidence(evidence: Evidence) -> list[tuple[str, str, str]]:
+    """Returns the rows of the file of evidence: fault, what shows it, result."""
+    row = evidence.row
+    seeds = f"{evidence.sessions} sessions in virtual time"
+    rows = [(row.mark, seeds, f"{evidence.broken} violations")] if row.kinds else []
+    return rows + [(row.mark, name, result) for name, result in evidence.results.items()]
+
+
+def write_table(path: Path, head: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    with path.open("w", encoding="utf-8", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows([head, *rows])
 
 
 def describe_seeds(seeds: Seeds) -> list[str]:
-    visited: Counter[str] = sum((one.visited for one in seeds.judged), Counter())
     holds = [ticks for one in seeds.judged for ticks in one.holds]
     each_s = seeds.took_s / len(seeds.judged)
-    came = ", ".join(f"{name} {count}" for name, count in sorted(visited.items()))
     count, broken, most = len(seeds.judged), len(seeds.failed), max(holds, default=0)
     return [
-        f"{count} seeds, {broken} with a violation. Each is two sessions of 5 s, of which the first is "
-        f"judged and the second must give the same bytes: {each_s:.1f} s of a processor, {240 / each_s:.0f} "
-        f"sessions a minute on two. Held {len(holds)} times: at most {most} ticks after the last sample that "
-        "came into use.",
+        f"{count} seeds, {broken} with a violation. Each takes {each_s:.1f} s of a processor: two sessions of "
+        f"5 s, of which the second must give the same bytes. Held {len(holds)} times: at most {most} ticks "
+        "after the last sample that came into use.",
         "",
         describe_torques(seeds),
-        "",
-        f"What they came by: {came}.",
     ]
+
+
+def count_visits(seeds: Seeds) -> list[tuple[str, int]]:
+    """Returns what sessions came by (modes, events, faults, what was dropped), each with its count."""
+    visited: Counter[str] = sum((one.visited for one in seeds.judged), Counter())
+    return sorted(visited.items())
 
 
 def describe_torques(seeds: Seeds) -> str:
@@ -164,13 +200,20 @@ def main() -> int:
         ends = run_tests(
             find_tests([name for row in ROWS for name in (*row.virtual, *row.real)])
         )
-        table = [describe_row(row, seeds, ends) for row in ROWS]
-        heads = ["| | fault | required | virtual time | real | |", "|---|---|---|---|---|---|"]
+        found = [find_evidence(row, seeds, ends) for row in ROWS]
+        table = [describe_row(evidence) for evidence in found]
+        write_table(
+            TESTS,
+            ("fault", "evidence", "result"),
+            [line for evidence in found for line in list_evidence(evidence)],
+        )
+        write_table(COUNTS, ("event", "count"), count_visits(seeds))
+        heads = ["| fault | what must happen | not tried |", "|---|---|---|"]
         text = PAGE.read_text("utf-8")
         before, _, rest = text.partition(BEGIN)
-        made = "\n".join([BEGIN, "", *lines, "", *heads, *table, "", END])
+        made = "\n".join([BEGIN, "", *heads, *table, "", *lines, "", END])
         PAGE.write_text(before + made + rest.partition(END)[2], "utf-8")
-        print("\n".join(line for line in table if "| not ok |" in line))
+        print("\n".join(describe_row(evidence) for evidence in found if not evidence.holds))
     return int(bool(seeds.failed))
 
 

@@ -185,9 +185,12 @@ def test_joints_that_are_missing_or_not_finite_are_named(
         read_joint_target(NAMES, joints(names, angles))
 
 
-PAGE = (Path(__file__).parents[2] / "docs" / "ros2.md").read_text(encoding="utf-8")
-FILE = "".join(re.findall(r"```\n((?:joint_states = |\[sites\.s\]).*?)```", PAGE, re.DOTALL))
-"""The examples of the page."""
+PAGES = "".join(
+    (Path(__file__).parents[2] / "docs" / page).read_text(encoding="utf-8")
+    for page in ("ros2-topics.md", "ros2.md")
+)
+FILE = "".join(re.findall(r"```\n((?:joint_states = |\[sites\.s\]).*?)```", PAGES, re.DOTALL))
+"""The examples of the pages."""
 
 
 def test_topics_are_called_as_a_file_says(tmp_path: Path) -> None:

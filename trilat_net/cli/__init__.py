@@ -128,7 +128,7 @@ _GROUPS: dict[str, dict[str, Any]] = {
     },
     "trace": {
         "help": "Imports delays that another program measured.",
-        "epilog": "Example: trilat trace import irtt run.json.gz\n\nDocs: docs/links.md",
+        "epilog": "Example: trilat trace import irtt run.json.gz\n\nDocs: docs/delay-traces.md",
     },
     "experiment": {
         "help": "Runs studies with people, from the protocol to the tables.",
@@ -141,7 +141,7 @@ _GROUPS: dict[str, dict[str, Any]] = {
     },
     "keys": {
         "help": "Creates keys that encrypt a session or sign logs.",
-        "epilog": "Example: trilat keys pair lab\n\nDocs: docs/network.md",
+        "epilog": "Example: trilat keys pair lab\n\nDocs: docs/keys.md",
     },
 }
 _GROUP_OPTIONS = {"set": "--session paper "}

@@ -151,7 +151,7 @@ def new_plant_command(
 
 
 @options.command(
-    "irtt run.json.gz", "csv drive.txt --way half -o drive.csv", page="docs/links.md"
+    "irtt run.json.gz", "csv drive.txt --way half -o drive.csv", page="docs/delay-traces.md"
 )
 def trace_import_command(
     form: Annotated[
@@ -197,7 +197,7 @@ def trace_import_command(
     terminal.print_line(f"{path}: use it with --set link.model=trace --set link.file={path}")
 
 
-@options.command("keys m1 m2 s recorder operator --host 192.0.2.1", page="docs/network.md")
+@options.command("keys m1 m2 s recorder operator --host 192.0.2.1", page="docs/keys.md")
 def keys_new_command(
     folder: Annotated[
         Path, typer.Argument(help="Folder to create for the keys.", metavar="DIR")
@@ -281,7 +281,7 @@ def keys_pair_command(
     terminal.print_text(f"{public}: checks, as in: trilat log check run.mcap --key {public}")
 
 
-@options.command("keys/m1", page="docs/network.md")
+@options.command("keys/m1", page="docs/keys.md")
 def keys_info_command(
     folder: Annotated[Path, typer.Argument(help="Folder of one member's keys.", metavar="DIR")],
     as_json: options.JsonOption = False,

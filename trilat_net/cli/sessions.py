@@ -178,7 +178,7 @@ _START_OPTIONS = {
 _check_count = options.check_range(5, 10_000, "a number")
 
 
-@options.command("--session paper", page="docs/network.md")
+@options.command("--session paper", page="docs/network-check.md")
 def ping_command(
     context: typer.Context,
     session: Annotated[str, value("--session", "ID", "Session to measure.")] = "paper",
@@ -721,7 +721,7 @@ def _send_change(context: typer.Context, site: str, change: dict[str, Any]) -> N
 
 
 @options.command(
-    "--keys keys/m1 --listen tls/0.0.0.0:7447", "--session paper", page="docs/network.md"
+    "--keys keys/m1 --listen tls/0.0.0.0:7447", "--session paper", page="docs/network-check.md"
 )
 def doctor_command(
     *,

@@ -107,7 +107,7 @@ def check_outside_arms(scenario: Scenario) -> None:
             raise ScenarioError(
                 f"is {site.on_stale.action!r}, but an external arm needs 'glide', so that its "
                 "site waits, holds and stops without a jump "
-                f"({find_page('links.md')})",
+                f"({find_page('silent-peers.md')})",
                 path=f"sites.{name}.on_stale.action",
                 source=scenario.name,
             )
