@@ -557,7 +557,12 @@ def bench(
     return run_bench(folder, jobs, on, confirm=confirm)
 
 
-def view(*files: str | Path, full: bool = False, save: str | Path | None = None) -> None:
+def view(
+    *files: str | Path,
+    full: bool = False,
+    save: str | Path | None = None,
+    foxglove: bool = False,
+) -> None:
     """Opens a log in the viewer Rerun; the command is `trilat log view`.
 
     The function returns when the viewer is closed.
@@ -569,14 +574,22 @@ def view(*files: str | Path, full: bool = False, save: str | Path | None = None)
         full: True to show the record of every control period. False shows fewer, evenly spaced
             ones.
         save: Path of a Rerun file to write instead of opening the viewer.
+        foxglove: True to write a layout for the viewers Foxglove and Lichtblick beside the log,
+            as run.foxglove.json, instead of opening Rerun.
 
     Raises:
-        UsageError: Rerun is not installed, or there is no display.
+        UsageError: Rerun is not installed, there is no display, or the layout exists.
         LogError: The log cannot be read.
     """
+    from .reporting.foxglove_layout import write_foxglove_layout
     from .reporting.rerun_viewer import ViewerOptions, open_rerun
 
     paths = [Path(file) for file in files]
+    if foxglove:
+        if full or save is not None:
+            raise UsageError("foxglove cannot be combined with full or save")
+        print(write_foxglove_layout(paths[0]))
+        return
     viewer_options = ViewerOptions(
         full=full, web=False, save=None if save is None else Path(save)
     )

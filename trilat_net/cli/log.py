@@ -14,7 +14,7 @@ from typing import Annotated
 
 import typer
 
-from ..errors import count_nouns
+from ..errors import UsageError, count_nouns
 from ..reporting import terminal_output as terminal
 from ..reporting.exports import list_export_formats
 from . import options
@@ -174,7 +174,7 @@ def log_export_command(
         terminal.print_text(f"{exporter.path}: {summary}")
 
 
-@options.command("run.mcap", page="docs/log-tools.md")
+@options.command("run.mcap", "run.mcap --foxglove", page="docs/log-tools.md")
 def log_view_command(
     files: options.LogsArgument,
     full: Annotated[
@@ -187,6 +187,13 @@ def log_view_command(
         Path | None,
         options.value("--save", "OUT.rrd", "Write a Rerun file instead of opening Rerun."),
     ] = None,
+    foxglove: Annotated[
+        bool,
+        typer.Option(
+            "--foxglove",
+            help="Write a layout for Foxglove and Lichtblick next to FILE instead.",
+        ),
+    ] = False,
     force: options.ForceOption = False,
 ) -> None:
     """Opens a log in Rerun, with a column for each site and a label for every curve.
@@ -200,6 +207,10 @@ def log_view_command(
     from ..files import stage_output
     from ..reporting.rerun_viewer import ViewerOptions, open_rerun
 
+    if foxglove:
+        if full or web or save:
+            raise UsageError("--foxglove cannot be combined with --full, --web or --save")
+        return _write_foxglove_layout(files[0], force=force)
     needs_rerun = full or web or save
     if not needs_rerun and find_spec("rerun") is None:
         return _open_page(files)
@@ -213,6 +224,21 @@ def log_view_command(
     if save is not None:
         terminal.print_text(f"{save}: open it with: rerun {save}")
     return None
+
+
+def _write_foxglove_layout(file: Path, *, force: bool) -> None:
+    """Writes the layout of a log for Foxglove and Lichtblick, and prints how to use it.
+
+    Args:
+        file: The log, its first part, or an exported bag.
+        force: True to replace an existing layout.
+    """
+    from ..reporting.foxglove_layout import write_foxglove_layout
+
+    layout = write_foxglove_layout(file, force=force)
+    terminal.print_text(
+        f"{layout}: open {file} in Foxglove or Lichtblick, and import this file as a layout"
+    )
 
 
 def _open_page(files: list[Path]) -> None:
