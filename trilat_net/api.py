@@ -562,6 +562,7 @@ def view(
     full: bool = False,
     save: str | Path | None = None,
     foxglove: bool = False,
+    rviz: bool = False,
 ) -> None:
     """Opens a log in the viewer Rerun; the command is `trilat log view`.
 
@@ -576,19 +577,24 @@ def view(
         save: Path of a Rerun file to write instead of opening the viewer.
         foxglove: True to write a layout for the viewers Foxglove and Lichtblick beside the log,
             as run.foxglove.json, instead of opening Rerun.
+        rviz: True to write a configuration of RViz for the ROS 2 topics of the session beside
+            the log, as run.rviz, instead of opening Rerun.
 
     Raises:
-        UsageError: Rerun is not installed, there is no display, or the layout exists.
+        UsageError: Rerun is not installed, there is no display, or a file exists.
         LogError: The log cannot be read.
     """
-    from .reporting.foxglove_layout import write_foxglove_layout
     from .reporting.rerun_viewer import ViewerOptions, open_rerun
+    from .reporting.viewer_files import write_foxglove_layout, write_rviz_config
 
     paths = [Path(file) for file in files]
-    if foxglove:
+    if foxglove or rviz:
         if full or save is not None:
-            raise UsageError("foxglove cannot be combined with full or save")
-        print(write_foxglove_layout(paths[0]))
+            raise UsageError("foxglove and rviz cannot be combined with full or save")
+        if foxglove:
+            print(write_foxglove_layout(paths[0]))
+        if rviz:
+            print(write_rviz_config(paths[0]))
         return
     viewer_options = ViewerOptions(
         full=full, web=False, save=None if save is None else Path(save)

@@ -13,7 +13,7 @@ import trilat_net as tn
 from tests.cli.running import trilat
 from tests.task_arms import planar_task
 from trilat_net.errors import UsageError
-from trilat_net.reporting.foxglove_layout import write_foxglove_layout
+from trilat_net.reporting.viewer_files import write_foxglove_layout
 
 PATH = re.compile(r"(?P<topic>(/\w+)+)\.(?P<fields>[\w.]+)(\[(?P<index>\d+)\])?")
 """What our layouts use of the syntax of message paths: /topic.field.field[0]."""
@@ -205,7 +205,9 @@ def test_the_command_says_how_to_use_it(paper: tuple[Path, Path], tmp_path: Path
     )
     trilat(*view, cwd=tmp_path).refuses("run.foxglove.json: already exists", "--force")
     trilat(*view, "--force", cwd=tmp_path).succeeds()
-    trilat(*view, "--web", cwd=tmp_path).refuses("--foxglove cannot be combined")
+    trilat("log", "view", "run.mcap", "--rviz", cwd=tmp_path).succeeds()
+    assert "rviz_default_plugins/RobotModel" in (tmp_path / "run.rviz").read_text()
+    trilat(*view, "--web", cwd=tmp_path).refuses("--foxglove and --rviz cannot be combined")
 
 
 def test_a_file_without_channels_says_what_to_do(tmp_path: Path) -> None:

@@ -194,6 +194,13 @@ def log_view_command(
             help="Write a layout for Foxglove and Lichtblick next to FILE instead.",
         ),
     ] = False,
+    rviz: Annotated[
+        bool,
+        typer.Option(
+            "--rviz",
+            help="Write a configuration of RViz next to FILE instead, for its ROS 2 topics.",
+        ),
+    ] = False,
     force: options.ForceOption = False,
 ) -> None:
     """Opens a log in Rerun, with a column for each site and a label for every curve.
@@ -207,10 +214,13 @@ def log_view_command(
     from ..files import stage_output
     from ..reporting.rerun_viewer import ViewerOptions, open_rerun
 
-    if foxglove:
+    if foxglove or rviz:
         if full or web or save:
-            raise UsageError("--foxglove cannot be combined with --full, --web or --save")
-        return _write_foxglove_layout(files[0], force=force)
+            raise UsageError(
+                "--foxglove and --rviz cannot be combined with --full, --web or --save"
+            )
+        return _write_viewer_files(files[0], foxglove=foxglove, rviz=rviz, force=force)
+
     needs_rerun = full or web or save
     if not needs_rerun and find_spec("rerun") is None:
         return _open_page(files)
@@ -226,19 +236,28 @@ def log_view_command(
     return None
 
 
-def _write_foxglove_layout(file: Path, *, force: bool) -> None:
-    """Writes the layout of a log for Foxglove and Lichtblick, and prints how to use it.
+def _write_viewer_files(file: Path, *, foxglove: bool, rviz: bool, force: bool) -> None:
+    """Writes the files with which other viewers show a log, and prints how to use them.
 
     Args:
         file: The log, its first part, or an exported bag.
-        force: True to replace an existing layout.
+        foxglove: True to write a layout for Foxglove and Lichtblick.
+        rviz: True to write a configuration of RViz.
+        force: True to replace existing files.
     """
-    from ..reporting.foxglove_layout import write_foxglove_layout
+    from ..reporting.viewer_files import write_foxglove_layout, write_rviz_config
 
-    layout = write_foxglove_layout(file, force=force)
-    terminal.print_text(
-        f"{layout}: open {file} in Foxglove or Lichtblick, and import this file as a layout"
-    )
+    if foxglove:
+        layout = write_foxglove_layout(file, force=force)
+        terminal.print_text(
+            f"{layout}: open {file} in Foxglove or Lichtblick, and import this file as a layout"
+        )
+    if rviz:
+        config = write_rviz_config(file, force=force)
+        terminal.print_text(
+            f"{config}: during a session with `trilat ros2`, run: rviz2 -d {config}\n"
+            "  for a bag: ros2 bag play --clock BAG, and add: --ros-args -p use_sim_time:=true"
+        )
 
 
 def _open_page(files: list[Path]) -> None:

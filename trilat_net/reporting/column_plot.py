@@ -345,19 +345,21 @@ def _draw_groups(
     lines = {name: group_lines for group in groups for name, group_lines in group.items()}
     with style.time_figure(log, REPORT_SIZE, height_in, interval_s) as plot:
         grid = style.add_panels(plot.figure, row_count, column_count, sharex=True)
-        for axes, name in zip(grid.flat, cells, strict=True):
+        # The lowest panel of each column, which has the time axis. Rows below may be empty.
+        lowest: dict[int, Axes] = {}
+        for index, name in enumerate(cells):
+            row, column = divmod(index, column_count)
+            axes: Axes = grid[row, column]
             if name:
                 _draw_panel(plot, axes, lines[name], interval_s)
+                lowest[column] = axes
             else:
                 axes.remove()
-        lowest = []
-        for column in np.reshape(cells, (row_count, column_count)).T:
-            last_row = max(row for row, name in enumerate(column) if name)
-            lowest.append(grid[last_row, len(lowest)])
-            lowest[-1].tick_params(labelbottom=True)
+        for axes in lowest.values():
+            axes.tick_params(labelbottom=True)
         drawn_sites = {line.site for panel in lines.values() for line in panel}
         entries = [site for site in sites if site in drawn_sites]
-        plot.finish(lowest, style.site_legend_entries(log, entries))
+        plot.finish(list(lowest.values()), style.site_legend_entries(log, entries))
     return plot.figure
 
 

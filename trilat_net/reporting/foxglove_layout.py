@@ -1,4 +1,4 @@
-"""Writes the layout in which Foxglove and Lichtblick, viewers for robot data, show a log.
+"""Makes the layout in which Foxglove and Lichtblick, viewers for robot data, show a log.
 
 A log is the MCAP file with the results of a run. A layout is a JSON file that a user imports
 into the viewer. It states which panels are shown, and which numbers of which topics they draw.
@@ -20,25 +20,15 @@ panel by its identifier, and `layout` is a binary tree of identifiers. Viewers i
 that they do not know.
 """
 
-import json
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
-from ..errors import UsageError
-from ..files import refuse_existing, write_whole
-from ..log.log_layout import VIZ_ROOT
-from ..log.log_reader import open_log
 from ..log.ros2.cdr import FLOAT64_ARRAY, POSE, STRING
-from ..log.ros2.published import list_topics
 from ..log.ros2.robot_model import SPACING_M, WORLD
-from ..log.ros2.ros2_messages import ROBOT, Ros2Channel, read_ros2_channels
-from ..log.ros2.topic_names import NAMINGS, make_session_name, read_topic_table
+from ..log.ros2.ros2_messages import Ros2Channel, is_robot_description
 from ..net.messages import MODE_WORDS
 from .rerun_viewer import CurvePlot, PlotLayout, build_plot_layout
 
-LAYOUT_SUFFIX = ".foxglove.json"
-"""Suffix of the file of a layout, which replaces the suffix of the log's name."""
 _MODE = "mode"
 """Name of the topic with the mode of a site."""
 _MODE_NUMBERS = (_MODE, "mode_number")
@@ -55,54 +45,6 @@ Ros2Channels = Mapping[str, Ros2Channel]
 JsonObject = dict[str, Any]
 Tree = str | JsonObject
 """Identifier of a panel, or a node that divides an area into two."""
-
-
-def write_foxglove_layout(
-    log: Path, layout: Path | None = None, *, force: bool = False
-) -> Path:
-    """Writes the layout of a log, or of an exported bag of ROS 2.
-
-    Args:
-        log: File of the log or bag.
-        layout: File of the layout. None to write it beside the log.
-        force: True to replace an existing file.
-
-    Returns:
-        The path of the layout.
-
-    Raises:
-        UsageError: The file contains no standard channels, or the layout exists.
-        LogError: The log cannot be read.
-    """
-    path = layout or log.with_suffix(LAYOUT_SUFFIX)
-    refuse_existing(path, force=force)
-    write_whole(path, json.dumps(_read_layout(log), indent=1) + "\n", force=force)
-    return path
-
-
-def _read_layout(log: Path) -> JsonObject:
-    """Returns the layout of a log or of a bag.
-
-    Raises:
-        UsageError: The file contains no standard channels.
-        LogError: The log cannot be read.
-    """
-    channels = read_ros2_channels(log)
-    if not build_plot_layout(channels).pages:
-        raise UsageError(
-            f"{log}: there is nothing to plot, because the file is not finished or was written "
-            f"with --views off; write a file for viewers with `trilat log export {log} --to "
-            "ros2`, and name that file instead"
-        )
-    is_log = any(topic.startswith(VIZ_ROOT) for topic in channels)
-    if not is_log:
-        return build_foxglove_layout({"ROS 2": channels})
-    opened = open_log(log)
-    session = make_session_name(opened.session["session"])
-    table = read_topic_table(NAMINGS[0])
-    live_topics = list_topics(opened.scenario, session, table)
-    live_channels = {f"/{topic}": channel for topic, channel in live_topics.items()}
-    return build_foxglove_layout({"Log": channels, "ROS 2": live_channels})
 
 
 def build_foxglove_layout(sources: Mapping[str, Ros2Channels]) -> JsonObject:
@@ -318,9 +260,9 @@ def _add_arms(panels: _Panels, channels: Ros2Channels) -> str:
     topics: JsonObject = {}
     arm_count = 0
     for topic, channel in channels.items():
-        root, _, name = topic.rpartition("/")
-        if name == ROBOT:
+        if is_robot_description(channel):
             arm_count += 1
+            root, _, _ = topic.rpartition("/")
             site = root.rpartition("/")[2]
             layers[f"arm-{site}"] = {
                 "instanceId": f"arm-{site}",
