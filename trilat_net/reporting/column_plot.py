@@ -31,7 +31,7 @@ from ..fields import suggest_nearest
 from ..log.data_tables import UNIT_SUFFIXES, Column
 from ..log.log_reader import Log
 from ..log.record_columns import Ints
-from ..net.messages import MODES
+from ..log.ros2.ros2_messages import NUMBERS_BY_MODE_WORD
 from ..scenario.arms import TASK_AXES
 from . import style
 from .appearance import REPORT_SIZE
@@ -400,14 +400,15 @@ def _draw_panel(
 def _list_words(lines: Sequence[_Line]) -> list[str]:
     """Returns the different texts of a column of texts, for the ticks of the value axis.
 
-    The list is empty for a column of numbers. Modes have the order of `MODES`.
+    The list is empty for a column of numbers. Modes have the order of their
+    numbers in messages for viewers.
     """
     words: set[str] = set()
     for line in lines:
         if line.column.is_text:
             words |= {str(word) for word in line.column.values}
-    ranks = {mode: rank for rank, mode in enumerate(MODES)}
-    return sorted(words, key=lambda word: (ranks.get(word, len(ranks)), word))
+    numbers = NUMBERS_BY_MODE_WORD
+    return sorted(words, key=lambda word: (numbers.get(word, len(numbers) + 1), word))
 
 
 def _read_numbers(column: Column, words: Sequence[str]) -> NDArray[np.float64]:

@@ -25,8 +25,7 @@ from typing import Any
 
 from ..log.ros2.cdr import FLOAT64_ARRAY, POSE, STRING
 from ..log.ros2.robot_model import SPACING_M, WORLD
-from ..log.ros2.ros2_messages import Ros2Channel, is_robot_description
-from ..net.messages import MODE_WORDS
+from ..log.ros2.ros2_messages import NUMBERS_BY_MODE_WORD, Ros2Channel, is_robot_description
 from .rerun_viewer import CurvePlot, PlotLayout, build_plot_layout
 
 _MODE = "mode"
@@ -223,10 +222,9 @@ def _add_modes(panels: _Panels, channels: Ros2Channels) -> str:
 
 def _name_mode_numbers() -> JsonObject:
     """Returns the setting with which a viewer shows the number of a mode as its name."""
-    states = [
-        {"value": int(mode), "operator": "=", "label": word}
-        for mode, word in MODE_WORDS.items()
-    ]
+    states = []
+    for word, number in NUMBERS_BY_MODE_WORD.items():
+        states.append({"value": number, "operator": "=", "label": word})
     return {"type": "range", "states": states, "otherwise": {"label": "other"}}
 
 
