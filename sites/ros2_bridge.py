@@ -25,12 +25,15 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
+from pathlib import Path
 
 from trilat_net.core.ticks import NS_PER_S
 from trilat_net.errors import TrilatError, UsageError, count_nouns
+from trilat_net.files import refuse_existing, write_whole
 from trilat_net.log.ros2 import cdr
-from trilat_net.log.ros2.published import COMMON_TOPICS, pack_session_diagnostics
+from trilat_net.log.ros2.published import COMMON_TOPICS, list_topics, pack_session_diagnostics
 from trilat_net.log.ros2.ros2_messages import SESSION_CHANNELS, Ros2SiteChannels, pack_event
+from trilat_net.log.ros2.rviz_config import build_rviz_config
 from trilat_net.log.ros2.topic_names import DIAGNOSTICS, FRAMES, RobotTable, TopicTable
 from trilat_net.net import topics
 from trilat_net.net.arm_client import ArmClient, Hand
@@ -849,6 +852,7 @@ def serve_ros2(
     stopped: Callable[[], bool],
     say: Callable[[str], None],
     timeout_s: float,
+    rviz: Path | None = None,
 ) -> None:
     """Runs the bridge of a session, for the command `trilat ros2`.
 
@@ -863,11 +867,15 @@ def serve_ros2(
         stopped: Function that returns True to end the call.
         say: Function that prints a line for the user.
         timeout_s: Longest wait for the first site or its router, in s.
+        rviz: File for the configuration of RViz that shows the session. None for no file.
 
     Raises:
-        UsageError: There is no router, or the settings of a robot do not fit the session.
+        UsageError: There is no router, the file exists, or the settings of a robot do not fit
+            the session.
     """
     clock = SystemClock()
+    if rviz is not None:
+        refuse_existing(rviz, force=False)
     with running.reach(BRIDGE, timeout_s) as bus:
         has_new_epoch = True
         is_announced = False
@@ -888,7 +896,7 @@ def serve_ros2(
                     session=running.name,
                     table=table,
                 )
-                has_new_epoch = publish_session(ends, rate_hz, stopped, say)
+                has_new_epoch = publish_session(ends, rate_hz, stopped, say, rviz)
 
 
 def publish_session(
@@ -896,6 +904,7 @@ def publish_session(
     rate_hz: float,
     stopped: Callable[[], bool],
     say: Callable[[str], None],
+    rviz: Path | None = None,
 ) -> bool:
     """Waits until a session begins, and connects it with ROS 2 until the session ends.
 
@@ -908,6 +917,7 @@ def publish_session(
         stopped: Function that is called repeatedly. The connection ends early when it returns
             True.
         say: Function that prints a line for the user.
+        rviz: File for the configuration of RViz that shows the session. None for no file.
 
     Returns:
         True if the session was replaced by another one of the same name, to which the caller
@@ -950,7 +960,26 @@ def publish_session(
         session_text = f"session {ends.session} is in the graph of ROS 2: /{ends.session}/..."
         input_clauses = _describe_inputs(ends, bridge, robots)
         say("; ".join([session_text, *input_clauses]))
+        if rviz is not None:
+            write_session_config(ends, scenario, rviz)
+            say(f"{rviz}: shows the arms: rviz2 -d {rviz}")
         return bridge.run(rate_hz, stopped, say)
+
+
+def write_session_config(ends: BridgeEnds, scenario: Scenario, path: Path) -> None:
+    """Writes the configuration of RViz that shows a session.
+
+    Args:
+        ends: Connections to ROS and to the session.
+        scenario: Scenario of the session.
+        path: File of the configuration. A file of an earlier session is replaced.
+
+    Raises:
+        UsageError: The file cannot be written.
+    """
+    topics = list_topics(scenario, ends.session, ends.table)
+    full_names = {f"/{topic}": channel for topic, channel in topics.items()}
+    write_whole(path, build_rviz_config(full_names))
 
 
 def _describe_inputs(ends: BridgeEnds, bridge: Bridge, robots: Iterable[str]) -> list[str]:

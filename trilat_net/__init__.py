@@ -174,16 +174,9 @@ def _import_name(name: str) -> _Any:
     except UsageError as error:
         return _make_stand_in(name, str(error))
     except ModuleNotFoundError as error:
-        package = (error.name or "").partition(".")[0]
-        if package in ("", "live", "recorder", "sites", "trilat_net"):
-            # A missing module of this program is a bug, not a missing package.
-            raise
-        from .files import STUDY_LIBRARIES
+        from .files import describe_missing_library
 
-        remedy = "which is not installed"
-        if package in STUDY_LIBRARIES:
-            remedy = "which trilat-net-core does not include: pip install trilat-net"
-        return _make_stand_in(name, f"{name} needs {package}, {remedy}")
+        return _make_stand_in(name, describe_missing_library(name, error))
 
 
 def _make_stand_in(name: str, problem: str) -> _Any:

@@ -557,7 +557,13 @@ def bench(
     return run_bench(folder, jobs, on, confirm=confirm)
 
 
-def view(*files: str | Path, full: bool = False, save: str | Path | None = None) -> None:
+def view(
+    *files: str | Path,
+    full: bool = False,
+    save: str | Path | None = None,
+    foxglove: bool = False,
+    rviz: bool = False,
+) -> None:
     """Opens a log in the viewer Rerun; the command is `trilat log view`.
 
     The function returns when the viewer is closed.
@@ -569,14 +575,27 @@ def view(*files: str | Path, full: bool = False, save: str | Path | None = None)
         full: True to show the record of every control period. False shows fewer, evenly spaced
             ones.
         save: Path of a Rerun file to write instead of opening the viewer.
+        foxglove: True to write a layout for the viewers Foxglove and Lichtblick beside the log,
+            as run.foxglove.json, instead of opening Rerun.
+        rviz: True to write a configuration of RViz for the ROS 2 topics of the session beside
+            the log, as run.rviz, instead of opening Rerun.
 
     Raises:
-        UsageError: Rerun is not installed, or there is no display.
+        UsageError: Rerun is not installed, there is no display, or a file exists.
         LogError: The log cannot be read.
     """
     from .reporting.rerun_viewer import ViewerOptions, open_rerun
+    from .reporting.viewer_files import write_foxglove_layout, write_rviz_config
 
     paths = [Path(file) for file in files]
+    if foxglove or rviz:
+        if full or save is not None:
+            raise UsageError("foxglove and rviz cannot be combined with full or save")
+        if foxglove:
+            print(write_foxglove_layout(paths[0]))
+        if rviz:
+            print(write_rviz_config(paths[0]))
+        return
     viewer_options = ViewerOptions(
         full=full, web=False, save=None if save is None else Path(save)
     )

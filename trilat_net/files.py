@@ -55,6 +55,28 @@ def require_libraries(*names: str) -> None:
         )
 
 
+def describe_missing_library(function: str, error: ModuleNotFoundError) -> str:
+    """Returns the error message that a function needs a library that is not installed.
+
+    Args:
+        function: Name of the function.
+        error: Error of the import. It names the missing module.
+
+    Returns:
+        The message, with the command that installs the library if the command is known.
+
+    Raises:
+        ModuleNotFoundError: The missing module belongs to this program, which is a bug.
+    """
+    package = (error.name or "").partition(".")[0]
+    if package in ("", "live", "recorder", "sites", "trilat_net"):
+        raise error
+    remedy = "which is not installed"
+    if package in STUDY_LIBRARIES:
+        remedy = "which trilat-net-core does not include: pip install trilat-net"
+    return f"{function} needs {package}, {remedy}"
+
+
 def import_extra(module: str, extra: str, purpose: str) -> Any:
     """Imports a module of an optional package, which may not be installed.
 

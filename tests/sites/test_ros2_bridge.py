@@ -16,6 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
+from ruamel.yaml import YAML
 from scipy.spatial.transform import Rotation
 
 import trilat_net
@@ -30,6 +31,7 @@ from sites.ros2_bridge import (
     read_joint_target,
     read_vector_target,
     refuse_other_robots,
+    write_session_config,
 )
 from sites.ros2_topics import BridgeEnds, SiteTopics
 from sites.running_session import ShareHistory
@@ -43,6 +45,7 @@ from trilat_net.core.ticks import Mode, TickRecord
 from trilat_net.errors import RunFailed, UsageError
 from trilat_net.log.ros2 import cdr
 from trilat_net.log.ros2.published import list_topics
+from trilat_net.log.ros2.robot_model import RobotModel
 from trilat_net.log.ros2.topic_names import RobotTable, read_topic_table
 from trilat_net.net import topics
 from trilat_net.net.arm_client import FRESH_NS, ArmClient
@@ -641,11 +644,13 @@ class Sites:
         self._state(encode_state("s", 1, peers, record, (), 0, 0))
 
     @contextmanager
-    def shown(self) -> Iterator[threading.Thread]:
+    def shown(self, rviz: Path | None = None) -> Iterator[threading.Thread]:
         over = threading.Event()
 
         def show() -> None:
-            self.anew.append(publish_session(self._ends, 100.0, over.is_set, self.said.append))
+            self.anew.append(
+                publish_session(self._ends, 100.0, over.is_set, self.said.append, rviz)
+            )
 
         bridge = threading.Thread(target=show)
         self.graph.came.clear()  # before the bridge takes its topics from it
@@ -757,3 +762,76 @@ def test_bags_of_other_scenarios_have_no_topic_of_their_own(
         "events",
         "log",
     }
+
+
+RVIZ_TYPES = {
+    "rviz_default_plugins/RobotModel": "std_msgs/msg/String",
+    "rviz_default_plugins/Pose": "geometry_msgs/msg/PoseStamped",
+}
+"""By class of a display the type of the messages that it shows."""
+
+
+def list_rviz_topics(config: Path) -> dict[str, tuple[str, bool]]:
+    """Type of every topic of a configuration of RViz, and whether it must be latched."""
+    manager = YAML(typ="safe").load(config)["Visualization Manager"]
+    found = {}
+    for display in manager["Displays"]:
+        topic = display.get("Topic") or display.get("Description Topic")
+        if topic is None:
+            assert display["Class"] in ("rviz_default_plugins/Grid", "rviz_default_plugins/TF")
+            continue
+        latched = topic["Durability Policy"] == "Transient Local"
+        assert topic["Value"].startswith("/")
+        found[topic["Value"][1:]] = RVIZ_TYPES[display["Class"]], latched
+    return found
+
+
+@pytest.mark.parametrize(
+    "name", ["paper", "play", "six_joints", "unlike_arms", "wall_in_space"]
+)
+@pytest.mark.parametrize("naming", ["crisp", "crtk"])
+def test_rviz_has_the_topics_of_the_live_bridge(tmp_path: Path, name: str, naming: str) -> None:
+    scenario = load_scenario(name)
+    graph = Listener()
+    ends: Any = BridgeEnds(graph, None, None, name, read_topic_table(naming))  # type: ignore[arg-type]
+    for site in scenario.names:
+        SiteTopics(ends, scenario, site, 0, graph.came["tf"])  # type: ignore[arg-type]
+    config = tmp_path / "view.rviz"
+    write_session_config(ends, scenario, config)
+    shown = list_rviz_topics(config)
+    assert shown.items() <= graph.offered.items()
+    poses = {topic for topic, (kind, _) in graph.offered.items() if kind == cdr.POSE}
+    arms = {f"{name}/{site}/robot_description" for site in scenario.names}
+    assert shown.keys() == poses | arms
+
+
+def test_rviz_s_fixed_frame_is_above_all_frames(tmp_path: Path) -> None:
+    log = trilat_net.simulate("two_sites", {"duration_s": 0.02})
+    trilat_net.view(log.save(tmp_path / "run.mcap"), rviz=True)
+    config = YAML(typ="safe").load(tmp_path / "run.rviz")
+    fixed = config["Visualization Manager"]["Global Options"]["Fixed Frame"]
+    for site in log.sites:
+        assert RobotModel(log.scenario, site).frames[0][0] == fixed
+
+
+def test_a_bag_and_its_log_have_one_view_in_rviz(tmp_path: Path) -> None:
+    log = trilat_net.simulate("two_sites", {"duration_s": 0.02})
+    file = log.save(tmp_path / "run.mcap")
+    bag = trilat_net.export(log, "ros2", tmp_path / "bag.mcap")
+    for path in (file, bag):
+        trilat_net.view(path, rviz=True)
+    shown = list_rviz_topics(tmp_path / "run.rviz")
+    assert shown == list_rviz_topics(tmp_path / "bag.rviz")
+    assert shown.items() <= list_bag(bag).items()
+    with pytest.raises(UsageError, match="already exists"):
+        trilat_net.view(bag, rviz=True)
+
+
+def test_the_bridge_writes_what_rviz_shows(tmp_path: Path) -> None:
+    config = tmp_path / "view.rviz"
+    sites = Sites([], "two_sites", "lab")
+    sites.begin(10**18)
+    with sites.shown(config):
+        until(config.is_file)
+        offered = dict(sites.graph.offered)
+    assert list_rviz_topics(config).items() <= offered.items()

@@ -14,7 +14,7 @@ from typing import Annotated
 
 import typer
 
-from ..errors import count_nouns
+from ..errors import UsageError, count_nouns
 from ..reporting import terminal_output as terminal
 from ..reporting.exports import list_export_formats
 from . import options
@@ -174,7 +174,7 @@ def log_export_command(
         terminal.print_text(f"{exporter.path}: {summary}")
 
 
-@options.command("run.mcap", page="docs/log-tools.md")
+@options.command("run.mcap", "run.mcap --foxglove", page="docs/log-tools.md")
 def log_view_command(
     files: options.LogsArgument,
     full: Annotated[
@@ -187,6 +187,20 @@ def log_view_command(
         Path | None,
         options.value("--save", "OUT.rrd", "Write a Rerun file instead of opening Rerun."),
     ] = None,
+    foxglove: Annotated[
+        bool,
+        typer.Option(
+            "--foxglove",
+            help="Write a layout for Foxglove and Lichtblick next to FILE instead.",
+        ),
+    ] = False,
+    rviz: Annotated[
+        bool,
+        typer.Option(
+            "--rviz",
+            help="Write a configuration of RViz next to FILE instead, for its ROS 2 topics.",
+        ),
+    ] = False,
     force: options.ForceOption = False,
 ) -> None:
     """Opens a log in Rerun, with a column for each site and a label for every curve.
@@ -199,6 +213,13 @@ def log_view_command(
 
     from ..files import stage_output
     from ..reporting.rerun_viewer import ViewerOptions, open_rerun
+
+    if foxglove or rviz:
+        if full or web or save:
+            raise UsageError(
+                "--foxglove and --rviz cannot be combined with --full, --web or --save"
+            )
+        return _write_viewer_files(files[0], foxglove=foxglove, rviz=rviz, force=force)
 
     needs_rerun = full or web or save
     if not needs_rerun and find_spec("rerun") is None:
@@ -213,6 +234,30 @@ def log_view_command(
     if save is not None:
         terminal.print_text(f"{save}: open it with: rerun {save}")
     return None
+
+
+def _write_viewer_files(file: Path, *, foxglove: bool, rviz: bool, force: bool) -> None:
+    """Writes the files with which other viewers show a log, and prints how to use them.
+
+    Args:
+        file: The log, its first part, or an exported bag.
+        foxglove: True to write a layout for Foxglove and Lichtblick.
+        rviz: True to write a configuration of RViz.
+        force: True to replace existing files.
+    """
+    from ..reporting.viewer_files import write_foxglove_layout, write_rviz_config
+
+    if foxglove:
+        layout = write_foxglove_layout(file, force=force)
+        terminal.print_text(
+            f"{layout}: open {file} in Foxglove or Lichtblick, and import this file as a layout"
+        )
+    if rviz:
+        config = write_rviz_config(file, force=force)
+        terminal.print_text(
+            f"{config}: during a session with `trilat ros2`, run: rviz2 -d {config}\n"
+            "  for a bag: ros2 bag play --clock BAG, and add: --ros-args -p use_sim_time:=true"
+        )
 
 
 def _open_page(files: list[Path]) -> None:

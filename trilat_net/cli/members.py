@@ -800,6 +800,7 @@ def ros2_command(
         float, value("--rate", "HZ", callback=options.check_range(1.0, 20000.0, "a rate in Hz"))
     ] = 100.0,
     names: Annotated[str, value("--names", "crisp|crtk|FILE")] = "crisp",
+    rviz: Annotated[Path | None, value("--rviz", "OUT.rviz")] = None,
     timeout: options.AnswerOption = 10.0,
     *,
     reach: options.Reach,
@@ -816,6 +817,7 @@ def ros2_command(
         rate: Rate of each topic, Hz.
         names: Naming scheme of the topics: crisp, crtk, or a TOML file that lists topics and
             robots.
+        rviz: Write a configuration of RViz that shows the arms of the session.
     """
     from sites.ros2_bridge import serve_ros2
     from sites.running_session import RunningSession
@@ -855,6 +857,7 @@ def ros2_command(
             stopped=interrupt.is_requested,
             say=terminal.print_line,
             timeout_s=timeout,
+            rviz=rviz,
         )
     if interrupt.is_requested():
         raise typer.Exit(interrupt.exit_code)

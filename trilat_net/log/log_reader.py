@@ -30,6 +30,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import cached_property, lru_cache
+from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar
@@ -38,9 +39,16 @@ import numpy as np
 
 from ..core.delay import MAX_DELAY_US
 from ..core.ticks import NS_PER_S, CoreChange
-from ..errors import LogError, ScenarioError, UnknownName, WireError, count_nouns
+from ..errors import (
+    LogError,
+    ScenarioError,
+    UnknownName,
+    UsageError,
+    WireError,
+    count_nouns,
+)
 from ..fields import suggest_nearest
-from ..files import open_regular
+from ..files import describe_missing_library, open_regular
 from ..net import topics
 from ..net.messages import READABLE, Event, LinkStats, RecorderStats, State
 from ..net.topics import count_under_way
@@ -81,6 +89,9 @@ if TYPE_CHECKING:
 
 
 M = TypeVar("M", Event, LinkStats, RecorderStats)
+
+_COLUMN_PLOT = "trilat_net.reporting.column_plot"
+"""Module that draws a log. Imported only for a figure, because it needs Matplotlib."""
 
 
 class Log(Result, Mapping[str, SiteLog]):
@@ -209,6 +220,51 @@ class Log(Result, Mapping[str, SiteLog]):
             kind: Kind of the table, see `table`.
         """
         return to_pandas_frame(self.table(name, kind)) if name else super().to_frame()
+
+    def plot(
+        self,
+        *columns: str,
+        sites: str | Sequence[str] | None = None,
+        joints: int | str | Sequence[int | str] | None = None,
+        from_s: float | None = None,
+        until_s: float | None = None,
+    ) -> Any:
+        """Draws the run, or columns of the records over time, with a line per site.
+
+        Without arguments, the figure is the overview of the run: errors, speeds, torques and
+        ages. A column has a panel of its own.
+
+        >>> log = tn.simulate("two_sites", duration_s=0.1)
+        >>> figure = log.plot("q", "tau", sites="s", joints=1, from_s=0.05)
+        >>> [panel.get_title() for panel in figure.axes]
+        ['q1 (rad)', 'tau1 (N m)']
+
+        Args:
+            columns: Quantities such as "q", "tau", "theta_hat", "age" and "mode", the error
+                "e", or single columns of `table`, such as "q1_rad" or "q1". By default "q",
+                "e" and "tau" if another argument is given.
+            sites: The sites to draw. None for all sites.
+            joints: The joints to draw, by number from 1 or by name. None for all joints.
+                Columns that belong to no joint are not affected.
+            from_s: First time to draw, in s. None for the start of the run.
+            until_s: Last time to draw, in s. None for the end of the run.
+
+        Returns:
+            A Matplotlib figure, which a notebook displays. Its method `savefig` writes it to a
+            file.
+
+        Raises:
+            UnknownName: There is no such column, site or joint.
+            UsageError: There are no records in this time, or Matplotlib is not installed.
+            LogError: The records cannot be read.
+        """
+        try:
+            column_plot = import_module(_COLUMN_PLOT)
+        except ModuleNotFoundError as error:
+            raise UsageError(describe_missing_library("plot", error)) from None
+        return column_plot.plot_log(
+            self, columns, sites=sites, joints=joints, from_s=from_s, until_s=until_s
+        )
 
     __eq__ = object.__eq__  # logs are not compared record by record
     __hash__ = object.__hash__

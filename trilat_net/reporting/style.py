@@ -676,16 +676,22 @@ def site_records(log: Log, values: Callable[[SiteLog], Array]) -> SiteSignal:
 
 
 @contextmanager
-def time_figure(log: Log, form: FigureSize, height_in: float) -> Iterator["TimeFigure"]:
+def time_figure(
+    log: Log,
+    form: FigureSize,
+    height_in: float,
+    interval_s: tuple[float, float] | None = None,
+) -> Iterator["TimeFigure"]:
     """Provides an empty figure over the time of a run, for use in a `with` statement.
 
     Args:
         log: Log of the run.
         form: Width of the figure and sizes of its texts.
         height_in: Height of the figure, in inches.
+        interval_s: First and last time that the figure shows, in s. None for the whole run.
     """
     with styled_figure(form, height_in) as figure:
-        yield TimeFigure(log, form, figure)
+        yield TimeFigure(log, form, figure, interval_s)
 
 
 class TimeFigure:
@@ -698,17 +704,30 @@ class TimeFigure:
         log: Log of the run.
         form: Width of the figure and sizes of its texts.
         figure: Empty Matplotlib figure.
+        interval_s: First and last time that the figure shows, in s. None for the whole run.
 
     Attributes:
         log: Log of the run.
         figure: The Matplotlib figure.
     """
 
-    def __init__(self, log: Log, form: FigureSize, figure: Figure) -> None:
+    def __init__(
+        self,
+        log: Log,
+        form: FigureSize,
+        figure: Figure,
+        interval_s: tuple[float, float] | None = None,
+    ) -> None:
         self.log = log
         self.figure = figure
         self._small_pt = form.small_pt
-        self._changes = list(enumerate(list_changes(log), 1))
+        self._interval_s = interval_s or (0.0, recorded_end_s(log))
+        changes = list_changes(log)
+        if interval_s is not None:
+            # Numbers of other changes would be drawn beside the panels.
+            first_s, last_s = interval_s
+            changes = [entry for entry in changes if first_s <= entry.change.at_s <= last_s]
+        self._changes = list(enumerate(changes, 1))
         self._modes = {site: find_mode_intervals(log[site]) for site in log.sites}
 
     def trace(
@@ -824,7 +843,7 @@ class TimeFigure:
         """
         for axes in lowest:
             axes.set_xlabel("time (s)")
-            axes.set_xlim(0.0, recorded_end_s(self.log))
+            axes.set_xlim(*self._interval_s)
         if title:
             add_legend(self.figure, entries, title=title, title_fontsize=8.0)
         else:

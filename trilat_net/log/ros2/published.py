@@ -22,6 +22,7 @@ from ..orientations import QuaternionSigns
 from . import cdr
 from .robot_model import WORLD, FramePose, RobotModel, Vector, compute_quaternion
 from .ros2_messages import (
+    ROBOT_METADATA,
     SESSION_CHANNELS,
     NamedMessages,
     Ros2Channel,
@@ -158,8 +159,7 @@ class SiteMessages:
             "names": " ".join(peers),
         }
         topics["dominance"] = Ros2Channel(cdr.FLOAT64_ARRAY, shares, latched=True)
-        robot = {"content": "URDF, with links named after their site"}
-        topics["robot_description"] = Ros2Channel(cdr.STRING, robot, latched=True)
+        topics["robot_description"] = Ros2Channel(cdr.STRING, ROBOT_METADATA, latched=True)
         return topics | self._list_array_topics()
 
     def _describe_pose(self, subject: str) -> Ros2Channel:

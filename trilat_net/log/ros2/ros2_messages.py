@@ -114,15 +114,28 @@ SESSION_CHANNELS = {
     EVENTS: Ros2Channel(cdr.STRING, {"content": "what happened, member first"}),
     LINES: Ros2Channel(cdr.LOG, {"content": "the same as lines of a log"}),
 }
-_ROBOT_METADATA = {"content": "URDF, with links named after their site"}
+ROBOT_METADATA = {"content": "URDF, with links named after their site"}
+"""Metadata of a channel with the URDF of an arm."""
 _FRAMES_METADATA = {
     "content": "frames of the links",
     "unit": "m",
 }
 ROBOT_CHANNELS = {
-    ROBOT: Ros2Channel(cdr.STRING, _ROBOT_METADATA),
+    ROBOT: Ros2Channel(cdr.STRING, ROBOT_METADATA),
     FRAMES: Ros2Channel(cdr.TRANSFORMS, _FRAMES_METADATA),
 }
+
+
+def is_robot_description(channel: Ros2Channel) -> bool:
+    """Tells whether a channel contains the URDF of an arm, whatever the name of its topic is.
+
+    Args:
+        channel: The channel, of a log, a bag or the live bridge.
+    """
+    content = channel.about.get("content")
+    return channel.kind == cdr.STRING and content == ROBOT_METADATA["content"]
+
+
 _LEVELS = {
     "diverged": cdr.RosLogLevel.ERROR,
     "failed": cdr.RosLogLevel.ERROR,
@@ -134,9 +147,11 @@ _LEVELS = {
     "clock fault": cdr.RosLogLevel.WARN,
 }
 """Level of an event in the log of ROS by its kind. Other kinds have the level INFO."""
+NUMBERS_BY_MODE_WORD = {word: float(mode) for mode, word in MODE_WORDS.items()}
+"""Number of each mode in messages for viewers, by the name of the mode in records."""
 _MODE_NUMBERS: dict[Mode | str, float] = {
     **{mode: float(mode) for mode in MODE_WORDS},
-    **{word: float(mode) for mode, word in MODE_WORDS.items()},
+    **NUMBERS_BY_MODE_WORD,
 }
 """Number of a mode, which is a `Mode` in a `TickRecord` and a word in a `State`."""
 

@@ -1,0 +1,156 @@
+"""`log.plot`: which columns, sites, joints and times a figure shows, and what a wrong name says."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import trilat_net as tn
+from tests.analysis import logs
+from tests.task_arms import planar_task
+from trilat_net.errors import UnknownName, UsageError
+from trilat_net.reporting import style
+from trilat_net.reporting.column_plot import DEFAULT_QUANTITIES
+
+
+def titles(figure):
+    return [axes.get_title() for axes in figure.axes]
+
+
+def curves(axes):
+    """Lines over time, without those that mark a change."""
+    return [line for line in axes.lines if line.get_transform() == axes.transData]
+
+
+def test_without_arguments_it_is_the_overview():
+    log = logs.simulated("four")
+    assert titles(log.plot()) == titles(tn.figure(log, "overview", width_in=7.0))
+
+
+def test_a_notebook_displays_the_figure():
+    figure = logs.simulated("four").plot("mode")
+    assert figure._repr_html_().startswith("<img")
+    assert figure._repr_png_().startswith(b"\x89PNG")
+
+
+def test_a_quantity_has_a_panel_per_column():
+    figure = logs.simulated("paper").plot("q", "tau", "theta_hat")
+    assert titles(figure)[:2] == ["q1 (rad)", "q2 (rad)"]
+    assert titles(figure)[2:4] == ["tau1 (N m)", "tau2 (N m)"]
+    assert titles(figure)[4:] == [
+        "theta_hat1 (kg m²)",
+        "theta_hat2 (kg m²)",
+        "theta_hat3 (kg m²)",
+        "theta_hat4 (kg m)",
+        "theta_hat5 (kg m)",
+    ]
+
+
+@pytest.mark.parametrize("name", ["q", "qd", "q_des", "tau", "tau_x", "e"])
+def test_curves_have_the_extremes_of_the_records(name):
+    log = logs.simulated("paper")
+    for joint, axes in enumerate(log.plot(name).axes):
+        for site, curve in zip(log.sites, curves(axes), strict=True):
+            values = getattr(log[site], name)[:, joint]
+            drawn = curve.get_ydata()
+            assert (np.nanmin(drawn), np.nanmax(drawn)) == (values.min(), values.max())
+            assert curve.get_color() == style.site_colour(log, site)
+
+
+@pytest.mark.parametrize("name", ["q2", "q2_rad"])
+def test_a_single_column_has_two_names(name):
+    assert titles(logs.simulated("four").plot(name)) == ["q2 (rad)"]
+
+
+def test_every_column_of_the_table_can_be_drawn():
+    log = logs.simulated("four")
+    for column in log.table("a").columns:
+        assert len(log.plot(column.name, sites="a").axes) == 1, column.name
+
+
+def test_sites_joints_and_times_restrict_a_figure():
+    log = logs.simulated("paper")
+    figure = log.plot("q", "age", sites=["s", "m1"], joints=2, from_s=1.0, until_s=1.5)
+    assert titles(figure) == ["q2 (rad)", "age_m2 (ms)", "age_s (ms)", "age_m1 (ms)"]
+    angles = figure.axes[0]
+    assert [len(curves(axes)) for axes in figure.axes] == [2, 2, 1, 1]
+    assert angles.get_xlim() == (1.0, 1.5)
+    for curve in curves(angles):
+        assert curve.get_xdata().min() >= 1.0
+        assert curve.get_xdata().max() <= 1.5
+    assert titles(log.plot(joints="q1")) == [
+        f"{name}1 ({unit})"
+        for name, unit in zip(DEFAULT_QUANTITIES, ("rad", "rad", "N m"), strict=True)
+    ]
+
+
+def test_modes_are_steps_between_words():
+    log = logs.busy().log
+    [axes] = log.plot("mode").axes
+    words = [label.get_text() for label in axes.get_yticklabels()]
+    recorded = {mode for site in log.sites for mode in log[site].mode}
+    assert set(words) == recorded
+    assert words[0] == "run"
+    assert {line.get_drawstyle() for line in curves(axes)} == {"steps-post"}
+
+
+def test_changes_outside_the_time_are_not_marked():
+    log = logs.busy().log
+    assert "a → c" in log.plot("q").get_supxlabel()
+    assert "a → c" not in log.plot("q", until_s=0.5).get_supxlabel()
+    assert not [text for axes in log.plot("q", until_s=0.5).axes for text in axes.texts]
+
+
+def test_sites_with_poses_have_errors_along_axes():
+    log = tn.simulate(planar_task(), duration_s=0.05)
+    assert titles(log.plot("e")) == ["e_x (m)", "e_y (m)", "e_z (m)"]
+    assert titles(log.plot("q_des", "q", joints=1)) == [
+        "q_des_x (m)",
+        "q_des_y (m)",
+        "q_des_z (m)",
+        "q1 (rad)",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("names", "selection", "error", "hint"),
+    [
+        (["tua"], {}, UnknownName, "did you mean 'tau'?"),
+        (["zzz"], {}, UnknownName, "the quantities are"),
+        (["positions"], {}, UnknownName, "trilat_net.figure(log, 'positions')"),
+        (["q"], {"sites": "m9"}, UnknownName, "the sites are a, b, c, d"),
+        (["q"], {"sites": []}, UsageError, "the sites are a, b, c, d"),
+        (["q"], {"joints": 3}, UnknownName, "the joints of a are 1 to 2, or q1, q2"),
+        (["q"], {"joints": 0}, UnknownName, "1 to 2"),
+        (["q1"], {"joints": 2}, UsageError, "q1 has no column of the joints 2"),
+        (["q"], {"joints": []}, UsageError, "joints is empty"),
+        (["q"], {"from_s": 1.0, "until_s": 1.0}, UsageError, "less than until_s"),
+        (["q"], {"from_s": 30.0}, UsageError, "the log ends at 2 s"),
+        (["q"], {"from_s": 30.0, "until_s": 31.0}, UsageError, "from 0 s until 2 s"),
+        (["q"], {"from_s": float("nan")}, UsageError, "less than until_s"),
+    ],
+)
+def test_a_wrong_name_says_what_would_be_right(names, selection, error, hint):
+    with pytest.raises(error) as refused:
+        logs.simulated("four").plot(*names, **selection)
+    assert hint in str(refused.value)
+
+
+@pytest.mark.long
+def test_without_matplotlib_it_says_what_to_install():
+    script = """
+import sys
+sys.modules["matplotlib"] = None
+import trilat_net as tn
+from trilat_net.errors import UsageError
+log = tn.simulate("two_sites", duration_s=0.05)
+try:
+    log.plot()
+except UsageError as error:
+    print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.stdout.strip() == (
+        "plot needs matplotlib, which trilat-net-core does not include: pip install trilat-net"
+    ), done.stderr

@@ -1,0 +1,70 @@
+"""Makes the configuration with which RViz shows the arms of a session.
+
+RViz is the 3D viewer of ROS 2, the Robot Operating System. Its configuration is a YAML file
+that states which displays are shown, and of which topics. The configuration of a session has a
+display for the model of each arm and for each pose, besides the frames of all links and a grid.
+It serves a running session that the live bridge publishes, and an exported bag of this session,
+because both have the same topics.
+
+Invariant:
+    - Each topic of the configuration is a topic of the session, and has its quality of service:
+      RViz receives a description that was published before RViz was started.
+    - The names of links in the descriptions are the names of their frames, so that no display
+      needs a prefix.
+"""
+
+from collections.abc import Mapping
+from string import Template
+
+from ...errors import UsageError
+from .cdr import DEFINITIONS, POSE
+from .robot_model import SPACING_M, WORLD
+from .ros2_messages import Ros2Channel, is_robot_description
+
+_SUFFIX = ".rviz"
+"""Suffix of the templates, and of configurations."""
+
+
+def build_rviz_config(topics: Mapping[str, Ros2Channel]) -> str:
+    """Returns the configuration of RViz for the topics of a session or a bag.
+
+    Args:
+        topics: Descriptions of the topics by their full names, which begin with /.
+
+    Raises:
+        UsageError: The topics describe no arm.
+    """
+    displays = ""
+    arm_count = 0
+    for topic, channel in topics.items():
+        site_and_name = "/".join(topic.split("/")[-2:])
+        if is_robot_description(channel):
+            arm_count += 1
+            site, _, _ = site_and_name.rpartition("/")
+            displays += _fill_template("robot_model", name=site, topic=topic)
+        elif channel.kind == POSE:
+            displays += _fill_template("pose", name=site_and_name, topic=topic)
+    if not arm_count:
+        raise UsageError(
+            "there is no arm that RViz could show: no topic has the description of a robot"
+        )
+    middle_y = SPACING_M * (arm_count - 1) / 2.0
+    distance = 3.0 + 2.0 * arm_count
+    return _fill_template(
+        "session",
+        displays=displays.rstrip("\n"),
+        frame=WORLD,
+        distance=f"{distance:g}",
+        middle_y=f"{middle_y:g}",
+    )
+
+
+def _fill_template(template: str, **values: str) -> str:
+    """Returns the text of a template with values in place of its placeholders.
+
+    Args:
+        template: Name of the file of the template, without its suffix.
+        **values: Value of each placeholder.
+    """
+    text = (DEFINITIONS / f"{template}{_SUFFIX}").read_text(encoding="utf-8")
+    return Template(text).substitute(values)

@@ -1,0 +1,300 @@
+"""Makes the layout in which Foxglove and Lichtblick, viewers for robot data, show a log.
+
+A log is the MCAP file with the results of a run. A layout is a JSON file that a user imports
+into the viewer. It states which panels are shown, and which numbers of which topics they draw.
+A site is a process that controls one arm. The layout has the plots of the layout for Rerun
+(`rerun_viewer.build_plot_layout`), the modes of the sites, the events, and the arms in space.
+
+The live bridge to ROS 2 and exported bags have other topics than logs. The layout of a log
+therefore has two tabs: one for the log itself, and one for a running session of the same
+scenario, which reaches the viewer over ROS 2.
+
+Invariant:
+    - Each message path of the layout names a number that exists in the file or in the topics of
+      the live bridge.
+    - Panels without data take no space.
+    - Equal channels give layouts with equal bytes.
+
+The format is that of files which the viewers export: `configById` contains the settings of each
+panel by its identifier, and `layout` is a binary tree of identifiers. Viewers ignore settings
+that they do not know.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from ..log.ros2.cdr import FLOAT64_ARRAY, POSE, STRING
+from ..log.ros2.robot_model import SPACING_M, WORLD
+from ..log.ros2.ros2_messages import NUMBERS_BY_MODE_WORD, Ros2Channel, is_robot_description
+from .rerun_viewer import CurvePlot, PlotLayout, build_plot_layout
+
+_MODE = "mode"
+"""Name of the topic with the mode of a site."""
+_MODE_NUMBERS = (_MODE, "mode_number")
+"""Names of the topics with the number of a mode, which have a panel of their own kind."""
+_PLOTS_PERCENT = 75.0
+"""Share of the height that plots have, above modes and events."""
+_MODES_PERCENT = 60.0
+"""Share of the width that modes have, beside events."""
+_TITLE_KEYS = ("foxglovePanelTitle", "lichtblickPanelTitle")
+"""Settings that contain the title of a panel, one for each viewer."""
+
+Ros2Channels = Mapping[str, Ros2Channel]
+"""Standard channels by topic."""
+JsonObject = dict[str, Any]
+Tree = str | JsonObject
+"""Identifier of a panel, or a node that divides an area into two."""
+
+
+def build_foxglove_layout(sources: Mapping[str, Ros2Channels]) -> JsonObject:
+    """Arranges the channels of a log or of a session in panels.
+
+    Args:
+        sources: Standard channels by topic, for each source of data. If there are several
+            sources, each has a tab, whose title is the name of the source.
+
+    Returns:
+        The layout as plain values of JSON.
+    """
+    panels = _Panels()
+    trees = {name: _arrange_source(panels, channels) for name, channels in sources.items()}
+    tree = panels.add_tabs(trees) if len(trees) > 1 else next(iter(trees.values()))
+    return {
+        "configById": panels.settings,
+        "globalVariables": {},
+        "userNodes": {},
+        "playbackConfig": {"speed": 1},
+        "layout": tree,
+    }
+
+
+class _Panels:
+    """Collects the settings of panels, and gives each panel an identifier.
+
+    Attributes:
+        settings: Settings of each panel, by its identifier.
+    """
+
+    def __init__(self) -> None:
+        self.settings: dict[str, JsonObject] = {}
+
+    def add(self, kind: str, settings: JsonObject, title: str = "") -> str:
+        """Adds a panel, and returns its identifier.
+
+        Args:
+            kind: Type of the panel, such as "Plot".
+            settings: Settings of the panel.
+            title: Title of the panel. Empty for the default title.
+        """
+        identifier = f"{kind}!{len(self.settings) + 1}"
+        titles = dict.fromkeys(_TITLE_KEYS, title) if title else {}
+        self.settings[identifier] = {**titles, **settings}
+        return identifier
+
+    def add_tabs(self, trees: Mapping[str, Tree]) -> str:
+        """Adds a panel that contains tabs, and returns its identifier.
+
+        Args:
+            trees: Contents of each tab, by its title.
+        """
+        tabs = [{"title": title, "layout": tree} for title, tree in trees.items()]
+        return self.add("Tab", {"activeTabIdx": 0, "tabs": tabs})
+
+
+def _arrange_source(panels: _Panels, channels: Ros2Channels) -> Tree:
+    """Arranges the channels of one source: tabs of plots and arms, above modes and events."""
+    layout = build_plot_layout(channels)
+    tabs: dict[str, Tree] = {}
+    for name, page in layout.pages.items():
+        rows = []
+        for plots in page:
+            row = [_add_plot(panels, channels, plot) for plot in plots if not _is_mode(plot)]
+            if row:
+                rows.append(_divide("row", row))
+        if rows:
+            tabs[name] = _divide("column", rows)
+    if layout.arms:
+        tabs["Arms"] = _add_arms(panels, channels)
+
+    states = [
+        tree for tree in (_add_modes(panels, channels), _add_events(panels, layout)) if tree
+    ]
+    top = panels.add_tabs(tabs)
+    if not states:
+        return top
+    bottom = _divide("row", states, _MODES_PERCENT)
+    return _divide("column", [top, bottom], _PLOTS_PERCENT)
+
+
+def _is_mode(plot: CurvePlot) -> bool:
+    """Returns True for the plot of a mode, because `_add_modes` shows modes."""
+    names = [curves.entity.rpartition("/")[2] for curves in plot.curves]
+    return all(name in _MODE_NUMBERS for name in names)
+
+
+def _divide(direction: str, trees: Sequence[Tree], first_percent: float | None = None) -> Tree:
+    """Divides an area among several trees.
+
+    Args:
+        direction: "row" to place the trees beside one another, "column" to stack them.
+        trees: The trees, at least one.
+        first_percent: Share of the first tree. None if all trees have the same size.
+    """
+    first, *others = trees
+    if not others:
+        return first
+    return {
+        "direction": direction,
+        "first": first,
+        "second": _divide(direction, others),
+        "splitPercentage": first_percent or round(100.0 / len(trees), 2),
+    }
+
+
+def _add_plot(panels: _Panels, channels: Ros2Channels, plot: CurvePlot) -> str:
+    """Adds a plot of the curves of one quantity, and returns its identifier."""
+    series = []
+    for curves in plot.curves:
+        topic_path = _get_list_path(channels, curves.entity)
+        for index, name in enumerate(curves.names):
+            if not curves.visible[index]:
+                continue
+            is_reference = name.endswith("_ref")
+            line = {"lineStyle": "dashed"} if is_reference else {}
+            series.append(
+                {
+                    "value": f"{topic_path}[{index}]",
+                    "label": name,
+                    "enabled": True,
+                    "timestampMethod": "receiveTime",
+                    **line,
+                }
+            )
+    settings = {
+        "paths": series,
+        "showLegend": True,
+        "legendDisplay": "floating",
+        "showPlotValuesInLegend": False,
+        "showXAxisLabels": True,
+        "showYAxisLabels": True,
+        "isSynced": True,
+        "xAxisVal": "timestamp",
+        "sidebarDimension": 240,
+    }
+    return panels.add("Plot", settings, plot.title)
+
+
+def _get_list_path(channels: Ros2Channels, entity: str) -> str:
+    """Returns the message path of the list from which curves are drawn.
+
+    Args:
+        channels: Standard channels by topic.
+        entity: Topic of an array, or the topic of joint states and the name of one of their
+            lists, as `rerun_viewer.PlotCurves` has it.
+    """
+    if entity in channels:
+        return f"{entity}.data"
+    topic, _, field = entity.rpartition("/")
+    return f"{topic}.{field}"
+
+
+def _add_modes(panels: _Panels, channels: Ros2Channels) -> str:
+    """Adds a panel with the modes of all sites over time. Returns "" if there are no modes."""
+    series = []
+    for topic, channel in channels.items():
+        root, _, name = topic.rpartition("/")
+        if name != _MODE or channel.kind not in (STRING, FLOAT64_ARRAY):
+            continue
+        entry: JsonObject = {
+            "value": f"{topic}.data",
+            "label": root.rpartition("/")[2],
+            "enabled": True,
+            "timestampMethod": "receiveTime",
+        }
+        if channel.kind == FLOAT64_ARRAY:
+            entry["value"] = f"{topic}.data[0]"
+            entry["customStates"] = _name_mode_numbers()
+        series.append(entry)
+    if not series:
+        return ""
+    return panels.add("StateTransitions", {"paths": series, "isSynced": True}, "modes")
+
+
+def _name_mode_numbers() -> JsonObject:
+    """Returns the setting with which a viewer shows the number of a mode as its name."""
+    states = []
+    for word, number in NUMBERS_BY_MODE_WORD.items():
+        states.append({"value": number, "operator": "=", "label": word})
+    return {"type": "range", "states": states, "otherwise": {"label": "other"}}
+
+
+def _add_events(panels: _Panels, layout: PlotLayout) -> str:
+    """Adds a panel with the events as lines of a log. Returns "" if there are no events."""
+    if not layout.lines:
+        return ""
+    # Viewers call the type of this panel "RosOut" in files.
+    settings = {"topicToRender": layout.lines, "minLogLevel": 1, "searchTerms": []}
+    return panels.add("RosOut", settings, "events")
+
+
+def _add_arms(panels: _Panels, channels: Ros2Channels) -> str:
+    """Adds a panel with the arms in space, and returns its identifier."""
+    layers: JsonObject = {
+        "grid": {
+            "instanceId": "grid",
+            "layerId": "foxglove.Grid",
+            "label": "Grid",
+            "visible": True,
+            "frameId": WORLD,
+            "size": 10,
+            "divisions": 10,
+            "lineWidth": 1,
+            "color": "#7f7f7fff",
+            "position": [0, 0, 0],
+            "rotation": [0, 0, 0],
+            "order": 1,
+        }
+    }
+    topics: JsonObject = {}
+    arm_count = 0
+    for topic, channel in channels.items():
+        if is_robot_description(channel):
+            arm_count += 1
+            root, _, _ = topic.rpartition("/")
+            site = root.rpartition("/")[2]
+            layers[f"arm-{site}"] = {
+                "instanceId": f"arm-{site}",
+                "layerId": "foxglove.Urdf",
+                "label": site,
+                "visible": True,
+                "sourceType": "topic",
+                "topic": topic,
+                "framePrefix": "",
+                "displayMode": "auto",
+                "order": arm_count + 1,
+            }
+        elif channel.kind == POSE:
+            topics[topic] = {"visible": True, "type": "axis", "axisScale": 0.2}
+    middle_y = SPACING_M * max(arm_count - 1, 0) / 2.0
+    camera = {
+        "perspective": True,
+        "distance": 3.0 + 2.0 * arm_count,
+        "phi": 65.0,
+        "thetaOffset": 45.0,
+        "targetOffset": [0.0, middle_y, 0.5],
+        "target": [0, 0, 0],
+        "targetOrientation": [0, 0, 0, 1],
+        "fovy": 45,
+        "near": 0.05,
+        "far": 1000,
+    }
+    settings = {
+        "followTf": WORLD,
+        "followMode": "follow-none",
+        "cameraState": camera,
+        "scene": {"transforms": {"visible": False, "showLabel": False}},
+        "transforms": {},
+        "topics": topics,
+        "layers": layers,
+    }
+    return panels.add("3D", settings, "arms")
