@@ -92,6 +92,7 @@ ELSEWHERE = {
     "docs/lerobot.md: $ pip install 'trilat-net[lerobot]'": "tests/cli/test_log_export.py",
     "docs/lerobot.md: $ pip install ./plugins": "tests/live/test_lerobot.py",
     "docs/lerobot.md: import trilat_net": "tests/sites/test_running_session.py",
+    "docs/replay.md: trilat replay": "tests/live/test_replay.py",
     "docs/ports.md: trilat identify hand": "tests/cli/test_linears.py",
     "docs/maps/README.md: trilat sweep runs/mine --confirm": "tests/studies/sweep/test_confirmation.py",
     "docs/maps/README.md: trilat sweep SCENARIO": "tests/cli/test_sweeps.py",

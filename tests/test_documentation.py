@@ -80,6 +80,7 @@ def test_command_in_sentence_is_one_and_has_these_options(page: str) -> None:
 
 SCENARIO_OF = {
     "docs/experiments.md": "paper",
+    "docs/arm-keys.md": "six_joints",
     "docs/arms.md": "six_joints",
     "docs/devices.md": "play",
     "docs/external-arm.md": "two_sites",
@@ -172,6 +173,7 @@ def list_pages(pages: set[str], pushed: set[str]) -> list[Any]:
 
 
 COMMAND_PAGES = {
+    "docs/arm-gains.md",
     "docs/arms.md",
     "docs/errata.md",
     "docs/fair-comparison.md",
@@ -179,14 +181,26 @@ COMMAND_PAGES = {
     "docs/lab.md",
     "docs/linear.md",
     "docs/links.md",
+    "docs/log-checks.md",
+    "docs/log-tools.md",
     "docs/rerun.md",
+    "docs/signatures.md",
     "docs/sweep.md",
+    "docs/verify.md",
 }
 SHORTER = {
     "compare": ["--law", "p_d,adaptive", "--budget", "4", "--duration", "2", "--jobs", "1"]
 }
 """What is added to a command that else would take minutes."""
-OF_RUNS = {"docs/rerun.md": "paper"}
+OF_RUNS = {
+    "docs/json.md": "free",
+    "docs/log.md": "free",
+    "docs/log-checks.md": "paper",
+    "docs/log-tools.md": "paper",
+    "docs/rerun.md": "paper",
+    "docs/signatures.md": "free",
+    "docs/verify.md": "paper",
+}
 """Pages whose blocks are about run.mcap, and its scenario."""
 
 
@@ -240,8 +254,11 @@ def test_code_of_hand_takes_hold_of_arm_and_lets_go(tmp_path: Path) -> None:
 PYTHON_PAGES = {
     "docs/certificate.md",
     "docs/first-hour.md",
+    "docs/json.md",
     "docs/linear.md",
     "docs/live-hands.md",
+    "docs/log.md",
+    "docs/log-tools.md",
     "docs/own-controller.md",
     "docs/policies.md",
     "docs/ports.md",
