@@ -73,7 +73,7 @@ def _iterate_words_of_code(path: Path) -> Iterator[str]:
 
 
 def _has_words(path: Path) -> bool:
-    return path.suffix in {".py", *DATA} or path.name in {"Makefile", "json.md"}
+    return path.suffix in {".py", *DATA} or path.name in {"Makefile", "json-keys.csv"}
 
 
 @cache

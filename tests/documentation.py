@@ -95,6 +95,7 @@ ELSEWHERE = {
     "docs/lerobot.md: import trilat_net": "tests/sites/test_running_session.py",
     "docs/live-page.md: trilat live": "tests/live/test_live_page.py",
     "docs/measured-hands.md: trilat identify hand": "tests/cli/test_linears.py",
+    "docs/replay.md: trilat replay": "tests/live/test_replay.py",
     "docs/maps/README.md: trilat sweep runs/mine --confirm": "tests/studies/sweep/test_confirmation.py",
     "docs/maps/README.md: trilat sweep SCENARIO": "tests/cli/test_sweeps.py",
     "docs/maps/p_d.md: trilat sweep runs/map-p_d --confirm": "tests/studies/sweep/test_confirmation.py",

@@ -1,4 +1,4 @@
-"""Writes docs/json.md: the keys and types of every result's JSON, as samples have them.
+"""Writes docs/data/json-keys.csv: the keys and types of every result's JSON, as samples have them.
 
 python -m tests.json_outline
 """
@@ -19,7 +19,7 @@ from tests.studies.experiment.experiments import (
 )
 from trilat_net.results import Result
 
-PAGE = Path(__file__).parents[1] / "docs" / "json.md"
+TABLE = Path(__file__).parents[1] / "docs" / "data" / "json-keys.csv"
 GOLDEN = Path(__file__).parent / "golden"
 LOGS = (GOLDEN / "live-4g.mcap", GOLDEN / "live-paper.mcap", GOLDEN / "v3.mcap")
 OF_LOGS: dict[str, Callable[[Path], Result]] = {
@@ -131,19 +131,6 @@ OF_PEOPLE: dict[str, Callable[[Path], list[Result]]] = {
         tn.compute_experiment_power(0.5, people) for people in (None, 20)
     ],
 }
-NOTES = {
-    "experiment run": "Also of `trilat experiment status`.",
-    "experiment analyse": "`mixed_models` has an entry by measure where statsmodels is installed.",
-}
-HEAD = """# JSON of the commands
-
-What `--json` prints, and `to_dict()` returns in Python ([python.md](python.md)): keys and their types. `*`
-stands for a name, of a site, a link, a quantity, a channel; `[]` for every entry of a list. Keys end in their
-unit; a number that is not known is null, and one that no sample has stands as null alone. Keys may be added,
-none is taken away or changes its meaning. Of `trilat sweep` a run has a column per axis besides, and of
-`compare --tune` a law the gains that it has ([sweep.md](sweep.md), [fair-comparison.md](fair-comparison.md),
-[bench.md](bench.md)). The page is written by `python -m tests.json_outline`.
-"""
 _KINDS = {bool: "boolean", int: "number", float: "number", str: "text", type(None): "null"}
 _NAMED = re.compile(
     r"\.(sites|links|walls|judged|records|parameters|channels|remarks|means|unknown|edges|q_rad|x|theta_hat"
@@ -154,14 +141,15 @@ _NAMED = re.compile(
 """Tables whose keys are names."""
 
 
+def read_keys(command: str) -> list[str]:
+    """Returns the keys that the table has of a command, as in "certify"."""
+    rows = (line.split(",") for line in TABLE.read_text(encoding="utf-8").splitlines())
+    return [key for name, key, _ in rows if name == f"trilat {command}"]
+
+
 def is_documented(command: str, value: Any) -> bool:
-    """True if the page has every key of a result, as it is, or with more below it."""
-    section = (
-        PAGE.read_text(encoding="utf-8")
-        .partition(f"## trilat {command}\n")[2]
-        .partition("\n## ")[0]
-    )
-    known = re.findall(r"^([^\s:]+): ", section, re.MULTILINE)
+    """True if the table has every key of a result, as it is, or with more below it."""
+    known = read_keys(command)
     return all(
         any(f"{one}.".startswith((f"{path}.", f"{path}[")) for one in known)
         for path in gather([value])
@@ -191,8 +179,8 @@ def gather(found: list[Any]) -> dict[str, str]:
     return {path: " or ".join(sorted(kinds[path])) for path in sorted(kinds)}
 
 
-def build_page() -> str:
-    """Returns the page."""
+def build_table() -> str:
+    """Returns the table."""
     samples = {name: [find(log).to_dict() for log in LOGS] for name, find in OF_LOGS.items()}
     for name in ("contact", "force_sharing"):
         log = tn.simulate(name)
@@ -203,13 +191,11 @@ def build_page() -> str:
         samples |= {
             name: [one.to_dict() for one in find(Path(folder))] for name, find in others.items()
         }
-    parts = [HEAD]
+    lines = ["command,key,type"]
     for name, found in samples.items():
-        lines = [f"{path}: {kind}" for path, kind in gather(found).items()]
-        note = [NOTES[name], ""] if name in NOTES else []
-        parts.append("\n".join([f"## trilat {name}", "", *note, "```text", *lines, "```", ""]))
-    return "\n".join(parts)
+        lines += [f"trilat {name},{path},{kind}" for path, kind in gather(found).items()]
+    return "\n".join([*lines, ""])
 
 
 if __name__ == "__main__":
-    PAGE.write_text(build_page(), encoding="utf-8")
+    TABLE.write_text(build_table(), encoding="utf-8")

@@ -16,7 +16,7 @@ import pytest
 import trilat_net as tn
 from tests.cli.running import trilat
 from tests.golden.surface import all_options
-from tests.json_outline import PAGE, build_page, is_documented
+from tests.json_outline import TABLE, build_table, is_documented
 from tests.laws import Adaptive
 from trilat_net.errors import ScenarioError, TrilatError, UsageError
 from trilat_net.results import Result
@@ -377,8 +377,8 @@ def test_errors_name_pages_that_are_there() -> None:
 
 
 @pytest.mark.long
-def test_the_page_of_keys_is_that_of_the_results() -> None:
-    assert PAGE.read_text(encoding="utf-8") == build_page()
+def test_the_table_of_keys_is_that_of_the_results() -> None:
+    assert TABLE.read_text(encoding="utf-8") == build_table()
 
 
 def test_a_run_stands_for_its_scenario() -> None:

@@ -80,6 +80,7 @@ def test_command_in_sentence_is_one_and_has_these_options(page: str) -> None:
 
 SCENARIO_OF = {
     "docs/experiment-protocol.md": "paper",
+    "docs/arm-keys.md": "six_joints",
     "docs/arms.md": "six_joints",
     "docs/devices.md": "play",
     "docs/external-arm.md": "two_sites",
@@ -177,6 +178,7 @@ def list_pages(pages: set[str], pushed: set[str]) -> list[Any]:
 
 
 COMMAND_PAGES = {
+    "docs/arm-gains.md",
     "docs/arms.md",
     "docs/damping-conditions.md",
     "docs/delay-traces.md",
@@ -187,14 +189,27 @@ COMMAND_PAGES = {
     "docs/linear.md",
     "docs/metrics.md",
     "docs/ports.md",
+    "docs/log-checks.md",
+    "docs/log-tools.md",
     "docs/rerun.md",
+    "docs/signatures.md",
     "docs/sweep.md",
+    "docs/verify.md",
 }
 SHORTER = {
     "compare": ["--law", "p_d,adaptive", "--budget", "4", "--duration", "2", "--jobs", "1"]
 }
 """What is added to a command that else would take minutes."""
 OF_RUNS = {"docs/metrics.md": "paper", "docs/rerun.md": "paper"}
+OF_RUNS = {
+    "docs/json.md": "free",
+    "docs/log.md": "free",
+    "docs/log-checks.md": "paper",
+    "docs/log-tools.md": "paper",
+    "docs/rerun.md": "paper",
+    "docs/signatures.md": "free",
+    "docs/verify.md": "paper",
+}
 """Pages whose blocks are about run.mcap, and its scenario."""
 
 
@@ -249,8 +264,11 @@ PYTHON_PAGES = {
     "docs/certificate.md",
     "docs/first-hour.md",
     "docs/law-interface.md",
+    "docs/json.md",
     "docs/linear.md",
     "docs/live-hands.md",
+    "docs/log.md",
+    "docs/log-tools.md",
     "docs/own-controller.md",
     "docs/own-plant.md",
     "docs/policies.md",

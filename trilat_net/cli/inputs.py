@@ -260,7 +260,7 @@ def keys_renew_command(
         terminal.print_line(f"{member_folder}: valid for {count_nouns(days, 'day')} from now")
 
 
-@options.command("lab", page="docs/log.md")
+@options.command("lab", page="docs/signatures.md")
 def keys_pair_command(
     name: Annotated[
         Path,

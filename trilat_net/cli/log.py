@@ -36,7 +36,7 @@ def log_info_command(files: options.LogsArgument, as_json: options.JsonOption = 
             terminal.warn_if_unfinished(path)
 
 
-@options.command("run.mcap", "run.mcap --key lab.pub", page="docs/log.md")
+@options.command("run.mcap", "run.mcap --key lab.pub", page="docs/log-checks.md")
 def log_check_command(
     files: options.LogsArgument,
     key: Annotated[
@@ -69,7 +69,7 @@ def log_check_command(
     raise typer.Exit(check.exit_code)
 
 
-@options.command("run.mcap --key lab.key", page="docs/log.md")
+@options.command("run.mcap --key lab.key", page="docs/signatures.md")
 def log_sign_command(
     file: options.LogArgument,
     key: Annotated[
@@ -93,7 +93,7 @@ def log_sign_command(
         terminal.print_text(f"{signature}: signs {file}")
 
 
-@options.command("run.mcap.active", page="docs/log.md")
+@options.command("run.mcap.active", page="docs/log-damage.md")
 def log_recover_command(
     file: options.LogArgument,
     output: Annotated[

@@ -394,7 +394,7 @@ def _conclude(parts: list[Path], *, png: bool) -> None:
             raise RunFailed(f"{parts[0]}: {event.text}")
 
 
-@options.command("run.mcap --rate 2 --start 5", page="docs/log-tools.md")
+@options.command("run.mcap --rate 2 --start 5", page="docs/replay.md")
 def replay_command(
     files: Annotated[list[Path], typer.Argument(metavar="FILE...")],
     rate: Annotated[str, value("--rate", "X")] = "1",

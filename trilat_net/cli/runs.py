@@ -76,7 +76,7 @@ def sim_command(
         raise typer.Exit(1)
 
 
-@options.command("run.mcap", page="docs/log-tools.md")
+@options.command("run.mcap", page="docs/verify.md")
 def verify_command(
     files: options.LogsArgument,
     virtual: Annotated[bool, flag("--virtual")] = False,

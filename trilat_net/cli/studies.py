@@ -417,7 +417,7 @@ def compare_command(
 @options.command(
     "--arm arm6.urdf --delay 40ms --figure gains.png",
     "--arm my.urdf --delay measured:run.mcap",
-    page="docs/arms.md",
+    page="docs/arm-gains.md",
 )
 def tune_command(
     arm: Annotated[
@@ -457,7 +457,7 @@ def tune_command(
     """Finds the largest gains for an arm on links with a delay.
 
     The gains keep a margin to the stability limit, and are tested in simulation. Two or three
-    such arms follow one another over links with that delay in both directions (docs/arms.md).
+    such arms follow one another over links with that delay in both directions (docs/arm-gains.md).
     Paste the last line of the output into a scenario. Exit code 0: all simulated runs behave as
     the linear loop predicts. 1: at least one run does not.
 
