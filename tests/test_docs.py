@@ -20,8 +20,15 @@ from sites import (
     site_process,
 )
 from sites.devices import haply_inverse3, spacemouse
-from trilat_net.analysis import arm_rows, envelope_trend, run_end, site_signals
-from trilat_net.analysis.certificate import premises
+from trilat_net.analysis import (
+    arm_rows,
+    envelope_trend,
+    run_end,
+    site_signals,
+    stability_decision,
+    twin_growth,
+)
+from trilat_net.analysis.certificate import observed_energy, premises
 from trilat_net.analysis.certificate import stability_certificate as certificates
 from trilat_net.analysis.metrics import measured_impedance, motion_metrics, static_windows
 from trilat_net.core import delay, link, live_hand, session_life, site_arrays, ticks, user_law
@@ -171,6 +178,12 @@ STATED: list[tuple[str, str, float, float]] = [
         100 * run_end.HELD_SHARE,
     ),
     ("certificate-premises.md", "they let go 1 s and five times", 1, premises.MIN_FREE_S),
+    ("observed-energy.md", "(to -1e-9 J and", -1e-9, observed_energy.LEAST_ENERGY_J),
+    ("observed-energy.md", "at most 1 % of", 1, 100 * observed_energy.SAMPLING_SHARE),
+    ("stability.md", "within 0.02 rad of that rest", 0.02, stability_decision.NEAR_REST_RAD),
+    ("stability.md", "fewer than 100 bursts", 100, stability_decision.LEAST_BURSTS),
+    ("twins.md", "at most 32", 32, twins.MAX_PUSHES),
+    ("twins.md", "for 5 s or more", 5, twin_growth.LEAST_LEFT_S),
     ("sweep.md", "eight times the duration", 8, sweep_plan.MAX_EXTENSION),
     ("sweep.md", "by more than 2 %", 2, 100 * sweep_cell.FLAT_LOG_CHANGE),
     ("sweep-cluster.md", "in batches of about 2 s", 2, executor.CLUSTER_BATCH_S),
@@ -260,7 +273,7 @@ STATED: list[tuple[str, str, float, float]] = [
     ("ports.md", "a circle of 0.001 1/s", 0.001, port_response.ZERO_ROOT_RADIUS_PER_S),
     ("recording.md", "it flushes every 65 ms", 65, record_process.FLUSH_NS / 1e6),
     ("recording.md", "the last 4096 events", 4096, retransmit_buffer.EVENTS_KEPT),
-    ("sweep.md", "more than a million runs", 1e6, sweep_run.MAX_RUNS),
+    ("sweep.md", "More than a million runs", 1e6, sweep_run.MAX_RUNS),
     ("sweep.md", "or more than a day", 1, sweep_run.MAX_SWEEP_S / 86_400),
     ("sweep-cluster.md", "after 10 s, exit code 2", 10, dask_cluster.CONNECT_S),
     ("sweep-cluster.md", "without a worker for a minute", 60, dask_cluster.NO_WORKER_S),
