@@ -112,8 +112,9 @@ ELSEWHERE = {
     "docs/two-people.md: trilat experiment new": "tests/cli/test_experiments.py",
     "docs/two-people.md: trilat experiment run": "tests/live/test_experiment_sessions.py",
     "docs/two-people.md: trilat experiment analyse": "tests/studies/experiment/test_experiment_analysis.py",
+    "docs/growth-exponents.md: $ trilat sweep p_d_margin": "tests/studies/sweep/test_exponents.py",
     "docs/sweep.md: $ trilat sweep p_d_margin": "tests/cli/test_sweeps.py",
-    "docs/sweep.md: $ dask scheduler": "tests/studies/test_dask_cluster.py",
+    "docs/sweep-cluster.md: $ dask scheduler": "tests/studies/test_dask_cluster.py",
 }
 """Beginnings of blocks that take machines, a robot, a session or minutes, and the tests of the same."""
 

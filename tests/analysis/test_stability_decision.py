@@ -1,4 +1,4 @@
-"""What the words stable, settled, not stable and open rest on (docs/definitions.md, "Stable")."""
+"""What the words stable, settled, not stable and open rest on (docs/stability.md)."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The final loop of a run and its roots (docs/linear.md; docs/certificate.md, "End of the run")."""
+"""The final loop of a run and its roots (docs/linear.md; docs/stability.md, "Exact roots")."""
 
 from fractions import Fraction
 from pathlib import Path

@@ -508,7 +508,7 @@ class WallEnergy(NamedTuple):
     systems", J. Robotic Systems 14 (1997).
 
     The condition is sufficient, if B acts on the speed at the tick, and the motion is straight
-    within a tick (docs/certificate.md). `trilat linear` shows whether the loop is stable in
+    within a tick (docs/certificate-premises.md). `trilat linear` shows whether the loop is stable in
     contact.
 
     Attributes:

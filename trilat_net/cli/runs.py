@@ -170,7 +170,7 @@ def certify_command(
     roots of the linearised loop at the final pose. With --all it also prints the conditions of
     the proof (premises) and the energies. It executes the run again together with twins, which
     are repetitions with a small push. The code of imported control laws runs only with --law or
-    --own-laws. docs/certificate.md defines every term and every key of the JSON.
+    --own-laws. docs/certificate.md explains the verdicts and leads to every term and key.
 
     Stable: a proof exists for this loop. Settled: the run came to rest and every push died
     away, but nothing proves more. Exit code 0: stable. 1: settled, not stable (bounded
@@ -202,7 +202,7 @@ _PUSH_HELP = (
 @options.command(
     "run.mcap --at 12 --push m1.q1=1e-6 -o twin.png",
     "run.mcap --delta 1e-9:1e-3",
-    page="docs/certificate.md",
+    page="docs/twins.md",
 )
 def twin_command(
     files: options.LogsArgument,
@@ -231,8 +231,8 @@ def twin_command(
 
     A repetition with a push is called a twin. Each twin uses the recorded arrivals of messages,
     delays, hands and changes of the run. The difference from the run is simulated in full,
-    without a linear model (docs/certificate.md, "Twins"). The exit code is 0 whether or not the
-    disturbances grow.
+    without a linear model (docs/twins.md). The exit code is 0 whether or not the disturbances
+    grow.
     """
     from ..analysis.twin_growth import twin
 

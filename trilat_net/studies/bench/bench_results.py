@@ -67,7 +67,7 @@ class BenchRun(msgspec.Struct, frozen=True):
         random: True if another seed would give another run.
         sha256: Digest of the scenario of the run.
         stability: Judgement of the run by its end and by its twins, which are repeated runs
-            with a small disturbance (docs/definitions.md).
+            with a small disturbance (docs/stability.md).
         behaviour: How the run ended, for example at rest or diverged.
         text: Explanation of the judgement.
         length_s: Duration of the judged run, in s.

@@ -280,7 +280,7 @@ CLASS_MEANINGS = {
     CandidateClass.OPEN: "it hardly decays, or is undecided: a longer run may decide",
     CandidateClass.SETTLED: "it converged or decays, and no other class applies",
 }
-"""Meanings of the classes. docs/definitions.md defines the judgement of a run."""
+"""Meanings of the classes. docs/stability.md defines the judgement of a run."""
 
 
 def classify_candidate(
