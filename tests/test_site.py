@@ -2,8 +2,10 @@
 
 import re
 import runpy
+import statistics
 import subprocess
 import sys
+import tomllib
 from html.parser import HTMLParser
 from pathlib import Path
 from types import SimpleNamespace
@@ -44,6 +46,29 @@ def test_every_picture_and_page_that_first_page_names_is_there() -> None:
     assert len(named) > 60
     places = [ROOT / "docs" / one for one in named if one not in MAKE.BESIDE]
     assert [place for place in places if not place.is_file()] == []
+
+
+def test_the_menu_has_nine_entries_at_most_and_every_page_once() -> None:
+    settings = tomllib.loads((ROOT / "docs/site/zensical.toml").read_text(encoding="utf-8"))
+    entries = settings["project"]["nav"]
+    assert len(entries) <= 9
+    named = [page for entry in entries for pages in entry.values() for page in pages]
+    assert len(named) == len(set(named))
+    docs = ROOT / "docs"
+    pages = {page.relative_to(docs).as_posix() for page in docs.rglob("*.md")}
+    made = {"index.md", "SECURITY.md", "CHANGELOG.md", "LICENSE.md"}
+    assert pages | made == {page for page in named if not page.startswith("reference/")}
+
+
+def test_pages_are_short() -> None:
+    """72 000 words in all; the median page has at most 1 200, none more than 2 500."""
+    pages = list((ROOT / "docs").rglob("*.md"))
+    words = [len(page.read_text(encoding="utf-8").split()) for page in pages]
+    assert sum(words) <= 72_000
+    assert statistics.median(words) <= 1_200
+    assert max(words) <= 2_500
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= 1_100
+    assert len((ROOT / "CHANGELOG.md").read_text(encoding="utf-8").split()) <= 1_500
 
 
 def test_the_list_of_scenarios_begins_with_the_paper() -> None:
