@@ -149,10 +149,8 @@ _LEVELS = {
 """Level of an event in the log of ROS by its kind. Other kinds have the level INFO."""
 NUMBERS_BY_MODE_WORD = {word: float(mode) for mode, word in MODE_WORDS.items()}
 """Number of each mode in messages for viewers, by the name of the mode in records."""
-_MODE_NUMBERS: dict[Mode | str, float] = {
-    **{mode: float(mode) for mode in MODE_WORDS},
-    **NUMBERS_BY_MODE_WORD,
-}
+_MODE_NUMBERS: dict[Mode | str, float] = {mode: float(mode) for mode in MODE_WORDS}
+_MODE_NUMBERS.update(NUMBERS_BY_MODE_WORD)
 """Number of a mode, which is a `Mode` in a `TickRecord` and a word in a `State`."""
 
 
