@@ -182,9 +182,12 @@ def test_a_result_says_what_its_command_prints(
     """By a short name: the command lays out tables for the width of its terminal."""
     monkeypatch.chdir(file.parent)
     file = Path(file.name)
-    more = {"compare": [file], "rerun": ["--replace", "s", "--set", "control.Kd=5"]}.get(
-        command, []
-    )
+    more = {
+        "compare": [file],
+        "rerun": ["--replace", "s", "--set", "control.Kd=5"],
+        "certify": ["--all"],
+        "metrics": ["--all"],
+    }.get(command, [])
     found = RESULTS[command](file)
     printed = trilat(*command.split(), file, *more, cwd=Path.cwd())
     assert found.summary().split() == (printed.out + printed.err).split()
