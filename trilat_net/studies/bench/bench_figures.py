@@ -2,21 +2,24 @@
 
 A figure has a panel per task. In a panel, a row is a control law, a column is a link (a
 connection with a certain delay and loss), and the colour of a cell is the mean of a quantity
-over the runs of that law over that link.
+over the runs of that law over that link. The figure "stable" shows the worst judgement of these
+runs instead.
 
 Invariant:
-    - The colour of a cell depends only on its mean.
-    - A white cross marks a cell with a run that is not stable. A white dot marks a cell without
-      such a run, but with a run whose stability is open.
+    - The colour of a cell depends only on its mean, or on its judgement.
+    - In a figure of means, a white cross marks a cell with a run that is not stable. A white
+      dot marks a cell without such a run, but with a run whose stability is open.
     - Equal results give equal bytes.
 """
 
 from pathlib import Path
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.colors import LogNorm, Normalize
+from matplotlib.colors import ListedColormap, LogNorm, Normalize
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 
 from ...analysis.run_end import Stability
 from ...core.vectors import Array
@@ -34,12 +37,19 @@ from .bench_results import (
 )
 
 FIGURES_OF_BENCH = {
-    "stable": ("share of stable runs", ""),
+    "stable": ("worst judgement of the runs", ""),
     "error": ("error, rad", "error_rad"),
     "effort": ("effort, N m", "effort_nm"),
     "stiffness": ("stiffness at the hand, N/m", "stiffness_n_m"),
 }
-"""For each figure its label and its quantity. The share of stable runs has no quantity."""
+"""For each figure its label and its quantity. The judgement has no quantity."""
+JUDGEMENTS = {
+    Stability.NOT_STABLE: "#a23b53",
+    Stability.OPEN: "#e2c044",
+    Stability.SETTLED: "#8fb8de",
+    Stability.STABLE: "#1f5a99",
+}
+"""Colour of each judgement, from the worst to the best. The best ones are blue."""
 _WIDTH_IN = 7.0
 """Width of a figure, which is that of two columns of a paper, in inches."""
 _ROW_IN = 0.14
@@ -100,9 +110,13 @@ def draw_bench(results: BenchResults, name: str) -> Figure:
     label, quantity = FIGURES_OF_BENCH[name]
     links = results.plan.links
     fields = _collect_fields(results, name)
-    is_share = not quantity
-    task_fields = list(fields.values())
-    scale = Normalize(0.0, 1.0) if is_share else _choose_scale(task_fields)
+    is_judgement = not quantity
+    if is_judgement:
+        scale = Normalize(-0.5, len(JUDGEMENTS) - 0.5)
+        palette = ListedColormap(list(JUDGEMENTS.values()))
+    else:
+        scale = _choose_scale(list(fields.values()))
+        palette = colormaps[_PALETTE]
     law_counts = [len(field) for field in fields.values()]
     panels_height = sum(_HEAD_IN / 2 + _ROW_IN * count for count in law_counts)
     size = make_print_size(_WIDTH_IN)
@@ -120,18 +134,23 @@ def draw_bench(results: BenchResults, name: str) -> Figure:
             image = axes.imshow(
                 field,
                 aspect="auto",
-                cmap=_PALETTE,
+                cmap=palette,
                 norm=scale,
                 interpolation="nearest",
             )
             _label_laws(axes, results, task)
-            _mark_cells(axes, results, task)
+            if not is_judgement:
+                _mark_cells(axes, results, task)
             axes.set_title(task)
         lowest_panel = panels[-1]
         columns = range(len(links))
         lowest_panel.set_xticks(columns, links, rotation=90, fontsize=_TEXT_PT)
-        # All panels have the same scale, so the last image stands for all of them.
-        figure.colorbar(image, ax=list(panels), label=label, fraction=0.03)
+        if is_judgement:
+            entries = [Patch(color=colour, label=text) for text, colour in JUDGEMENTS.items()]
+            figure.legend(handles=entries[::-1], loc="outside upper center", ncols=len(entries))
+        else:
+            # All panels have the same scale, so the last image stands for all of them.
+            figure.colorbar(image, ax=list(panels), label=label, fraction=0.03)
     return figure
 
 
@@ -174,7 +193,7 @@ def _collect(results: BenchResults, task: str, quantity: str) -> Array:
     Args:
         results: The results of the suite.
         task: The task of the panel.
-        quantity: The quantity. Empty for the share of stable runs.
+        quantity: The quantity. Empty for the judgement.
 
     Returns:
         The numbers, shape (laws, links). A missing number is NaN.
@@ -194,17 +213,17 @@ def _collect(results: BenchResults, task: str, quantity: str) -> Array:
 
 
 def _compute_number(result: BenchCellResult, quantity: str) -> float | None:
-    """Computes the number of a cell: the mean of a quantity, or the share of stable runs.
+    """Computes the number of a cell: the mean of a quantity, or the place of its judgement.
 
     Args:
         result: Result of the cell.
-        quantity: The quantity. Empty for the share of stable runs.
+        quantity: The quantity. Empty for the judgement, whose place in `JUDGEMENTS` counts.
 
     Returns:
         The number. None if the runs lack the quantity.
     """
     if not quantity:
-        return result.stable / len(result.runs)
+        return list(JUDGEMENTS).index(result.judgement)
     mean = result.compute_mean(quantity)
     return mean.mean if isinstance(mean, MeanInterval) else mean
 

@@ -294,13 +294,15 @@ _ALL_LAWS = {"three": LAWS_OF_ANY, "two": LAWS_OF_TWO}
 _GRID = tuple(name for name in LINKS if name.startswith("rtt"))
 _LOSSY = ("rtt68-loss50", "rtt136-loss50", "rtt544-loss50")
 _COARSE = tuple(name for name in LINKS if "-loss" not in name or name in _LOSSY)
+FULL_SEEDS = 4
+"""Runs over a random link in the large studies: two cores then take less than 90 minutes."""
 STUDIES = {
     "full": BenchStudy(
         about="all laws in all tasks",
         tasks=tuple(TASKS),
         laws=_ALL_LAWS,
         links=_COARSE,
-        seeds=20,
+        seeds=FULL_SEEDS,
     ),
     "small": BenchStudy(
         about="all laws in all tasks, over three links",
@@ -316,7 +318,7 @@ STUDIES = {
         tasks=("free", "contact"),
         laws={"level": ("wave", "smith", "sync", "adaptive", "p_d", "pd_d", "lee_spong")},
         links=_GRID,
-        seeds=20,
+        seeds=FULL_SEEDS,
     ),
 }
 
