@@ -95,7 +95,7 @@ STATED: list[tuple[str, str, float, float]] = [
     ("twins.md", "a run within 1e-7 of its records has twins", 1e-7, twins.SAME_RUN),
     ("twins.md", "A difference below 1e-12 is rounding", 1e-12, twins.SMALLEST),
     ("stability.md", "(`FLOOR_RAD`, 1e-12)", 1e-12, envelope_trend.FLOOR_RAD),
-    ("definitions.md", "exceeds 0.01 rad", 0.01, site_signals.SETTLED_ERROR_RAD),
+    ("data/summary-numbers.csv", "exceeds 0.01 rad", 0.01, site_signals.SETTLED_ERROR_RAD),
     ("design.md", "at most 200 ppm", 200.0, timing.SLEW_LIMIT / 1e3),
     ("design.md", "more than 10 s ahead", 10, link.AHEAD_LIMIT_S),
     ("session-protocol.md", "an epoch 500 ms ahead", 500, session.EPOCH_AHEAD_NS / 1e6),
