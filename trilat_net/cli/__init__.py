@@ -65,7 +65,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
     help="Two people, one remote arm, and a network with delays: live, simulated, or again "
     "from the log.",
-    epilog="Start with: trilat demo paper\n\nDocs: docs/first-hour.md, docs/commands.md",
+    epilog="Start with: trilat live play\n\nDocs: docs/first-hour.md, docs/commands.md",
 )
 
 
