@@ -362,3 +362,14 @@ def test_every_test_that_the_security_page_names_is_there() -> None:
     assert len(named) > 20
     for file, name in named:
         assert f"def {name}(" in (ROOT / file).read_text(encoding="utf-8"), (file, name)
+
+
+def test_a_link_that_names_a_page_leads_to_it() -> None:
+    pattern = re.compile(r"\[([\w./-]+\.md)\]\(([^)#]+\.md)[^)]*\)")
+    wrong = [
+        (page.name, label, target)
+        for page in (ROOT / "docs").rglob("*.md")
+        for label, target in pattern.findall(page.read_text(encoding="utf-8"))
+        if Path(label).name != Path(target).name
+    ]
+    assert wrong == []

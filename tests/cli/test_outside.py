@@ -1,5 +1,6 @@
 """Laws and arms from outside, by commands: what works, and one sentence where it does not."""
 
+import csv
 import re
 import shlex
 from pathlib import Path
@@ -15,6 +16,7 @@ from trilat_net.log.log_reader import open_log
 LAWS = Path(__file__).parents[1] / "laws.py"
 DOC = Path(__file__).parents[2] / "docs" / "own-controller.md"
 INTERFACE = DOC.with_name("law-interface.md")
+INPUTS = DOC.parent / "data" / "law-inputs.csv"
 FAILING = ("--set", "sites.s.control.law=tests.laws:Failing", "--set", "sites.s.control.at=40")
 SHORT = ("--duration", "0.1")
 
@@ -69,12 +71,11 @@ def test_law_of_page_holds_arms_together_as_it_says(
 def test_what_page_says_of_law_is_what_law_gets() -> None:
     from trilat_net.core.user_law import LawContext, LawInput
 
-    page = INTERFACE.read_text(encoding="utf-8")
-    rows = dict(
-        re.findall(r"^\| `(LawContext|LawInput)`, [^|]*\| (.*) \|$", page, re.MULTILINE)
-    )
+    with INPUTS.open(newline="", encoding="utf-8") as stream:
+        rows = [(row["object"], row["field"]) for row in csv.DictReader(stream)]
+    assert f"(data/{INPUTS.name})" in INTERFACE.read_text(encoding="utf-8")
     for kind in (LawContext, LawInput):
-        assert set(re.findall(r"`(\w+)`", rows[kind.__name__])) == set(kind._fields)
+        assert [field for name, field in rows if name == kind.__name__] == list(kind._fields)
 
 
 @pytest.fixture
