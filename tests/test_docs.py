@@ -205,8 +205,18 @@ STATED: list[tuple[str, str, float, float]] = [
         2e-4,
         certificates.BROKEN_BALANCE_SHARE,
     ),
-    ("certificate-energy.md", "less than 1e-3 is unexplained", 1e-3, certificates.CLEAR_BREAK_SHARE),
-    ("certificate-premises.md", "up to 1e-4 of the largest energy", 1e-4, premises.SAMPLING_RISE_SHARE),
+    (
+        "certificate-energy.md",
+        "less than 1e-3 is unexplained",
+        1e-3,
+        certificates.CLEAR_BREAK_SHARE,
+    ),
+    (
+        "certificate-premises.md",
+        "up to 1e-4 of the largest energy",
+        1e-4,
+        premises.SAMPLING_RISE_SHARE,
+    ),
     (
         "certificate-premises.md",
         "more than 1e-2 of the largest energy",

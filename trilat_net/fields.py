@@ -283,6 +283,10 @@ def reword_problem(problem: str) -> str:
         The reworded message. A message without terms of msgspec is returned unchanged.
     """
     replacements = (
+        (" | null", ""),
+        ("`float`", "a number"),
+        ("`int`", "a whole number"),
+        ("`bool`", "true or false"),
         ("`", ""),
         ("Expected ", "expected "),
         ("array", "list"),
@@ -290,6 +294,8 @@ def reword_problem(problem: str) -> str:
     )
     for old, new in replacements:
         problem = problem.replace(old, new)
+    if problem.endswith("number, got text"):
+        problem += ": write it without quotes and unit, which the key's name states"
     return problem
 
 

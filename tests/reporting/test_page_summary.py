@@ -53,6 +53,7 @@ def test_stable_run_names_its_proof() -> None:
     html = verdict_text(certificate)
     assert '<strong class="chip good">Stable</strong> A proof holds for this loop' in html
     assert "exact roots, slowest -0.5 /s." in html
+    assert "small motions near the final pose" in html
     assert "the arms were at rest and agreed" in html
 
 

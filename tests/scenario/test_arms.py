@@ -95,7 +95,7 @@ def test_shipped_arms_weigh_and_reach_what_their_makers_say() -> None:
             "arm.payload_inertia_kg_m2",
             "sum of the other two",
         ),
-        ({"arm.payload_kg": "x"}, "arm.payload_kg", "expected float, got text"),
+        ({"arm.payload_kg": "x"}, "arm.payload_kg", "expected a number, got text"),
         ({"arm.payload_kg": -1.0}, "arm.payload_kg", ">= 0"),
         ({"arm.tip": "wrist"}, "arm.tip", "did you mean 'wrist_3_link'"),
         ({"arm.base": "bas"}, "arm.base", "did you mean 'base'"),

@@ -262,9 +262,9 @@ def test_a_mass_of_zero_leaves_a_link_out() -> None:
         (3, "links", "must be a table"),
         ({"finger": {"mass": 1.0}}, "links.finger.mass", "did you mean 'mass_kg'"),
         ({"finger": {"mass_kg": -1.0}}, "links.finger.mass_kg", ">= 0"),
-        ({"finger": {"mass_kg": "x"}}, "links.finger.mass_kg", "expected float"),
+        ({"finger": {"mass_kg": "x"}}, "links.finger.mass_kg", "expected a number"),
         ({"finger": {"com_m": [1.0, 2.0]}}, "links.finger.com_m", "length >= 3"),
-        ({"finger": {"com_m": [1.0, "x", 0.0]}}, "links.finger.com_m[1]", "expected float"),
+        ({"finger": {"com_m": [1.0, "x", 0.0]}}, "links.finger.com_m[1]", "expected a number"),
         ({"finger": {"inertia_kg_m2": [1.0] * 3}}, "links.finger.inertia_kg_m2", "length >= 6"),
         (
             {"finger": {"inertia_kg_m2": [1.0, 0.0, 1.0, 0.0, 0.0, 3.0]}},

@@ -5,6 +5,7 @@ move the arms. In virtual time, the program computes the run as fast as it can, 
 arms and delays and without a network. The log is the MCAP file with all results of the run.
 """
 
+import shlex
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
@@ -64,6 +65,7 @@ def sim_command(
         terminal.print_json(open_log(path).to_dict())
     else:
         terminal.print_text(f"{path}: {chosen.duration_s:g} s of {', '.join(chosen.names)}")
+        terminal.print_text(f"next: trilat report {shlex.quote(str(path))}")
 
     if not stayed_in_limits:
         remedy = ""

@@ -47,6 +47,11 @@ _MEANINGS = {
     Stability.OPEN: "Nothing decides whether this loop is stable",
 }
 """What each judgement means."""
+_ROOTS_AND_THEOREM = (
+    "This proof is about small motions near the final pose. The paper's theorem, which is "
+    "examined below, is another proof, and this one does not need it."
+)
+"""What readers must know if the loop has stable roots, but not all premises of the theorem."""
 _MARKS = {
     Stability.STABLE: "good",
     Stability.SETTLED: "good",
@@ -79,6 +84,8 @@ def render_verdict(log: Log, certificate: Certificate, findings: Sequence[Findin
     word = certificate.stability.value
     css_class = _MARKS[certificate.stability]
     sentences = [_explain_end(log, certificate)]
+    if certificate.stability is Stability.STABLE and "roots" in certificate.decision.rests_on:
+        sentences.append(_ROOTS_AND_THEOREM)
     if any(finding.judged and not finding.passed for finding in findings):
         css_class = "bad" if css_class == "bad" else "warn"
         sentences.append("The log failed a check, so that the judgement may be wrong.")
