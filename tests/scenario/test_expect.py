@@ -39,7 +39,7 @@ def test_every_other_key_asks_something_whatever_its_value(keys: dict[str, Any])
     ("key", "value", "facts"),
     [
         ("stabel", True, ["expect.stabel", "did you mean 'stable'"]),
-        ("stable", 1, ["expect.stable", "expected bool"]),
+        ("stable", 1, ["expect.stable", "expected true or false"]),
         ("rms_error_max_rad", -0.1, ["expect.rms_error_max_rad"]),
         ("synchronised_rad", 0.0, ["expect.synchronised_rad"]),
         ("late_samples_max", 1.5, ["expect.late_samples_max"]),

@@ -457,9 +457,9 @@ def tune_command(
     """Finds the largest gains for an arm on links with a delay.
 
     The gains keep a margin to the stability limit, and are tested in simulation. Two or three
-    such arms follow one another over links with that delay in both directions (docs/arm-gains.md).
-    Paste the last line of the output into a scenario. Exit code 0: all simulated runs behave as
-    the linear loop predicts. 1: at least one run does not.
+    such arms follow one another over links with that delay in both directions
+    (docs/arm-gains.md). Paste the last line of the output into a scenario. Exit code 0: all
+    simulated runs behave as the linear loop predicts. 1: at least one run does not.
 
     Options:
         delay: One-way delay of the links, for example 40ms. The delays can also come from a
