@@ -101,7 +101,8 @@ def _print_skeleton(kind: str, written: list[Path], key: str, check: str) -> Non
         kind: "law", "hand" or "plant".
         written: Path of the file, and path of its test.
         key: Override that makes a scenario use the class, with {} in place of the class.
-        check: The command that examines the log of the run, as in "certify".
+        check: The command that examines the log of the run, as in "certify {log}", with {log}
+            and {file} in place of the names of the log and of the file.
     """
     from ..scenario.skeletons import name_skeleton_class
 
@@ -113,7 +114,8 @@ def _print_skeleton(kind: str, written: list[Path], key: str, check: str) -> Non
         f"Change the {kind}, {change_folder}run"
     )
     terminal.print_text(f"  trilat sim paper --set {key.format(code)} -o {file.stem}.mcap")
-    terminal.print_texts([f"  trilat {check} {file.stem}.mcap", f"  pytest {test.name}"])
+    terminal.print_text(f"  trilat {check.format(log=f'{file.stem}.mcap', file=file.name)}")
+    terminal.print_text(f"  pytest {test.name}   (pip install pytest)")
 
 
 @options.command("mylaw.py", page="docs/own-controller.md")
@@ -124,7 +126,8 @@ def new_law_command(
     """Creates a working, commented control law to start from, and its test."""
     from ..scenario.skeletons import new_law
 
-    _print_skeleton("law", new_law(file, force=force), "control.law={}", "certify")
+    check = "certify {log} --law {file}"
+    _print_skeleton("law", new_law(file, force=force), "control.law={}", check)
 
 
 @options.command("myhand.py", page="docs/policies.md")
@@ -136,7 +139,7 @@ def new_hand_command(
     from ..scenario.skeletons import new_hand
 
     key = """'sites.m2.hands=[{{kind="own", class="{}"}}]'"""
-    _print_skeleton("hand", new_hand(file, force=force), key, "report")
+    _print_skeleton("hand", new_hand(file, force=force), key, "report {log}")
 
 
 @options.command("myplant.py", page="docs/own-plant.md")
@@ -147,7 +150,7 @@ def new_plant_command(
     """Creates a working plant (a model of an arm) to start from, and its test."""
     from ..scenario.skeletons import new_plant
 
-    _print_skeleton("plant", new_plant(file, force=force), "sites.s.plant={}", "verify")
+    _print_skeleton("plant", new_plant(file, force=force), "sites.s.plant={}", "verify {log}")
 
 
 @options.command(

@@ -139,7 +139,8 @@ def certify_command(
         bool,
         flag(
             "--own-laws",
-            "Run the code of imported control laws to compute the energies that they declare.",
+            "Run the control laws whose files you permitted earlier with --remember. "
+            "Else permit them with --law FILE.",
         ),
     ] = False,
     twins: Annotated[
@@ -171,8 +172,8 @@ def certify_command(
     important reasons: the energy function V of the stability proof, its energy balance, and the
     roots of the linearised loop at the final pose. With --all it also prints the conditions of
     the proof (premises) and the energies. It executes the run again together with twins, which
-    are repetitions with a small push. The code of imported control laws runs only with --law or
-    --own-laws. docs/certificate.md explains the verdicts and leads to every term and key.
+    are repetitions with a small push. The code of imported control laws runs only with --law,
+    or with --own-laws if it was remembered. docs/certificate.md explains the verdicts and leads to every term and key.
 
     Stable: a proof exists for this loop. Settled: the run came to rest and every push died
     away, but nothing proves more. Exit code 0: stable. 1: settled, not stable (bounded

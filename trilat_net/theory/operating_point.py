@@ -352,7 +352,7 @@ def _explain_missing_gains(law: Any) -> str:
     if isinstance(law, ImportedLaw):
         return (
             f"{law.code} is known by its code only, which may not run here; "
-            "trilat linear and trilat certify --own-laws run it"
+            "trilat linear and trilat certify --law FILE run it"
         )
     others = (
         "adaptive, adaptive_box, p_d, pd_d, p_f and others have one, "
