@@ -1,5 +1,6 @@
 """`trilat new law`, `hand`, `plant`: skeletons that work, and their tests, which pass."""
 
+import json
 import shlex
 import subprocess
 import sys
@@ -27,7 +28,7 @@ def test_the_skeleton_is_a_law_and_replaces_nothing(
     (tmp_path / "soft_law.py").unlink()
     trilat("new", "law", "soft_law.py", cwd=tmp_path).refuses("test_soft_law.py", "exists")
     trilat("new", "law", "numpy.py", cwd=tmp_path).refuses("Python already has a module numpy")
-    trilat("new", "law", "my-law.py", cwd=tmp_path).refuses("as in mylaw.py or my_law.py")
+    trilat("new", "law", "my-law.py", cwd=tmp_path).refuses("such as mylaw.py or my_law.py")
 
 
 @pytest.mark.long
@@ -42,6 +43,19 @@ def test_the_test_of_the_skeleton_passes(tmp_path: Path) -> None:
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert "1 failed" in done.stdout, "a memory that does not say all is found out"
     assert "FAILED test_stiff.py::test_its_memory_is_all_that_it_keeps" in done.stdout
+
+
+@pytest.mark.long
+def test_report_judges_a_permitted_law_as_certify_does(tmp_path: Path) -> None:
+    made = trilat("new", "law", "mine.py", cwd=tmp_path)
+    assert "trilat certify mine.mcap --law mine.py" in made.out
+    run = ["sim", "two_sites", "--set", "control.law=mine:Mine", "--duration", "6"]
+    trilat(*run, "-o", "mine.mcap", cwd=tmp_path).succeeds()
+    allowed = ["mine.mcap", "--law", "mine.py", "--json"]
+    certified = json.loads(trilat("certify", *allowed, cwd=tmp_path).out)
+    reported = json.loads(trilat("report", *allowed, cwd=tmp_path).out)
+    assert certified["stability"] in ("settled", "not stable")
+    assert reported["verdict"].startswith(certified["stability"])
 
 
 @pytest.mark.parametrize(

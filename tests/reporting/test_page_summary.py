@@ -142,3 +142,13 @@ def test_log_without_records_has_dashes() -> None:
     empty = logs.rewritten(logs.simulated("paper"), lambda _: False, finished=False)
     html = render_key_numbers(empty, summarise_run(empty))
     assert html.count("<dd>–</dd>") == 4
+
+
+def test_end_error_of_a_pushed_arm_says_so() -> None:
+    log = logs.simulated("paper")
+    pushed = logs.rewritten(log, change=lambda row: logs.replaced(row, tau_x=[1.0, 0.0]))
+    html = render_key_numbers(pushed, summarise_run(pushed))
+    assert "which a hand or a wall still pushes" in html
+    assert "which a hand or a wall still pushes" not in render_key_numbers(
+        log, summarise_run(log)
+    )

@@ -12,6 +12,7 @@ Invariant:
     - Every text that comes from a log is escaped.
 """
 
+import math
 from collections.abc import Sequence
 from html import escape
 from typing import NamedTuple
@@ -35,6 +36,8 @@ from .page_html import NO_NUMBER, format_cell, join_words, render_details
 from .result_text import escape_text
 from .style import typeset
 
+_FAR_SMALLER = 0.1
+"""Share of the largest error below which the errors of other sites are stated too."""
 _MAX_ALARMS = 8
 """Largest number of alarms at the top of the page."""
 _SEVERE_ALARMS = ("FAULT", "STOPPED")
@@ -151,14 +154,20 @@ def _explain_end(log: Log, certificate: Certificate) -> str:
 
 def _explain_remaining_error(log: Log) -> str:
     """Returns which sites hands or walls still push at the end, as a clause. Empty if none."""
+    pushed = _list_pushed_sites(log)
+    if not pushed:
+        return ""
+    return f": hands or walls still push {join_words(pushed)}"
+
+
+def _list_pushed_sites(log: Log) -> list[str]:
+    """Lists the sites that hands or walls still push in the last record."""
     pushed = []
     for site in log.sites:
         records = log[site]
         if len(records) and np.abs(records.tau_x[-1]).max() > FORCE_NM:
             pushed.append(site)
-    if not pushed:
-        return ""
-    return f": hands or walls still push {join_words(pushed)}"
+    return pushed
 
 
 class _KeyNumber(NamedTuple):
@@ -238,12 +247,37 @@ def _find_largest_error(log: Log) -> _KeyNumber:
 
 
 def _describe_last_error(log: Log, facts: JsonObject) -> _KeyNumber:
-    """Returns the largest error of the last second."""
+    """Returns the largest error of the last second, with its site.
+
+    If somebody holds this site away from the others, its error says nothing about how well the
+    others follow. Therefore the error of the others is stated if it is far smaller.
+    """
     name = "Error at the end"
     error = facts["max_error_end_rad"]
     if error is None:
         return _KeyNumber(name, NO_NUMBER, "no record")
-    return _KeyNumber(name, f"{error:.3g} {shared_unit(log)}", "largest in the last second")
+
+    errors = _measure_last_errors(log)
+    worst = max(errors, key=lambda site: errors[site])
+    detail = f"of {worst}, in the last second"
+    if worst in _list_pushed_sites(log):
+        detail = f"of {worst}, which a hand or a wall still pushes"
+    largest_other = max((errors[site] for site in errors if site != worst), default=math.inf)
+    if largest_other < _FAR_SMALLER * errors[worst]:
+        detail += f"; of the others at most {largest_other:.2g}"
+    return _KeyNumber(name, f"{error:.3g} {shared_unit(log)}", detail)
+
+
+def _measure_last_errors(log: Log) -> dict[str, float]:
+    """Returns the largest error of each site in its last second of records."""
+    errors = {}
+    for site in log.sites:
+        records = log[site]
+        if len(records):
+            is_last = records.t_s > records.t_s[-1] - 1.0
+            last_errors = largest_magnitude(joint_errors(records))[is_last]
+            errors[site] = float(np.nanmax(last_errors, initial=0.0))
+    return errors
 
 
 def _describe_settling(log: Log, facts: JsonObject) -> _KeyNumber:
