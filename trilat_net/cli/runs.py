@@ -173,7 +173,8 @@ def certify_command(
     roots of the linearised loop at the final pose. With --all it also prints the conditions of
     the proof (premises) and the energies. It executes the run again together with twins, which
     are repetitions with a small push. The code of imported control laws runs only with --law,
-    or with --own-laws if it was remembered. docs/certificate.md explains the verdicts and leads to every term and key.
+    or with --own-laws if it was remembered. docs/certificate.md explains the verdicts and leads
+    to every term and key.
 
     Stable: a proof exists for this loop. Settled: the run came to rest and every push died
     away, but nothing proves more. Exit code 0: stable. 1: settled, not stable (bounded
