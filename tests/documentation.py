@@ -106,7 +106,6 @@ ELSEWHERE = {
     "docs/network-check.md: trilat doctor": "tests/sites/test_doctor.py",
     "docs/network.md: trilat site m2 --scenario glide.toml": "tests/live/test_returning.py",
     "docs/own-controller.md: trilat sim paper": "tests/cli/test_outside.py",
-    "docs/policies.md: trilat hand": "tests/live/test_own_hands.py",
     "docs/recording.md: trilat record": "tests/live/test_recording.py",
     "docs/ros2.md: trilat": "tests/live/test_ros2.py",
     "docs/two-people.md: trilat experiment new": "tests/cli/test_experiments.py",
