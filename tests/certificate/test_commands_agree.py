@@ -29,8 +29,8 @@ THEOREM = "the theorem, all of whose premises hold"
 """The only basis that needs all records of a run, so that a sweep and a bench cannot name it."""
 SAME_RATE = 1e-6
 """Largest difference of the rates of one root, relative and in 1/s: 2 or 6 roots are computed."""
-SIMPLE_SEEDS = (0, 3, 5, 13, 24, 31, 35, 2001, 2004, 2013)
-"""Seeds for `make test`: noise, growth, an adaptive law, a long period, a wall, four channels."""
+SIMPLE_SEEDS = (0, 5, 13, 31, 2001, 2013)
+"""Seeds for `make test`: noise, growth, an adaptive law, a long period, a wall."""
 BLOCK = 50
 SEEDS = (*range(250), *range(2000, 2250))
 BLOCKS = [SEEDS[first : first + BLOCK] for first in range(0, len(SEEDS), BLOCK)]
