@@ -146,9 +146,10 @@ def test_log_without_records_has_dashes() -> None:
 
 def test_end_error_of_a_pushed_arm_says_so() -> None:
     log = logs.simulated("paper")
-    pushed = logs.rewritten(log, change=lambda row: logs.replaced(row, tau_x=[1.0, 0.0]))
-    html = render_key_numbers(pushed, summarise_run(pushed))
-    assert "which a hand or a wall still pushes" in html
-    assert "which a hand or a wall still pushes" not in render_key_numbers(
-        log, summarise_run(log)
-    )
+    words = "which a hand or a wall still pushes"
+    for torque_nm, is_pushed in ((1.0, True), (0.0, False)):
+        run = logs.rewritten(
+            log,
+            change=lambda row, t=torque_nm: logs.replaced(row, tau_x=[t, 0.0]),  # type: ignore[misc]
+        )
+        assert (words in render_key_numbers(run, summarise_run(run))) == is_pushed
