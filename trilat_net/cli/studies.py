@@ -717,7 +717,11 @@ def experiment_new_command(
     from ..studies.experiment.experiment_run import new_experiment
 
     new_experiment(file, pair=pair, force=force)
-    terminal.print_text(f"{file}: a protocol; run it with: trilat experiment run {file}")
+    people = f"trilat experiment run {file} --live"
+    models = f"trilat experiment run {file}"
+    terminal.print_text(
+        f"{file}: a protocol; with people: {people}; with models of people: {models}"
+    )
 
 
 @options.command("reaching.toml", page="docs/experiment-protocol.md")

@@ -87,7 +87,9 @@ def render_verdict(log: Log, certificate: Certificate, findings: Sequence[Findin
     word = certificate.stability.value
     css_class = _MARKS[certificate.stability]
     sentences = [_explain_end(log, certificate)]
-    if certificate.stability is Stability.STABLE and "roots" in certificate.decision.rests_on:
+    basis = certificate.decision.rests_on
+    is_proved_by_roots = "roots" in basis and "theorem" not in basis
+    if certificate.stability is Stability.STABLE and is_proved_by_roots:
         sentences.append(_ROOTS_AND_THEOREM)
     if any(finding.judged and not finding.passed for finding in findings):
         css_class = "bad" if css_class == "bad" else "warn"
