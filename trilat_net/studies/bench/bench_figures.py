@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.colors import ListedColormap, LogNorm, Normalize
+from matplotlib.colors import Colormap, ListedColormap, LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
@@ -113,7 +113,7 @@ def draw_bench(results: BenchResults, name: str) -> Figure:
     is_judgement = not quantity
     if is_judgement:
         scale = Normalize(-0.5, len(JUDGEMENTS) - 0.5)
-        palette = ListedColormap(list(JUDGEMENTS.values()))
+        palette: Colormap = ListedColormap(list(JUDGEMENTS.values()))
     else:
         scale = _choose_scale(list(fields.values()))
         palette = colormaps[_PALETTE]
