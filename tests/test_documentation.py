@@ -200,8 +200,8 @@ SHORTER = {
     "compare": ["--law", "p_d,adaptive", "--budget", "4", "--duration", "2", "--jobs", "1"]
 }
 """What is added to a command that else would take minutes."""
-OF_RUNS = {"docs/metrics.md": "paper", "docs/rerun.md": "paper"}
 OF_RUNS = {
+    "docs/metrics.md": "paper",
     "docs/json.md": "free",
     "docs/log.md": "free",
     "docs/log-checks.md": "paper",
