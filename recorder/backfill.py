@@ -235,13 +235,12 @@ class GapRepair:
             last_missing: Last number of the first gap.
             limit: Highest number that the request may contain.
         """
-        next_gap: tuple[int, int] | None = (limit, last_missing)
-        while next_gap is not None and next_gap[0] <= limit:
-            last_missing = next_gap[1]
-            if last_missing >= limit:
-                return limit
+        while last_missing < limit:
             next_gap = account.find_requestable_gap(last_missing + 1)
-        return last_missing
+            if next_gap is None or next_gap[0] > limit:
+                break
+            last_missing = next_gap[1]
+        return min(last_missing, limit)
 
     def _receive_reply(
         self, open_request: _OpenRequest, now_ns: int

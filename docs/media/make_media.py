@@ -66,13 +66,13 @@ def make_picture(picture: Picture, folder: Path) -> Path:
         folder: Folder in which the new folder is made.
     """
     # The first part of the path names the picture, and the rest is what the commands write.
-    place = folder / picture.path.parts[0]
-    place.mkdir()
+    work_folder = folder / picture.path.parts[0]
+    work_folder.mkdir()
     programs = Path(sys.executable).parent
     environment = {**os.environ, "PATH": f"{programs}{os.pathsep}{os.environ['PATH']}"}
     subprocess.run(
         ["sh", "-e", "-c", picture.commands],
-        cwd=place,
+        cwd=work_folder,
         env=environment,
         stdin=subprocess.DEVNULL,
         check=True,
@@ -91,11 +91,11 @@ def main() -> None:
         for picture in read_gallery(PAGE.read_text(encoding="utf-8")):
             if wanted and picture.path.parts[0] not in wanted:
                 continue
-            made = make_picture(picture, Path(folder))
-            kept = PICTURES / picture.path
-            kept.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(made, kept)
-            print(f"{picture.title}: {kept.stat().st_size / 1000:.0f} kB", flush=True)
+            new_path = make_picture(picture, Path(folder))
+            kept_path = PICTURES / picture.path
+            kept_path.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(new_path, kept_path)
+            print(f"{picture.title}: {kept_path.stat().st_size / 1000:.0f} kB", flush=True)
 
 
 if __name__ == "__main__":

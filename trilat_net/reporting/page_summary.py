@@ -87,9 +87,7 @@ def render_verdict(log: Log, certificate: Certificate, findings: Sequence[Findin
     word = certificate.stability.value
     css_class = _MARKS[certificate.stability]
     sentences = [_explain_end(log, certificate)]
-    basis = certificate.decision.rests_on
-    is_proved_by_roots = "roots" in basis and "theorem" not in basis
-    if certificate.stability is Stability.STABLE and is_proved_by_roots:
+    if certificate.stability is Stability.STABLE and _is_proved_by_roots_alone(certificate):
         sentences.append(_ROOTS_AND_THEOREM)
     if any(finding.judged and not finding.passed for finding in findings):
         css_class = "bad" if css_class == "bad" else "warn"
@@ -98,6 +96,12 @@ def render_verdict(log: Log, certificate: Certificate, findings: Sequence[Findin
     text = escape(typeset(describe_basis(certificate)))
     more = escape(" ".join(sentences))
     return f'<div id="verdict" class="{css_class}"><p>{chip} {text}</p><p>{more}</p></div>'
+
+
+def _is_proved_by_roots_alone(certificate: Certificate) -> bool:
+    """Returns True if neither the theorem nor a condition of the law is among the proofs."""
+    roots = certificate.roots
+    return roots is not None and certificate.decision.rests_on == roots.describe_as_basis()
 
 
 def describe_basis(certificate: Certificate) -> str:
@@ -259,7 +263,10 @@ def _describe_last_error(log: Log, facts: JsonObject) -> _KeyNumber:
     if error is None:
         return _KeyNumber(name, NO_NUMBER, "no record")
 
-    errors = _measure_last_errors(log)
+    errors = {}
+    for site, numbers in facts["sites"].items():
+        if numbers["max_error_end_rad"] is not None:
+            errors[site] = numbers["max_error_end_rad"]
     worst = max(errors, key=lambda site: errors[site])
     detail = f"of {worst}, in the last second"
     if worst in _list_pushed_sites(log):
@@ -268,18 +275,6 @@ def _describe_last_error(log: Log, facts: JsonObject) -> _KeyNumber:
     if largest_other < _FAR_SMALLER * errors[worst]:
         detail += f"; of the others at most {largest_other:.2g}"
     return _KeyNumber(name, f"{error:.3g} {shared_unit(log)}", detail)
-
-
-def _measure_last_errors(log: Log) -> dict[str, float]:
-    """Returns the largest error of each site in its last second of records."""
-    errors = {}
-    for site in log.sites:
-        records = log[site]
-        if len(records):
-            is_last = records.t_s > records.t_s[-1] - 1.0
-            last_errors = largest_magnitude(joint_errors(records))[is_last]
-            errors[site] = float(np.nanmax(last_errors, initial=0.0))
-    return errors
 
 
 def _describe_settling(log: Log, facts: JsonObject) -> _KeyNumber:
