@@ -16,9 +16,9 @@ import time
 
 import numpy as np
 
-from sites.realtime import FIFO_PRIORITY
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.net.timing import find_turn_ns
+from trilat_net.process import FIFO_PRIORITY
 
 from .sessions import SITES, paper
 

@@ -87,6 +87,7 @@ def main() -> None:
     robot = Robot(scenario, options.site)
     session = options.session or scenario.name
     with tn.ArmClient.connected(session, options.site, [options.connect]) as client:
+        print(f"scheduling: {tn.request_real_time_scheduling()}", flush=True)
         next_s = time.monotonic()
         while not client.over:
             client.send(robot.q, robot.qd, robot.tau_x if options.sensor else ())

@@ -65,6 +65,7 @@ def main() -> None:
         options.session, options.site, connect=options.connect, source="haptic device"
     )
     with connected as hand:
+        trilat_net.request_real_time_scheduling()
         start = hand.pose
         start_s = time.monotonic()
         next_s = start_s

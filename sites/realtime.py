@@ -14,16 +14,10 @@ import ctypes
 import os
 import sys
 from collections.abc import Callable
-from contextlib import suppress
-from pathlib import Path
 
 from trilat_net import process
 from trilat_net.errors import count_nouns
 
-FIFO_PRIORITY = 50
-"""Priority of the thread of the loop with real-time scheduling (SCHED_FIFO)."""
-NICE = -10
-"""Nice value that is requested if real-time scheduling is not permitted."""
 SITES_PER_PROCESSOR = 2
 """Largest number of loops per processor that receive priority.
 
@@ -67,7 +61,9 @@ def prepare(cpu: int | None, sites: int = 1) -> dict[str, str]:
         "affinity": lambda: _set_affinity(cpu),
         "timer_slack": lambda: _call_libc("1 ns", "prctl", _PR_SET_TIMERSLACK, 1),
         "memory": lambda: _call_libc("locked", "mlockall", memory_flags),
-        "scheduling": _set_scheduling if has_room else describe_crowded_machine,
+        "scheduling": process.request_real_time_scheduling
+        if has_room
+        else describe_crowded_machine,
         "collector": _stop_collector,
     }
     # A setting that is refused or does not exist on this platform does not prevent the others.
@@ -114,50 +110,6 @@ def _call_libc(setting: str, function: str, *arguments: int) -> str:
         error_number = ctypes.get_errno()
         raise OSError(error_number, os.strerror(error_number))
     return setting
-
-
-def _set_scheduling() -> str:
-    """Requests real-time scheduling, or at least a better nice value.
-
-    Returns:
-        Description of the scheduling that was obtained.
-    """
-    try:
-        # All threads get real-time scheduling, and the thread of the loop the highest priority.
-        _set_threads(
-            lambda thread: os.sched_setscheduler(
-                thread, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY - 1)
-            )
-        )
-        calling_thread = 0
-        os.sched_setscheduler(calling_thread, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
-        return f"SCHED_FIFO {FIFO_PRIORITY}"
-    except (OSError, AttributeError):
-        pass  # not permitted, or not on this platform
-
-    try:
-        _set_threads(lambda thread: os.setpriority(os.PRIO_PROCESS, thread, NICE))
-        return f"nice {NICE} (SCHED_FIFO was not permitted)"
-    except (OSError, AttributeError):
-        return "normal (neither SCHED_FIFO nor a better nice value was permitted)"
-
-
-def _set_threads(change: Callable[[int], None]) -> None:
-    """Applies a change to this thread, and then to all other threads of the process.
-
-    All threads are changed, because a thread that waits for a processor may hold the
-    interpreter lock, for which the loop would have to wait.
-
-    Args:
-        change: Function that changes the thread of a given number. 0 is the calling thread.
-    """
-    change(0)
-    threads_folder = Path("/proc/self/task")  # Linux lists the threads of a process here
-    if not threads_folder.is_dir():
-        return
-    for thread in threads_folder.iterdir():
-        with suppress(ProcessLookupError):  # the thread has ended meanwhile
-            change(int(thread.name))
 
 
 def _stop_collector() -> str:

@@ -45,6 +45,7 @@ from trilat_net.net.messages import Event, Info, LinkStats
 from trilat_net.net.ros2_graph import Attachment, Refusals, Ros2Graph, TopicPublisher
 from trilat_net.net.zenoh_bus import RouterSilent
 from trilat_net.net.zenoh_config import BRIDGE
+from trilat_net.process import LOOP_NICE, raise_priority
 from trilat_net.scenario import Scenario, parse_embedded
 
 from .ros2_topics import RELIABLE, BridgeEnds, SiteTopics
@@ -945,6 +946,9 @@ def publish_session(
                 robot_context = open_robot(ends, site, robot, names)
                 robots[site] = stack.enter_context(robot_context)
             robots[site].armed = True
+        if robots:
+            # a site is in fault when its arm's measurements are delayed by 0.2 s
+            raise_priority(LOOP_NICE)
 
         running_info = await_site(ends, stopped, running=True)
         if running_info is None:

@@ -62,6 +62,7 @@ if _TYPE_CHECKING:
     from .net.member_keys import create_keys as create_keys
     from .net.member_keys import read_member_keys as read_member_keys
     from .net.member_keys import renew_keys as renew_keys
+    from .process import request_real_time_scheduling as request_real_time_scheduling
     from .reporting.figures.registry import figure as figure
     from .scenario import Scenario as Scenario
     from .scenario import list_shipped as list_shipped
@@ -114,6 +115,7 @@ _NAMES = {
     "trilat_net.log.session_check": "check_file",
     "trilat_net.net.arm_client": "ArmClient SwitchClient",
     "trilat_net.net.member_keys": "create_keys read_member_keys renew_keys",
+    "trilat_net.process": "request_real_time_scheduling",
     "trilat_net.reporting.figures.registry": "figure",
     "trilat_net.scenario": "Scenario list_shipped load_scenario read_template",
     "trilat_net.scenario.describe": "describe_scenario",

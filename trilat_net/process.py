@@ -31,6 +31,10 @@ from typing import Any
 
 from .errors import TrilatError
 
+FIFO_PRIORITY = 50
+"""Priority of the thread of a control loop with real-time scheduling (SCHED_FIFO)."""
+LOOP_NICE = -10
+"""Nice value of a control loop if real-time scheduling is not permitted."""
 _PARENT_POLL_S = 0.5
 """Period in which a worker process checks that its parent process still exists, in s."""
 
@@ -332,6 +336,54 @@ def join_arguments(arguments: Iterable[str]) -> str:
         needs_quotes = not re.fullmatch(r"[\w.:/\\=+-]+", escaped)
         texts.append(f'"{escaped}"' if needs_quotes else escaped)
     return " ".join(texts)
+
+
+def request_real_time_scheduling() -> str:
+    """Requests real-time scheduling for this process, or at least a better nice value.
+
+    Call it in a program that must exchange messages with a site in every period, such as the
+    driver of an arm or of a haptic device. On a busy machine its loop then still runs on time.
+    A loop that never sleeps would block a processor.
+
+    All threads of the process get real-time scheduling (SCHED_FIFO), and the calling thread the
+    highest priority. The other threads are included because one of them may hold the lock of the
+    interpreter, for which the calling thread would have to wait.
+
+    Returns:
+        Description of the scheduling that was obtained, for example "SCHED_FIFO 50".
+    """
+    try:
+        _change_threads(
+            lambda thread: os.sched_setscheduler(
+                thread, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY - 1)
+            )
+        )
+        calling_thread = 0
+        os.sched_setscheduler(calling_thread, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
+        return f"SCHED_FIFO {FIFO_PRIORITY}"
+    except (OSError, AttributeError):
+        pass  # not permitted, or not on this platform
+
+    try:
+        _change_threads(lambda thread: os.setpriority(os.PRIO_PROCESS, thread, LOOP_NICE))
+        return f"nice {LOOP_NICE} (SCHED_FIFO was not permitted)"
+    except (OSError, AttributeError):
+        return "normal (neither SCHED_FIFO nor a better nice value was permitted)"
+
+
+def _change_threads(change: Callable[[int], None]) -> None:
+    """Applies a change to this thread, and then to all other threads of the process.
+
+    Args:
+        change: Function that changes the thread of a given number. 0 is the calling thread.
+    """
+    change(0)
+    threads_folder = Path("/proc/self/task")  # Linux lists the threads of a process here
+    if not threads_folder.is_dir():
+        return
+    for thread in threads_folder.iterdir():
+        with suppress(ProcessLookupError):  # the thread has ended meanwhile
+            change(int(thread.name))
 
 
 def raise_priority(nice: int) -> bool:

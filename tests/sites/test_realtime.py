@@ -8,6 +8,7 @@ import sys
 import pytest
 
 from sites import realtime
+from trilat_net import process
 
 PROGRAM = """
 import json, os, sys
@@ -44,7 +45,8 @@ def test_every_step_says_what_it_obtained_and_pins_its_process() -> None:
 def test_a_processor_that_is_not_there_is_a_warning(
     cpu: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for step in ("_call_libc", "_set_scheduling", "_stop_collector"):
+    monkeypatch.setattr(process, "request_real_time_scheduling", lambda: "")
+    for step in ("_call_libc", "_stop_collector"):
         monkeypatch.setattr(realtime, step, lambda *_, **__: "")
     assert realtime.prepare(cpu)["affinity"].startswith("not obtained (")
 
@@ -73,7 +75,8 @@ def test_another_priority_is_better_than_none() -> None:
 def test_many_sites_leave_processors_to_recorders(
     sites: int, crowded: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for step in ("_call_libc", "_set_affinity", "_set_scheduling", "_stop_collector"):
+    monkeypatch.setattr(process, "request_real_time_scheduling", lambda: "as asked")
+    for step in ("_call_libc", "_set_affinity", "_stop_collector"):
         monkeypatch.setattr(realtime, step, lambda *_, **__: "as asked")
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     expected = "normal (5 sites share 2 processors)" if crowded else "as asked"
