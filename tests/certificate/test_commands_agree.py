@@ -26,7 +26,7 @@ DRAWN_S = 10.0
 SHIPPED_S = 8.0
 """Largest duration of the run of a shipped scenario."""
 THEOREM = "the theorem, all of whose premises hold"
-"""The only basis that needs all records of a run, so that a sweep and a bench cannot name it."""
+"""A basis that needs all records of a run. A sweep and a bench keep them only where nothing else decides."""
 SAME_RATE = 1e-6
 """Largest difference of the rates of one root, relative and in 1/s: 2 or 6 roots are computed."""
 SIMPLE_SEEDS = (0, 5, 13, 31, 2001, 2013)
@@ -46,6 +46,8 @@ class Statement(NamedTuple):
         roots: Verdict on small motions: "stable", "unstable", "at the edge", or empty.
         rate_per_s: Real part of the slowest root, in 1/s. None without roots.
         pushes: Growth of every push as (push, joint, trend, rate in 1/s). None without twins.
+        is_about_run: False if the command states that its verdict is about a rest to which the
+            run does not come.
     """
 
     command: str
@@ -54,16 +56,17 @@ class Statement(NamedTuple):
     roots: str = ""
     rate_per_s: float | None = None
     pushes: list[tuple[str, ...]] | None = None
+    is_about_run: bool = True
 
     @property
     def says_stable(self) -> bool:
         """True if the command says that the run or its small motions are stable."""
-        return (self.word or self.roots) == "stable"
+        return self.is_about_run and (self.word or self.roots) == "stable"
 
     @property
     def says_unstable(self) -> bool:
         """True if the command says the opposite."""
-        return (self.word or self.roots) in ("not stable", "unstable")
+        return self.is_about_run and (self.word or self.roots) in ("not stable", "unstable")
 
 
 def list_pushes(growth: TwinGrowth) -> list[tuple[str, ...]]:
@@ -72,6 +75,11 @@ def list_pushes(growth: TwinGrowth) -> list[tuple[str, ...]]:
         (push.push.name, push.joint, push.trend.name, f"{push.rate_per_s:.9g}")
         for push in growth.pushes
     ]
+
+
+def _without_theorem(rests_on: str) -> str:
+    """Returns a basis without the theorem that may precede it."""
+    return rests_on.removeprefix(THEOREM).removeprefix("; ")
 
 
 def judge(scenario: Scenario) -> list[Statement]:
@@ -86,27 +94,34 @@ def judge(scenario: Scenario) -> list[Statement]:
     certified = Statement(
         command="certify",
         word=decision.stability.value,
-        rests_on=decision.rests_on.removeprefix(THEOREM).removeprefix("; "),
+        rests_on=_without_theorem(decision.rests_on),
         roots=roots.verdict,
         rate_per_s=roots.rate_per_s,
         pushes=list_pushes(twins),
     )
     cell = classify_cell(scenario.text, scenario.duration_s)
-    swept = Statement("sweep", cell.stability, cell.rests_on)
+    swept = Statement("sweep", cell.stability, _without_theorem(cell.rests_on))
     suite_run = judge_bench_run(scenario, scenario.duration_s)
     benched = Statement(
         command="bench",
         word=suite_run.stability.value,
-        rests_on=suite_run.rests_on,
+        rests_on=_without_theorem(suite_run.rests_on),
         roots=suite_run.roots.verdict,
         rate_per_s=suite_run.roots.rate_per_s,
     )
     statements = [certified, swept, benched]
     if roots.verdict:
-        spectrum = analyse_linear_loop(scenario).decisive
-        root = spectrum.rightmost
-        rate_per_s = None if root is None else root.s.real
-        linear = Statement("linear", roots=spectrum.verdict, rate_per_s=rate_per_s)
+        analysis = analyse_linear_loop(scenario)
+        root = analysis.decisive.rightmost
+        linear = Statement(
+            command="linear",
+            roots=analysis.verdict,
+            rate_per_s=None if root is None else root.s.real,
+            is_about_run=not analysis.is_far_from_rest,
+        )
+        assert linear.is_about_run or any(
+            "away from this rest" in note for note in analysis.notes
+        )
         statements.append(linear)
     if not twins.why:
         growth = twin(log).growth
@@ -170,14 +185,16 @@ def test_commands_agree_on_drawn_runs(seeds: tuple[int, ...]) -> None:
 
     - Those that judge a whole run, `certify`, the report, `compare`, `sweep` and `bench`, give
       the same word and the same basis (`rests_on`). The report and `compare` call the function
-      of `certify` (see `test_commands_themselves_agree`). A sweep and a bench keep no records,
-      so that they cannot name the theorem, whose function V needs all of them: that phrase may
-      precede the common basis. A sweep is compared at its longest duration.
+      of `certify` (see `test_commands_themselves_agree`). Where roots or a law's own condition
+      decide, a sweep and a bench keep no records and so do not name the theorem, whose function
+      V needs all of them: that phrase may precede the common basis. A sweep is compared at its
+      longest duration.
     - `linear` states the verdict on small motions and the rate of the slowest root that the
       roots of the certificate have. If these do not exist, `linear` says why, or analyses
       another rest, and states which: it is not compared.
     - `twin` states the same growth of every push as the twins of the certificate.
-    - No command says "stable" where another one says "unstable" or "not stable".
+    - No command says "stable" where another one says "unstable" or "not stable". `linear` says
+      of a rest to which the run does not come that its verdict is not about the run.
     """
     disagreements = [
         text for seed in seeds for text in find_disagreements(str(seed), draw_short(seed))

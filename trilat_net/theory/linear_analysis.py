@@ -26,6 +26,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..analysis.stability_decision import NEAR_REST_RAD
 from ..core.vectors import Array
 from ..errors import ScenarioError, UsageError
 from ..execution.fused import FusedRun
@@ -75,6 +76,9 @@ class LinearAnalysis(Result):
             stable or unstable.
         ports: Analysis of the joints at which operators act, the haptic ports. None if it was
             not requested.
+        distance_rad: Largest difference between the last angle of a joint in the run and its
+            angle at the equilibrium, in rad. None if the equilibrium was not sought next to the
+            end of a run.
     """
 
     scenario: Scenario
@@ -86,6 +90,7 @@ class LinearAnalysis(Result):
     margin: DelayMargin
     scans: tuple[EdgeScan, ...] = ()
     ports: PortAnalysis | None = None
+    distance_rad: float | None = None
 
     @property
     def end_effectors(self) -> tuple[Array, ...]:
@@ -114,6 +119,11 @@ class LinearAnalysis(Result):
         return self.decisive.verdict
 
     @property
+    def is_far_from_rest(self) -> bool:
+        """True if the run ends so far from the equilibrium that the verdict is not about it."""
+        return self.distance_rad is not None and self.distance_rad > NEAR_REST_RAD
+
+    @property
     def notes(self) -> tuple[str, ...]:
         """Remarks for the user that qualify the verdict of the linear analysis.
 
@@ -121,6 +131,11 @@ class LinearAnalysis(Result):
         about which the arms are linearised, and the characteristic roots.
         """
         notes = [*self.conditions.notes, *self.rest.notes]
+        if self.is_far_from_rest:
+            notes.append(
+                f"the run of {self.scenario.duration_s:g} s ends {self.distance_rad:.3g} rad "
+                "away from this rest: the verdict does not say whether it gets there"
+            )
         if self.sampled is not None and self.sampled.verdict != self.continuous.verdict:
             decides = "ticks and delays decide"
             if self.sampled.span_s is None:
@@ -184,6 +199,7 @@ class LinearAnalysis(Result):
         values: dict[str, Any] = {
             "how": rest.how,
             "residual": rest.residual,
+            "run_ends_away_rad": self.distance_rad,
             "q_rad": q,
             "theta_hat": theta_hat,
         }
@@ -249,12 +265,15 @@ class _AnalysedLoop(NamedTuple):
         conditions: The numbers from which the loop is built.
         rest: The equilibrium.
         uses: The samples in use in every tick. None if the scenario determines them.
+        distance_rad: Distance of the end of the run from the equilibrium, in rad. None if the
+            equilibrium was not sought next to the end of a run.
     """
 
     scenario: Scenario
     conditions: OperatingConditions
     rest: Equilibrium
     uses: SamplesInUse | None = None
+    distance_rad: float | None = None
 
 
 def _find_end_loop(scenario: Scenario, log: Log | None) -> _AnalysedLoop:
@@ -284,7 +303,7 @@ def _find_end_loop(scenario: Scenario, log: Log | None) -> _AnalysedLoop:
         # The remarks on delays that vary stay, although the loop has only their means.
         conditions = conditions._replace(age_s=end.conditions.age_s)
     rest = add_limit_notes(conditions, end.rest)
-    return _AnalysedLoop(scenario, conditions, rest, end.uses)
+    return _AnalysedLoop(scenario, conditions, rest, end.uses, end.distance_rad)
 
 
 def analyse_linear_loop(
@@ -341,6 +360,7 @@ def analyse_linear_loop(
         continuous=compute_delay_spectrum(loop, roots),
         sampled=compute_sampled_spectrum(conditions, rest, roots, analysed.uses),
         margin=find_delay_margin(loop),
+        distance_rad=analysed.distance_rad,
     )
 
     scans = []

@@ -2,7 +2,8 @@
 
 A recorded run is certified by V, the energy function of the stability proof, by twins, which
 are repeated runs with a small push, and by the characteristic roots of its final loop. A
-simulated run without a log, as in a sweep, is decided in the same way without V.
+simulated run without a log, as in a sweep, is decided in the same way. Its V is computed only
+if roots and pushes leave the decision open to it.
 
 Invariant:
     - All commands decide by `analysis.stability_decision.decide_stability`, with roots from
@@ -15,7 +16,7 @@ from typing import NamedTuple
 import msgspec
 
 from ..analysis.certificate.stability_certificate import Certificate, certify
-from ..analysis.run_end import RunEnd, RunTrace, classify_run_end
+from ..analysis.run_end import RunEnd, RunTrace, Stability, classify_run_end
 from ..analysis.stability_decision import (
     LoopRoots,
     RunFindings,
@@ -25,6 +26,7 @@ from ..analysis.stability_decision import (
 )
 from ..analysis.twin_growth import TwinGrowth, measure_twins, measure_virtual_twins
 from ..execution.fused import FusedRun
+from ..execution.virtual import simulate_scenario
 from ..log.accounting import MIN_COVERAGE
 from ..log.log_reader import Log
 from ..scenario import Scenario
@@ -92,7 +94,9 @@ def judge_virtual_run(
 ) -> VirtualJudgement:
     """Judges a simulated run as its certificate would, without a log.
 
-    Twins, one for every joint, are executed only if they may change the decision.
+    Twins, one for every joint, are executed only if they may change the decision. The run is
+    repeated with all its records only if it has settled or is open. The energy function V,
+    which needs them, may then prove that the run is stable, or contradict that it settled.
 
     Args:
         scenario: Scenario of the run. Its duration may be shorter than that of the run.
@@ -114,5 +118,16 @@ def judge_virtual_run(
     if not is_decided_by_roots(findings):
         twins = measure_virtual_twins(ended, end, run.ran_s)
         findings = findings._replace(twins=twins)
+    decision = decide_stability(findings)
+    if decision.stability in (Stability.SETTLED, Stability.OPEN):
+        recorded = certify(simulate_scenario(ended), own_laws=True)
+        certificate = replace(
+            recorded,
+            roots=findings.roots,
+            twins=twins,
+            law_proofs=tuple(findings.proofs),
+            has_lasting_delays=has_lasting_delays(ended),
+        )
+        decision = certificate.decision
     assert findings.roots is not None
-    return VirtualJudgement(end, findings.roots, twins, decide_stability(findings))
+    return VirtualJudgement(end, findings.roots, twins, decision)
