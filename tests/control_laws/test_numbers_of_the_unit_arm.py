@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 import trilat_net as tn
-from tests.control_laws.test_passivity_control import contact
-from tests.energy_runs import pair, ticked
+from tests.energy_runs import pair, run_contact, ticked
 
 ROOT = Path(__file__).parents[2]
 WAVE = runpy.run_path(str(ROOT / "examples" / "wave_law.py"))["Wave"]
@@ -77,7 +76,7 @@ def test_distance_of_a_line_whose_waves_carry_velocity() -> None:
 
 
 def test_an_acceleration_margin_costs_stiffness_for_as_long_as_it_lasts() -> None:
-    run = contact(120.0, duration_s=30.0, acceleration_rad_s2=100.0)
+    run = run_contact(120.0, duration_s=30.0, acceleration_rad_s2=100.0)
     assert list_values("stiffness felt") == [
         pytest.approx(felt_stiffness(run, to_s), abs=0.06) for to_s in (20, 30)
     ]
@@ -85,6 +84,6 @@ def test_an_acceleration_margin_costs_stiffness_for_as_long_as_it_lasts() -> Non
 
 @pytest.mark.parametrize(("loss", "row"), [(0.0, 0), (0.5, 1)])
 def test_books_of_steps_hardly_chatter(loss: float, row: int) -> None:
-    tau = contact(136.0, loss=loss)["m"].tau[10000:, 0]
+    tau = run_contact(136.0, loss=loss)["m"].tau[10000:, 0]
     stated = list_values("chatter")[row]
     assert np.abs(np.diff(tau)).mean() == pytest.approx(stated, abs=6e-5)
