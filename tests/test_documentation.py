@@ -220,7 +220,7 @@ def prepare(page: str, folder: Path) -> None:
     if page == "docs/first-hour.md":  # the log of the reader's session
         session = folder / "runs" / "play-001"
         session.mkdir(parents=True)
-        trilat("sim", "play", "--duration", "3", "-o", str(session / "run.mcap")).succeeds()
+        trilat("sim", "play", "--duration", "3", "-o", "run.mcap", cwd=session).succeeds()
     if page == "docs/delay-traces.md":
         irtt(folder, zipped=True)
     if page == "docs/arms.md":

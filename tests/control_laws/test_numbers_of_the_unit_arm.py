@@ -75,6 +75,7 @@ def test_distance_of_a_line_whose_waves_carry_velocity() -> None:
     ]
 
 
+@pytest.mark.long
 def test_an_acceleration_margin_costs_stiffness_for_as_long_as_it_lasts() -> None:
     run = run_contact(120.0, duration_s=30.0, acceleration_rad_s2=100.0)
     assert list_values("stiffness felt") == [
@@ -82,7 +83,9 @@ def test_an_acceleration_margin_costs_stiffness_for_as_long_as_it_lasts() -> Non
     ]
 
 
-@pytest.mark.parametrize(("loss", "row"), [(0.0, 0), (0.5, 1)])
+@pytest.mark.parametrize(
+    ("loss", "row"), [(0.0, 0), pytest.param(0.5, 1, marks=pytest.mark.long)]
+)
 def test_books_of_steps_hardly_chatter(loss: float, row: int) -> None:
     tau = run_contact(136.0, loss=loss)["m"].tau[10000:, 0]
     stated = list_values("chatter")[row]
