@@ -31,6 +31,20 @@ def pair(control: dict[str, Any], *, clamped: bool, duration_s: float, **more: A
     return unit_scenario(sites, control, **{"duration_s": duration_s, "link": CONSTANT, **more})
 
 
+def run_contact(
+    delay_ms: float, duration_s: float = 20.0, loss: float = 0.0, **more: Any
+) -> Any:
+    """A master that leads only, and a slave that 700 N m/rad and 3 N m s/rad hold; every tick."""
+    law = {"law": "tdpa", **more}
+    clamp = {**CLAMP, "stiffness_nm_rad": 700.0, "damping_nm_s_rad": 3.0}
+    sites = {
+        "m": {"hands": [hand(0.3, 40.0, 6.0)], "control": {**law, "K": 0.0, "B": 0.0}},
+        "s": {"hands": [clamp], "control": {**law, "K": 80.0, "B": 8.0}},
+    }
+    link = {**CONSTANT, "delay_ms": delay_ms, "loss": loss}
+    return ticked(unit_scenario(sites, law, duration_s=duration_s, link=link))
+
+
 def ticked(scenario: Scenario, every: int = 1) -> dict[str, Any]:
     """Returns per site arrays with a row for every so many ticks, up to the last.
 

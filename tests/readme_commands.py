@@ -5,8 +5,8 @@
 Invariant:
 - Every command that the table of docs/commands.md names stands here or in a fenced block of one of the
   pages (`list_missing_commands`).
-- Every command of the README's table stands here as it stands there, apart from names of logs and from
-  options that follow (`list_unlike_commands`).
+- Every command of the README's table stands here as it stands there, apart from names of logs, the address
+  HOST, and options that follow (`list_unlike_commands`).
 - A chain runs one command after another; chains run side by side and share no file but those that
   `FIRST` made.
 - What would go on until somebody ends it is bounded by its own options, or interrupted (`LiveSession`).
@@ -45,8 +45,10 @@ CHAINS = [
         "trilat compare sim.mcap kd15.mcap",
         "trilat report sim.mcap",
         "trilat figure sim.mcap --with kd15.mcap -o figures",
-        "trilat sim training -o training.mcap",
-        "trilat report training.mcap",
+        "trilat sim docs/media/two_people.toml -o handover.mcap",
+        "trilat report handover.mcap",
+        "trilat certify handover.mcap",
+        "trilat rerun handover.mcap --replace s --set control.Kd=15",
     ],
     [
         "trilat log info sim.mcap",
@@ -128,9 +130,14 @@ LIVE = LiveSession(
 ALONE = [
     "trilat demo two_sites --duration 1",
     "trilat replay sim.mcap --rate max",
-    "trilat ping --benchmark free --seconds 2",
 ]
 """Uses the network of this machine, one after another, after the live session."""
+AGAINST = {
+    "trilat ping --benchmark p_d_margin --connect tcp/127.0.0.1:7447 --seconds 2": (
+        "trilat ping --answer tcp/0.0.0.0:7447 --insecure"
+    )
+}
+"""What needs another machine, here this one, and what runs on that machine until Ctrl-C."""
 INTERRUPTED = {"trilat router": "listening at"}
 """What goes on until Ctrl-C, and what it prints once it works."""
 ENDED_BY_CTRL_C = (0, 130)
@@ -139,7 +146,17 @@ ENDED_BY_CTRL_C = (0, 130)
 def list_all() -> list[str]:
     """Every command of this table."""
     chained = [command for chain in CHAINS for command in chain]
-    return [*FIRST, *chained, LIVE.start, LIVE.watch, *LIVE.meanwhile, *ALONE, *INTERRUPTED]
+    made_against = [*AGAINST, *AGAINST.values()]
+    return [
+        *FIRST,
+        *chained,
+        LIVE.start,
+        LIVE.watch,
+        *LIVE.meanwhile,
+        *ALONE,
+        *made_against,
+        *INTERRUPTED,
+    ]
 
 
 def read_table_commands() -> set[str]:
@@ -192,8 +209,8 @@ def read_wishes() -> list[tuple[str, list[str]]]:
     """Returns the rows of the README's table: what somebody wants, and the commands for it."""
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     table = text.partition("| I want to … | command |")[2].partition("\n\n")[0]
-    rows = re.findall(r"^\| (.+?) \| `(.+)` \|$", table, re.MULTILINE)
-    return [(wish, commands.split(" && ")) for wish, commands in rows]
+    rows = re.findall(r"^\| (.+?) \| (`.+`) \|$", table, re.MULTILINE)
+    return [(wish, re.split(r" && |` `", cell.strip("`"))) for wish, cell in rows]
 
 
 def list_unlike_commands() -> list[str]:
@@ -208,5 +225,5 @@ def list_unlike_commands() -> list[str]:
 
 
 def _drop_log_names(command: str) -> str:
-    """Returns a command in which every log has the same name."""
-    return re.sub(r"\S+\.mcap", "run.mcap", command)
+    """Returns a command in which every log has the same name, and the other machine is this one."""
+    return re.sub(r"\S+\.mcap", "run.mcap", command.replace("/HOST:", "/127.0.0.1:"))

@@ -1,13 +1,22 @@
-"""CITATION.cff, pyproject.toml and LICENSE tell the same."""
+"""CITATION.cff, pyproject.toml, LICENSE and the BibTeX of `trilat certify --cite` tell the same."""
 
+import csv
 import re
 import tomllib
 from pathlib import Path
 
+import pytest
+
 import trilat_net
+from trilat_net.reporting.citation import compose_citation
 
 ROOT = Path(trilat_net.__file__).parents[1]
 CITATION = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+PAPER_TITLE = (
+    "Adaptive Control of Dual User Teleoperation with Time Delay and Dynamic Uncertainty"
+)
+PAPER_AUTHORS = ["Motaharifar", "Bataleblu", "Taghirad"]
+PAPER_YEAR = "2016"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 
 
@@ -42,8 +51,43 @@ def test_they_name_the_same_licence_and_holder() -> None:
 
 def test_the_paper_is_a_reference() -> None:
     reference = CITATION.split("references:")[1]
-    assert "type: article" in reference
-    assert (
-        "Adaptive Control of Dual User Teleoperation with Time Delay and Dynamic Uncertainty"
-        in reference
+    assert "type: conference-paper" in reference
+    assert f'title: "{PAPER_TITLE}"' in reference
+    assert re.findall(r"family-names: (\w+)", reference) == PAPER_AUTHORS
+    assert f"year: {PAPER_YEAR}" in reference
+
+
+def test_the_list_of_works_has_the_paper_and_as_many_works_as_the_page_says() -> None:
+    with (ROOT / "docs/data/references.csv").open(encoding="utf-8", newline="") as file:
+        works = list(csv.DictReader(file))
+    page = (ROOT / "docs/references.md").read_text(encoding="utf-8")
+    assert re.findall(r"lists all (\d+) works", page) == [str(len(works))]
+    (paper,) = (work for work in works if work["title"].lower() == PAPER_TITLE.lower())
+    assert [name.split()[-1] for name in paper["authors"].split(", ")] == PAPER_AUTHORS
+    assert paper["year"] == PAPER_YEAR
+
+
+@pytest.mark.parametrize(
+    ("scenario", "works"),
+    [("paper", {"Motaharifar2016"}), ("p_d_margin", {"Nuno2009"})],
+)
+def test_the_paragraph_cites_the_works_that_it_lists(scenario: str, works: set[str]) -> None:
+    log = trilat_net.simulate(scenario, duration_s=2.0)
+    paragraph, _, *entries = compose_citation(log, trilat_net.certify(log))
+    cited = set(re.findall(r"\\cite\{(\w+)\}", paragraph))
+    listed = {key for entry in entries for key in re.findall(r"^@\w+\{(\w+),", entry)}
+    assert cited == listed
+    assert listed & {"Motaharifar2016", "Nuno2009"} == works
+
+
+def test_the_entry_of_the_paper_is_that_of_the_citation_file() -> None:
+    log = trilat_net.simulate("paper", duration_s=1.0)
+    (entry,) = (
+        entry
+        for entry in compose_citation(log, trilat_net.certify(log))
+        if "{Motaharifar2016," in entry
     )
+    fields = dict(re.findall(r"(\w+) = \{([^{}]+)\}", " ".join(entry.split())))
+    assert fields["title"].lower() == PAPER_TITLE.lower()
+    assert re.findall(r"(\w+), [A-Z]", fields["author"]) == PAPER_AUTHORS
+    assert fields["year"] == PAPER_YEAR

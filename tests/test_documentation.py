@@ -217,6 +217,10 @@ def prepare(page: str, folder: Path) -> None:
     """Makes the files that a page takes for granted."""
     if page in OF_RUNS:
         trilat("sim", OF_RUNS[page], "-o", "run.mcap", cwd=folder).succeeds()
+    if page == "docs/first-hour.md":  # the log of the reader's session
+        session = folder / "runs" / "play-001"
+        session.mkdir(parents=True)
+        trilat("sim", "play", "--duration", "3", "-o", "run.mcap", cwd=session).succeeds()
     if page == "docs/delay-traces.md":
         irtt(folder, zipped=True)
     if page == "docs/arms.md":

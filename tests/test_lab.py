@@ -8,6 +8,7 @@ import pytest
 
 import trilat_net
 from tests.cli.running import trilat
+from trilat_net.theory import iterate_linear_edges
 
 SHEET = (Path(__file__).parents[1] / "docs" / "lab.md").read_text()
 BLOCKS = re.findall(r"^```sh\n(.*?)^```", SHEET, re.S | re.M)
@@ -39,10 +40,22 @@ def test_every_experiment_of_the_lab_runs(tmp_path: Path) -> None:
     trilat("report", "free.mcap", cwd=tmp_path).succeeds()
 
 
-@pytest.mark.parametrize("words", [w for w in COMMANDS if w[1] == "test"], ids=shlex.join)
-def test_every_trial_is_of_a_scenario_that_expects_something(words: list[str]) -> None:
-    source, *options = words[2:]
-    changes = options[1::2]
-    assert options[::2] == ["--set"] * len(changes)
-    (trial,) = trilat_net.trials(source, set=changes)
-    assert trial.scenario.expect.windows or trial.scenario.expect.has_expectations
+def test_no_command_of_the_sheet_tells_results_before_they_are_predicted() -> None:
+    """`test` prints the limits that a scenario expects, and `show` and `list` print its text, which tells them."""
+    named = {tuple(words[1:3]) for words in COMMANDS}
+    assert not {words for words in named if words[0] == "test"}
+    assert not {("scenario", "show"), ("scenario", "list")} & named
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("k_nm_rad", [7.0, 21.0])
+@pytest.mark.parametrize(("scenario", "sites"), [("p_d_margin", 3), ("p_d_margin_two", 2)])
+def test_every_group_finds_its_prediction_at_most_10_percent_above_the_edge(
+    scenario: str, sites: int, k_nm_rad: float
+) -> None:
+    """The least eigenvalue of equal factors is -1 / (sites - 1); links have 200 ms."""
+    predicted = k_nm_rad * 0.2 / (sites - 1)
+    loaded = trilat_net.load_scenario(scenario, {"control.K": k_nm_rad})
+    edges = [edge.value for edge in iterate_linear_edges(loaded, "control.d", 0.1, 10.0)]
+    assert len(edges) == 1
+    assert edges[0] <= predicted <= 1.1 * edges[0]

@@ -342,6 +342,11 @@ PORT_CONDITIONS: dict[str, Make] = {
     ],
 }
 LAB: dict[str, Make] = {
+    "of these arms are {}, {} and {}, so": lambda: [
+        edge("p_d_margin", "control.d", 0.5, 1.5, {}),
+        edge("p_d_margin_two", "control.d", 1.0, 3.0, {}),
+        edge("p_d_margin", "control.d", 0.8, 2.4, {"dominance": SHARES}),
+    ],
     "only the first decays: {} rad at 38 s": lambda: seen(
         "jitter", "error_peak_rad", (38, 40, "")
     ),
@@ -461,6 +466,7 @@ CERTIFIED = (
     "judged all {} ticks; the digest chain agrees over {} messages",
 )
 LONG = (
+    "of these arms are",
     "| roots |",
     "prints its edge",
     "ones still fail",

@@ -68,6 +68,59 @@ def test_law_of_page_holds_arms_together_as_it_says(
     assert np.ptp(rest, axis=0).max() < 1e-6
 
 
+@pytest.mark.long
+def test_certificate_of_page_is_printed(tmp_path: Path) -> None:
+    (tmp_path / "mylaws.py").write_text(block("python"))
+    sim, *_ = (shlex.split(line, comments=True)[1:] for line in block("sh").splitlines())
+    trilat(*sim, cwd=tmp_path).succeeds()
+    done = trilat("certify", "spring.mcap", "--law", "mylaws.py", cwd=tmp_path)
+    assert done.out.startswith(block("text"))
+
+
+def read_input_table() -> list[tuple[str, str, str]]:
+    """Returns the fields of `now` in the page's table, with the shape and the unit of each."""
+    rows = re.findall(r"^\| (`now\..*?) \| (.*?) \| (.*?) \|", DOC.read_text("utf-8"), re.M)
+    fields = []
+    for names, shape, units in rows:
+        found = re.findall(r"`now\.(\w+)`", names)
+        stated = units.split(", ") if ", " in units else [units] * len(found)
+        stated = ["" if unit == "–" else unit for unit in stated]
+        fields += [(name, shape, unit) for name, unit in zip(found, stated, strict=True)]
+    return fields
+
+
+def test_units_of_page_are_those_of_the_interface() -> None:
+    with INPUTS.open(newline="", encoding="utf-8") as stream:
+        units = {row["field"]: row["unit"] for row in csv.DictReader(stream)}
+    table = read_input_table()
+    assert len(table) == 10
+    assert [(name, unit) for name, _, unit in table] == [(one, units[one]) for one, *_ in table]
+
+
+def test_shapes_of_page_are_what_a_law_gets(tmp_path: Path) -> None:
+    sizes = {"n": "len({}) == now.joints", "a number": "{} + 0.0 == {}"}
+    checks = [
+        f"        assert {sizes[shape].format(f'now.{name}', f'now.{name}')}, {name!r}"
+        for name, shape, _ in read_input_table()
+        if shape in sizes
+    ]
+    per_peer = [f"        assert len(now.peers[1].{key}) == 2" for key in ("q", "qd", "tau_x")]
+    lines = [
+        "class Probe:",
+        "    def __init__(self, facts):",
+        "        assert len(facts.peers) == 2",
+        "    def torque(self, now):",
+        *checks,
+        *per_peer,
+        "        assert 0.0 < now.peers[0].alpha < 1.0 and now.peers[0].age_s >= 0.0",
+        "        return [0.0] * now.joints",
+    ]
+    (tmp_path / "probing.py").write_text("\n".join(lines))
+    trilat(
+        "sim", "paper", *SHORT, "--set", "control.law=probing:Probe", cwd=tmp_path
+    ).succeeds()
+
+
 def test_what_page_says_of_law_is_what_law_gets() -> None:
     from trilat_net.core.user_law import LawContext, LawInput
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.energy_runs import CONSTANT, FOLLOWER, JITTER, least_energy, ticked
+from tests.energy_runs import CONSTANT, FOLLOWER, JITTER, least_energy, run_contact, ticked
 from tests.energy_runs import pair as pair_of
 from tests.unit_arm import CLAMP, H50, hand, unit_scenario
 from trilat_net.errors import ScenarioError
@@ -92,18 +92,6 @@ def test_contact_stays_bounded() -> None:
     assert least_energy(far) >= -1e-15
 
 
-def contact(delay_ms: float, duration_s: float = 20.0, loss: float = 0.0, **more: Any) -> Any:
-    """A master that leads only, and a slave that 700 N m/rad and 3 N m s/rad hold; every tick."""
-    law = {"law": "tdpa", **more}
-    clamp = {**CLAMP, "stiffness_nm_rad": 700.0, "damping_nm_s_rad": 3.0}
-    sites = {
-        "m": {"hands": [hand(0.3, 40.0, 6.0)], "control": {**law, "K": 0.0, "B": 0.0}},
-        "s": {"hands": [clamp], "control": {**law, "K": 80.0, "B": 8.0}},
-    }
-    link = {**CONSTANT, "delay_ms": delay_ms, "loss": loss}
-    return ticked(unit_scenario(sites, law, duration_s=duration_s, link=link))
-
-
 def mean_felt(result: Any) -> float:
     """Over the last half of a run, N m/rad: as it is published it chatters."""
     half = len(result["m"].q) // 2
@@ -113,11 +101,11 @@ def mean_felt(result: Any) -> float:
 @pytest.mark.long
 def test_books_of_steps_cost_no_stiffness_unlike_an_acceleration_margin() -> None:
     """34.9 N m/rad as it is published, 71.8 by spring and clamp alone; the margin costs two thirds."""
-    assert mean_felt(contact(120.0, **PUBLISHED)) == pytest.approx(34.9, rel=1e-2)
-    by_step = contact(120.0)
+    assert mean_felt(run_contact(120.0, **PUBLISHED)) == pytest.approx(34.9, rel=1e-2)
+    by_step = run_contact(120.0)
     assert mean_felt(by_step) == pytest.approx(43.9, rel=1e-2)
     assert least_energy(by_step) >= 0.0
-    assert mean_felt(contact(120.0, acceleration_rad_s2=100.0)) < 0.4 * 34.9
+    assert mean_felt(run_contact(120.0, acceleration_rad_s2=100.0)) < 0.4 * 34.9
 
 
 @pytest.mark.parametrize(
@@ -127,7 +115,7 @@ def test_contact_chatters_less_by_books_of_steps(loss: float, published: float) 
     """Mean step of the master's torque; N m."""
     chatter = {}
     for name, more in (("published", PUBLISHED), ("step", {})):
-        tau = contact(136.0, loss=loss, **more)["m"].tau[10000:, 0]
+        tau = run_contact(136.0, loss=loss, **more)["m"].tau[10000:, 0]
         chatter[name] = float(np.abs(np.diff(tau)).mean())
     assert chatter["published"] == pytest.approx(published, rel=0.1)
     assert chatter["step"] < 0.0015

@@ -48,9 +48,13 @@ _POSITION_EXCHANGE = """@article{Nuno2009,
   year    = {2009},
   doi     = {10.1177/0278364908099461}
 }"""
-_THEOREM = """@misc{DualUser,
-  title = {Adaptive Control of Dual User Teleoperation with Time Delay and Dynamic Uncertainty},
-  note  = {The proof is used as corrected in the errata of trilat-net}
+_THEOREM = """@inproceedings{Motaharifar2016,
+  title     = {Adaptive control of dual user teleoperation with time delay and dynamic
+               uncertainty},
+  author    = {Motaharifar, M. and Bataleblu, A. and Taghirad, H. D.},
+  booktitle = {24th Iranian Conference on Electrical Engineering (ICEE)},
+  year      = {2016},
+  note      = {The proof is used as corrected in the errata of trilat-net}
 }"""
 _STATEMENTS = {
     Stability.STABLE: "is stable",
@@ -91,6 +95,13 @@ def _compose_sentences(log: Log, certificate: Certificate) -> Iterator[str]:
     if decision.rests_on:
         statement += f"; this rests on {decision.rests_on}"
     yield f"{statement}."
+    if certificate.law_proofs:
+        yield "A stability condition of its control law holds \\cite{Nuno2009}."
+    if certificate.has_functional:
+        yield (
+            "The premises of the theorem on adaptive dual-user teleoperation were compared "
+            "with the run \\cite{Motaharifar2016}."
+        )
     if decision.reasons:
         yield f"Findings that prevent a better judgement: {'; '.join(decision.reasons)}."
     if certificate.roots is not None and certificate.roots.verdict:
