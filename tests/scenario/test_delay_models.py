@@ -137,7 +137,7 @@ def test_whether_anything_is_drawn_and_whether_the_network_decides(
         (
             {"model": "uniform", "delay_ms": 5, "deviation_ms": 1},
             "link.deviation_ms",
-            "unknown key",
+            "belongs to model",
         ),
         ({"model": "measured", "delay_ms": 5}, "link.delay_ms", "belongs to model"),
         ({"delay_ms": 5, "los": 0.1}, "link.los", "did you mean 'loss'"),

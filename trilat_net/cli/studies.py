@@ -177,7 +177,7 @@ def _run_virtual(trials: "list[Trial]", jobs: int | None, on: str | None) -> "Tr
     from ..studies.trials import run_trials
 
     remaining = Counter(trial.source for trial in trials)
-    with terminal.progress_bar("runs") as show:
+    with terminal.progress_bar("running the trials") as show:
 
         def report_done(result: "TrialResult") -> None:
             """Updates the progress that the user sees after one run of a scenario has finished.
@@ -395,7 +395,9 @@ def compare_command(
         from ..studies.log_comparison import compare
 
         logs = [terminal.open_with_progress(file) for file in files or []]
-        terminal.print_result(compare(*logs), as_json=as_json)
+        with terminal.progress_lines(f"comparing {count_nouns(len(logs), 'log')}"):
+            comparison = compare(*logs)
+        terminal.print_result(comparison, as_json=as_json)
         return
     if files:
         raise UsageError("--tune makes its own runs: leave out either the logs or --tune")
@@ -472,7 +474,7 @@ def tune_command(
     from ..studies.arm_gains import tune_arm
 
     delay_text = _measure_delay(delay, reach)
-    with terminal.progress_bar("edge and runs") as show:
+    with terminal.progress_bar("computing the edge of stability and running") as show:
         gains = tune_arm(
             arm,
             delay_text,
