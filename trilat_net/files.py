@@ -35,6 +35,19 @@ DISK_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
 STUDY_LIBRARIES = ("loky", "matplotlib", "scipy")
 """Libraries that `trilat-net` installs and `trilat-net-core` does not (pyproject.toml)."""
 
+EXTRAS = {
+    "dask": "cluster",
+    "distributed": "cluster",
+    "gymnasium": "gym",
+    "mujoco": "sim",
+    "pandas": "frames",
+    "polars": "frames",
+    "pyarrow": "lerobot",
+    "rerun": "view",
+    "statsmodels": "stats",
+}
+"""For each optional library, the extra of trilat-net that installs it (pyproject.toml)."""
+
 
 def require_libraries(*names: str) -> None:
     """Checks that the libraries that a command needs are installed, before it starts.
@@ -63,7 +76,7 @@ def describe_missing_library(function: str, error: ModuleNotFoundError) -> str:
         error: Error of the import. It names the missing module.
 
     Returns:
-        The message, with the command that installs the library if the command is known.
+        The message, with the command that installs the library.
 
     Raises:
         ModuleNotFoundError: The missing module belongs to this program, which is a bug.
@@ -71,9 +84,13 @@ def describe_missing_library(function: str, error: ModuleNotFoundError) -> str:
     package = (error.name or "").partition(".")[0]
     if package in ("", "live", "recorder", "sites", "trilat_net"):
         raise error
-    remedy = "which is not installed"
     if package in STUDY_LIBRARIES:
         remedy = "which trilat-net-core does not include: pip install trilat-net"
+    elif package in EXTRAS:
+        remedy = f"which is not installed: {format_extra_install(EXTRAS[package])}"
+    else:
+        # A library that every installation has, or that another library needs.
+        remedy = f"which is not installed: pip install {package}"
     return f"{function} needs {package}, {remedy}"
 
 
@@ -94,9 +111,12 @@ def import_extra(module: str, extra: str, purpose: str) -> Any:
     """
     try:
         return import_module(module)
-    except ImportError:
+    except ImportError as error:
         package = module.partition(".")[0]
-        raise UsageError(f"{purpose} need {package}: {format_extra_install(extra)}") from None
+        # The package may be installed, but not a library that it needs itself.
+        missing = (error.name or package).partition(".")[0]
+        need = package if missing == package else f"{package}, which needs {missing}"
+        raise UsageError(f"{purpose} need {need}: {format_extra_install(extra)}") from None
 
 
 def format_extra_install(extra: str) -> str:

@@ -23,8 +23,15 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from ..errors import LogRefused, TrilatError, find_nearest
-from ..files import DISK_ERRNOS, STUDY_LIBRARIES, find_version, require_libraries
+from ..errors import LogRefused, TrilatError, UsageError, find_nearest
+from ..files import (
+    DISK_ERRNOS,
+    EXTRAS,
+    STUDY_LIBRARIES,
+    describe_missing_library,
+    find_version,
+    require_libraries,
+)
 from ..process import Interrupt
 from ..reporting.terminal_output import err, print_error, print_line
 from . import options, sessions
@@ -277,7 +284,7 @@ _MEMORY_ERRORS = (
 def _run() -> None:
     """Runs `trilat`.
 
-    If a library is missing that `trilat-net-core` does without, the error names the remedy.
+    If a library is missing that an installation may lack, the error names the remedy.
     """
     try:
         app()
@@ -285,6 +292,9 @@ def _run() -> None:
         library = (error.name or "").partition(".")[0]
         if library in STUDY_LIBRARIES:
             require_libraries(library)  # raises the error that names the remedy
+        if library in EXTRAS:
+            problem = describe_missing_library("this command", error)
+            raise UsageError(problem) from None
         raise
 
 
