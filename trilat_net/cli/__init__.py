@@ -54,7 +54,7 @@ _SYNONYMS = {
         "resume": "enable", "restart": "reset", "latency": "ping", "recorder": "record",
         "config": "scenario show", "version": "--version", "help": "--help",
     },
-    "keys": {"make": "new", "create": "new", "generate": "new", "show": "info",
+    "keys": {"join": "add","make": "new", "create": "new", "generate": "new", "show": "info",
              "extend": "renew", "sign": "pair"},
     "log": {"show": "info", "repair": "recover", "convert": "export", "open": "view",
             "verify": "check", "plot": "view"},
