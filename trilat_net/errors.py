@@ -230,7 +230,7 @@ class PlantFailed(CodeFailed):
     kind = "plant"
 
 
-class RuntimeFault(TrilatError):  # noqa: N818 - a fault of ours, by its name in docs/design.md
+class RuntimeFault(TrilatError):  # noqa: N818 - programs catch it by this name
     """A state that the program must never reach, which shows a bug of the program itself.
 
     Users cannot correct it, and should report it.

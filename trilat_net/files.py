@@ -169,16 +169,16 @@ def find_page(name: str) -> Path:
 
 
 def open_regular(path: Path, **options: Any) -> Any:
-    """Opens a file for reading. Pipes and devices are refused.
+    """Opens a file for reading. Folders, pipes and devices are refused.
 
-    They are refused because they may have no end. Reading would then never return.
+    Pipes and devices are refused because they may have no end. Reading would then never return.
 
     Args:
         path: The file.
         options: Further arguments of `open`. With `encoding`, the file is opened as text.
 
     Raises:
-        OSError: The path is a pipe or a device, or cannot be opened.
+        OSError: The path is a folder, a pipe or a device, or cannot be opened.
     """
     mode = "r" if "encoding" in options else "rb"
     # Without this flag, opening a pipe that has no writer would block.
@@ -187,6 +187,12 @@ def open_regular(path: Path, **options: Any) -> Any:
     def open_without_blocking(name: str, flags: int) -> int:
         return os.open(name, flags | no_block)
 
+    if path.is_dir():
+        problem = "the path is a folder, not a file"
+        logs = sorted(path.glob("*.mcap"))
+        if logs:
+            problem += f"; name a file in it, for example {logs[0]}"
+        raise IsADirectoryError(errno.EISDIR, problem, str(path))
     stream = open(path, mode, opener=open_without_blocking, **options)  # noqa: SIM115
     mode_bits = os.fstat(stream.fileno()).st_mode
     if not stat.S_ISREG(mode_bits):

@@ -305,7 +305,7 @@ def test_a_file_that_cannot_be_read_is_named(
         path.write_bytes(content)
     with pytest.raises(UsageError, match=f"{path}: .*{problem}"):
         read_zenoh_file(path)
-    with pytest.raises(UsageError, match="Is a directory"):
+    with pytest.raises(UsageError, match="is a folder, not a file"):
         read_zenoh_file(tmp_path)
 
 

@@ -353,7 +353,16 @@ def compare_command(
     context: typer.Context,
     files: Annotated[list[Path] | None, typer.Argument(metavar="FILE FILE...")] = None,
     tune: Annotated[str | None, _option("--tune", "SCENARIO")] = None,
-    law: Annotated[str | None, _option("--law", "LAW,LAW...")] = None,
+    law: Annotated[
+        str | None,
+        _option(
+            "--law",
+            "LAW,LAW...",
+            "Control laws; default: adaptive,adaptive_box,p_d,pd_d. All laws: "
+            f"{', '.join(options.list_laws())}, known (adaptive with a known arm), and your "
+            "own, for example mylaws:Law.",
+        ),
+    ] = None,
     budget: Annotated[int, _option("--budget", "N")] = 64,
     seed: Annotated[int, _option("--seed", "S", "Seed of the search.")] = 1,
     seeds: Annotated[int, _option("--seeds", "N")] = 1,
@@ -370,15 +379,14 @@ def compare_command(
     """Compares logs, or tuned control laws, side by side.
 
     For logs, the command also shows how their experiments differ. All control laws are tuned by
-    the same procedure. The results are not ranked, because small errors can also mean that an
-    arm hangs freely, or that no operator moves it.
+    the same procedure. Whether a tuned law is stable is judged from the motion in the second
+    half of its runs alone; `trilat certify` also uses twins and roots. The results are not
+    ranked, because small errors can also mean that an arm hangs freely, or that no operator
+    moves it.
 
     Options:
-        files: Two or more MCAP logs.
+        files: Files of two or more MCAP logs.
         tune: Tune control laws in this scenario and compare them, instead of logs.
-        law: Control laws; default: adaptive,adaptive_box,p_d,pd_d. Others: adaptive_robust,
-            known, p_f, wave, tdpa, tanks, four_channel, six_channel, saturated_pd, authority,
-            impedance, smith, and your own, for example mylaws:Law.
         budget: Number of settings (candidates) that are tried for each control law.
         seeds: Number of seeds of the scenario over which each candidate is averaged.
         objective: Objective that is minimised together with effort.
