@@ -643,6 +643,8 @@ def describe_write_error(
         UsageError.
     """
     text = f"{path}: cannot be written: {error.strerror or error}"
+    if error.errno == errno.ENOENT and not path.parent.is_dir():
+        text += f"; the folder {path.parent} does not exist"
     if error.errno in DISK_ERRNOS:
         return LogRefused(f"{text}; {remedy}" if remedy else text)
     return UsageError(text)

@@ -600,6 +600,8 @@ def test_members_that_cannot_be_added_change_nothing(
             add_keys(folder, ["s2"])
     assert read_files(folder) == before
 
+    with pytest.raises(UsageError, match="there is no such folder of keys"):
+        add_keys(tmp_path / "nothing", ["s2"])
     shutil.move(folder / "s", tmp_path / "elsewhere")
     with pytest.raises(UsageError, match="no folder of the member s, whose list"):
         add_keys(folder, ["s2"])

@@ -257,6 +257,8 @@ def _read_authority(folder: Path) -> tuple[x509.Certificate, Any]:
     Raises:
         UsageError: The authority is missing or damaged.
     """
+    if not folder.is_dir():
+        raise UsageError(f"{folder}: there is no such folder of keys made by `trilat keys new`")
     authority_folder = folder / _AUTHORITY_FOLDER
     try:
         authority = x509.load_pem_x509_certificate(_read_trusted(authority_folder / AUTHORITY))
