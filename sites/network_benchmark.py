@@ -470,6 +470,8 @@ class NetworkBenchmark(Result):
         needs: Requirements of the scenario.
         rows: Measurements, one row per message size, message rate and transport.
         judged: Verdict for each transport, whether it is good enough, see `judge_network`.
+        connect: Endpoints of the far end on another machine. Empty if both ends ran on this
+            machine, so that no network was measured.
     """
 
     scenario: str
@@ -477,6 +479,7 @@ class NetworkBenchmark(Result):
     needs: ScenarioNeeds
     rows: list[dict[str, Any]]
     judged: list[dict[str, Any]]
+    connect: tuple[str, ...] = ()
 
     @property
     def good(self) -> bool:
@@ -495,6 +498,7 @@ class NetworkBenchmark(Result):
             "scenario": self.scenario,
             "duration_s": self.duration_s,
             "good": self.good,
+            "connect": list(self.connect),
             "needs": self.needs._asdict(),
             "transports": self.judged,
             "rows": self.rows,
@@ -547,6 +551,7 @@ def ping_benchmark(
     """
     loaded = load_scenario(scenario, set)
     needs = find_needs(loaded)
+    far_endpoints = tuple(connect or ())
     with ExitStack() as stack:
         if not connect:
             connect, keys = stack.enter_context(_run_local_far_end(duration_s))
@@ -563,7 +568,7 @@ def ping_benchmark(
         for row in rows
         if (row["bytes"], row["rate_hz"]) == scenario_case
     ]
-    return NetworkBenchmark(loaded.name, duration_s, needs, rows, verdicts)
+    return NetworkBenchmark(loaded.name, duration_s, needs, rows, verdicts, far_endpoints)
 
 
 def _measure_endpoint(

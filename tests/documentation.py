@@ -86,6 +86,7 @@ ELSEWHERE = {
     "docs/devices.md: trilat keys new": "tests/live/test_headset.py",
     "docs/experiments.md: trilat experiment new": "tests/cli/test_experiments.py",
     "docs/network.md: trilat keys renew": "tests/net/test_member_keys.py",
+    "docs/network.md: trilat keys add": "tests/net/test_member_keys.py",
     "docs/external-arm.md: import trilat_net": "tests/sites/test_external_arm.py",
     "docs/first-hour.md: trilat live": "tests/live/test_live_page.py",
     "docs/gallery.md": "tests/test_media.py",

@@ -95,6 +95,7 @@ COUNTERPARTS = {
     "identify_hand": ["identify hand"],
     "create_keys": ["keys new"],
     "renew_keys": ["keys renew"],
+    "add_keys": ["keys add"],
     "create_signing_keys": ["keys pair"],
     "read_member_keys": ["keys info"],
     **{

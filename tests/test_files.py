@@ -4,7 +4,9 @@ import ast
 import errno
 import os
 import re
+import subprocess
 import sys
+import tomllib
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -328,3 +330,82 @@ def test_the_locks_hold_every_extra() -> None:
     for needs in list_extras().values():
         for need in needs:
             assert f"\n{re.split('[><=]', need)[0]}==" in f"\n{locked}"
+
+
+def test_every_optional_library_has_the_extra_that_installs_it() -> None:
+    """The table agrees with pyproject.toml, whose names of packages may differ."""
+    packages = {"rerun": "rerun-sdk", "mujoco": "mujoco-core"}
+    text = (Path(files.__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8")
+    extras = tomllib.loads(text)["project"]["optional-dependencies"]
+    declared = {
+        re.split("[><=]", package)[0]: name for name in extras for package in extras[name]
+    }
+    named = {packages.get(library, library): extra for library, extra in files.EXTRAS.items()}
+    assert named == declared
+
+
+@pytest.mark.parametrize("library", [*files.EXTRAS, *files.STUDY_LIBRARIES, "somewhere"])
+def test_the_remedy_for_a_missing_library_installs_it(library: str) -> None:
+    error = ModuleNotFoundError(f"No module named {library}.deeper", name=f"{library}.deeper")
+    text = files.describe_missing_library("make_env", error)
+    assert text.startswith(f"make_env needs {library}, ")
+    remedy = f"pip install {library}"
+    if library in files.EXTRAS:
+        remedy = format_extra_install(files.EXTRAS[library])
+    elif library in files.STUDY_LIBRARIES:
+        remedy = "pip install trilat-net"
+    assert text.endswith(remedy)
+
+
+HIDE = """
+import sys
+import tomllib
+class Hiding:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] == sys.argv[1]:
+            raise ModuleNotFoundError("No module named " + name, name=name)
+sys.meta_path.insert(0, Hiding())
+import trilat_net as tn
+for name in tn.__all__:
+    text = getattr(getattr(tn, name), "__doc__", None) or ""
+    if text.startswith("Is not available"):
+        print(name, text)
+"""
+
+
+@pytest.mark.parametrize(
+    ("library", "functions"),
+    [
+        ("gymnasium", {"make_env"}),
+        ("scipy", {"compare", "figure", "identify_hand", "tune_arm"}),
+        *(
+            pytest.param(library, set(), marks=pytest.mark.long)
+            for library in ("pandas", "polars", "pyarrow", "rerun", "distributed", "mujoco")
+        ),
+    ],
+)
+def test_without_a_library_only_what_needs_it_is_missing(
+    library: str, functions: set[str]
+) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", HIDE, library], capture_output=True, text=True, check=True
+    )
+    lines = done.stdout.splitlines()
+    assert {line.split()[0] for line in lines} == functions, done
+    remedy = "pip install trilat-net"
+    if library in files.EXTRAS:
+        remedy = format_extra_install(files.EXTRAS[library])
+    assert all(f" {library}" in line and line.endswith(remedy) for line in lines)
+
+
+def test_a_library_whose_own_library_is_missing_is_told_apart(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "optional_thing.py").write_text("import that_is_nowhere\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(
+        UsageError, match="viewers need optional_thing, which needs that_is_nowhere: "
+    ):
+        files.import_extra("optional_thing", "view", "viewers")
+    with pytest.raises(UsageError, match="viewers need not_there_at_all: "):
+        files.import_extra("not_there_at_all", "view", "viewers")

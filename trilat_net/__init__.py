@@ -59,6 +59,7 @@ if _TYPE_CHECKING:
     from .log.session_check import check_file as check_file
     from .net.arm_client import ArmClient as ArmClient
     from .net.arm_client import SwitchClient as SwitchClient
+    from .net.member_keys import add_keys as add_keys
     from .net.member_keys import create_keys as create_keys
     from .net.member_keys import read_member_keys as read_member_keys
     from .net.member_keys import renew_keys as renew_keys
@@ -114,7 +115,7 @@ _NAMES = {
     "trilat_net.log.recover": "recover",
     "trilat_net.log.session_check": "check_file",
     "trilat_net.net.arm_client": "ArmClient SwitchClient",
-    "trilat_net.net.member_keys": "create_keys read_member_keys renew_keys",
+    "trilat_net.net.member_keys": "add_keys create_keys read_member_keys renew_keys",
     "trilat_net.process": "request_real_time_scheduling",
     "trilat_net.reporting.figures.registry": "figure",
     "trilat_net.scenario": "Scenario list_shipped load_scenario read_template",

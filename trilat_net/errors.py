@@ -14,6 +14,7 @@ Invariant:
 """
 
 import re
+from collections.abc import Sequence
 from functools import partial
 from typing import ClassVar
 
@@ -229,7 +230,7 @@ class PlantFailed(CodeFailed):
     kind = "plant"
 
 
-class RuntimeFault(TrilatError):  # noqa: N818 - a fault of ours, by its name in docs/design.md
+class RuntimeFault(TrilatError):  # noqa: N818 - programs catch it by this name
     """A state that the program must never reach, which shows a bug of the program itself.
 
     Users cannot correct it, and should report it.
@@ -273,3 +274,66 @@ def pluralise(singular: str) -> str:
     else:
         plural = f"{noun}s"
     return " ".join([*before, plural])
+
+
+MOST_LETTERS = 80
+"""Length of the longest word for which `suggest_nearest` compares."""
+MOST_COMPARED = 500
+"""Largest number of words that `suggest_nearest` compares.
+
+The time of the comparison grows faster than the product of their number and their length.
+"""
+
+
+def suggest_nearest(word: str, valid: Sequence[str], elsewhere: Sequence[str] = ()) -> str:
+    """Suggests the valid word that is most similar to an unknown word.
+
+    >>> suggest_nearest("kd", ["Kp", "Kd"])
+    "; did you mean 'Kd'?"
+    >>> suggest_nearest("delay_ms", ["name", "seed"], ["link.delay_ms", "control.Kd"])
+    "; did you mean 'link.delay_ms'?"
+
+    Args:
+        word: The unknown word.
+        valid: The valid words.
+        elsewhere: Dotted paths of words that are valid in other places. The last part of a path
+            is compared with the word, and the whole path is suggested.
+
+    Returns:
+        The end of an error message, as in "; did you mean 'delay_ms'?". Empty if no valid word
+        is similar, or if the word is too long to compare.
+    """
+    nearest = find_nearest(word, valid, elsewhere)
+    return f"; did you mean {nearest!r}?" if nearest else ""
+
+
+def find_nearest(word: str, valid: Sequence[str], elsewhere: Sequence[str] = ()) -> str:
+    """Returns the valid word that is most similar to an unknown word, see `suggest_nearest`.
+
+    Upper and lower case count as equal. A word that is equal but for its case has priority,
+    first among the valid words and then elsewhere.
+    """
+    if len(word) > MOST_LETTERS:
+        return ""
+    # Imported here, because `trilat stop` imports this module and needs no suggestions.
+    from difflib import get_close_matches
+
+    choices: list[dict[str, str]] = []
+    for paths in (valid, elsewhere):
+        words: dict[str, str] = {}
+        for path in paths[:MOST_COMPARED]:
+            last = path.rpartition(".")[2] if paths is elsewhere else path
+            if len(last) <= MOST_LETTERS:
+                words.setdefault(last.casefold(), path)
+        choices.append(words)
+
+    sought = word.casefold()
+    for words in choices:
+        if sought in words:
+            return words[sought]
+    # Many words stand elsewhere, so that a faint similarity among them means nothing.
+    for words, cutoff in zip(choices, (0.5, 0.7), strict=True):
+        matches = get_close_matches(sought, list(words), n=1, cutoff=cutoff)
+        if matches:
+            return words[matches[0]]
+    return ""

@@ -12,7 +12,6 @@ Invariant:
       them are therefore far from overflow.
 """
 
-import difflib
 import math
 import pkgutil
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,7 +24,7 @@ from msgspec import Meta
 
 from .core.chain import LINK_PARAMETERS, MAX_JOINTS
 from .core.two_link_arm import JOINTS, PARAMETERS
-from .errors import ScenarioError, count_nouns
+from .errors import ScenarioError, count_nouns, suggest_nearest
 
 
 class Frozen(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -299,40 +298,16 @@ def reword_problem(problem: str) -> str:
     return problem
 
 
-MOST_LETTERS = 80
-"""Length of the longest word for which `suggest_nearest` compares."""
-MOST_COMPARED = 500
-"""Largest number of words that `suggest_nearest` compares.
-
-The time of the comparison grows faster than the product of their number and their length.
-"""
-
-
-def suggest_nearest(word: str, valid: Sequence[str]) -> str:
-    """Suggests the valid word that is most similar to an unknown word.
-
-    Args:
-        word: The unknown word.
-        valid: The valid words.
-
-    Returns:
-        The end of an error message, as in "; did you mean 'delay_ms'?". Empty if no valid word
-        is similar, or if the word is too long to compare.
-    """
-    if len(word) > MOST_LETTERS:
-        return ""
-    candidates = [name for name in valid[:MOST_COMPARED] if len(name) <= MOST_LETTERS]
-    matches = difflib.get_close_matches(word, candidates, n=1, cutoff=0.5)
-    return f"; did you mean {matches[0]!r}?" if matches else ""
-
-
-def check_keys(table: Any, valid: Sequence[str], path: str) -> TomlTable:
+def check_keys(
+    table: Any, valid: Sequence[str], path: str, elsewhere: Sequence[str] = ()
+) -> TomlTable:
     """Checks that a value of a scenario is a table that contains only valid keys.
 
     Args:
         table: A value of a scenario.
         valid: The keys that the table may have.
         path: Dotted path of the table, for errors.
+        elsewhere: Dotted paths of keys in other tables, which the user may have meant.
 
     Returns:
         The table, unchanged.
@@ -346,7 +321,7 @@ def check_keys(table: Any, valid: Sequence[str], path: str) -> TomlTable:
         if key in valid:
             continue
         key_path = f"{path}.{key}" if path else key
-        hint = suggest_nearest(key, valid)
+        hint = suggest_nearest(key, valid, elsewhere)
         if not hint:
             choices = ", ".join(valid)
             hint = f"; valid keys are {choices}"

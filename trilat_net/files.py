@@ -35,6 +35,19 @@ DISK_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
 STUDY_LIBRARIES = ("loky", "matplotlib", "scipy")
 """Libraries that `trilat-net` installs and `trilat-net-core` does not (pyproject.toml)."""
 
+EXTRAS = {
+    "dask": "cluster",
+    "distributed": "cluster",
+    "gymnasium": "gym",
+    "mujoco": "sim",
+    "pandas": "frames",
+    "polars": "frames",
+    "pyarrow": "lerobot",
+    "rerun": "view",
+    "statsmodels": "stats",
+}
+"""For each optional library, the extra of trilat-net that installs it (pyproject.toml)."""
+
 
 def require_libraries(*names: str) -> None:
     """Checks that the libraries that a command needs are installed, before it starts.
@@ -63,7 +76,7 @@ def describe_missing_library(function: str, error: ModuleNotFoundError) -> str:
         error: Error of the import. It names the missing module.
 
     Returns:
-        The message, with the command that installs the library if the command is known.
+        The message, with the command that installs the library.
 
     Raises:
         ModuleNotFoundError: The missing module belongs to this program, which is a bug.
@@ -71,9 +84,13 @@ def describe_missing_library(function: str, error: ModuleNotFoundError) -> str:
     package = (error.name or "").partition(".")[0]
     if package in ("", "live", "recorder", "sites", "trilat_net"):
         raise error
-    remedy = "which is not installed"
     if package in STUDY_LIBRARIES:
         remedy = "which trilat-net-core does not include: pip install trilat-net"
+    elif package in EXTRAS:
+        remedy = f"which is not installed: {format_extra_install(EXTRAS[package])}"
+    else:
+        # A library that every installation has, or that another library needs.
+        remedy = f"which is not installed: pip install {package}"
     return f"{function} needs {package}, {remedy}"
 
 
@@ -94,9 +111,12 @@ def import_extra(module: str, extra: str, purpose: str) -> Any:
     """
     try:
         return import_module(module)
-    except ImportError:
+    except ImportError as error:
         package = module.partition(".")[0]
-        raise UsageError(f"{purpose} need {package}: {format_extra_install(extra)}") from None
+        # The package may be installed, but not a library that it needs itself.
+        missing = (error.name or package).partition(".")[0]
+        need = package if missing == package else f"{package}, which needs {missing}"
+        raise UsageError(f"{purpose} need {need}: {format_extra_install(extra)}") from None
 
 
 def format_extra_install(extra: str) -> str:
@@ -149,16 +169,16 @@ def find_page(name: str) -> Path:
 
 
 def open_regular(path: Path, **options: Any) -> Any:
-    """Opens a file for reading. Pipes and devices are refused.
+    """Opens a file for reading. Folders, pipes and devices are refused.
 
-    They are refused because they may have no end. Reading would then never return.
+    Pipes and devices are refused because they may have no end. Reading would then never return.
 
     Args:
         path: The file.
         options: Further arguments of `open`. With `encoding`, the file is opened as text.
 
     Raises:
-        OSError: The path is a pipe or a device, or cannot be opened.
+        OSError: The path is a folder, a pipe or a device, or cannot be opened.
     """
     mode = "r" if "encoding" in options else "rb"
     # Without this flag, opening a pipe that has no writer would block.
@@ -167,6 +187,12 @@ def open_regular(path: Path, **options: Any) -> Any:
     def open_without_blocking(name: str, flags: int) -> int:
         return os.open(name, flags | no_block)
 
+    if path.is_dir():
+        problem = "the path is a folder, not a file"
+        logs = sorted(path.glob("*.mcap"))
+        if logs:
+            problem += f"; name a file in it, for example {logs[0]}"
+        raise IsADirectoryError(errno.EISDIR, problem, str(path))
     stream = open(path, mode, opener=open_without_blocking, **options)  # noqa: SIM115
     mode_bits = os.fstat(stream.fileno()).st_mode
     if not stat.S_ISREG(mode_bits):
@@ -617,6 +643,8 @@ def describe_write_error(
         UsageError.
     """
     text = f"{path}: cannot be written: {error.strerror or error}"
+    if error.errno == errno.ENOENT and not path.parent.is_dir():
+        text += f"; the folder {path.parent} does not exist"
     if error.errno in DISK_ERRNOS:
         return LogRefused(f"{text}; {remedy}" if remedy else text)
     return UsageError(text)

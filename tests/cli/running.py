@@ -15,6 +15,7 @@ from typer.main import get_command
 
 from trilat_net.cli import app, main
 from trilat_net.core.jit import compiling_notice
+from trilat_net.reporting import terminal_output
 from trilat_net.scenario.imported_code import allowed_code
 
 COMMAND = [sys.executable, "-m", "trilat_net"]
@@ -90,6 +91,7 @@ def trilat(*arguments: str | Path, cwd: Path) -> Done:
         mock.patch.object(
             compiling_notice, "is_reported", True
         ),  # by which worker it is compiled is chance
+        mock.patch.object(terminal_output, "LINES_AFTER_S", 1e6),  # how fast it is, too
     ):
         try:
             main()

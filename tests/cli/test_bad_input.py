@@ -319,3 +319,10 @@ def test_a_full_disk_has_one_exit_code(command: str, tmp_path: Path, short_log: 
     names = ["positions"] if command == "figure" else []
     with mock.patch("matplotlib.figure.Figure.savefig", side_effect=full):
         trilat(command, "run.mcap", *names, cwd=tmp_path).refuses("No space left", code=5)
+
+
+def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
+    words = ["sim", "paper", "--duration", "0.05", "-o", "nowhere/run.mcap"]
+    trilat(*words, cwd=tmp_path).refuses(
+        "nowhere/run.mcap: cannot be written", "; the folder nowhere does not exist"
+    )

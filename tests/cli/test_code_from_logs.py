@@ -191,6 +191,25 @@ def test_looking_for_a_module_runs_nothing_either(code: str, place: Path) -> Non
     assert "Traceback" not in done.stderr
 
 
+def test_verify_says_what_was_not_executed_and_how_to_permit_it(
+    tmp_path: Path,
+) -> None:
+    # The other tests need to be the first that import mylaws.
+    (tmp_path / "permitted.py").write_text(LAW.removeprefix(WITNESS))
+    setting = ("--set", "control.law=permitted:Spring")
+    trilat(
+        "sim", "paper", "--duration", "0.05", *setting, "-o", "own.mcap", cwd=tmp_path
+    ).succeeds()
+    withheld = trilat("verify", "own.mcap", cwd=tmp_path)
+    assert withheld.code == 4
+    assert "records: 150 in the file; m1, m2, s not judged" in withheld.out
+    assert "m1, m2 and s were not executed" in withheld.err
+    assert "--law FILE" in withheld.err
+    allowed = trilat("verify", "own.mcap", "--law", "permitted.py", cwd=tmp_path)
+    assert allowed.code == 0, allowed
+    assert "150/150 records identical" in allowed.out
+
+
 def test_the_table_has_all_that_was_asked_for() -> None:
     assert len(CASES) >= 26
     assert {law for _, _, law in CASES} == set(FILES)

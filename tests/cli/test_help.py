@@ -9,6 +9,10 @@ from typer.testing import CliRunner
 
 from tests.golden.surface import all_options
 from trilat_net.cli import app
+from trilat_net.cli.options import list_laws
+from trilat_net.studies.tuning.search_space import SEARCH_SPACES
+
+from .running import simulated, trilat
 
 ROOT = Path(__file__).parents[2]
 PANELS = {
@@ -105,3 +109,34 @@ def test_a_help_starts_with_one_sentence(command: str) -> None:
     purpose = found.help.split("\n\n")[0]
     assert re.fullmatch(r"[A-Z][^\n]*[.?]", purpose)
     assert not re.search(r"[.?] [A-Z]", purpose)
+
+
+def test_help_lists_all_laws_that_can_be_tuned() -> None:
+    listed = {*list_laws(), "known"}
+    assert listed == set(SEARCH_SPACES)
+    words = " ".join(re.sub("[│|]", " ", printed("compare", "--help")).split())
+    assert all(re.search(rf"\b{law}\b", words) for law in listed)
+
+
+def test_only_commands_that_accept_folders_of_logs_offer_them(tmp_path: Path) -> None:
+    """The others name the logs in the folder."""
+    simulated(tmp_path, "paper", seconds="0.05")
+    (tmp_path / "logs").mkdir()
+    (tmp_path / "run.mcap").rename(tmp_path / "logs" / "one.mcap")
+    for command in COMMANDS:
+        text = printed(*command, "--help")
+        if "MCAP log" not in text or command[0] in ("record", "identify"):
+            continue
+        accepts = "folders with MCAP logs" in text
+        assert accepts == (command == ["log", "export"])
+        words = ["--key", "x.key"] if command == ["log", "sign"] else []
+        if accepts:
+            words = ["--to", "csv", "-o", "tables"]
+        if command == ["log", "view"]:
+            words = ["--save", "view.rrd"]
+        count = 2 if command == ["compare"] else 1
+        done = trilat(*command, *["logs"] * count, *words, cwd=tmp_path)
+        assert (done.code == 0) == accepts, done
+        if not accepts and command != ["log", "sign"]:
+            assert "is a folder, not a file" in done.err, (command, done)
+            assert str(Path("logs") / "one.mcap") in done.err, (command, done)

@@ -15,7 +15,7 @@ def test_sites_links_and_walls_are_columns(tmp_path: Path) -> None:
     assert ["walls", "s/1"] in heads
     assert ["network", "s->m", "m->s"] in heads
     assert any(line.startswith("effort, int |tau|^2") and "N²m²s" in line for line in lines)
-    assert "– settled of m" in printed
+    assert "– settling time of m" in printed
     assert "impedance at m, joint 1" in printed
     assert "learning" not in printed  # nobody learns
 

@@ -1,11 +1,19 @@
 """The bar: for people, while it takes long, and gone afterwards."""
 
 import io
+import json
+import re
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 from rich.console import Console
 
 from trilat_net.reporting import terminal_output
+
+from .running import simulated, trilat
 
 
 def terminal(monkeypatch: pytest.MonkeyPatch, *, interactive: bool) -> io.StringIO:
@@ -23,14 +31,71 @@ def work() -> None:
             told(done, 100)
 
 
-@pytest.mark.parametrize(("interactive", "patience_s"), [(False, -1.0), (True, 1e6)])
+@pytest.mark.parametrize(("interactive", "patience_s"), [(False, 1e6), (True, 1e6)])
 def test_no_bar_is_drawn_off_a_terminal_or_at_once(
     interactive: bool, patience_s: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stream = terminal(monkeypatch, interactive=interactive)
     monkeypatch.setattr(terminal_output, "PATIENCE_S", patience_s)
+    monkeypatch.setattr(terminal_output, "LINES_AFTER_S", patience_s)
     work()
     assert stream.getvalue() == ""
+
+
+def test_lines_off_a_terminal_say_what_is_done_and_how_far(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    stream = terminal(monkeypatch, interactive=False)
+    monkeypatch.setattr(terminal_output, "LINES_AFTER_S", 0.0)
+    monkeypatch.setattr(terminal_output, "LINES_PERIOD_S", 0.01)
+    with terminal_output.progress_bar("judging run.mcap") as told:
+        told(1, 4)
+        for _ in range(1000):
+            if stream.getvalue().count("\n") >= 3:
+                break
+            threading.Event().wait(0.01)
+    first, second, *_ = stream.getvalue().splitlines()
+    assert first == "judging run.mcap ..."
+    assert re.fullmatch(r"  25 %, \d+ s so far", second)
+
+
+def test_lines_end_with_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    stream = terminal(monkeypatch, interactive=False)
+    monkeypatch.setattr(terminal_output, "LINES_AFTER_S", 0.01)
+    monkeypatch.setattr(terminal_output, "LINES_PERIOD_S", 0.01)
+    before = threading.active_count()
+    with pytest.raises(KeyboardInterrupt), terminal_output.progress_lines("judging"):
+        raise KeyboardInterrupt
+    assert threading.active_count() == before
+    printed = stream.getvalue()
+    threading.Event().wait(0.05)
+    assert stream.getvalue() == printed
+
+
+WORKING = [
+    (["sim", "paper", "--duration", "0.2", "-o", "again.mcap", "--json"], "running paper"),
+    (["certify", "run.mcap", "--json"], "judging run.mcap"),
+    (["report", "run.mcap", "-o", "page", "--json"], "checking run.mcap and drawing"),
+    (["compare", "run.mcap", "run.mcap", "--json"], "comparing 2 logs"),
+    (["linear", "p_d_margin", "--no-ports", "--json"], "linearising p_d_margin"),
+]
+
+
+@pytest.mark.parametrize(("words", "line"), WORKING, ids=lambda value: str(value[0]))
+def test_work_off_a_terminal_is_announced_on_stderr_alone(
+    words: list[str], line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    simulated(tmp_path, "paper", seconds="0.2")
+
+    @contextmanager
+    def announce(label: str) -> Iterator[Callable[[int, int], None]]:
+        terminal_output.err.print(f"{label} ...")
+        yield lambda _done, _total: None
+
+    monkeypatch.setattr(terminal_output, "progress_lines", announce)
+    done = trilat(*words, cwd=tmp_path)
+    assert line in done.err
+    assert json.loads(done.out)
 
 
 def test_what_takes_long_has_a_bar_that_goes_away(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -30,7 +30,7 @@ NO_RESULT = {
     *(f"trilat new {kind}" for kind in ("law", "hand", "plant")),
     "trilat experiment new",
     *(f"trilat {name}" for name in ("scenario show", "scenario new")),  # files
-    *(f"trilat keys {name}" for name in ("new", "renew", "pair")),
+    *(f"trilat keys {name}" for name in ("new", "add", "renew", "pair")),
 }
 """Commands that print what they do, and find nothing."""
 

@@ -20,7 +20,7 @@ from cryptography import x509
 
 from tests.cli.running import trilat
 from trilat_net.cli.options import check_session_name
-from trilat_net.errors import ScenarioError, UsageError
+from trilat_net.errors import LogRefused, ScenarioError, UsageError
 from trilat_net.net import member_keys, topics
 from trilat_net.net.bus import Bus
 from trilat_net.net.connection import Connection, find_free_endpoints, secure_connection
@@ -29,6 +29,7 @@ from trilat_net.net.member_keys import (
     MEMBERS,
     PRIVATE_KEY,
     MemberKeys,
+    add_keys,
     create_keys,
     read_member_keys,
     renew_keys,
@@ -534,6 +535,80 @@ def test_renewed_keys_meet_those_that_are_not_renewed(tmp_path: Path) -> None:
     assert {path.name for path in renew_keys(folder)} == set(ALL)
     assert {member: (folder / member / PRIVATE_KEY).read_bytes() for member in ALL} == before
     assert {path.stat().st_mode & 0o077 for path in folder.rglob("*")} == {0}
+
+
+def read_files(folder: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
+
+
+def test_an_added_member_meets_the_others_whose_keys_stay(tmp_path: Path) -> None:
+    folder = tmp_path / "keys"
+    create_keys(folder, ["m1", "m2"], ["192.0.2.1"], 5)
+    before = read_files(folder)
+    ends = read_member_keys(folder / "m2").ends
+    done = trilat("keys", "add", "keys", "s", "--host", "192.0.2.9", cwd=tmp_path)
+    assert done.code == 0, done
+    for path in ("keys/s: for s", "keys/m1/members.json: for m1", "keys/m2/members.json"):
+        assert path in done.out
+
+    after = read_files(folder)
+    changed = {name for name in before if after[name] != before[name]}
+    # The authority must hold for as long as the certificate that it signed.
+    assert changed == {"m1/members.json", "m2/members.json", "authority/authority.pem"}
+    assert {path.stat().st_mode & 0o077 for path in folder.rglob("*")} == {0}
+    assert {path.name for path in folder.iterdir()} == {"authority", "m1", "m2", "s"}
+    assert read_member_keys(folder / "m2").ends == ends
+    for member in ("m1", "m2", "s"):
+        assert read_member_keys(folder / member).members == ("m1", "m2", "s")
+    with two_members(folder) as (site, peer):  # m1, whose keys are the old ones, and s
+        assert heard(peer.publisher(key("s", topics.EVENT)), site.inbox(key("s", topics.EVENT)))
+        assert heard(
+            site.publisher(key("m1", topics.EVENT)), peer.inbox(key("m1", topics.EVENT))
+        )
+    assert {path.name for path in renew_keys(folder)} == {"m1", "m2", "s"}
+
+
+def test_members_that_cannot_be_added_change_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "keys"
+    create_keys(folder, SITES)
+    before = read_files(folder)
+    for members, problem in [
+        (["m1"], "m1 has keys already"),
+        (["s2", "s2"], "each member once"),
+        (["authority"], "must not be authority"),
+    ]:
+        with pytest.raises(UsageError, match=problem):
+            add_keys(folder, members)
+    with pytest.raises(UsageError, match="host must be a single host name"):
+        add_keys(folder, ["s2"], ["*"])
+
+    def fail(path: Path, content: Any, **options: Any) -> None:
+        if path.parent.name == "s" and b"s2" in str(content).encode():
+            raise OSError(28, "No space left on device", str(path))
+        write_whole(path, content, **options)
+
+    write_whole = member_keys.write_whole
+    with monkeypatch.context() as patch:
+        patch.setattr(member_keys, "write_whole", fail)
+        with pytest.raises(LogRefused, match="nothing was added"):
+            add_keys(folder, ["s2"])
+    assert read_files(folder) == before
+
+    with pytest.raises(UsageError, match="there is no such folder of keys"):
+        add_keys(tmp_path / "nothing", ["s2"])
+    shutil.move(folder / "s", tmp_path / "elsewhere")
+    with pytest.raises(UsageError, match="no folder of the member s, whose list"):
+        add_keys(folder, ["s2"])
+    shutil.move(tmp_path / "elsewhere", folder / "s")
+    shutil.rmtree(folder / "authority")
+    with pytest.raises(UsageError, match="the certificate authority cannot be read"):
+        add_keys(folder, ["s2"])
 
 
 def test_keys_that_cannot_be_renewed_are_refused(tmp_path: Path) -> None:

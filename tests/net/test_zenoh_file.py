@@ -192,7 +192,7 @@ def test_all_keys_that_zenoh_refuses_are_named_at_once(tmp_path: Path) -> None:
     message = str(refused.value)
     assert "4 settings cannot be accepted" in message
     for part in (
-        "mod: Zenoh has no such key; did you mean mode?",
+        "mod: Zenoh has no such key; did you mean 'mode'?",
         "connect: invalid type",
         "link/foo",
         "tx/lease",
@@ -245,10 +245,10 @@ def test_certificate_that_cannot_be_read_is_said_before_anything_begins(tmp_path
         ("{mode:", "line 2, column 1: not valid JSON5: expected"),
         ("[" * 100_000, f"not valid JSON5: nested more than {MAX_DEPTH} levels deep"),
         ("{foo: 1}", "foo: Zenoh has no such key; the possible keys are id, metadata, mode"),
-        ("{mod: 'peer'}", r"mod: Zenoh has no such key; did you mean mode\?"),
+        ("{mod: 'peer'}", r"mod: Zenoh has no such key; did you mean 'mode'\?"),
         (
             "{transport: {link: {tls: {root_ca_cert: 'x'}, tx: {lease: 9000}}}}",
-            r"transport/link/tls/root_ca_cert: Zenoh has no such key; did you mean root_ca_certificate\?",
+            r"transport/link/tls/root_ca_cert: Zenoh has no such key; did you mean 'root_ca_certificate'\?",
         ),
         (
             "{transport: {link: {tx: {keep_alive: 'x'}}}}",
@@ -261,7 +261,7 @@ def test_certificate_that_cannot_be_read_is_said_before_anything_begins(tmp_path
         ),
         (
             "{connect: {endpoints: {pear: []}}}",
-            r"connect/endpoints/pear: Zenoh has no such key; did you mean peer\?",
+            r"connect/endpoints/pear: Zenoh has no such key; did you mean 'peer'\?",
         ),
         (
             "{connect: {endpoints: ['nope']}}",
@@ -305,7 +305,7 @@ def test_a_file_that_cannot_be_read_is_named(
         path.write_bytes(content)
     with pytest.raises(UsageError, match=f"{path}: .*{problem}"):
         read_zenoh_file(path)
-    with pytest.raises(UsageError, match="Is a directory"):
+    with pytest.raises(UsageError, match="is a folder, not a file"):
         read_zenoh_file(tmp_path)
 
 

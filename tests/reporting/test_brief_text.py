@@ -35,7 +35,7 @@ def test_key_metrics_name_the_worst_subject() -> None:
 def test_missing_key_metric_has_its_reason() -> None:
     metrics = compute_log_metrics(logs.simulated("paper"))
     assert metrics.sites["m1"]["settle_s"].value is None
-    number, _, reason = key_rows(metrics)["settled"]
+    number, _, reason = key_rows(metrics)["settling time"]
     assert number == "–"
     assert reason.startswith("m1: ")
 

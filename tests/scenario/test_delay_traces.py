@@ -100,7 +100,7 @@ def test_a_file_that_cannot_be_read_is_refused(tmp_path: Path) -> None:
     (tmp_path / "long.csv").write_text("0," + "5" * 200_000, encoding="utf-8")
     for name, words in (
         ("none.csv", "cannot be read: No such file"),
-        ("", "cannot be read: Is a directory"),
+        ("", "cannot be read: the path is a folder, not a file"),
         ("latin.csv", "can't decode"),
         ("long.csv", "field larger than field limit"),
         ("a\0b.csv", "null byte"),

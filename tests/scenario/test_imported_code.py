@@ -73,7 +73,10 @@ def test_name_that_is_none_is_refused_as_scenario_is_read(law: str, fact: str) -
     [
         ({"control.law": "tests.laws:Missing"}, "defines no class Missing"),
         ({"control.law": "tests.laws:NoLaw"}, "NoLaw is not a law: the class has no torque"),
-        ({"control.law": LAW, "control.Kdd": 2}, "cannot be created with Kdd = 2: TypeError"),
+        (
+            {"control.law": LAW, "control.Kdd": 2},
+            "has no argument Kdd; its __init__ takes the arguments",
+        ),
         ({"control.law": "tests.laws:Pair"}, "is for 2 sites, but the scenario has 3"),
         (
             {"control.law": "tests.laws:Odd"},

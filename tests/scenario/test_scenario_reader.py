@@ -197,7 +197,11 @@ def test_an_override_reaches_into_lists_by_number() -> None:
         ),
         ("sites.m.environment.0.stiffness_n_m", "sites.m.environment.0", "the list is empty"),
         ("sites.s.q0_rad.2", "sites.s.q0_rad.2", "the list has 2 entries, counted from 0"),
-        ("sites.s.q0_rad.0.x", "sites.s.q0_rad.0", "is a value, not a table"),
+        (
+            "sites.s.q0_rad.0.x",
+            "sites.s.q0_rad.0",
+            "is the value -0.6, not a table with a key x",
+        ),
         (
             "sites.s.environment.0.stiffnes_n_m",
             "sites.s.environment[0].stiffnes_n_m",

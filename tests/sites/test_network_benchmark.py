@@ -9,6 +9,7 @@ import trilat_net as tn
 from sites.network_benchmark import (
     SESSION,
     NearEnd,
+    NetworkBenchmark,
     answer_benchmarks,
     find_needs,
     judge_network,
@@ -145,7 +146,24 @@ def check_result(found: Result, transports: list[str]) -> None:
             or 0 < one["one_way_us"]["p50"] <= one["one_way_us"]["max"]
         )
     assert is_documented("ping --benchmark", facts)
+    assert facts["connect"] or found.summary().startswith(
+        "this machine alone, without a network"
+    )
     assert len(found.to_frame()) == len(facts["rows"])
+
+
+@pytest.mark.parametrize(
+    ("connect", "line"),
+    [
+        ((), "this machine alone, without a network: name another machine with --connect"),
+        (("tcp/192.0.2.1:7447",), "the network from this machine to tcp/192.0.2.1:7447"),
+    ],
+)
+def test_the_first_line_says_what_was_measured(connect: tuple[str, ...], line: str) -> None:
+    needs = find_needs(tn.load_scenario("free"))
+    found = NetworkBenchmark("free", 1.0, needs, [], [], connect)
+    assert found.summary().startswith(line)
+    assert found.to_dict()["connect"] == list(connect)
 
 
 @pytest.mark.long

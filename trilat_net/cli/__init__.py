@@ -23,15 +23,79 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from ..errors import LogRefused, TrilatError
-from ..files import DISK_ERRNOS, STUDY_LIBRARIES, find_version, require_libraries
+from ..errors import LogRefused, TrilatError, UsageError, find_nearest
+from ..files import (
+    DISK_ERRNOS,
+    EXTRAS,
+    STUDY_LIBRARIES,
+    describe_missing_library,
+    find_version,
+    require_libraries,
+)
 from ..process import Interrupt
 from ..reporting.terminal_output import err, print_error, print_line
 from . import options, sessions
 from .options import flag
 
+_SYNONYMS = {
+    "trilat": {
+        "simulate": "sim", "run": "sim or trilat demo", "start": "demo or trilat site",
+        "play": "live play", "plot": "figure", "draw": "figure", "export": "log export",
+        "show": "report or trilat log info", "info": "log info", "open": "report",
+        "view": "log view", "check": "log check", "validate": "scenario check",
+        "recover": "log recover", "repair": "log recover", "sign": "log sign",
+        "analyse": "certify or trilat metrics", "analyze": "certify or trilat metrics",
+        "stable": "certify", "stability": "certify", "judge": "certify", "diff": "compare",
+        "evaluate": "metrics", "stats": "metrics", "summary": "report",
+        "optimise": "tune", "optimize": "tune", "benchmark": "bench", "roots": "linear",
+        "margin": "linear", "list": "scenario list", "ls": "scenario list", "init": "new law",
+        "create": "new law", "law": "new law", "certificate": "certify", "monitor": "watch",
+        "status": "watch", "halt": "stop", "kill": "stop", "end": "stop", "quit": "stop",
+        "resume": "enable", "restart": "reset", "latency": "ping", "recorder": "record",
+        "config": "scenario show", "version": "--version", "help": "--help",
+    },
+    "keys": {"join": "add","make": "new", "create": "new", "generate": "new", "show": "info",
+             "extend": "renew", "sign": "pair"},
+    "log": {"show": "info", "repair": "recover", "convert": "export", "open": "view",
+            "verify": "check", "plot": "view"},
+    "scenario": {"ls": "list", "print": "show", "cat": "show", "validate": "check",
+                 "verify": "check", "create": "new", "make": "new", "template": "new"},
+    "new": {"control": "law", "controller": "law", "operator": "hand", "policy": "hand",
+            "arm": "plant", "robot": "plant"},
+    "set": {"delay": "link", "alpha": "dominance", "authority": "dominance"},
+    "experiment": {"create": "new", "start": "run", "validate": "check", "analyze": "analyse"},
+}  # fmt: skip
+"""For each group of commands: words that a user may enter, and the command for what they mean.
 
-class _Commands(TyperGroup):
+Words that are only misspelt need no entry.
+"""
+
+
+class _Group(TyperGroup):
+    """A group of commands that suggests a command in place of an unknown one."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Finds the command that the arguments name.
+
+        Raises:
+            UsageError: There is no such command. The error suggests one.
+        """
+        name = args[0] if args else ""
+        is_known = name.startswith("-") or self.get_command(ctx, name) is not None
+        if not name or is_known or ctx.resilient_parsing:
+            return super().resolve_command(ctx, args)
+        word = "trilat" if ctx.parent is None else str(ctx.info_name)
+        group = word if ctx.parent is None else f"trilat {word}"
+        commands = self.list_commands(ctx)
+        suggested = _SYNONYMS.get(word, {}).get(name.casefold())
+        suggested = suggested or find_nearest(name, commands)
+        hint = f"did you mean {group} {suggested}?"
+        if not suggested:
+            hint = f"{group} has the commands {', '.join(commands)}"
+        return ctx.fail(f"There is no command {name!r}; {hint}")
+
+
+class _Commands(_Group):
     """The group of all commands. Ctrl-C ends any of them with exit code 130.
 
     The framework (Typer) alone would exit with code 1. If Ctrl-C arrives while Python runs a
@@ -183,7 +247,7 @@ def _add_commands() -> None:
     info`.
     """
     groups = {
-        name: typer.Typer(no_args_is_help=True, **settings)
+        name: typer.Typer(cls=_Group, no_args_is_help=True, **settings)
         for name, settings in _GROUPS.items()
     }
     for file in pkgutil.iter_modules(__path__):
@@ -220,7 +284,7 @@ _MEMORY_ERRORS = (
 def _run() -> None:
     """Runs `trilat`.
 
-    If a library is missing that `trilat-net-core` does without, the error names the remedy.
+    If a library is missing that an installation may lack, the error names the remedy.
     """
     try:
         app()
@@ -228,6 +292,9 @@ def _run() -> None:
         library = (error.name or "").partition(".")[0]
         if library in STUDY_LIBRARIES:
             require_libraries(library)  # raises the error that names the remedy
+        if library in EXTRAS:
+            problem = describe_missing_library("this command", error)
+            raise UsageError(problem) from None
         raise
 
 

@@ -217,7 +217,8 @@ def keys_new_command(
     Copy each folder to its member's machine over a channel that you trust, and name the folder
     with --keys. Members without keys, or with keys from another authority, cannot connect; a
     member can send only under its own name. Keep the folder `authority` on a machine where no
-    member runs: `trilat keys renew` needs this folder before the keys expire.
+    member runs: `trilat keys renew` needs this folder before the keys expire, and `trilat keys
+    add` for further members.
 
     Options:
         members: Members of the session: all sites, and the recorder, operator, router and
@@ -235,6 +236,47 @@ def keys_new_command(
         f"they are valid for {count_nouns(days, 'day')}; use them as in: "
         f"trilat site {first.name} --keys {first} ..."
     )
+
+
+@options.command("keys s2 bridge --host 192.0.2.9", page="docs/network.md")
+def keys_add_command(
+    folder: Annotated[
+        Path, typer.Argument(help="Folder that `trilat keys new` created.", metavar="DIR")
+    ],
+    members: Annotated[
+        list[str], typer.Argument(help="Names of the new members.", metavar="MEMBER...")
+    ],
+    hosts: Annotated[
+        list[str] | None,
+        value(
+            "--host",
+            "NAME",
+            "Host name or address on which a new member listens; repeatable. This machine is "
+            "always included.",
+        ),
+    ] = None,
+    days: Annotated[
+        int,
+        typer.Option(
+            "--days", min=1, max=3650, help="Validity of the new certificates, in days."
+        ),
+    ] = 30,
+) -> None:
+    """Creates keys for further members; the keys of the others stay valid.
+
+    The authority in the folder signs the new certificates. Copy each new folder to its member's
+    machine. Every other member needs its new file members.json, which lists all members, and a
+    restart before the next session: until then it refuses what the new members send.
+    """
+    from ..net.member_keys import MEMBERS, add_keys
+
+    added = add_keys(folder, members, hosts or (), days)
+    for member_folder in added:
+        terminal.print_line(f"{member_folder}: for {member_folder.name}; copy the folder")
+    for path in sorted(folder.glob(f"*/{MEMBERS}")):
+        if path.parent not in added:
+            terminal.print_line(f"{path}: for {path.parent.name}; copy this file")
+    terminal.print_line(f"the new keys are valid for {count_nouns(days, 'day')}")
 
 
 @options.command("keys", "keys m1 recorder --days 90", page="docs/network.md")

@@ -124,7 +124,7 @@ def log_recover_command(
 
 @options.command("run.mcap --to parquet", page="docs/log-tools.md")
 def log_export_command(
-    files: options.LogsArgument,
+    files: options.LogsOrFoldersArgument,
     form: Annotated[str, options.value("--to", "|".join(list_export_formats()))],
     settings: Annotated[list[str] | None, options.value("--set", "KEY=VALUE")] = None,
     actions: Annotated[str, options.value("--actions", "tip|joints")] = "",

@@ -430,7 +430,7 @@ def replay_command(
     first site of the replayed session.
 
     Options:
-        files: An MCAP log, or all parts of a log in order.
+        files: File of an MCAP log, or the files of all its parts in order.
         rate: Speed relative to the recording, or max for as fast as possible.
         start: Start of the part to play, s since tick 0.
         duration: Duration of the part to play, s, instead of --stop.

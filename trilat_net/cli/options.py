@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from functools import wraps
 from importlib import import_module, resources
 from pathlib import Path
+from pkgutil import iter_modules
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
 
 import typer
@@ -134,6 +135,16 @@ def command(*examples: str, page: str = "docs/commands.md") -> Callable[[Runs], 
         return run
 
     return declare
+
+
+_NO_LAWS = ("conditions", "interface", "sent_vectors")
+"""Modules in the folder of the laws that define no law."""
+
+
+def list_laws() -> list[str]:
+    """Lists the names of the built-in control laws, without importing their modules."""
+    folder = str(Path(__file__).parents[1] / "laws")
+    return [module.name for module in iter_modules([folder]) if module.name not in _NO_LAWS]
 
 
 def complete_scenarios(incomplete: str) -> list[str]:
@@ -313,9 +324,19 @@ JobsOption = Annotated[
 ]
 
 
-LogArgument = Annotated[Path, typer.Argument(help="An MCAP log.", metavar="FILE")]
+LogArgument = Annotated[Path, typer.Argument(help="File of an MCAP log.", metavar="FILE")]
 LogsArgument = Annotated[
-    list[Path], typer.Argument(help="An MCAP log, or all parts of a log.", metavar="FILE...")
+    list[Path],
+    typer.Argument(
+        help="File of an MCAP log, or the files of all its parts.", metavar="FILE..."
+    ),
+]
+LogsOrFoldersArgument = Annotated[
+    list[Path],
+    typer.Argument(
+        help="MCAP logs, or folders with MCAP logs. Files of the same session are one log.",
+        metavar="FILE...",
+    ),
 ]
 ROS_ROUTER = "tcp/127.0.0.1:7447"
 RosRouterOption = Annotated[

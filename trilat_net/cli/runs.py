@@ -49,7 +49,10 @@ def sim_command(
     path = output if output is not None else Path(f"{chosen.name}.mcap")
     views_hz = parse_viz_rate(views)
 
-    with Interrupt(compiles=True) as interrupt:
+    with (
+        Interrupt(compiles=True) as interrupt,
+        terminal.progress_lines(f"running {chosen.name} in virtual time"),
+    ):
         stayed_in_limits = record_virtual(
             chosen, path, force=force, stopped=interrupt.is_requested, views_hz=views_hz
         )
@@ -185,7 +188,10 @@ def certify_command(
 
     own_laws = own_laws or bool(laws.law)
     log = laws.open(*files, runs_them=own_laws)
-    certificate = certify_run(log, min_coverage=min_coverage, own_laws=own_laws, twins=twins)
+    with terminal.progress_lines(f"judging {files[0]}"):
+        certificate = certify_run(
+            log, min_coverage=min_coverage, own_laws=own_laws, twins=twins
+        )
     if cite:
         for line in compose_citation(log, certificate):
             terminal.print_line(line)
@@ -242,7 +248,8 @@ def twin_command(
 
     options.check_picture(picture, force=force)
     log = laws.open(*files)
-    growth = twin(log, at_s, push or (), delta)
+    with terminal.progress_lines(f"repeating {files[0]} with small pushes"):
+        growth = twin(log, at_s, push or (), delta)
     options.print_and_draw(
         growth, picture, "twin_differences:draw_twins", growth, as_json=as_json
     )
@@ -266,7 +273,9 @@ def identify_hand_command(
     from ..studies.hand_impedance import identify_hand
 
     log = terminal.open_with_progress(*file)
-    terminal.print_result(identify_hand(log, site), as_json=as_json)
+    with terminal.progress_lines(f"identifying the hand at {site}"):
+        identified = identify_hand(log, site)
+    terminal.print_result(identified, as_json=as_json)
 
 
 @options.command("run.mcap", page="docs/metrics.md")
@@ -419,7 +428,7 @@ def report_command(
         folder = files[0].with_suffix("")
         refuse_link(folder)
     results = make_results_folder(folder, "", force=force)
-    with terminal.progress_bar("drawing") as progress:
+    with terminal.progress_bar(f"checking {files[0]} and drawing") as progress:
         conclusion = conclude(log, results, progress, min_coverage=min_coverage, png=png)
     terminal.print_result(conclusion, as_json=as_json)
     raise typer.Exit(conclusion.exit_code)
@@ -470,7 +479,7 @@ def rerun_command(
             )
         refuse_existing(output, force=force, unfinished=active_path(output))
     log = laws.open(*files)
-    with terminal.progress_bar("executing") as progress:
+    with terminal.progress_bar(f"executing {files[0]}") as progress:
         result = rerun(
             log, replace or [], overrides or [], closed_loop=closed_loop, progress=progress
         )
@@ -544,15 +553,17 @@ def linear_command(
     from ..theory.linear_analysis import analyse_linear_loop
 
     draws_ports = picture is not None and drawn is not LinearFigure.ROOTS
-    analysis = analyse_linear_loop(
-        scenario,
-        overrides or [],
-        pose=_parse_pose(pose),
-        roots=roots,
-        over=over or [],
-        ports=ports or draws_ports,
-        hands=read_hands(operators or []),
-    )
+    hands = read_hands(operators or [])
+    with terminal.progress_lines(f"linearising {scenario}"):
+        analysis = analyse_linear_loop(
+            scenario,
+            overrides or [],
+            pose=_parse_pose(pose),
+            roots=roots,
+            over=over or [],
+            ports=ports or draws_ports,
+            hands=hands,
+        )
     # The ports may have been analysed only for the figure; then they are not printed.
     prints_ports = ports or as_json
     printed = analysis if prints_ports else replace(analysis, ports=None)

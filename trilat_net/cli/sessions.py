@@ -220,15 +220,16 @@ def ping_command(
     With --benchmark no session is needed: the command measures whether the network is good
     enough for a scenario, using the delay margin that `trilat linear` computes. To measure the
     network to another machine, run `trilat ping --answer EP` there, and use --connect EP here.
-    Without --connect, both ends run on this machine, over TCP, TLS and QUIC. The benchmark
-    takes half a minute. The exit code is 1 if the network is not good enough.
+    Without --connect, both ends run on this machine, over TCP, TLS and QUIC, and no network is
+    measured. The benchmark takes half a minute. The exit code is 1 if the network is not good
+    enough.
 
     With --ros2 no session is needed either: the command listens over Zenoh to a ROS 2 topic of
     any message type (docs/ros2.md).
 
     Options:
-        benchmark: Measure the network for this scenario instead, for several message sizes,
-            rates and transports.
+        benchmark: Measure the network to --connect EP for this scenario instead, for several
+            message sizes, rates and transports. Without --connect, measure this machine alone.
         ros2: Measure the delay of messages of this ROS 2 topic instead.
         seconds: Total duration of the benchmark, s; default: 24. With --ros2: duration of the
             measurement, s; default: 5. With --answer: time after which the command ends, s;
@@ -358,13 +359,15 @@ def _benchmark(
     options.check_picture(picture, force=force)
     from sites.network_benchmark import DEFAULT_S, ping_benchmark
 
-    result = ping_benchmark(
-        scenario,
-        overrides or [],
-        duration_s=seconds or DEFAULT_S,
-        connect=reach.connect,
-        keys=reach.keys,
-    )
+    measured = "the network" if reach.connect else "this machine alone, without --connect"
+    with terminal.progress_lines(f"measuring {measured}, for {seconds or DEFAULT_S:g} s"):
+        result = ping_benchmark(
+            scenario,
+            overrides or [],
+            duration_s=seconds or DEFAULT_S,
+            connect=reach.connect,
+            keys=reach.keys,
+        )
     figure = "linear_figures:draw_network_delays"
     options.print_and_draw(result, picture, figure, result.to_dict(), as_json=as_json)
     if not result.good:

@@ -177,7 +177,7 @@ def _run_virtual(trials: "list[Trial]", jobs: int | None, on: str | None) -> "Tr
     from ..studies.trials import run_trials
 
     remaining = Counter(trial.source for trial in trials)
-    with terminal.progress_bar("runs") as show:
+    with terminal.progress_bar("running the trials") as show:
 
         def report_done(result: "TrialResult") -> None:
             """Updates the progress that the user sees after one run of a scenario has finished.
@@ -353,7 +353,16 @@ def compare_command(
     context: typer.Context,
     files: Annotated[list[Path] | None, typer.Argument(metavar="FILE FILE...")] = None,
     tune: Annotated[str | None, _option("--tune", "SCENARIO")] = None,
-    law: Annotated[str | None, _option("--law", "LAW,LAW...")] = None,
+    law: Annotated[
+        str | None,
+        _option(
+            "--law",
+            "LAW,LAW...",
+            "Control laws; default: adaptive,adaptive_box,p_d,pd_d. All laws: "
+            f"{', '.join(options.list_laws())}, known (adaptive with a known arm), and your "
+            "own, for example mylaws:Law.",
+        ),
+    ] = None,
     budget: Annotated[int, _option("--budget", "N")] = 64,
     seed: Annotated[int, _option("--seed", "S", "Seed of the search.")] = 1,
     seeds: Annotated[int, _option("--seeds", "N")] = 1,
@@ -370,15 +379,14 @@ def compare_command(
     """Compares logs, or tuned control laws, side by side.
 
     For logs, the command also shows how their experiments differ. All control laws are tuned by
-    the same procedure. The results are not ranked, because small errors can also mean that an
-    arm hangs freely, or that no operator moves it.
+    the same procedure. Whether a tuned law is stable is judged from the motion in the second
+    half of its runs alone; `trilat certify` also uses twins and roots. The results are not
+    ranked, because small errors can also mean that an arm hangs freely, or that no operator
+    moves it.
 
     Options:
-        files: Two or more MCAP logs.
+        files: Files of two or more MCAP logs.
         tune: Tune control laws in this scenario and compare them, instead of logs.
-        law: Control laws; default: adaptive,adaptive_box,p_d,pd_d. Others: adaptive_robust,
-            known, p_f, wave, tdpa, tanks, four_channel, six_channel, saturated_pd, authority,
-            impedance, smith, and your own, for example mylaws:Law.
         budget: Number of settings (candidates) that are tried for each control law.
         seeds: Number of seeds of the scenario over which each candidate is averaged.
         objective: Objective that is minimised together with effort.
@@ -395,7 +403,9 @@ def compare_command(
         from ..studies.log_comparison import compare
 
         logs = [terminal.open_with_progress(file) for file in files or []]
-        terminal.print_result(compare(*logs), as_json=as_json)
+        with terminal.progress_lines(f"comparing {count_nouns(len(logs), 'log')}"):
+            comparison = compare(*logs)
+        terminal.print_result(comparison, as_json=as_json)
         return
     if files:
         raise UsageError("--tune makes its own runs: leave out either the logs or --tune")
@@ -472,7 +482,7 @@ def tune_command(
     from ..studies.arm_gains import tune_arm
 
     delay_text = _measure_delay(delay, reach)
-    with terminal.progress_bar("edge and runs") as show:
+    with terminal.progress_bar("computing the edge of stability and running") as show:
         gains = tune_arm(
             arm,
             delay_text,

@@ -199,7 +199,7 @@ def _check_log(
     if not virtual:
         return
     if result.withheld:
-        reason = f"the law of {' and '.join(result.withheld)} may not run"
+        reason = f"the law of {_join_names(result.withheld)} may not run"
         yield Finding("virtual time", f"not compared: {reason}", False, judged=False)
     elif recorded:
         yield Finding(
@@ -273,11 +273,16 @@ def _check_coverage(log: Log, result: VerifyResult) -> Finding:
         result: Result of executing the log again.
     """
     coverage = result.coverage
-    records_in_file = sum(len(log[name]) for name in coverage.expected)
-    expected_records = sum(coverage.expected.values())
-    parts = [f"{records_in_file}/{expected_records} in the file"]
     if coverage.expected:
-        parts.append(coverage.describe(result.min_coverage))
+        records_in_file = sum(len(log[name]) for name in coverage.expected)
+        expected_records = sum(coverage.expected.values())
+        parts = [
+            f"{records_in_file}/{expected_records} in the file",
+            coverage.describe(result.min_coverage),
+        ]
+    else:
+        # No site may be executed, so no number of records is expected of any.
+        parts = [f"{sum(map(len, log.values()))} in the file"]
     if result.withheld:
         parts.append(f"{', '.join(result.withheld)} not judged")
     if log.unknown_ends:
@@ -306,11 +311,17 @@ def _check_execution(result: VerifyResult, recorded: str) -> Finding:
         recorded: Subject and verb of a sentence on sites whose records were copied, such as
             "m1 stands". Empty if all sites were executed.
     """
-    if not result.records:
-        no_code_was_withheld = not result.withheld  # otherwise the check was not possible
-        return Finding(
-            "executed again", "no records to execute", False, judged=no_code_was_withheld
+    withheld = ""
+    if result.withheld:
+        was = "was" if len(result.withheld) == 1 else "were"
+        withheld = (
+            f"{_join_names(result.withheld)} {was} not executed, because the law may not run: "
+            "permit the file of the law with --law FILE"
         )
+    if not result.records:
+        # Without permission for the laws, the check was not possible.
+        text = withheld or "no records to execute"
+        return Finding("executed again", text, False, judged=not result.withheld)
 
     if result.whole_run:
         method = "whole runs, bit for bit"
@@ -330,9 +341,17 @@ def _check_execution(result: VerifyResult, recorded: str) -> Finding:
             text += ", not judged: the log that the rerun was made of is not beside it"
     if result.unjudged:
         text += f"; {result.unjudged} behind gaps could not be judged"
+    if withheld:
+        text += f"; {withheld}"
     if result.first:
         text += f"; {result.differing} differ, the first: {result.first}"
     return Finding("executed again", text, result.agreed)
+
+
+def _join_names(names: Sequence[str]) -> str:
+    """Returns names of sites as a list in a sentence, such as "m1, m2 and s"."""
+    *before, last = names
+    return f"{', '.join(before)} and {last}" if before else last
 
 
 def _describe_gaps(gaps: Sequence[tuple[str, int, int]]) -> str:

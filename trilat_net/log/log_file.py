@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from ..errors import LogRefused, UsageError, count_nouns
-from ..files import publish_file, refuse_existing, sync_folder
+from ..files import describe_write_error, publish_file, refuse_existing, sync_folder
 from ..net import topics
 from ..net.clock import SystemClock
 from .log_layout import active_path
@@ -248,7 +248,7 @@ class LogFile:
                 self.working.unlink(missing_ok=True)
             self._raw = (opened or FileIO)(self.working, "xb")
         except OSError as error:
-            raise UsageError(f"{path}: cannot be written: {error.strerror}") from None
+            raise UsageError(str(describe_write_error(path, error))) from None
         sync_folder(path.parent)
         self._room = room or DiskReserve(path.parent)
         self._syncing = FileSync(

@@ -46,8 +46,8 @@ from ..errors import (
     UsageError,
     WireError,
     count_nouns,
+    suggest_nearest,
 )
-from ..fields import suggest_nearest
 from ..files import describe_missing_library, open_regular
 from ..net import topics
 from ..net.messages import READABLE, Event, LinkStats, RecorderStats, State

@@ -39,6 +39,7 @@ from .log_layout import (
     SCENARIO,
     SESSION,
     VIZ_ROOT,
+    describe_unfinished,
     parse_filter_facts,
 )
 from .log_reader import Log
@@ -136,7 +137,8 @@ def check_file(*files: str | Path, progress: Progress | None = None) -> LogCheck
             before += path.stat().st_size
     except OSError as error:
         name = error.filename or " ".join(map(str, paths))
-        raise LogError(f"{name}: cannot be read: {error.strerror}") from None
+        hint = describe_unfinished(Path(name))
+        raise LogError(f"{name}: cannot be read: {error.strerror}{hint}") from None
     return LogCheckResult(
         [path.as_posix() for path in paths], list(check.findings()), check.ours
     )

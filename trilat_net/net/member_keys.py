@@ -1,4 +1,4 @@
-"""Creates, renews and reads the keys with which members of a session prove their identity.
+"""Creates, adds, renews and reads the keys by which members of a session prove who they are.
 
 A member is a process that takes part in a session, such as a site or a recorder. `trilat keys
 new` creates a private certificate authority for the session, which signs one certificate per
@@ -21,9 +21,12 @@ import ipaddress
 import json
 import os
 import re
+import shutil
 import stat
 import sys
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,8 +35,9 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from ..errors import UsageError
+from ..errors import LogRefused, UsageError
 from ..files import (
+    describe_write_error,
     make_folder,
     open_regular,
     read_foreign_permissions,
@@ -129,7 +133,8 @@ def create_keys(
     is_occupied = folder.exists() and not is_empty_folder
     if not folder.name or is_occupied:
         raise UsageError(
-            f"{folder}: already exists; keys are never replaced: name a new folder"
+            f"{folder}: already exists; keys are never replaced: name a new folder, or add "
+            "members to this one with trilat keys add"
         )
 
     make_folder(folder.parent)
@@ -215,24 +220,7 @@ def renew_keys(folder: str | Path, members: Sequence[str] = (), days: int = 30) 
     folder = Path(folder)
     if not 0 <= days <= MOST_DAYS:
         raise UsageError(f"the validity of keys must be 0 to {MOST_DAYS} days, not {days}")
-    authority_folder = folder / _AUTHORITY_FOLDER
-    try:
-        old_authority = x509.load_pem_x509_certificate(
-            _read_trusted(authority_folder / AUTHORITY)
-        )
-        authority_key: Any = serialization.load_pem_private_key(
-            _read_trusted(authority_folder / PRIVATE_KEY), password=None
-        )
-    except (OSError, ValueError, TypeError) as error:
-        raise UsageError(
-            f"{authority_folder}: the certificate authority cannot be read ({error}); without "
-            "the authority, make new keys for all members with trilat keys new"
-        ) from None
-    if authority_key.public_key() != old_authority.public_key():
-        raise UsageError(
-            f"{authority_folder}: the private key and the certificate do not match"
-        )
-
+    old_authority, authority_key = _read_authority(folder)
     present = [path.name for path in sorted(folder.iterdir()) if (path / MEMBERS).is_file()]
     names = list(members) or present
     missing = [name for name in names if name not in present]
@@ -253,8 +241,194 @@ def renew_keys(folder: str | Path, members: Sequence[str] = (), days: int = 30) 
         write_whole(folder / name / CERTIFICATE, _encode(certificate), mode=0o600)
         # The list comes last, because it states the new end of the keys.
         write_whole(folder / name / MEMBERS, member_list, mode=0o600)
-    write_whole(authority_folder / AUTHORITY, _encode(authority), mode=0o600)
+    write_whole(folder / _AUTHORITY_FOLDER / AUTHORITY, _encode(authority), mode=0o600)
     return [folder / name for name in names]
+
+
+def _read_authority(folder: Path) -> tuple[x509.Certificate, Any]:
+    """Reads the certificate and the private key of the authority.
+
+    Args:
+        folder: Folder that `create_keys` created.
+
+    Returns:
+        The certificate and the private key.
+
+    Raises:
+        UsageError: The authority is missing or damaged.
+    """
+    if not folder.is_dir():
+        raise UsageError(f"{folder}: there is no such folder of keys made by `trilat keys new`")
+    authority_folder = folder / _AUTHORITY_FOLDER
+    try:
+        authority = x509.load_pem_x509_certificate(_read_trusted(authority_folder / AUTHORITY))
+        authority_key: Any = serialization.load_pem_private_key(
+            _read_trusted(authority_folder / PRIVATE_KEY), password=None
+        )
+    except (OSError, ValueError, TypeError) as error:
+        raise UsageError(
+            f"{authority_folder}: the certificate authority cannot be read ({error}); without "
+            "the authority, make new keys for all members with trilat keys new"
+        ) from None
+    if authority_key.public_key() != authority.public_key():
+        raise UsageError(
+            f"{authority_folder}: the private key and the certificate do not match"
+        )
+    return authority, authority_key
+
+
+def add_keys(
+    folder: str | Path,
+    members: Sequence[str],
+    hosts: Sequence[str] = (),
+    days: int = 30,
+) -> list[Path]:
+    """Creates keys for further members of a session, as `trilat keys add` does.
+
+    The keys of the other members stay valid. Only the list of all members in their folders, the
+    file members.json, is replaced.
+
+    >>> folders = tn.create_keys("lab-keys", ["m", "s"])
+    >>> [folder.name for folder in tn.add_keys("lab-keys", ["s2"])]
+    ['s2']
+
+    Args:
+        folder: Folder that `create_keys` created, with its folder `authority` and the folders
+            of all members.
+        members: Names of the new members.
+        hosts: Names and addresses at which the new members listen, in addition to those of the
+            local machine.
+        days: Validity of the new keys, in days.
+
+    Returns:
+        The folders of the new members.
+
+    Raises:
+        UsageError: A name is not valid or in use, or the authority or the folder of a member is
+            missing or damaged.
+        LogRefused: The disk refused to write. The folder is as it was before.
+    """
+    folder = Path(folder)
+    faults = [_find_name_fault(members), *map(_find_host_fault, hosts)]
+    if not 0 <= days <= MOST_DAYS:
+        faults.append(f"the validity of keys must be 0 to {MOST_DAYS} days, not {days}")
+    for fault in faults:
+        if fault:
+            raise UsageError(fault)
+    authority, authority_key = _read_authority(folder)
+    old_lists = _read_member_lists(folder)
+    old_names = list(next(iter(old_lists.values()))["members"])
+    for name in members:
+        if name in old_names or (folder / name).exists():
+            raise UsageError(
+                f"{folder}: {name} has keys already; name a new member, or renew its keys with "
+                "trilat keys renew"
+            )
+
+    ends = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=days)
+    # The certificate of the authority must hold for as long as those that it signs.
+    needs_longer = authority.not_valid_after_utc < ends + STOPPING_TIME
+    if needs_longer:
+        authority = _sign_authority(authority_key, ends)
+    names = [*old_names, *members]
+    lists = {
+        folder / name / MEMBERS: f"{json.dumps({**entry, 'members': names})}\n"
+        for name, entry in old_lists.items()
+    }
+    files = dict(lists)
+    if needs_longer:
+        files[folder / _AUTHORITY_FOLDER / AUTHORITY] = _encode(authority).decode()
+    _add_folders(
+        folder=folder,
+        members=members,
+        files=files,
+        write=lambda staged: _write_member_keys(
+            staged, members, names, hosts, authority, authority_key, ends
+        ),
+    )
+    return [folder / member for member in members]
+
+
+def _read_member_lists(folder: Path) -> dict[str, dict[str, Any]]:
+    """Reads the lists of members in the folders of all members.
+
+    Args:
+        folder: Folder of the keys of all members.
+
+    Returns:
+        The content of the file `MEMBERS` of each member, by the name of the member.
+
+    Raises:
+        UsageError: A list is missing or damaged, or two lists have different members.
+    """
+    lists: dict[str, dict[str, Any]] = {}
+    waiting = sorted(path.parent.name for path in folder.glob(f"*/{MEMBERS}"))
+    if not waiting:
+        raise UsageError(f"{folder}: has no keys made by `trilat keys new`")
+    while waiting:
+        name = waiting.pop(0)
+        path = folder / name / MEMBERS
+        try:
+            entry = json.loads(_read_trusted(path))
+            names = entry["members"]
+            is_valid = entry["member"] == name and not _find_name_fault(names)
+        except OSError:
+            raise UsageError(
+                f"{folder}: has no folder of the member {name}, whose list of members must "
+                f"change too: copy {name}/{MEMBERS} back from its machine"
+            ) from None
+        except (ValueError, TypeError, KeyError):
+            is_valid = False
+        if not is_valid:
+            raise UsageError(f"{path}: is damaged, or was not made by `trilat keys new`")
+        lists[name] = entry
+        waiting += [other for other in names if other not in lists and other not in waiting]
+    first = next(iter(lists.values()))["members"]
+    for name, entry in lists.items():
+        if set(entry["members"]) != set(first):
+            raise UsageError(
+                f"{folder / name / MEMBERS}: lists other members than the other folders: copy "
+                "the newest folder of each member here"
+            )
+    return lists
+
+
+def _add_folders(
+    folder: Path,
+    members: Sequence[str],
+    files: dict[Path, str],
+    write: Callable[[Path], None],
+) -> None:
+    """Adds folders of members and replaces files, all of them or none.
+
+    Args:
+        folder: Folder of the keys of all members.
+        members: Names of the new folders.
+        files: New contents of existing files.
+        write: Function that writes the new folders into the folder that it gets.
+
+    Raises:
+        LogRefused: The disk refused to write. The folder is as it was before.
+    """
+    before = {path: path.read_text(encoding="utf-8") for path in files}
+    try:
+        # The scratch is on the same disk, so that folders can be moved out of it at once.
+        with tempfile.TemporaryDirectory(prefix=".add-", dir=folder) as scratch:
+            write(Path(scratch))
+            for member in members:
+                (Path(scratch) / member).rename(folder / member)
+        for path, content in files.items():
+            write_whole(path, content, mode=0o600)
+    except BaseException as error:
+        for path, content in before.items():
+            with suppress(OSError, LogRefused):
+                if path.read_text(encoding="utf-8") != content:
+                    write_whole(path, content, mode=0o600)
+        for member in members:
+            shutil.rmtree(folder / member, ignore_errors=True)
+        if isinstance(error, OSError):
+            raise describe_write_error(folder, error, "nothing was added") from None
+        raise
 
 
 def _renew_member(
@@ -320,6 +494,29 @@ def _write_all_keys(
     authority = _sign_authority(authority_key, ends)
     _write_folder(folder / _AUTHORITY_FOLDER, authority, authority, authority_key)
 
+    _write_member_keys(folder, members, members, hosts, authority, authority_key, ends)
+
+
+def _write_member_keys(
+    folder: Path,
+    members: Sequence[str],
+    all_members: Sequence[str],
+    hosts: Sequence[str],
+    authority: x509.Certificate,
+    authority_key: Any,
+    ends: datetime.datetime,
+) -> None:
+    """Creates the folders of members, with a new private key for each.
+
+    Args:
+        folder: Folder in which they are created.
+        members: Names of the members whose folders are created.
+        all_members: Names of all members of the session.
+        hosts: Names and addresses at which the members listen.
+        authority: Certificate of the authority.
+        authority_key: Private key of the authority.
+        ends: Time at which the keys expire.
+    """
     for member in members:
         member_key = ec.generate_private_key(ec.SECP256R1())
         certificate = _sign_member(
@@ -330,7 +527,7 @@ def _write_all_keys(
             ends=ends,
         )
         _write_folder(folder / member, authority, certificate, member_key)
-        member_list = _format_member_list(member, members, ends)
+        member_list = _format_member_list(member, all_members, ends)
         _write_new_file(folder / member / MEMBERS, member_list.encode())
 
 

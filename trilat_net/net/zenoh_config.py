@@ -27,7 +27,6 @@ Invariant:
       only under its own name, because its connections show a certificate with that name.
 """
 
-import difflib
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -35,7 +34,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from ..errors import UsageError, count_nouns
+from ..errors import UsageError, count_nouns, suggest_nearest
 from ..files import open_regular
 from . import topics
 
@@ -530,10 +529,9 @@ def _suggest_key(path: Sequence[str], reason: str) -> str:
         return reason
     unknown_key, valid_text = match.groups()
     valid_keys = re.findall(r"`([^`]*)`", valid_text)
-    similar = difflib.get_close_matches(unknown_key, valid_keys, 1)
-    if similar:
-        return f"Zenoh has no such key; did you mean {similar[0]}?"
-    return f"Zenoh has no such key; the possible keys are {valid_text.replace('`', '')}"
+    hint = suggest_nearest(unknown_key, valid_keys)
+    hint = hint or f"; the possible keys are {valid_text.replace('`', '')}"
+    return f"Zenoh has no such key{hint}"
 
 
 RECORDER = topics.RECORDER

@@ -26,8 +26,7 @@ from numpy.typing import NDArray
 
 from ..analysis.timeline import recorded_end_s
 from ..core.vectors import Array
-from ..errors import UnknownName, UsageError
-from ..fields import suggest_nearest
+from ..errors import UnknownName, UsageError, suggest_nearest
 from ..log.data_tables import UNIT_SUFFIXES, Column
 from ..log.log_reader import Log
 from ..log.record_columns import Ints

@@ -278,7 +278,7 @@ def _describe_last_error(log: Log, facts: JsonObject) -> _KeyNumber:
 
 
 def _describe_settling(log: Log, facts: JsonObject) -> _KeyNumber:
-    """Returns the time from which all errors stay below the limit of a settled site."""
+    """Returns the time from which all errors stay below the limit of the settling time."""
     name = f"All errors below {facts['settle_below_rad']:g} {shared_unit(log)}"
     if facts["max_error_end_rad"] is None:
         return _KeyNumber(name, NO_NUMBER, "no record")

@@ -588,6 +588,13 @@ def compose_benchmark(benchmark: Result) -> Iterator[Block]:
     facts = benchmark.to_dict()
     needs = facts["needs"]
     name = facts["scenario"]
+    if facts["connect"]:
+        yield f"the network from this machine to {', '.join(facts['connect'])}"
+    else:
+        yield (
+            "this machine alone, without a network: name another machine with --connect, on "
+            "which trilat ping --answer runs"
+        )
     yield "one way is half a round trip with the handling at the far end; times in us"
     rows = []
     for row in facts["rows"]:

@@ -16,6 +16,7 @@ Invariant:
 import json
 import re
 import sys
+import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, redirect_stdout
 from pathlib import Path
@@ -79,6 +80,10 @@ PATIENCE_S = 1.0
 """Time until a progress bar appears, in s."""
 _REDRAW_PERIOD_S = 0.1
 """Shortest time between two drawings of a progress bar, in s."""
+LINES_AFTER_S = 1.0
+"""Time until `progress_lines` says what is being done, in s."""
+LINES_PERIOD_S = 10.0
+"""Time between two lines of `progress_lines`, in s."""
 _MAX_DAMAGED = 3
 """Largest number of listed damaged parts of a log."""
 MAX_LETTERS = 4000
@@ -273,17 +278,59 @@ def conclude_files(
 
 
 @contextmanager
+def progress_lines(label: str) -> Iterator[Callable[[int, int], None]]:
+    """Prints lines on stderr while a `with` statement runs for long.
+
+    The first line appears after `LINES_AFTER_S`, and says what is being done. Further lines
+    follow every `LINES_PERIOD_S`, with the time so far. They come from a thread, because some
+    work cannot report its progress.
+
+    Args:
+        label: What is being done, as in "judging run.mcap".
+
+    Yields:
+        A function that may be called with (done, total). The lines then state the percentage.
+    """
+    has_ended = threading.Event()
+    percent = ""
+
+    def show(done: int, total: int) -> None:
+        """Stores the progress for the next line."""
+        nonlocal percent
+        percent = f"{100 * done // total} %, " if total > 0 else ""
+
+    def print_lines() -> None:
+        """Prints the lines until the work ends."""
+        if has_ended.wait(LINES_AFTER_S):
+            return
+        err.print(f"{label} ...", markup=False, soft_wrap=True)
+        elapsed_s = LINES_AFTER_S
+        while not has_ended.wait(LINES_PERIOD_S):
+            elapsed_s += LINES_PERIOD_S
+            err.print(f"  {percent}{elapsed_s:.0f} s so far", markup=False, soft_wrap=True)
+
+    printer = threading.Thread(target=print_lines, daemon=True)
+    printer.start()
+    try:
+        yield show
+    finally:
+        has_ended.set()
+        printer.join()
+
+
+@contextmanager
 def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
     """Yields a function that draws a progress bar, for use in a `with` statement.
 
     The function is called with (done, total), at any rate. The bar appears after `PATIENCE_S`,
-    and only on a terminal.
+    and only on a terminal. Elsewhere, `progress_lines` prints a few lines.
 
     Args:
-        label: Text before the bar.
+        label: What is being done, as in "reading run.mcap".
     """
     if not err.is_interactive:
-        yield lambda _done, _total: None
+        with progress_lines(label) as show_lines:
+            yield show_lines
         return
     from rich.progress import (
         BarColumn,

@@ -21,7 +21,7 @@ import msgspec
 from msgspec import Meta
 
 from ..core.chain import MAX_JOINTS
-from ..errors import ScenarioError, count_nouns
+from ..errors import ScenarioError, count_nouns, suggest_nearest
 from ..fields import (
     Joints,
     KeyProblem,
@@ -31,7 +31,6 @@ from ..fields import (
     TomlTable,
     check_keys,
     field_names,
-    suggest_nearest,
 )
 
 WindowTime = Annotated[float, Meta(ge=0.0, le=86_400.0)]

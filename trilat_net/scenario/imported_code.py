@@ -31,11 +31,11 @@ from typing import Annotated, Any, ClassVar, NamedTuple, Protocol, cast
 from msgspec import Meta, field
 
 from ..core.user_law import LawContext, UserLaw, UserLawFactory
-from ..errors import CodeWithheld, ScenarioError
-from ..fields import suggest_nearest
+from ..errors import CodeWithheld, ScenarioError, suggest_nearest
 from ..files import find_page, open_regular
-from ..laws.interface import LawSettings, check_law_class, make_instance
+from ..laws.interface import LawSettings, check_law_class
 from ..laws.sent_vectors import SentVectorSpecs, convert_sends, parse_classes
+from .class_arguments import make_own_instance
 
 CLASS_PATTERN = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*$"
 
@@ -297,7 +297,7 @@ class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
                     f"{self.code!r} again so that the scenario is updated",
                     path=f"{path}.sends",
                 )
-            law: UserLaw = make_instance(kind, self.code, context, self.settings)
+            law: UserLaw = make_own_instance(kind, self.code, context, self.settings, path)
             return law
 
         return make
@@ -347,9 +347,15 @@ def _find_file(code: str, path: str) -> Path:
     Raises:
         ScenarioError: There is no such module, or it is not a file.
     """
-    module = code.partition(":")[0]
+    module, _, name = code.partition(":")
     with _searching(None):
         spec = _find_spec(module)
+    if spec is None and module.endswith(".py"):
+        raise ScenarioError(
+            f"is {code!r}, but must name the module, not its file: "
+            f"{module.removesuffix('.py')}:{name}",
+            path=path,
+        )
     if spec is None or spec.origin is None or not Path(spec.origin).is_file():
         raise ScenarioError(
             f"the module {module}, which {code} names, was not found; install the module, or "

@@ -16,8 +16,8 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ..errors import ScenarioError, count_nouns
-from ..fields import TomlTable, check_keys, field_names, suggest_nearest
+from ..errors import ScenarioError, count_nouns, suggest_nearest
+from ..fields import TomlTable, check_keys, field_names
 from .delay_models import DELAY_MODELS
 from .imported_code import ImportedLaw, name_law_classes
 from .laws import LAWS
@@ -332,13 +332,15 @@ def _reach_table(tables: TomlTable, parents: Sequence[str], last: str) -> TomlTa
     container: Any = tables
     for depth, name in enumerate(parents):
         path = ".".join(parents[: depth + 1])
+        next_key = (*parents, last)[depth + 1]
         if isinstance(container, list):
             entry = container[_list_index(container, name, path)]
         else:
-            next_key = (*parents, last)[depth + 1]
             entry = container.setdefault(name, [] if next_key.isdecimal() else {})
         if not isinstance(entry, dict | list):
-            raise ScenarioError("is a value, not a table", path=path)
+            raise ScenarioError(
+                f"is the value {entry!r}, not a table with a key {next_key}", path=path
+            )
         container = entry
     return container  # type: ignore[no-any-return]
 

@@ -25,7 +25,7 @@ from ..core.ticks import PlantState
 from ..core.vectors import Array
 from ..errors import PlantFailed, ScenarioError, count_nouns
 from ..fields import Frozen, is_number
-from ..laws.interface import make_instance
+from .class_arguments import make_own_instance
 from .imported_code import CLASS_PATTERN, CodeKey, Watch, call_directly, import_class, read_code
 
 if TYPE_CHECKING:
@@ -245,8 +245,8 @@ class PlantPlayer:
             seed=scenario.draw_seed(site),
             bodies_m=plant.bodies,
         )
-        self._program: PlantProgram = make_instance(
-            kind, plant.code, context, plant.settings, path=path
+        self._program: PlantProgram = make_own_instance(
+            kind, plant.code, context, plant.settings, path
         )
         self._body_count = len(plant.bodies)
         bodies = self._call(0, self._read_poses)

@@ -24,6 +24,7 @@ Invariant:
 import math
 import re
 import tomllib
+from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any, TypeVar
@@ -33,7 +34,7 @@ import numpy as np
 
 from ..core import dominance
 from ..core.two_link_arm import ArmLinks
-from ..errors import ScenarioError, count_nouns
+from ..errors import ScenarioError, count_nouns, suggest_nearest
 from ..fields import (
     Frozen,
     TomlTable,
@@ -48,7 +49,6 @@ from ..fields import (
     is_number,
     reword_problem,
     split_refusal,
-    suggest_nearest,
 )
 from ..files import open_regular
 from ..laws.sent_vectors import read_sends
@@ -182,13 +182,29 @@ def resolve_scenario(tables: TomlTable, folder: Path | None) -> TomlTable:
     }
 
 
+def _list_group_paths() -> list[str]:
+    """Returns the dotted paths of all keys of the tables for all sites or all links.
+
+    A user who writes only the last part of such a path learns the whole path.
+    """
+    link_keys = {key for model in DELAY_MODELS.values() for key in field_names(model)}
+    gains = {key for law in LAWS.values() for key in field_names(law)}
+    paths = [f"link.{key}" for key in ("model", "preset", *sorted(link_keys))]
+    paths += [f"control.{key}" for key in ("law", *sorted(gains))]
+    for group, kind in SITE_GROUPS.items():
+        paths += [f"{group}.{key}" for key in field_names(kind)]
+    return paths
+
+
 def _check_top_level(tables: TomlTable) -> None:
     """Checks the names of the scenario's keys, and those of its tables for all sites.
 
     Raises:
         ScenarioError: A key is unknown, a required table is missing, or a number is not finite.
     """
-    check_keys(tables, _TOP_LEVEL_KEYS + _TABLES, "")
+    sites = tables.get("sites", {})
+    site_paths = [f"sites.{name}" for name in sites] if isinstance(sites, dict) else []
+    check_keys(tables, _TOP_LEVEL_KEYS + _TABLES, "", [*site_paths, *_list_group_paths()])
     check_finite(tables, "")
     for required in ("name", "sites", "dominance"):
         if required not in tables:
@@ -317,6 +333,50 @@ def _find_file(name: str, folder: Path) -> Path:
     return shipped if is_plain_name and shipped.is_file() else folder / name
 
 
+def _check_kind_keys(
+    table: TomlTable,
+    valid: Sequence[str],
+    path: str,
+    kind: str,
+    keys_by_kind: dict[str, tuple[str, ...]],
+) -> None:
+    """Refuses a key that belongs to another law or delay model than that of a table.
+
+    Upper and lower case count as equal, so that the user of `control.D` learns of `d`. A key
+    that differs from a valid one only in its case is left to `check_keys`, which suggests it.
+
+    Args:
+        table: Table of a control law or a delay model.
+        valid: The keys that the table may have.
+        path: Dotted path of the table, for errors.
+        kind: The kind of the table, as in "law adaptive" or "model constant".
+        keys_by_kind: The keys of every kind.
+
+    Raises:
+        ScenarioError: The key belongs to other kinds.
+    """
+    valid_words = {key.casefold() for key in valid}
+    for key in table:
+        sought = key.casefold()
+        if sought in valid_words:
+            continue
+        owners = {
+            name: owned
+            for name, keys in keys_by_kind.items()
+            for owned in keys
+            if owned.casefold() == sought
+        }
+        if owners:
+            group, _, name = kind.partition(" ")
+            owned_keys = " or ".join(dict.fromkeys(owners.values()))
+            subject = "belongs to" if owned_keys == key else f"{owned_keys} belongs to"
+            raise ScenarioError(
+                f"{subject} {group} {', '.join(owners)}, but {path}.{group} is {name}, which "
+                f"has {', '.join(owned for owned in valid if owned != group)}",
+                path=f"{path}.{key}",
+            )
+
+
 def _resolve_control(
     written: Any, default: TomlTable, path: str, counts: VectorCounts
 ) -> TomlTable:
@@ -339,7 +399,10 @@ def _resolve_control(
     if ":" in law:
         return _resolve_user_law(law, written, default, path)
     check_choice(law, [*LAWS, "package.module:Law"], f"{path}.law")
-    gains = check_keys(written, ("law", *field_names(LAWS[law])), path)
+    gain_names = {name: field_names(kind) for name, kind in LAWS.items() if name != "own"}
+    valid_keys = ("law", *field_names(LAWS[law]))
+    _check_kind_keys(written, valid_keys, path, f"law {law}", gain_names)
+    gains = check_keys(written, valid_keys, path)
     inherited = default if default_law == law else {}
     return expand_vectors({**inherited, **gains, "law": law}, LAWS[law], counts)
 
@@ -842,7 +905,8 @@ def resolve_links(tables: TomlTable, names: list[str], folder: Path | None) -> T
         folder: Folder of the files of delays that links name. None refuses every file.
     """
     link_names = [f"{peer}->{site}" for site in names for peer in names if peer != site]
-    written = check_keys(tables.get("links", {}), link_names, "links")
+    link_paths = [key for key in _list_group_paths() if key.startswith("link.")]
+    written = check_keys(tables.get("links", {}), link_names, "links", link_paths)
     default = resolve_link(tables.get("link", {}), {}, "link")
     links: TomlTable = {}
     for name in link_names:
@@ -938,6 +1002,9 @@ def resolve_link(written: Any, base: TomlTable, path: str) -> TomlTable:
 
     file_keys = TRACE_KEYS if model == "trace" else ()
     valid_keys = ("model", "preset", *field_names(DELAY_MODELS[model]), *file_keys)
+    model_keys = {name: field_names(kind) for name, kind in DELAY_MODELS.items()}
+    model_keys["trace"] = (*model_keys["trace"], *TRACE_KEYS)
+    _check_kind_keys(written, valid_keys, path, f"model {model}", model_keys)
     local_table = check_keys(written, valid_keys, path)
 
     # Delays that are written out replace the file of the defaults, and a file replaces delays.

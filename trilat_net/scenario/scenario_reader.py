@@ -19,8 +19,7 @@ from typing import Any, NamedTuple
 
 import tomli_w
 
-from ..errors import ScenarioError
-from ..fields import suggest_nearest
+from ..errors import ScenarioError, suggest_nearest
 from ..files import open_regular
 from .code_consent import allow_own_code
 from .imported_code import name_law_classes
@@ -63,9 +62,11 @@ def read_shipped(name: str) -> str:
     file = SHIPPED_FOLDER / f"{name}.toml"
     shipped_names = list_shipped()
     if name not in shipped_names and not (len(name) < _MAX_NAME_LENGTH and file.is_file()):
+        hint = suggest_nearest(name, shipped_names)
+        # A question mark ends a sentence.
+        separator = " The" if hint else "; the"
         raise ScenarioError(
-            "there is no scenario of that name"
-            f"{suggest_nearest(name, shipped_names)}; the shipped scenarios are "
+            f"there is no scenario of that name{hint}{separator} shipped scenarios are "
             f"{', '.join(shipped_names)}; name a file by its path, as in ./mine.toml",
             source=name,
         )
@@ -266,8 +267,10 @@ def find_site(scenario: Scenario, name: str) -> SiteSpec:
     """
     if name not in scenario.sites:
         hint = suggest_nearest(name, scenario.names)
+        # A question mark ends a sentence.
+        separator = " The" if hint else "; the"
         raise ScenarioError(
-            f"there is no site {name!r}{hint}; the sites are {', '.join(scenario.names)}",
+            f"there is no site {name!r}{hint}{separator} sites are {', '.join(scenario.names)}",
             source=scenario.name,
         )
     return scenario.sites[name]

@@ -30,8 +30,8 @@ import numpy as np
 
 from ..core.chain import MAX_JOINTS, Matrix, Three, apply, multiply
 from ..core.elementary import sincos
-from ..errors import ScenarioError, count_nouns
-from ..fields import MAX_QUANTITY, suggest_nearest
+from ..errors import ScenarioError, count_nouns, suggest_nearest
+from ..fields import MAX_QUANTITY
 from .link_inertia import LinkInertia, balance_tensor, fill_tensor
 
 MAX_CHARACTERS = 1_000_000

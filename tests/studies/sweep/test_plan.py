@@ -208,7 +208,7 @@ def test_a_law_that_cannot_be_swept_is_refused(laws: list[str], words: tuple[str
 
 def test_axis_that_swept_law_has_not_is_refused_with_law() -> None:
     problem = refused("p_d_margin", over=["control.d=1,2"], laws=["p_d", "adaptive"])
-    assert "control.d: with law adaptive: unknown key" in problem
+    assert "control.d: with law adaptive: belongs to law" in problem
     assert "is swept twice" in refused(
         "p_d_margin", over=["control.law=p_d,pd_d"], laws=["p_d"]
     )

@@ -80,7 +80,10 @@ _ERROR_UNITS = {"joints": "rad", "position": "m", "pose": "m or rad"}
 
 
 @measures(
-    "site", TRACKING, Quantity("settle_s", "settled", "s"), *list_shared_quantities(_ERRORS)
+    "site",
+    TRACKING,
+    Quantity("settle_s", "settling time", "s"),
+    *list_shared_quantities(_ERRORS),
 )
 def measure_tracking(view: RunView, site: str) -> MetricValues:
     """Measures how well a site tracks its reference: settling time, RMS and peak of the error.

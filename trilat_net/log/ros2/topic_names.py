@@ -19,8 +19,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from ...errors import UsageError
-from ...fields import suggest_nearest
+from ...errors import UsageError, suggest_nearest
 from ...files import open_regular
 from ...net.ros2_names import check_ros_name
 

@@ -320,8 +320,8 @@ def draw_tracking_errors(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the tracking errors of every site over time, as Fig. 5 of the paper.
 
     The error is e = q - q_des, the actual minus the desired joint angles. The panel below
-    shows, at each time, the largest error of any joint from then on. A site has settled when
-    this line falls below the dashed limit.
+    shows, at each time, the largest error of any joint from then on. The settling time is
+    reached when this line falls below the dashed limit.
 
     Args:
         log: Log of the run.
@@ -356,7 +356,7 @@ def draw_tracking_errors(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         )
         plot.mark(settling, log.sites)
         entries = style.site_legend_entries(log, log.sites)
-        entries.append((f"settled: {SETTLED_ERROR_RAD:g} {unit}", style.LIMIT_LINE))
+        entries.append((f"settling limit: {SETTLED_ERROR_RAD:g} {unit}", style.LIMIT_LINE))
         plot.finish([*panels.lowest, settling], entries)
     return plot.figure
 
@@ -391,7 +391,7 @@ def draw_settling(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
             line = style.site_line(log, site)
             settled_s = site_signals.settling_time_s(log[site])
             if settled_s is None:
-                entries.append((f"{site}: not settled", line))
+                entries.append((f"{site}: no settling time", line))
             else:
                 axes.plot(
                     settled_s,
@@ -401,7 +401,7 @@ def draw_settling(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
                     color=line["color"],
                     clip_on=False,
                 )
-                entries.append((f"{site}: settled at {settled_s:.1f} s", line))
+                entries.append((f"{site}: settling time {settled_s:.1f} s", line))
         axes.axhline(SETTLED_ERROR_RAD, **style.LIMIT_LINE)
         axes.set(
             yscale="log",

@@ -21,8 +21,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from ...analysis.twin_growth import PushedTwins, TwinGrowth
-from ...errors import UsageError
-from ...fields import suggest_nearest
+from ...errors import UsageError, suggest_nearest
 from ...files import make_folder, refuse_existing
 from ...log.log_reader import Log, open_log
 from ...log.mcap_reader import Progress

@@ -33,7 +33,7 @@ from .figure_entry import draws
 _HEIGHT_IN = 3.9
 _NARROW_HEIGHT_IN = 5.6
 _DECADES = 6.0
-"""Number of decades on the axis of errors. Smaller errors have settled long ago."""
+"""Number of decades on the axis of errors. Smaller errors are far below the limit."""
 _LETTERS_PER_IN = 15.0
 """Average number of letters of the title per inch."""
 _MAX_SPANS = 1_000
@@ -123,7 +123,7 @@ def _compose_title(log: Log, form: FigureSize) -> str:
     """Returns the title of a run: its name, its stability and its settling time."""
     settling_times_s = [site_signals.settling_time_s(log[site]) for site in log.sites]
     settled_s = settling_time_of_all_s(settling_times_s)
-    settling = "not settled" if settled_s is None else f"settled at {settled_s:.1f} s"
+    settling = "no settling time" if settled_s is None else f"settling time {settled_s:.1f} s"
     name = log.scenario.title or log.scenario.name
     title = f"{name}: {certify_run(log).stability}, {settling}"
     letters = round(_LETTERS_PER_IN * form.width_in)

@@ -24,7 +24,7 @@ from ...core.site_arrays import SiteArrays
 from ...core.site_step import Site
 from ...core.ticks import NS_PER_S, tick_ns
 from ...core.vectors import Array
-from ...laws.interface import make_instance
+from ..class_arguments import make_own_instance
 from ..imported_code import (
     CLASS_PATTERN,
     CodeKey,
@@ -352,8 +352,8 @@ def make_hand_program(hand_site: HandSite) -> HandProgram:
     spec = hand_site.spec
     assert isinstance(spec, ProgramHand)
     kind = import_class(CodeKey.of(spec), f"{path}.class", spec.method)
-    program: HandProgram = make_instance(
-        kind, spec.code, hand_site.describe(), spec.settings, path=path
+    program: HandProgram = make_own_instance(
+        kind, spec.code, hand_site.describe(), spec.settings, path
     )
     return program
 

@@ -34,8 +34,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from ...core import control
-from ...errors import UsageError
-from ...fields import suggest_nearest
+from ...errors import UsageError, suggest_nearest
 from ...files import write_whole
 from ...laws.interface import ControlLaw
 from ...laws.six_channel import complementary_shares

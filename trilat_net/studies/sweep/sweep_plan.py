@@ -26,8 +26,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...analysis.metrics.log_metrics import find_quantity
-from ...errors import ScenarioError, UsageError, count_nouns
-from ...fields import is_number, split_unit, suggest_nearest
+from ...errors import ScenarioError, UsageError, count_nouns, suggest_nearest
+from ...fields import is_number, split_unit
 from ...scenario import Scenario, apply_overrides
 from ...scenario.code_consent import allow_own_code
 from ...scenario.imported_code import name_law_classes

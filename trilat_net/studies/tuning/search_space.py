@@ -24,8 +24,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...analysis.arm_rows import build_arm_rows
-from ...errors import ScenarioError, UsageError
-from ...fields import MAX_QUANTITY, is_number, suggest_nearest
+from ...errors import ScenarioError, UsageError, suggest_nearest
+from ...fields import MAX_QUANTITY, is_number
 from ...laws.interface import (
     DAMPING,
     ERROR_DAMPING,

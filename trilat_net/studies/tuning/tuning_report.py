@@ -198,7 +198,7 @@ def tabulate_paper_gains(tuned: TuningResult) -> TextTable:
     return TextTable(("law", "class", *_SCORE_HEADS), rows, align="llr")
 
 
-_SCORE_HEADS = ("error rad", "spread rad", "pose rad", "effort N m", "settled s", "clamped %")
+_SCORE_HEADS = ("error rad", "spread rad", "pose rad", "effort N m", "settling s", "clamped %")
 """Headers of the columns of a score."""
 
 
@@ -249,6 +249,8 @@ def describe_procedure(plan: TuningPlan) -> list[str]:
         f"{scenario.duration_s:g} s of {scenario.name} with its seed {scenario.seed}, torques "
         f"clamped at {limits} N m",
         knowledge,
+        "class: judged from the motion in the second half of each run alone, without the twins "
+        "and roots that trilat certify uses for a log",
         "error: RMS distance of the arms from the pose of a weightless consensus; effort: RMS "
         "of tau - G(q)",
     ]
@@ -463,7 +465,7 @@ def _draw_paper_gains(axes: Axes, tuned: TuningResult) -> list[Line2D]:
             value, effort_nm = point
             axes.plot([effort_nm], [value], **look)
         elif outcome is CandidateClass.SETTLED:
-            label += " (never)"  # a stable run that has not settled at its end
+            label += " (never)"  # a stable run whose |e| is still above the limit at its end
         else:
             label += f" ({outcome.word})"
         entries.append(Line2D([], [], label=label, **look))

@@ -1,0 +1,88 @@
+"""What a user meant instead: commands by their synonyms, and keys by the table that has them."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from trilat_net.cli import _SYNONYMS
+from trilat_net.errors import find_nearest, suggest_nearest
+
+from .running import trilat, whole_command
+
+
+def in_one_line(text: str) -> str:
+    return " ".join(re.sub("[│╭╮╰╯─]", " ", text).split())
+
+
+@pytest.mark.parametrize(
+    ("words", "suggestion"),
+    [
+        (["simulate", "paper"], "trilat sim?"),
+        (["run"], "trilat sim or trilat demo?"),
+        (["Plot", "run.mcap"], "trilat figure?"),
+        (["analyse"], "trilat certify or trilat metrics?"),
+        (["stable"], "trilat certify?"),
+        (["verfy"], "trilat verify?"),
+        (["log", "inf"], "trilat log info?"),
+        (["keys", "make"], "trilat keys new?"),
+        (["set", "--session", "x", "delay"], "trilat set link?"),
+    ],
+)
+def test_an_unknown_command_suggests_one(
+    words: list[str], suggestion: str, tmp_path: Path
+) -> None:
+    done = trilat(*words, cwd=tmp_path)
+    assert done.code == 2
+    assert f"did you mean {suggestion}" in in_one_line(done.err)
+
+
+def test_a_word_like_no_command_lists_all(tmp_path: Path) -> None:
+    text = in_one_line(trilat("log", "zzzzzz", cwd=tmp_path).err)
+    assert "trilat log has the commands info" in text
+
+
+def test_every_synonym_leads_to_a_command() -> None:
+    root = whole_command()
+    for group, synonyms in _SYNONYMS.items():
+        holder = root if group == "trilat" else root.commands[group]
+        for word, suggested in synonyms.items():
+            assert word not in holder.commands
+            for path in suggested.split(" or trilat "):
+                if path.startswith("--"):
+                    continue
+                command = holder
+                for name in path.split():
+                    if hasattr(command, "commands"):
+                        command = command.commands[name]
+
+
+@pytest.mark.parametrize(
+    ("override", "facts"),
+    [
+        ("delay_ms=400", "delay_ms: unknown key; did you mean 'link.delay_ms'?"),
+        ("delay=400", "did you mean 'link.delay_ms'?"),
+        ("links.delay_ms=400", "did you mean 'link.delay_ms'?"),
+        ("Kd=5", "did you mean 'control.Kd'?"),
+        ("law=p_d", "did you mean 'control.law'?"),
+        ("m1.control.Kd=5", "did you mean 'sites.m1'?"),
+        ("control.kd=5", "did you mean 'Kd'?"),
+        ("control.D=1", "control.D: d belongs to law authority"),
+        ("control.K=5", "but control.law is adaptive, which has Lambda, Kp, Kd"),
+        ("link.half_width_ms=5", "belongs to model uniform, but link.model is constant"),
+    ],
+)
+def test_an_unknown_key_suggests_the_whole_path(
+    override: str, facts: str, tmp_path: Path
+) -> None:
+    trilat("scenario", "check", "paper", "--set", override, cwd=tmp_path).refuses(facts)
+
+
+def test_the_case_of_a_gain_is_corrected(tmp_path: Path) -> None:
+    words = ["--set", "control.law=p_d", "--set", "control.D=1"]
+    trilat("scenario", "check", "paper", *words, cwd=tmp_path).refuses("did you mean 'd'?")
+
+
+def test_a_faint_similarity_elsewhere_suggests_nothing() -> None:
+    assert suggest_nearest("foo", ["name", "seed"], ["control.follows"]) == ""
+    assert find_nearest("x" * 81, ["x" * 81]) == ""
