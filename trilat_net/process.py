@@ -345,6 +345,9 @@ def request_real_time_scheduling() -> str:
     driver of an arm or of a haptic device. On a busy machine its loop then still runs on time.
     A loop that never sleeps would block a processor.
 
+    >>> tn.request_real_time_scheduling()  # doctest: +SKIP
+    'SCHED_FIFO 50'
+
     All threads of the process get real-time scheduling (SCHED_FIFO), and the calling thread has
     the highest priority. The other threads are included because one of them may hold the
     interpreter lock, for which the calling thread would have to wait.
