@@ -58,6 +58,7 @@ from .page_data import (
     TableSeries,
     TimeChart,
 )
+from .page_leaders import caption_site, list_lead_bars, trace_leads
 
 Values = NDArray[Any]
 """Numbers of any type."""
@@ -107,6 +108,7 @@ class ChartBuilder:
         bounds_m: Left, right, bottom and top of a box around the motion of all arms, in m.
         units_per_m: Scale of the pictures of the arms, in units of the picture per m. It is 1
             for planar arms. Pictures with a chain are scaled to the size `PICTURE_SIDE`.
+        leads: Who leads each slave over time.
     """
 
     def __init__(self, log: Log, twin: Log | None) -> None:
@@ -116,6 +118,7 @@ class ChartBuilder:
         self._end_s = recorded_end_s(log)
         self._tables: list[ColumnTable] = []
         self._has_values: list[list[bool]] = []  # by table and column
+        self.leads = trace_leads(log)
 
         times_s = np.linspace(0.0, self._end_s, _BOX_INSTANTS)
         poses = [arm_poses.find_pose(log, site, t_s) for site in log.sites for t_s in times_s]
@@ -179,6 +182,7 @@ class ChartBuilder:
             end_s=self._end_s,
             colours=Palettes(light, dark),
             arms=arms,
+            leads=list_lead_bars(self.leads),
             tables=self._tables,
             charts=charts,
             changes=changes,
@@ -668,6 +672,7 @@ class ChartBuilder:
         table = self._add_records(site, np.hstack([actual, desired, *bodies]))
         return PlanarArm(
             site=site,
+            caption=caption_site(self._log.scenario, site),
             colour=index,
             table=table,
             bodies=len(bodies),
@@ -710,6 +715,7 @@ class ChartBuilder:
         table = self._add_table(site, records.tick[rows], values)
         return ChainArm(
             site=site,
+            caption=caption_site(self._log.scenario, site),
             colour=index,
             table=table,
             bodies=len(bodies),
