@@ -77,7 +77,7 @@ _CHAIN_INSTANTS = 400
 _MAXIMA = 400
 """Number of intervals of a line of maxima."""
 _LEAST_DRAWN = 1e-6
-"""Smallest drawn maximum. A logarithmic axis needs a positive number."""
+"""Smallest drawn maximum, at which smaller ones are drawn. A logarithmic axis has no zero."""
 PICTURE_SIDE = 4.0
 """Longer side of a picture of a chain, in the unit of the line widths of the page."""
 
@@ -199,11 +199,12 @@ class ChartBuilder:
         """
         log = self._log
         limit = self._draw_limit(site_signals.SETTLED_ERROR_RAD)
+        limit_note = f"dashed: {limit.value:g}{self._note_floor()}"
         stated = [line for site in log.sites for line in self._list_stated_delays(site)]
         has_one_delay = len({line.value for line in stated}) == 1
         yield self._make_chart(
             section="overview",
-            title=f"Largest error |e| of each site; dashed: {limit.value:g}",
+            title=f"Largest error |e| of each site; {limit_note}",
             unit=site_signals.shared_unit(log),
             series=self._add_maxima(lambda site: np.abs(site_signals.joint_errors(log[site]))),
             lines=[limit],
@@ -218,6 +219,18 @@ class ChartBuilder:
             zero=True,
             margin=0.05,
         )
+
+    def _note_floor(self) -> str:
+        """Returns a clause that says where errors below the floor of the chart are drawn.
+
+        Returns:
+            The clause. Empty if no site has such small errors.
+        """
+        for site in self._log.sites:
+            largest = site_signals.largest_magnitude(site_signals.joint_errors(self._log[site]))
+            if (largest < _LEAST_DRAWN).any():
+                return f"; smaller than {_LEAST_DRAWN:g}: drawn at {_LEAST_DRAWN:g}"
+        return ""
 
     def _add_maxima(self, read_values: Callable[[str], Array]) -> list[TableSeries]:
         """Adds a line per site with the largest values of a signal in short intervals.

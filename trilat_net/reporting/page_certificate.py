@@ -35,8 +35,9 @@ _PREMISE_MARKS = {True: "holds", False: '<b class="bad">fails</b>', None: "undec
 _SENTENCE_MARKS = {"ok": "✓", "FAIL": "✗", "open": "?", "note": "·"}
 _SENTENCE_CLASSES = {"ok": "passed", "FAIL": "failed", "open": "open", "note": "note"}
 _BALANCE_NOTE = (
-    "V of the theorem, with the weights that the shares ask for, and its energy balance: what "
-    "is left of V − V(0) + dissipation − work must vanish, whatever the operators do."
+    "V is the energy function of the stability theorem: a weighted sum of the energies of the "
+    "arms, of their errors and of the estimates (docs/certificate-energy.md). What is left of "
+    "V − V(0) + dissipation − work must vanish, whatever the operators do."
 )
 
 
@@ -57,7 +58,9 @@ def render_certificate(log: Log, certificate: Certificate) -> str:
     folds = []
     if certificate.premises:
         premises = _render_premises(certificate)
-        folds.append(render_details("Premises of the theorem", premises))
+        folds.append(
+            render_details("What the theorem requires, and whether it holds here", premises)
+        )
     if certificate.balance is not None:
         energies = list_energies(certificate.balance)
         rows = [(escape(name), f"{energy_j:.4g}") for name, energy_j in energies]
@@ -71,9 +74,14 @@ def render_certificate(log: Log, certificate: Certificate) -> str:
         folds.append(render_details(f"Figures: {names}", pictures))
     body += render_folds(folds)
     intro = (
-        "What speaks for (✓) and against (✗) stability, and what decides nothing (?), as "
-        "`trilat certify --all` prints it."
+        "What speaks for (✓) and against (✗) stability, what decides nothing (?), and remarks "
+        "and checks that do not apply (·), as `trilat certify --all` prints it."
     )
+    if certificate.has_functional:
+        intro += (
+            " V is the energy function of the paper's stability theorem: while the theorem "
+            "applies and nobody pushes, it does not rise."
+        )
     return render_section("Why this judgement", intro, body, "certificate")
 
 
@@ -102,7 +110,9 @@ def _draw_certificate(log: Log, certificate: Certificate) -> list[tuple[str, Fig
     twins = certificate.twins
     figures = []
     if certificate.balance is not None:
-        figures.append(("V and energies", draw_functional(log, certificate)))
+        figures.append(
+            ("V, the energy of the theorem, and its parts", draw_functional(log, certificate))
+        )
     if observed is not None and observed.curves:
         title = "energies that the laws declare"
         figures.append((title, draw_observed_energy(log, observed)))

@@ -81,7 +81,7 @@ def render_chart_groups(
 
     Args:
         log: Log of the run.
-        place: Place on the page, a table of `report.toml`, such as "paper" or "links".
+        place: Place on the page, a table of `report.toml`, such as "motion" or "links".
         charts: Charts of the page.
         missing: Titles of the charts for which the log has no value, by section.
     """
