@@ -199,12 +199,11 @@ class ChartBuilder:
         """
         log = self._log
         limit = self._draw_limit(site_signals.SETTLED_ERROR_RAD)
-        limit_note = f"dashed: {limit.value:g}{self._note_floor()}"
         stated = [line for site in log.sites for line in self._list_stated_delays(site)]
         has_one_delay = len({line.value for line in stated}) == 1
         yield self._make_chart(
             section="overview",
-            title=f"Largest error |e| of each site; {limit_note}",
+            title=f"Largest error |e| by site{self._note_floor()}; dashed: {limit.value:g}",
             unit=site_signals.shared_unit(log),
             series=self._add_maxima(lambda site: np.abs(site_signals.joint_errors(log[site]))),
             lines=[limit],
@@ -221,15 +220,15 @@ class ChartBuilder:
         )
 
     def _note_floor(self) -> str:
-        """Returns a clause that says where errors below the floor of the chart are drawn.
+        """Returns a remark with the smallest drawn error, at which smaller ones are drawn.
 
         Returns:
-            The clause. Empty if no site has such small errors.
+            The remark. Empty if no site has such small errors.
         """
         for site in self._log.sites:
             largest = site_signals.largest_magnitude(site_signals.joint_errors(self._log[site]))
             if (largest < _LEAST_DRAWN).any():
-                return f"; smaller than {_LEAST_DRAWN:g}: drawn at {_LEAST_DRAWN:g}"
+                return f" (smaller ones at {_LEAST_DRAWN:g})"
         return ""
 
     def _add_maxima(self, read_values: Callable[[str], Array]) -> list[TableSeries]:

@@ -4,7 +4,7 @@ A certificate judges from its log whether a run was stable, and gives the reason
 energy function of the stability proof.
 
 Invariant:
-    - The sentences are those that `trilat certify` prints.
+    - The sentences are those that `trilat certify` prints, with longer names of the checks.
     - The figures are embedded as PNG data, because the page must be a single file.
 """
 
@@ -34,6 +34,13 @@ _PAGE_DPI = 110
 _PREMISE_MARKS = {True: "holds", False: '<b class="bad">fails</b>', None: "undecided"}
 _SENTENCE_MARKS = {"ok": "✓", "FAIL": "✗", "open": "?", "note": "·"}
 _SENTENCE_CLASSES = {"ok": "passed", "FAIL": "failed", "open": "open", "note": "note"}
+_LONG_NAMES = {
+    "e and qd": "the end of the record (e: error, qd: speed of a joint)",
+    "this rest": "roots, the rates of small motions about the final pose",
+    "twins": "twins, repetitions of the run with a small push",
+    "log": "the log itself",
+}
+"""Names of the checks on the page, by their names on a terminal."""
 _BALANCE_NOTE = (
     "V is the energy function of the stability theorem: a weighted sum of the energies of the "
     "arms, of their errors and of the estimates (docs/certificate-energy.md). What is left of "
@@ -53,7 +60,8 @@ def render_certificate(log: Log, certificate: Certificate) -> str:
     for line in grounds:
         mark = _SENTENCE_MARKS[line.mark]
         css_class = _SENTENCE_CLASSES[line.mark]
-        items += f'<li class="{css_class}"><b>{mark}</b>{escape(typeset(line.text))}</li>'
+        text = escape(typeset(_lengthen_name(line.text)))
+        items += f'<li class="{css_class}"><b>{mark}</b>{text}</li>'
     body = f'<ul class="verdicts">{items}</ul>'
     folds = []
     if certificate.premises:
@@ -83,6 +91,12 @@ def render_certificate(log: Log, certificate: Certificate) -> str:
             "applies and nobody pushes, it does not rise."
         )
     return render_section("Why this judgement", intro, body, "certificate")
+
+
+def _lengthen_name(sentence: str) -> str:
+    """Returns a sentence of a certificate with the long name of the check that it is about."""
+    name, colon, rest = sentence.partition(": ")
+    return f"{_LONG_NAMES.get(name, name)}{colon}{rest}"
 
 
 def _render_premises(certificate: Certificate) -> str:
