@@ -18,7 +18,12 @@ from trilat_net.analysis.dominance_history import trace_dominance
 from trilat_net.log.log_reader import Log
 from trilat_net.reporting.charts import ChartBuilder
 from trilat_net.reporting.page import write_report
-from trilat_net.reporting.page_leaders import describe_phases, render_leads, trace_leads
+from trilat_net.reporting.page_leaders import (
+    describe_leads,
+    describe_phases,
+    render_lead_bars,
+    trace_leads,
+)
 
 SHORT = {"rate_hz": 100, "duration_s": 14.0, "expect": {}}
 
@@ -49,16 +54,16 @@ def test_a_sudden_change_is_a_step() -> None:
 
 def test_constant_dominance_is_a_sentence() -> None:
     log = training(timeline=[])
-    html = render_leads(log, trace_leads(log))
-    assert "m1 leads the slave with 90 % and m2 with 10 %, during the whole run." in html
-    assert "<svg" not in html
+    leads = trace_leads(log)
+    sentence = "m1 leads the slave with 90 % and m2 with 10 %, during the whole run."
+    assert describe_leads(log, leads) == [sentence]
+    assert render_lead_bars(log, leads) == ""
 
 
 def test_one_master_leads_alone() -> None:
     log = runs.run("two_sites", {"rate_hz": 100, "duration_s": 1.0, "expect": {}}).log
-    assert "m alone leads the slave, during the whole run." in render_leads(
-        log, trace_leads(log)
-    )
+    sentences = describe_leads(log, trace_leads(log))
+    assert sentences == ["m alone leads the slave, during the whole run."]
 
 
 @pytest.mark.parametrize("name", ["four", "busy"])

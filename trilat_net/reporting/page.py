@@ -171,7 +171,8 @@ def _render_motion(charts: str) -> str:
         return ""
     intro = (
         "Drag over a chart to zoom all of them, double-click to see the whole run, and click a "
-        "name to hide its line."
+        "name to hide its line. Figures 3 to 6 of the paper show the same quantities; "
+        "docs/vocabulary.md explains the symbols."
     )
     heading = "Positions, torques and estimates over time"
     return render_section(heading, intro, charts, "figures")

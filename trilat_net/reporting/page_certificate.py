@@ -35,9 +35,9 @@ _PREMISE_MARKS = {True: "holds", False: '<b class="bad">fails</b>', None: "undec
 _SENTENCE_MARKS = {"ok": "✓", "FAIL": "✗", "open": "?", "note": "·"}
 _SENTENCE_CLASSES = {"ok": "passed", "FAIL": "failed", "open": "open", "note": "note"}
 _LONG_NAMES = {
-    "e and qd": "the end of the record (e: error, qd: speed of a joint)",
-    "this rest": "roots, the rates of small motions about the final pose",
-    "twins": "twins, repetitions of the run with a small push",
+    "e and qd": "end of the record (e: error, qd: speed of a joint)",
+    "this rest": "roots of small motions about the final pose",
+    "twins": "twins, runs with a small push",
     "log": "the log itself",
 }
 """Names of the checks on the page, by their names on a terminal."""

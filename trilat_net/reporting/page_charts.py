@@ -21,7 +21,7 @@ from .figures.arm_poses import render_arms_svg
 from .figures.joint_motion import explain_absent_operator
 from .page_data import Chart
 from .page_html import render_details, render_note
-from .page_leaders import render_leads
+from .page_leaders import describe_leads, render_lead_bars
 
 _TEXTS: dict[str, dict[str, Any]] = tomllib.loads(
     (resources.files("trilat_net.reporting") / "assets" / "report.toml").read_text("utf-8")
@@ -60,8 +60,8 @@ def render_overview(log: Log, builder: ChartBuilder, charts: Sequence[Chart]) ->
     html = ""
     has_records = any(len(log[site]) for site in log.sites)
     if has_records:
-        html = _ARM_PLAYER + render_leads(log, builder.leads)
-        html += f'<p class="note screen">{_ARM_NOTE}</p>'
+        html = _ARM_PLAYER + render_lead_bars(log, builder.leads)
+        html += render_note(" ".join([*describe_leads(log, builder.leads), _ARM_NOTE]))
     absent = [site for site in log.sites if not len(log[site])]
     if absent:
         html += render_note(f"Not drawn, because there is no record: {', '.join(absent)}.")

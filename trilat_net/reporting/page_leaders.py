@@ -22,7 +22,7 @@ from ..core.vectors import Array
 from ..log.log_reader import Log
 from ..scenario import Scenario
 from .page_data import LeadBar
-from .page_html import join_words, render_note, render_swatch
+from .page_html import join_words, render_swatch
 
 _MAX_BARS = 4
 """Largest number of slaves with a bar or a sentence."""
@@ -136,20 +136,24 @@ def list_lead_bars(leads: Sequence[Lead]) -> list[LeadBar]:
     return bars
 
 
-def render_leads(log: Log, leads: Sequence[Lead]) -> str:
-    """Renders a bar for each slave whose leader changes, and a sentence for each other slave.
+def render_lead_bars(log: Log, leads: Sequence[Lead]) -> str:
+    """Renders a bar for each slave whose dominance factors change.
 
     Args:
         log: Log of the run.
         leads: Who leads each slave, from `trace_leads`.
     """
-    html = ""
-    for lead in leads:
-        if lead.is_constant:
-            html += render_note(describe_constant_lead(log.scenario, lead))
-        else:
-            html += _render_bar(log, lead)
-    return html
+    return "".join(_render_bar(log, lead) for lead in leads if not lead.is_constant)
+
+
+def describe_leads(log: Log, leads: Sequence[Lead]) -> list[str]:
+    """Returns a sentence for each slave whose dominance factors never change.
+
+    Args:
+        log: Log of the run.
+        leads: Who leads each slave, from `trace_leads`.
+    """
+    return [describe_constant_lead(log.scenario, lead) for lead in leads if lead.is_constant]
 
 
 def describe_constant_lead(scenario: Scenario, lead: Lead) -> str:
