@@ -170,9 +170,8 @@ def _render_motion(charts: str) -> str:
     if not charts:
         return ""
     intro = (
-        "Drag over a chart to zoom all of them, double-click to see the whole run, and click a "
-        "name to hide its line. Figures 3 to 6 of the paper show the same quantities; "
-        "docs/vocabulary.md explains the symbols."
+        "Drag over a chart to zoom all, double-click to see the whole run, click a name to "
+        "hide its line. Fig. 3 to 6 are those of the paper; symbols: docs/vocabulary.md."
     )
     heading = "Positions, torques and estimates over time"
     return render_section(heading, intro, charts, "figures")

@@ -35,7 +35,7 @@ _PREMISE_MARKS = {True: "holds", False: '<b class="bad">fails</b>', None: "undec
 _SENTENCE_MARKS = {"ok": "✓", "FAIL": "✗", "open": "?", "note": "·"}
 _SENTENCE_CLASSES = {"ok": "passed", "FAIL": "failed", "open": "open", "note": "note"}
 _LONG_NAMES = {
-    "e and qd": "end of the record (e: error, qd: speed of a joint)",
+    "e and qd": "end (e: error, qd: joint speed)",
     "this rest": "roots of small motions about the final pose",
     "twins": "twins, runs with a small push",
     "log": "the log itself",
@@ -82,14 +82,11 @@ def render_certificate(log: Log, certificate: Certificate) -> str:
         folds.append(render_details(f"Figures: {names}", pictures))
     body += render_folds(folds)
     intro = (
-        "What speaks for (✓) and against (✗) stability, what decides nothing (?), and remarks "
-        "and checks that do not apply (·), as `trilat certify --all` prints it."
+        "✓ speaks for stability, ✗ against it, ? decides nothing, · is a remark or does not "
+        "apply (`trilat certify --all`)."
     )
     if certificate.has_functional:
-        intro += (
-            " V is the energy function of the paper's stability theorem: while the theorem "
-            "applies and nobody pushes, it does not rise."
-        )
+        intro += " V: the energy function of the paper's theorem."
     return render_section("Why this judgement", intro, body, "certificate")
 
 
