@@ -204,6 +204,15 @@ def test_a_log_with_next_to_nothing_has_a_report(sites, tmp_path):
     assert "the file was not finished" in paths[0].read_text(encoding="utf-8")
 
 
+@pytest.mark.parametrize("name", ["paper", "four"])
+def test_error_chart_names_its_floor(name):
+    log = logs.simulated(name)
+    _, data = page(log)
+    errors = [site_signals.largest_magnitude(log[site].e).min() for site in log.sites]
+    title = next(c["title"] for c in data["charts"] if c["section"] == "overview")
+    assert ("(smaller ones at 1e-06)" in title) == (min(errors) < 1e-6)
+
+
 def test_a_run_that_diverged_has_a_page():
     html, _ = page(logs.diverged())
     assert '<th scope="row">diverged</th><td>yes</td>' in html
