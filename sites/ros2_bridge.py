@@ -31,7 +31,11 @@ from trilat_net.core.ticks import NS_PER_S
 from trilat_net.errors import TrilatError, UsageError, count_nouns
 from trilat_net.files import refuse_existing, write_whole
 from trilat_net.log.ros2 import cdr
-from trilat_net.log.ros2.published import COMMON_TOPICS, list_topics, pack_session_diagnostics
+from trilat_net.log.ros2.published import (
+    COMMON_TOPICS,
+    list_full_topics,
+    pack_session_diagnostics,
+)
 from trilat_net.log.ros2.ros2_messages import SESSION_CHANNELS, Ros2SiteChannels, pack_event
 from trilat_net.log.ros2.rviz_config import build_rviz_config
 from trilat_net.log.ros2.topic_names import DIAGNOSTICS, FRAMES, RobotTable, TopicTable
@@ -981,9 +985,8 @@ def write_session_config(ends: BridgeEnds, scenario: Scenario, path: Path) -> No
     Raises:
         UsageError: The file cannot be written.
     """
-    topics = list_topics(scenario, ends.session, ends.table)
-    full_names = {f"/{topic}": channel for topic, channel in topics.items()}
-    write_whole(path, build_rviz_config(full_names))
+    topics = list_full_topics(scenario, ends.session, ends.table)
+    write_whole(path, build_rviz_config(topics))
 
 
 def _describe_inputs(ends: BridgeEnds, bridge: Bridge, robots: Iterable[str]) -> list[str]:

@@ -19,6 +19,7 @@ from tests.cli.running import COMMAND, PLAIN, shorten, trilat
 from tests.log_editing import edited, opened
 from trilat_net.cli import app
 from trilat_net.errors import CodeWithheld, ScenarioError, UsageError
+from trilat_net.reporting.figures.registry import list_drawable_figures
 from trilat_net.scenario.code_consent import list_imported_code
 from trilat_net.scenario.imported_code import (
     CodeKey,
@@ -461,6 +462,21 @@ def test_law_of_own_run_allows_no_strangers_settings(reader: Path) -> None:
     ):
         with pytest.raises(CodeWithheld, match=r"secret\.txt"):
             run()
+    assert not imports(reader)
+
+
+def test_figures_run_the_laws_that_a_user_permitted_and_no_others(reader: Path) -> None:
+    stranger = tn.open_log("stranger.mcap")
+    tn.figure(stranger, "overview")
+    assert "twins" not in list_drawable_figures(stranger)
+    assert not imports(reader)
+    log = tn.open_log("own.mcap", law="mylaws.py")
+    assert not imports(reader)
+    tn.figure(log, "overview")
+    assert imports(reader)
+    assert "twins" in list_drawable_figures(log)
+    (reader / "witness").unlink()
+    tn.figure(stranger, "overview")  # the permission is for other settings
     assert not imports(reader)
 
 

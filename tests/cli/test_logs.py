@@ -133,7 +133,9 @@ def test_report_goes_beside_its_log_and_keeps_what_is_there(tmp_path: Path) -> N
     assert text.splitlines()[0].split()[1] == "stability:"
     assert text.splitlines()[-1] == "open first: run/report.html"
     assert "400/400 records identical" in text
-    assert "certificate: " in text
+    assert "late p50" not in text
+    assert text.count("virtual time: no clock was read") == 1
+    assert "stability theorem of the paper (V: its energy function): " in text
     page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
     assert page.lstrip().lower().startswith("<!doctype html")
     assert 'src="http' not in page  # it works offline

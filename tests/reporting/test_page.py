@@ -82,7 +82,7 @@ def test_a_report_is_a_page_with_numbers_and_pictures(tmp_path):
     assert len(html) < 1_500_000
     body = html[html.index("</h1>") :]
     assert 0 < body.index('id="verdict"') < body.index("✗ Failed: ") < body.index('id="arms"')
-    assert "</b>outside the theorem (delays): V rose by" in html
+    assert "</b>the theorem does not apply (premises that fail: delays): V rose by" in html
     assert "<td>V at 0 s</td>" in html
     assert 'src="data:image/png;base64,' in html
     sections = {attrs.get("data-section") for _, attrs in Page(html).elements} - {None}
@@ -181,7 +181,7 @@ def test_the_page_of_a_plain_log_has_nothing_superfluous():
     assert data["changes"] == []
     assert set(map(len, data["spans"].values())) == {0}
     assert not [c for c in data["charts"] if c["section"] == "delays"]
-    assert "Charts mark the changes" not in html
+    assert "Charts mark changes" not in html
     assert "clock of the sender" not in html
     ages = [c for c in data["charts"] if c["section"] == "ages"]
     line = {"value": 200.0, "colour": "limit", "from": 0.0, "to": data["end_s"]}
@@ -202,6 +202,15 @@ def test_a_log_with_next_to_nothing_has_a_report(sites, tmp_path):
     pictures = write_report_figures(log, tmp_path, twin)
     assert {"positions.png", "arms.png"} <= {path.name for path in pictures}
     assert "the file was not finished" in paths[0].read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", ["paper", "four"])
+def test_error_chart_names_its_floor(name):
+    log = logs.simulated(name)
+    _, data = page(log)
+    errors = [site_signals.largest_magnitude(log[site].e).min() for site in log.sites]
+    title = next(c["title"] for c in data["charts"] if c["section"] == "overview")
+    assert ("(smaller ones at 1e-06)" in title) == (min(errors) < 1e-6)
 
 
 def test_a_run_that_diverged_has_a_page():

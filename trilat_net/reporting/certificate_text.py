@@ -13,6 +13,7 @@ Invariant:
       entries that are too small to be listed.
 """
 
+import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -24,6 +25,7 @@ from ..analysis.certificate.premises import Premise
 from ..analysis.certificate.stability_certificate import Certificate, StabilityFinding
 from ..analysis.envelope_trend import EnvelopeTrend
 from ..analysis.run_end import Stability
+from ..analysis.stability_decision import LoopRoots
 from ..analysis.twin_growth import PushedTwins, TwinGrowth
 from ..core.vectors import Array
 from ..errors import count_nouns
@@ -40,6 +42,8 @@ _SOURCE_NAMES = {
 }
 """Texts of the sources of energy other than links, by their names in a balance."""
 
+_SAME_RATE = 0.2
+"""Largest relative difference of two rates that needs no explanation."""
 _HOLDS = {True: "holds", False: "fails", None: "undecided"}
 
 
@@ -161,6 +165,7 @@ def describe_certificate(certificate: Certificate) -> list[CertificateLine]:
     twins = certificate.twins
     if twins is not None:
         lines.append(CertificateLine(_mark_twins(twins), twins.text))
+        lines += _compare_rates(roots, twins)
     lines.append(_describe_evidence(certificate))
     paper_note = _describe_paper_weights(certificate)
     if paper_note:
@@ -172,6 +177,8 @@ def _describe_verdict(certificate: Certificate) -> list[CertificateLine]:
     """Returns the judgement, the verdict about V, and the end of the run."""
     stability_mark = _JUDGEMENT_MARKS[certificate.stability]
     verdict_mark = "ok" if certificate.bounded_by_v else "open"
+    if certificate.verdict.finding is StabilityFinding.DID_NOT_RISE:
+        verdict_mark = "note"  # a theorem that does not apply has neither held nor failed
     if certificate.verdict.finding is StabilityFinding.BROKEN:
         stability_mark = "FAIL"
         verdict_mark = "FAIL"
@@ -182,6 +189,50 @@ def _describe_verdict(certificate: Certificate) -> list[CertificateLine]:
     end_mark = _JUDGEMENT_MARKS[certificate.end.stability]
     lines.append(CertificateLine(end_mark, f"e and qd: {certificate.end.text}"))
     return lines
+
+
+def describe_theorem(certificate: Certificate) -> list[str]:
+    """Returns a line that says what the paper's stability theorem says about a run.
+
+    Args:
+        certificate: Judgement whether a run was stable, with its reasons.
+
+    Returns:
+        The line. Empty if the theorem is about another control law, and has nothing to say.
+    """
+    if not certificate.has_functional:
+        return []
+    text = certificate.verdict.text
+    return [f"stability theorem of the paper (V: its energy function): {text}"]
+
+
+def _compare_rates(roots: LoopRoots | None, twins: TwinGrowth) -> list[CertificateLine]:
+    """Returns why the rate of the pushes is not that of the roots, if the rates differ.
+
+    Both are rates of amplitudes. The roots are about small motions near one pose, whereas
+    pushes follow the motion of the run for a limited time.
+
+    Args:
+        roots: Characteristic roots of the loop at its final pose. None if there are none.
+        twins: Growth of the pushes.
+
+    Returns:
+        A remark. Empty if the rates agree, or if one of them is unknown.
+    """
+    worst = twins.worst
+    if roots is None or roots.rate_per_s is None or worst is None:
+        return []
+    if twins.departure is not None or worst.factor == 0.0 or math.isnan(worst.rate_per_s):
+        return []  # the text about the pushes states no rate of a push
+    difference = abs(roots.rate_per_s - worst.rate_per_s)
+    if difference <= _SAME_RATE * max(abs(roots.rate_per_s), abs(worst.rate_per_s)):
+        return []
+    text = (
+        "the two rates are both of amplitudes, exp(rate t), yet not of one motion: the roots "
+        "are about small motions near the final pose, in the long run; pushes were followed "
+        f"along this run, from {twins.from_s:.4g} to {twins.to_s:.4g} s"
+    )
+    return [CertificateLine("note", text)]
 
 
 def _describe_evidence(certificate: Certificate) -> CertificateLine:

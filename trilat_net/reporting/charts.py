@@ -58,6 +58,7 @@ from .page_data import (
     TableSeries,
     TimeChart,
 )
+from .page_leaders import caption_site, list_lead_bars, trace_leads
 
 Values = NDArray[Any]
 """Numbers of any type."""
@@ -76,7 +77,7 @@ _CHAIN_INSTANTS = 400
 _MAXIMA = 400
 """Number of intervals of a line of maxima."""
 _LEAST_DRAWN = 1e-6
-"""Smallest drawn maximum. A logarithmic axis needs a positive number."""
+"""Smallest drawn maximum, at which smaller ones are drawn. A logarithmic axis has no zero."""
 PICTURE_SIDE = 4.0
 """Longer side of a picture of a chain, in the unit of the line widths of the page."""
 
@@ -107,6 +108,7 @@ class ChartBuilder:
         bounds_m: Left, right, bottom and top of a box around the motion of all arms, in m.
         units_per_m: Scale of the pictures of the arms, in units of the picture per m. It is 1
             for planar arms. Pictures with a chain are scaled to the size `PICTURE_SIDE`.
+        leads: Who leads each slave over time.
     """
 
     def __init__(self, log: Log, twin: Log | None) -> None:
@@ -116,6 +118,7 @@ class ChartBuilder:
         self._end_s = recorded_end_s(log)
         self._tables: list[ColumnTable] = []
         self._has_values: list[list[bool]] = []  # by table and column
+        self.leads = trace_leads(log)
 
         times_s = np.linspace(0.0, self._end_s, _BOX_INSTANTS)
         poses = [arm_poses.find_pose(log, site, t_s) for site in log.sites for t_s in times_s]
@@ -179,6 +182,7 @@ class ChartBuilder:
             end_s=self._end_s,
             colours=Palettes(light, dark),
             arms=arms,
+            leads=list_lead_bars(self.leads),
             tables=self._tables,
             charts=charts,
             changes=changes,
@@ -199,7 +203,7 @@ class ChartBuilder:
         has_one_delay = len({line.value for line in stated}) == 1
         yield self._make_chart(
             section="overview",
-            title=f"Largest error |e| of each site; dashed: {limit.value:g}",
+            title=f"Largest error |e| by site{self._note_floor()}; dashed: {limit.value:g}",
             unit=site_signals.shared_unit(log),
             series=self._add_maxima(lambda site: np.abs(site_signals.joint_errors(log[site]))),
             lines=[limit],
@@ -214,6 +218,18 @@ class ChartBuilder:
             zero=True,
             margin=0.05,
         )
+
+    def _note_floor(self) -> str:
+        """Returns a remark with the smallest drawn error, at which smaller ones are drawn.
+
+        Returns:
+            The remark. Empty if no site has such small errors.
+        """
+        for site in self._log.sites:
+            largest = site_signals.largest_magnitude(site_signals.joint_errors(self._log[site]))
+            if (largest < _LEAST_DRAWN).any():
+                return f" (smaller ones at {_LEAST_DRAWN:g})"
+        return ""
 
     def _add_maxima(self, read_values: Callable[[str], Array]) -> list[TableSeries]:
         """Adds a line per site with the largest values of a signal in short intervals.
@@ -668,6 +684,7 @@ class ChartBuilder:
         table = self._add_records(site, np.hstack([actual, desired, *bodies]))
         return PlanarArm(
             site=site,
+            caption=caption_site(self._log.scenario, site),
             colour=index,
             table=table,
             bodies=len(bodies),
@@ -710,6 +727,7 @@ class ChartBuilder:
         table = self._add_table(site, records.tick[rows], values)
         return ChainArm(
             site=site,
+            caption=caption_site(self._log.scenario, site),
             colour=index,
             table=table,
             bodies=len(bodies),

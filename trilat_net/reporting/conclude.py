@@ -28,10 +28,12 @@ from ..log.accounting import MIN_COVERAGE
 from ..log.findings import CheckReport, Finding
 from ..log.log_reader import Log
 from ..log.mcap_reader import Progress
+from ..log.site_log import SiteLog
 from ..process import worker_pool
+from ..scenario.code_consent import may_run_user_laws
 from ..scenario.imported_code import allowed_code
 from ..theory.run_certificate import certify_run
-from .certificate_text import CertificateLine, describe_certificate
+from .certificate_text import CertificateLine, describe_certificate, describe_theorem
 from .result_text import MARKS, Block, MarkedText, TextTable
 from .summary_text import format_run_lines
 
@@ -134,6 +136,7 @@ def conclude(
         RunFailed: The process that executes the log was terminated.
     """
     # Importing Matplotlib takes a second, which `trilat verify` need not wait for.
+    from .figures.age_and_lateness import explain_missing_loop_times
     from .figures.registry import write_report_figures
     from .page import write_report
 
@@ -143,8 +146,8 @@ def conclude(
         allowed = dict(allowed_code)
         check = pool.submit(check_log_files, log.sources, min_coverage, allowed)
         twin = _run_without_operators(log)
-        # Whoever permitted the log's laws to run permitted their twins and roots as well.
-        certificate = certify_run(log, min_coverage=min_coverage, own_laws=bool(allowed))
+        own_laws = may_run_user_laws(log.scenario)
+        certificate = certify_run(log, min_coverage=min_coverage, own_laws=own_laws)
         # A record that cannot be read raises here, before anything is written.
         run_lines = format_run_lines(log)
         figures: list[Path] = []
@@ -184,10 +187,12 @@ def conclude(
             certificate=certificate,
             verdicts=wait_for_findings(),
         )
+    untimed = explain_missing_loop_times(log)
+    timing_lines = [untimed] if untimed else []
     return Conclusion(
         verdict=describe_certificate(certificate)[0],
-        table=_tabulate_sites(log),
-        notes=[*run_lines, f"certificate: {certificate.verdict.text}"],
+        table=_tabulate_sites(log, is_timed=not untimed),
+        notes=[*timing_lines, *run_lines, *describe_theorem(certificate)],
         findings=findings,
         paths=[*map(Path, log.sources), *report, *figures],
     )
@@ -211,38 +216,39 @@ def _run_without_operators(log: Log) -> Log | None:
         return None
 
 
-_HEADERS = (
-    "site",
-    "records",
-    "missing",
-    "late p50 us",
-    "p99",
-    "max",
-    "busy p50 us",
-    "p99",
-)
+_HEADERS = ("site", "records", "missing")
+_TIMING_HEADERS = ("late p50 us", "p99", "max", "busy p50 us", "p99")
 
 
-def _tabulate_sites(log: Log) -> TextTable:
-    """Returns a table with a row per site: records, timing of the loop, and last error."""
-    headers = (*_HEADERS, f"max|e| end {shared_unit(log)}")
-    rows = [_list_site_cells(log, site) for site in log.sites]
+def _tabulate_sites(log: Log, *, is_timed: bool) -> TextTable:
+    """Returns a table with a row per site: records, timing of the loop, and last error.
+
+    Args:
+        log: Log of the run.
+        is_timed: False to leave out the timing. Loops in virtual time are never late.
+    """
+    timing = _TIMING_HEADERS if is_timed else ()
+    headers = (*_HEADERS, *timing, f"max|e| end {shared_unit(log)}")
+    rows = []
+    for site in log.sites:
+        records = log[site]
+        if not len(records):
+            empty = [""] * (len(headers) - 2)
+            rows.append([site, "0", *empty])
+            continue
+        ticks = max(log.last_ticks[site], records.last_tick) + 1
+        missing = ticks - len(records) - log.absent_ticks(site)
+        times = _list_timing_cells(records) if is_timed else []
+        last_error = np.abs(records.e[-1]).max()
+        rows.append([site, str(len(records)), str(missing), *times, f"{last_error:.2e}"])
     return TextTable(headers, rows, align="lr")
 
 
-def _list_site_cells(log: Log, site: str) -> list[str]:
-    """Returns the cells of a site. Without records, only the name and the number are filled."""
-    records = log[site]
-    if not len(records):
-        empty = [""] * (len(_HEADERS) - 1)
-        return [site, "0", *empty]
-    ticks = max(log.last_ticks[site], records.last_tick) + 1
-    missing = ticks - len(records) - log.absent_ticks(site)
+def _list_timing_cells(records: SiteLog) -> list[str]:
+    """Returns the percentiles of the lateness and of the computing time of a site's ticks."""
     late_us = np.percentile(records.late_us, (50, 99, 100))
     busy_us = np.zeros(2)
     # A record has the computing time of the previous tick, so that the first record has none.
     if len(records) > 1:
         busy_us = np.percentile(records.busy_us, (50, 99))
-    times = [f"{time_us:.0f}" for time_us in (*late_us, *busy_us)]
-    last_error = np.abs(records.e[-1]).max()
-    return [site, str(len(records)), str(missing), *times, f"{last_error:.2e}"]
+    return [f"{time_us:.0f}" for time_us in (*late_us, *busy_us)]

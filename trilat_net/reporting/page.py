@@ -6,7 +6,7 @@ draws the figures that explain whether the run was stable, and writes two files:
 
 - `report.html`, a page for people. `render_report` fills the template `assets/report.html`.
   Each section of the page comes from one module `page_...`, in the order of the page:
-  `page_summary` and `page_charts` (the first screen), `page_charts` (the paper's figures),
+  `page_summary`, `page_charts` and `page_leaders` (the first screen), `page_charts` (motion),
   `page_timeline`, `page_links`, `page_sites`, `page_certificate`, `page_sites` (the loops) and
   `page_origin`.
 - `summary.json`, the same numbers for programs.
@@ -125,7 +125,7 @@ def render_report(
     data, missing = builder.build()
     groups = {
         place: render_chart_groups(log, place, data.charts, missing)
-        for place in ("paper", "links", "loops")
+        for place in ("motion", "links", "loops")
     }
     # A "<" in a text could end the script element that contains the data. In JSON, "\u003c"
     # means the same character.
@@ -139,7 +139,7 @@ def render_report(
         checks=render_checks(verdicts, facts),
         numbers=render_key_numbers(log, facts),
         overview=render_overview(log, builder, data.charts),
-        paper=_render_paper_figures(groups["paper"]),
+        motion=_render_motion(groups["motion"]),
         timeline=render_timeline(log, facts),
         links=render_links(log, facts, groups["links"]),
         sites=render_sites(log, facts),
@@ -165,15 +165,16 @@ def _to_json(value: Any, indent: int | None = None) -> str:
     return json.dumps(value, allow_nan=False, ensure_ascii=False, indent=indent)
 
 
-def _render_paper_figures(charts: str) -> str:
-    """Returns the section with the quantities that the paper plots. Empty without charts."""
+def _render_motion(charts: str) -> str:
+    """Returns the section with positions, torques and estimates. Empty without charts."""
     if not charts:
         return ""
     intro = (
-        "The quantities that the paper plots, from this run. Drag over a chart to zoom all of "
-        "them, double-click to see the whole run, and click a name to hide its line."
+        "Drag over a chart to zoom all, double-click to see the whole run, click a name to "
+        "hide its line. Fig. 3 to 6 are those of the paper; symbols: docs/vocabulary.md."
     )
-    return render_section("The figures of the paper", intro, charts, "figures")
+    heading = "Positions, torques and estimates over time"
+    return render_section(heading, intro, charts, "figures")
 
 
 def _render_site_css(scenario: Scenario) -> str:

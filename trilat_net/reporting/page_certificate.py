@@ -4,7 +4,7 @@ A certificate judges from its log whether a run was stable, and gives the reason
 energy function of the stability proof.
 
 Invariant:
-    - The sentences are those that `trilat certify` prints.
+    - The sentences are those that `trilat certify` prints, with longer names of the checks.
     - The figures are embedded as PNG data, because the page must be a single file.
 """
 
@@ -34,9 +34,17 @@ _PAGE_DPI = 110
 _PREMISE_MARKS = {True: "holds", False: '<b class="bad">fails</b>', None: "undecided"}
 _SENTENCE_MARKS = {"ok": "✓", "FAIL": "✗", "open": "?", "note": "·"}
 _SENTENCE_CLASSES = {"ok": "passed", "FAIL": "failed", "open": "open", "note": "note"}
+_LONG_NAMES = {
+    "e and qd": "end (e: error, qd: joint speed)",
+    "this rest": "roots of small motions about the final pose",
+    "twins": "twins, runs with a small push",
+    "log": "the log itself",
+}
+"""Names of the checks on the page, by their names on a terminal."""
 _BALANCE_NOTE = (
-    "V of the theorem, with the weights that the shares ask for, and its energy balance: what "
-    "is left of V − V(0) + dissipation − work must vanish, whatever the operators do."
+    "V is the energy function of the stability theorem: a weighted sum of the energies of the "
+    "arms, of their errors and of the estimates (docs/certificate-energy.md). What is left of "
+    "V − V(0) + dissipation − work must vanish, whatever the operators do."
 )
 
 
@@ -52,12 +60,15 @@ def render_certificate(log: Log, certificate: Certificate) -> str:
     for line in grounds:
         mark = _SENTENCE_MARKS[line.mark]
         css_class = _SENTENCE_CLASSES[line.mark]
-        items += f'<li class="{css_class}"><b>{mark}</b>{escape(typeset(line.text))}</li>'
+        text = escape(typeset(_lengthen_name(line.text)))
+        items += f'<li class="{css_class}"><b>{mark}</b>{text}</li>'
     body = f'<ul class="verdicts">{items}</ul>'
     folds = []
     if certificate.premises:
         premises = _render_premises(certificate)
-        folds.append(render_details("Premises of the theorem", premises))
+        folds.append(
+            render_details("What the theorem requires, and whether it holds here", premises)
+        )
     if certificate.balance is not None:
         energies = list_energies(certificate.balance)
         rows = [(escape(name), f"{energy_j:.4g}") for name, energy_j in energies]
@@ -71,10 +82,18 @@ def render_certificate(log: Log, certificate: Certificate) -> str:
         folds.append(render_details(f"Figures: {names}", pictures))
     body += render_folds(folds)
     intro = (
-        "What speaks for (✓) and against (✗) stability, and what decides nothing (?), as "
-        "`trilat certify --all` prints it."
+        "✓ speaks for stability, ✗ against it, ? decides nothing, · is a remark or does not "
+        "apply (`trilat certify --all`)."
     )
+    if certificate.has_functional:
+        intro += " V: the energy function of the paper's theorem."
     return render_section("Why this judgement", intro, body, "certificate")
+
+
+def _lengthen_name(sentence: str) -> str:
+    """Returns a sentence of a certificate with the long name of the check that it is about."""
+    name, colon, rest = sentence.partition(": ")
+    return f"{_LONG_NAMES.get(name, name)}{colon}{rest}"
 
 
 def _render_premises(certificate: Certificate) -> str:
@@ -102,7 +121,9 @@ def _draw_certificate(log: Log, certificate: Certificate) -> list[tuple[str, Fig
     twins = certificate.twins
     figures = []
     if certificate.balance is not None:
-        figures.append(("V and energies", draw_functional(log, certificate)))
+        figures.append(
+            ("V, the energy of the theorem, and its parts", draw_functional(log, certificate))
+        )
     if observed is not None and observed.curves:
         title = "energies that the laws declare"
         figures.append((title, draw_observed_energy(log, observed)))

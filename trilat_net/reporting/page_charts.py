@@ -21,6 +21,7 @@ from .figures.arm_poses import render_arms_svg
 from .figures.joint_motion import explain_absent_operator
 from .page_data import Chart
 from .page_html import render_details, render_note
+from .page_leaders import describe_leads, render_lead_bars
 
 _TEXTS: dict[str, dict[str, Any]] = tomllib.loads(
     (resources.files("trilat_net.reporting") / "assets" / "report.toml").read_text("utf-8")
@@ -41,13 +42,15 @@ _ARM_PLAYER = """<div id="arms" class="screen">
 <input type="range" min="0" max="1000" value="0" step="1"
 aria-label="time"><output>0.000 s</output></div>
 </div>
-<p class="note screen">Solid: the arm; dashed: the reference of Eq. (6), to which its peers lead
-it. The arms follow the slider, and the pointer in any chart.</p>
 """
+_ARM_NOTE = (
+    "Solid: the arm; dashed: where the other arms lead it, delayed and weighted. The arms "
+    "follow the slider, and the pointer in any chart."
+)
 
 
 def render_overview(log: Log, builder: ChartBuilder, charts: Sequence[Chart]) -> str:
-    """Renders the moving arms, the error over time and the delay in use over time.
+    """Renders the moving arms, who leads, the error over time and the delay over time.
 
     Args:
         log: Log of the run.
@@ -57,7 +60,8 @@ def render_overview(log: Log, builder: ChartBuilder, charts: Sequence[Chart]) ->
     html = ""
     has_records = any(len(log[site]) for site in log.sites)
     if has_records:
-        html = _ARM_PLAYER
+        html = _ARM_PLAYER + render_lead_bars(log, builder.leads)
+        html += render_note(" ".join([*describe_leads(log, builder.leads), _ARM_NOTE]))
     absent = [site for site in log.sites if not len(log[site])]
     if absent:
         html += render_note(f"Not drawn, because there is no record: {', '.join(absent)}.")
@@ -77,7 +81,7 @@ def render_chart_groups(
 
     Args:
         log: Log of the run.
-        place: Place on the page, a table of `report.toml`, such as "paper" or "links".
+        place: Place on the page, a table of `report.toml`, such as "motion" or "links".
         charts: Charts of the page.
         missing: Titles of the charts for which the log has no value, by section.
     """

@@ -189,6 +189,7 @@ class PlanarArm(msgspec.Struct, frozen=True, kw_only=True, tag="planar", tag_fie
 
     Attributes:
         site: Name of the site, the process that runs the arm.
+        caption: Name and role of the site, such as "m1, master 1".
         colour: Number that selects the colour of the arm.
         table: Index of the table that the picture uses. It contains the actual and the desired
             angles of both joints, in rad, and then the outlines of the bodies.
@@ -197,6 +198,7 @@ class PlanarArm(msgspec.Struct, frozen=True, kw_only=True, tag="planar", tag_fie
     """
 
     site: str
+    caption: str
     colour: int
     table: int
     bodies: int
@@ -208,6 +210,7 @@ class ChainArm(msgspec.Struct, frozen=True, kw_only=True, tag="chain", tag_field
 
     Attributes:
         site: Name of the site, the process that runs the arm.
+        caption: Name and role of the site, such as "m1, master 1".
         colour: Number that selects the colour of the arm.
         table: Index of the table with the coordinates to draw. It contains the points of the
             actual arm, of the arm in the desired pose, and of the shadow on the floor, and then
@@ -217,10 +220,30 @@ class ChainArm(msgspec.Struct, frozen=True, kw_only=True, tag="chain", tag_field
     """
 
     site: str
+    caption: str
     colour: int
     table: int
     bodies: int
     points: int
+
+
+class LeadBar(msgspec.Struct, frozen=True, kw_only=True):
+    """Who leads a slave over time, for a slave whose dominance factors change.
+
+    A slave follows its peers with weights, the dominance factors. Between two points in time
+    the factors change linearly.
+
+    Attributes:
+        site: Name of the slave.
+        peers: Names of the peers.
+        t: Times of the points, in s.
+        shares: For each peer its dominance factor at these times.
+    """
+
+    site: str
+    peers: list[str]
+    t: list[float]
+    shares: list[list[float]]
 
 
 class MarkedChange(msgspec.Struct, frozen=True):
@@ -280,6 +303,7 @@ class PageData(msgspec.Struct, frozen=True, kw_only=True):
         changes: Changes during the run.
         spans: For each site, the intervals in which it does not follow its peers.
         arms: Arms of the sites that have records.
+        leads: Who leads each slave whose dominance factors change, in the order of the bars.
         bounds_m: Left, right, bottom and top of the pictures of the arms, in the units of these
             pictures.
     """
@@ -291,6 +315,7 @@ class PageData(msgspec.Struct, frozen=True, kw_only=True):
     changes: list[MarkedChange]
     spans: dict[str, list[ModeSpan]]
     arms: list[PlanarArm | ChainArm]
+    leads: list[LeadBar]
     bounds_m: list[float]
 
     def to_builtins(self) -> dict[str, Any]:

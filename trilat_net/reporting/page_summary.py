@@ -51,8 +51,8 @@ _MEANINGS = {
 }
 """What each judgement means."""
 _ROOTS_AND_THEOREM = (
-    "This proof is about small motions near the final pose. The paper's theorem, which is "
-    "examined below, is another proof, and this one does not need it."
+    "This proof is about small motions near the final pose{pace}. The paper's theorem, which "
+    "is examined below, is another proof, and this one does not need it."
 )
 """What readers must know if the loop has stable roots, but not all premises of the theorem."""
 _MARKS = {
@@ -88,7 +88,7 @@ def render_verdict(log: Log, certificate: Certificate, findings: Sequence[Findin
     css_class = _MARKS[certificate.stability]
     sentences = [_explain_end(log, certificate)]
     if certificate.stability is Stability.STABLE and _is_proved_by_roots_alone(certificate):
-        sentences.append(_ROOTS_AND_THEOREM)
+        sentences.append(_ROOTS_AND_THEOREM.format(pace=_describe_pace(certificate)))
     if any(finding.judged and not finding.passed for finding in findings):
         css_class = "bad" if css_class == "bad" else "warn"
         sentences.append("The log failed a check, so that the judgement may be wrong.")
@@ -102,6 +102,14 @@ def _is_proved_by_roots_alone(certificate: Certificate) -> bool:
     """Returns True if neither the theorem nor a condition of the law is among the proofs."""
     roots = certificate.roots
     return roots is not None and certificate.decision.rests_on == roots.describe_as_basis()
+
+
+def _describe_pace(certificate: Certificate) -> str:
+    """Returns how fast the slowest small motion dies away, as a clause. Empty if not known."""
+    roots = certificate.roots
+    if roots is None or roots.rate_per_s is None or roots.rate_per_s >= 0.0:
+        return ""
+    return f": the slowest of them halves every {math.log(2.0) / -roots.rate_per_s:.2g} s"
 
 
 def describe_basis(certificate: Certificate) -> str:

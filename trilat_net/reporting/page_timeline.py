@@ -84,9 +84,9 @@ def render_timeline(log: Log, facts: JsonObject) -> str:
     if others:
         summary = f"{count_nouns(len(moments) - MAX_SHOWN, 'more moment')}"
         body += render_details(summary, _render_moments(log, others))
-    intro = "What was done to the arms, what changed, and how they reacted."
+    intro = "What was done to the arms, and how they reacted."
     if facts["changes"]:
-        intro += " Charts mark the changes by their numbers."
+        intro += " Charts mark changes by number."
     return render_section("What happened", intro, body, "moments")
 
 

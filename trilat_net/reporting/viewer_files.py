@@ -16,7 +16,7 @@ from ..errors import UsageError
 from ..files import refuse_existing, write_whole
 from ..log.log_layout import VIZ_ROOT
 from ..log.log_reader import open_log
-from ..log.ros2.published import list_topics
+from ..log.ros2.published import list_full_topics
 from ..log.ros2.ros2_messages import Ros2Channel, read_ros2_channels
 from ..log.ros2.rviz_config import build_rviz_config
 from ..log.ros2.topic_names import NAMINGS, make_session_name, read_topic_table
@@ -103,5 +103,4 @@ def _list_session_topics(log: Path) -> dict[str, Ros2Channel]:
     opened = open_log(log)
     session = make_session_name(opened.session["session"])
     table = read_topic_table(NAMINGS[0])
-    topics = list_topics(opened.scenario, session, table)
-    return {f"/{topic}": channel for topic, channel in topics.items()}
+    return list_full_topics(opened.scenario, session, table)

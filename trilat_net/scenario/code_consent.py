@@ -326,6 +326,18 @@ def find_user_laws(scenario: "Scenario") -> list[LoggedUserLaw]:
     return [_inspect_user_law(key, law, sites[key]) for key, law in laws.items()]
 
 
+def may_run_user_laws(scenario: "Scenario") -> bool:
+    """Returns True if every control law in a scenario that is a user's class may run.
+
+    Whoever permitted the laws of a log also permitted what repeats its run: twins, roots and
+    the energies that the laws declare.
+
+    Args:
+        scenario: Scenario of a log.
+    """
+    return all(law.allowed for law in find_user_laws(scenario))
+
+
 def _inspect_user_law(key: CodeKey, law: ImportedLaw, sites: tuple[str, ...]) -> LoggedUserLaw:
     """Finds the file of a user's control law, and whether the law may run.
 

@@ -18,6 +18,7 @@ from ..log.log_reader import Log, open_log
 from ..reporting.certificate_text import describe_judgement
 from ..reporting.result_text import Block, MarkedText, TextTable, format_number
 from ..results import Result
+from ..scenario.code_consent import may_run_user_laws
 from ..scenario.describe import ScenarioDifference, compare_scenarios
 from ..scenario.scenario_reader import reseed_scenario
 from ..theory.run_certificate import certify_run
@@ -156,7 +157,7 @@ def compare(*logs: str | Path | Log) -> LogComparison:
     names = name_columns(files)
     remarks = {}
     for name, log in zip(names, opened, strict=True):
-        judgement = certify_run(log)
+        judgement = certify_run(log, own_laws=may_run_user_laws(log.scenario))
         verdict = describe_judgement(judgement)
         remarks[name] = [verdict, *check_final_posture(log)]
     metrics = compare_metrics(opened, names)

@@ -60,7 +60,7 @@ def test_outside_and_yet_not_risen() -> None:
     found = runs.run("wall").certificate
     assert found.verdict.finding is StabilityFinding.DID_NOT_RISE
     assert found.verdict.text.startswith(
-        "outside the theorem (hands), yet V rose by no more than the hands"
+        "the theorem does not apply (premises that fail: hands); V rose by no more than the"
     )
     assert found.bounded_by_v
 

@@ -90,7 +90,7 @@ class StabilityFinding(StrEnum):
     """
 
     COVERED = "covered by the theorem"
-    DID_NOT_RISE = "outside the theorem, yet V did not rise"
+    DID_NOT_RISE = "the theorem does not apply, and V did not rise"
     ROSE = "V rose"
     BROKEN = "the energy balance is broken"
     NOT_JUDGED = "V cannot be judged"
@@ -476,7 +476,7 @@ def _judge_course(run: FunctionalFacts, premises: Sequence[Premise]) -> Stabilit
     """
     balance = run.balance
     failed = [premise.name for premise in premises if premise.holds is False]
-    outside = f"outside the theorem ({', '.join(failed)})"
+    outside = f"the theorem does not apply (premises that fail: {', '.join(failed)})"
     rise = _find_largest_rise(balance, run.tolerance)
     if rise is not None:
         context = outside
@@ -504,7 +504,7 @@ def _judge_course(run: FunctionalFacts, premises: Sequence[Premise]) -> Stabilit
     text = "; ".join([text, *undecided])
 
     if failed:
-        return StabilityVerdict(StabilityFinding.DID_NOT_RISE, f"{outside}, yet {text}")
+        return StabilityVerdict(StabilityFinding.DID_NOT_RISE, f"{outside}; {text}")
     covered = StabilityFinding.COVERED.value
     if undecided:
         covered += ", as far as the log tells"

@@ -69,7 +69,7 @@ def list_topics(scenario: Scenario, session: str, table: TopicTable) -> Topics:
         table: Names of the topics in ROS 2.
 
     Returns:
-        The description of each topic, by its full name.
+        The description of each topic, by its full name without the "/" at its beginning.
     """
     topics = {**COMMON_TOPICS}
     for name, channel in SESSION_CHANNELS.items():
@@ -80,6 +80,20 @@ def list_topics(scenario: Scenario, session: str, table: TopicTable) -> Topics:
             topic = table.find(session, site, name)
             topics[topic] = channel
     return topics
+
+
+def list_full_topics(scenario: Scenario, session: str, table: TopicTable) -> Topics:
+    """Lists all ROS 2 topics of a session as `list_topics` does, by names that begin with "/".
+
+    Viewers and bags need these names.
+
+    Args:
+        scenario: Scenario of the session, its description in a TOML file.
+        session: Name of the session.
+        table: Names of the topics in ROS 2.
+    """
+    topics = list_topics(scenario, session, table)
+    return {f"/{topic}": channel for topic, channel in topics.items()}
 
 
 class SiteMessages:

@@ -20,11 +20,11 @@
   const drawn = page.arms.map((arm) => {
     const cell = document.createElement("div");
     const name = document.createElement("span");
-    name.textContent = arm.site;
+    name.textContent = arm.caption;
     cell.append(name);
     row.append(cell);
     const svg = element(cell, "svg", { viewBox: `${left} ${-top} ${right - left} ${top - bottom}`, role: "img",
-      "aria-label": arm.site });
+      "aria-label": arm.caption });
     if (arm.kind === "planar") element(svg, "line", { class: "ground", x1: left, x2: right, y1: 0, y2: 0 });
     const shadow = element(svg, "polyline", { class: "shadow" });
     const desired = element(svg, "polyline", { class: "desired" });
@@ -57,10 +57,28 @@
     const point = (first, n) => [q[first + 2 * n], -q[first + 2 * n + 1]];
     return [0, 1, 2].map((part) => Array.from({ length: arm.points }, (_, n) => point(2 * arm.points * part, n)));
   };
+  const bars = [...document.querySelectorAll(".lead .bar")].map((bar, n) => ({
+    lead: page.leads[n], line: bar.querySelector(".now"), words: bar.querySelector("output"),
+  }));
+  const shareAt = (t, values, time) => { // linear between the points
+    const next = t.findIndex((point) => point > time);
+    if (next < 1) return values[next < 0 ? values.length - 1 : 0];
+    const part = (time - t[next - 1]) / (t[next] - t[next - 1]);
+    return values[next - 1] + part * (values[next] - values[next - 1]);
+  };
+  function showLeads(now) {
+    for (const { lead, line, words } of bars) {
+      line.setAttribute("x1", now);
+      line.setAttribute("x2", now);
+      const shares = lead.peers.map((peer, n) => `${peer} ${Math.round(100 * shareAt(lead.t, lead.shares[n], now))} %`);
+      words.textContent = shares.join(", ");
+    }
+  }
   function show(time) {
     const now = Math.max(0, Math.min(page.end_s, time));
     slider.value = (1000 * now) / page.end_s;
     clock.textContent = `${now.toFixed(3)} s`;
+    showLeads(now);
     for (const { arm, shadow, desired, actual, joints, bodies } of drawn) {
       const q = at(arm.table, now);
       const known = q !== null;

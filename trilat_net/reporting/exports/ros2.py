@@ -25,7 +25,7 @@ from ...log.log_layout import SCENARIO, collect_provenance
 from ...log.log_reader import Log
 from ...log.mcap_writer import McapWriter
 from ...log.ros2 import cdr, ros2_messages
-from ...log.ros2.published import SiteMessages, list_topics, pack_session_diagnostics
+from ...log.ros2.published import SiteMessages, list_full_topics, pack_session_diagnostics
 from ...log.ros2.topic_names import (
     DIAGNOSTICS,
     FRAMES,
@@ -98,9 +98,9 @@ def export_ros2(
             data=log.scenario_text.encode(),
         )
         channels = {}
-        topics = list_topics(log.scenario, session, table)
+        topics = list_full_topics(log.scenario, session, table)
         for topic, channel in topics.items():
-            channels[f"/{topic}"] = _add_quality(channel)
+            channels[topic] = _add_quality(channel)
         channel_numbers = ros2_messages.StandardChannels(file, channels)
 
         streams: list[Iterator[TimedMessages]] = []

@@ -29,6 +29,7 @@ from ...analysis.certificate.premises import explain_no_functional, find_unjudge
 from ...analysis.certificate.stability_certificate import Certificate, certify
 from ...core.vectors import Array
 from ...log.log_reader import Log
+from ...scenario.code_consent import may_run_user_laws
 from .. import style
 from ..appearance import REPORT_SIZE, FigureSize
 from .figure_entry import draws, unless
@@ -127,7 +128,8 @@ def _draw_certificate(log: Log, form: FigureSize) -> Figure:
 
     This function is called through the registry of figures.
     """
-    return draw_functional(log, certify(log), form)
+    own_laws = may_run_user_laws(log.scenario)
+    return draw_functional(log, certify(log, own_laws=own_laws), form)
 
 
 def draw_observed_energy(
@@ -171,7 +173,7 @@ def draw_observed_energy(
 
 def _has_declared_energies(log: Log) -> bool:
     """Returns True if at least one control law of the run declares energies."""
-    observed = observe_energies(log)
+    observed = observe_energies(log, own_laws=may_run_user_laws(log.scenario))
     return observed is not None and bool(observed.curves)
 
 
@@ -183,7 +185,7 @@ def _has_declared_energies(log: Log) -> bool:
 )
 def _draw_observed(log: Log, form: FigureSize) -> Figure:
     """Draws the declared energies of a log's control laws, for the registry of figures."""
-    observed = observe_energies(log)
+    observed = observe_energies(log, own_laws=may_run_user_laws(log.scenario))
     assert observed is not None
     return draw_observed_energy(log, observed, form)
 

@@ -3,7 +3,7 @@
 A log is the MCAP file with the results of a run. A module of this folder adds a figure by
 decorating a function:
 
-    @draws("positions", "actual and desired angles (Fig. 4)", in_report=True)
+    @draws("positions", "actual and desired angles", in_report=True)
     def draw_positions(log, form): ...
 
 The command `trilat figure` and the report then offer the figure under this name.

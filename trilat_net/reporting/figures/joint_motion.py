@@ -59,7 +59,10 @@ explain_absent_operator = unless(site_signals.sites_with_operator, NO_OPERATOR)
 
 
 @draws(
-    "operator_torques", "torque on the arms (Fig. 3)", explain_absent_operator, in_report=True
+    "operator_torques",
+    "torque of operators and walls on the arms (Fig. 3 of the paper)",
+    explain_absent_operator,
+    in_report=True,
 )
 def draw_operator_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the torques of the operators on the arms over time, as Fig. 3 of the paper.
@@ -277,7 +280,7 @@ def _choose_height_in(log: Log, two_joints_in: float) -> float:
     return two_joints_in if count == 2 else 0.8 + 0.9 * count
 
 
-@draws("positions", "actual and desired angles (Fig. 4)", in_report=True)
+@draws("positions", "actual and desired angles (Fig. 4 of the paper)", in_report=True)
 def draw_positions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the desired and the actual joint angles over time, as Fig. 4 of the paper.
 
@@ -315,7 +318,11 @@ def draw_positions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     return plot.figure
 
 
-@draws("tracking_errors", "errors, and the largest one still to come (Fig. 5)", in_report=True)
+@draws(
+    "tracking_errors",
+    "errors, and the largest one still to come (Fig. 5 of the paper)",
+    in_report=True,
+)
 def draw_tracking_errors(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the tracking errors of every site over time, as Fig. 5 of the paper.
 
@@ -425,7 +432,7 @@ def _has_changing_estimates(log: Log) -> bool:
 
 @draws(
     "parameter_estimates",
-    "estimates and true values (Fig. 6)",
+    "estimates and true values (Fig. 6 of the paper)",
     unless(_has_changing_estimates, "no estimate changed in this run"),
     in_report=True,
 )

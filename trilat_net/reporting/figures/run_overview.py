@@ -25,6 +25,7 @@ from ...analysis.timeline import recorded_end_s
 from ...core.vectors import Array
 from ...errors import UsageError
 from ...log.log_reader import Log
+from ...scenario.code_consent import may_run_user_laws
 from ...theory.run_certificate import certify_run
 from .. import style
 from ..appearance import REPORT_SIZE, SITE_COLOURS, FigureSize
@@ -125,7 +126,8 @@ def _compose_title(log: Log, form: FigureSize) -> str:
     settled_s = settling_time_of_all_s(settling_times_s)
     settling = "no settling time" if settled_s is None else f"settling time {settled_s:.1f} s"
     name = log.scenario.title or log.scenario.name
-    title = f"{name}: {certify_run(log).stability}, {settling}"
+    certificate = certify_run(log, own_laws=may_run_user_laws(log.scenario))
+    title = f"{name}: {certificate.stability}, {settling}"
     letters = round(_LETTERS_PER_IN * form.width_in)
     return "\n".join(textwrap.wrap(title, letters))
 

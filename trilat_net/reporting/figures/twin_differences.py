@@ -38,6 +38,7 @@ from ...core.vectors import Array
 from ...execution.fused import explain_not_repeatable
 from ...execution.twins import SMALLEST, TwinPath, Twins
 from ...log.log_reader import Log
+from ...scenario.code_consent import may_run_user_laws
 from .. import style
 from ..appearance import REPORT_SIZE, FigureSize
 from .figure_entry import draws
@@ -127,10 +128,16 @@ def draw_twins(pushed: PushedTwins, form: FigureSize = REPORT_SIZE) -> Figure:
     return plot.figure
 
 
-@draws("twins", "growth or decay of small pushes", explain_not_repeatable, in_report=True)
+def _explain_absent_twins(log: Log) -> str:
+    """Explains why a log has no twins. Empty if it has, as with laws that a user permitted."""
+    return explain_not_repeatable(log, own_laws=may_run_user_laws(log.scenario))
+
+
+@draws("twins", "growth or decay of small pushes", _explain_absent_twins, in_report=True)
 def _draw_log_twins(log: Log, form: FigureSize) -> Figure:
     """Draws the differences of twins that are pushed at the start of a log's run."""
-    growth = measure_twins(log, classify_log_end(log))
+    own_laws = may_run_user_laws(log.scenario)
+    growth = measure_twins(log, classify_log_end(log), own_laws=own_laws)
     return draw_twins(PushedTwins(log, 0.0, growth), form)
 
 

@@ -1,0 +1,118 @@
+"""Who leads the slave, as the first screen of a report shows it."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from playwright.sync_api import Browser
+
+from tests.analysis import logs
+from tests.analysis.certificate import runs
+from tests.live.browsers import needs_browser
+from tests.page.whole_pages import watched_page
+from trilat_net.analysis.certificate.stability_certificate import certify
+from trilat_net.analysis.dominance_history import trace_dominance
+from trilat_net.log.log_reader import Log
+from trilat_net.reporting.charts import ChartBuilder
+from trilat_net.reporting.page import write_report
+from trilat_net.reporting.page_leaders import (
+    describe_leads,
+    describe_phases,
+    render_lead_bars,
+    trace_leads,
+)
+
+SHORT = {"rate_hz": 100, "duration_s": 14.0, "expect": {}}
+
+
+def training(**settings: Any) -> Log:
+    """The shipped scenario in which the lead passes from m1 to m2, from 10 to 12 s."""
+    return runs.run("training", {**SHORT, **settings}).log
+
+
+def test_the_bar_is_the_dominance_at_every_tick() -> None:
+    log = training()
+    (lead,) = trace_leads(log)
+    t_s = log["s"].t_s
+    alpha = trace_dominance(log, "s", t_s).alpha
+    for column, peer in enumerate(lead.peers):
+        drawn = np.interp(t_s, lead.t_s, lead.shares[:, column])
+        recorded = alpha[:, log.scenario.peers("s").index(peer)]
+        assert drawn == pytest.approx(recorded, abs=1e-9)
+    assert describe_phases(lead) == "0 to 10 s: m1 90 %, m2 10 %; from 12 s: m1 10 %, m2 90 %"
+
+
+def test_a_sudden_change_is_a_step() -> None:
+    step = {"at_s": 5.0, "dominance": "s", "to": {"m1": 0.2, "m2": 0.8}}
+    (lead,) = trace_leads(training(timeline=[step]))
+    for at_s, share in ((4.999, 0.9), (5.0, 0.2), (9.0, 0.2)):
+        assert np.interp(at_s, lead.t_s, lead.shares[:, 0]) == pytest.approx(share)
+
+
+def test_constant_dominance_is_a_sentence() -> None:
+    log = training(timeline=[])
+    leads = trace_leads(log)
+    sentence = "m1 leads the slave with 90 % and m2 with 10 %, during the whole run."
+    assert describe_leads(log, leads) == [sentence]
+    assert render_lead_bars(log, leads) == ""
+
+
+def test_one_master_leads_alone() -> None:
+    log = runs.run("two_sites", {"rate_hz": 100, "duration_s": 1.0, "expect": {}}).log
+    sentences = describe_leads(log, trace_leads(log))
+    assert sentences == ["m alone leads the slave, during the whole run."]
+
+
+@pytest.mark.parametrize("name", ["four", "busy"])
+def test_every_slave_that_follows_somebody_is_shown(name: str) -> None:
+    log = logs.busy().log if name == "busy" else logs.simulated(name)
+    followers = {
+        site
+        for site, spec in log.scenario.sites.items()
+        if spec.role == "slave" and any(log.scenario.dominance[site].values())
+    }
+    assert {lead.slave for lead in trace_leads(log)} == followers
+    for lead in trace_leads(log):
+        assert lead.shares.sum(axis=1) == pytest.approx(1.0)
+
+
+def test_page_data_has_the_captions_and_the_bars() -> None:
+    data = json.loads(json.dumps(ChartBuilder(training(), None).build().data.to_builtins()))
+    captions = [arm["caption"] for arm in data["arms"]]
+    assert captions == ["m1, master 1", "m2, master 2", "s, slave"]
+    (bar,) = data["leads"]
+    assert bar["peers"] == ["m1", "m2"]
+    assert bar["t"][-1] == pytest.approx(14.0)
+
+
+@needs_browser
+@pytest.mark.parametrize("size", [(1440, 900), (390, 844)])
+def test_the_bar_stands_below_the_slider(
+    size: tuple[int, int], browser: Browser, tmp_path: Path
+) -> None:
+    log = training()
+    path, _ = write_report(log, tmp_path, certificate=certify(log))
+    options: dict[str, Any] = {
+        "viewport": {"width": size[0], "height": size[1]},
+        "reduced_motion": "reduce",
+    }
+    with watched_page(browser, **options) as watched:
+        page = watched.page
+        page.goto(path.as_uri())
+        slider = page.locator("#arms input").bounding_box()
+        bar = page.locator(".lead svg").bounding_box()
+        assert slider is not None
+        assert bar is not None
+        assert bar["y"] + bar["height"] <= size[1]
+        assert bar["x"] == pytest.approx(slider["x"] + 8.0, abs=1.0)
+        assert bar["width"] == pytest.approx(slider["width"] - 16.0, abs=1.0)
+        for share, words in ((0, "m1 90 %, m2 10 %"), (1000, "m1 10 %, m2 90 %")):
+            page.locator("#arms input").fill(str(share))
+            assert page.inner_text(".lead output") == words
+        page.locator("#arms input").fill(str(round(1000 * 11.0 / 14.0)))
+        shown = re.findall(r"(\d+) %", page.inner_text(".lead output"))
+        assert [int(number) for number in shown] == [50, 50]
+        watched.assert_whole()

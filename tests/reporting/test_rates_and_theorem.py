@@ -1,0 +1,41 @@
+"""Remarks of a certificate: rates of different motions, and a theorem that does not apply."""
+
+from dataclasses import replace
+
+import pytest
+
+from tests.analysis.certificate import runs
+from trilat_net.analysis.stability_decision import LoopRoots
+from trilat_net.reporting.certificate_text import describe_certificate, describe_theorem
+from trilat_net.theory.run_certificate import certify_run
+
+
+@pytest.mark.parametrize(
+    ("factor", "remarks"), [(1.0, 0), (1.1, 0), (2.0, 1), (0.5, 1), (-1, 1)]
+)
+def test_rates_that_differ_are_explained(factor: float, remarks: int) -> None:
+    found = certify_run(runs.run("paper", {"duration_s": 16.0, "rate_hz": 100}).log)
+    assert found.twins is not None
+    assert found.twins.worst is not None
+    rate_per_s = factor * found.twins.worst.rate_per_s
+    roots = LoopRoots("stable", rate_per_s, True, "this rest: stable")
+    lines = describe_certificate(replace(found, roots=roots))
+    told = [line for line in lines if line.text.startswith("the two rates are both")]
+    assert [line.mark for line in told] == ["note"] * remarks
+
+
+def test_a_theorem_that_does_not_apply_has_not_passed() -> None:
+    found = runs.run("wall").certificate
+    (line,) = [line for line in describe_certificate(found) if line.text == found.verdict.text]
+    assert line.mark == "note"
+    assert line.text.startswith(
+        "the theorem does not apply (premises that fail: hands); V rose"
+    )
+    assert describe_theorem(found) == [
+        f"stability theorem of the paper (V: its energy function): {found.verdict.text}"
+    ]
+
+
+def test_a_law_without_v_has_no_line_about_the_theorem() -> None:
+    settings = {"control.law": "p_d", "duration_s": 1.0, "rate_hz": 200}
+    assert describe_theorem(runs.run("free", settings).certificate) == []
