@@ -108,6 +108,7 @@ ELSEWHERE = {
     "docs/own-controller.md: trilat sim paper": "tests/cli/test_outside.py",
     "docs/recording.md: trilat record": "tests/live/test_recording.py",
     "docs/ros2.md: trilat": "tests/live/test_ros2.py",
+    "docs/two-operators.md: trilat": "tests/live/test_routers.py",
     "docs/two-people.md: trilat experiment new": "tests/cli/test_experiments.py",
     "docs/two-people.md: trilat experiment run": "tests/live/test_experiment_sessions.py",
     "docs/two-people.md: trilat experiment analyse": "tests/studies/experiment/test_experiment_analysis.py",
@@ -125,6 +126,7 @@ NOT_RUN = {
     "docs/maps/round-trips.md: trilat sweep p_d_margin_two": "3 135 runs: minutes; it draws the page itself",
     "docs/maps/tick-rate.md: trilat sweep free": "870 runs: minutes; it draws the page itself",
     "docs/ros2.md: export RMW": "needs an installation of ROS 2",
+    "docs/two-operators.md: ros2": "needs an installation of ROS 2",
     "docs/ros2.md: ros2": "needs an installation of ROS 2",
     "docs/network.md: docker compose up": "needs a container engine: .ci/compose starts the first",
 }
