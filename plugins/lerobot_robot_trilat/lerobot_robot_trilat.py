@@ -76,6 +76,7 @@ class TrilatRobot(Robot):
     def __init__(self, config: TrilatRobotConfig) -> None:
         super().__init__(config)
         self.config = config
+        self.cameras: dict[str, Any] = {}  # lerobot-record reads how many there are
         scenario = tn.load_scenario(config.scenario or config.session)
         mode = _find_hand_mode(scenario, config.site)
         self._command, quantity = _HAND_COMMANDS[mode]
