@@ -160,6 +160,17 @@ def test_scenario_for_headsets_holds_together() -> None:
     assert log.scenario.open_hands == ("m1", "m2")
 
 
+def test_scenario_of_two_operators_runs_with_a_simulated_robot() -> None:
+    path = LOOK.with_name("two_operators.toml")
+    live = trilat_net.load_scenario(path)
+    assert live.sites["s"].plant == "external"
+    assert {spec.on_stale.action for spec in live.sites.values()} == {"glide"}
+    settings = {"sites.s.plant": "simulated", "sites.s.arm.known": True, "link.model": "none"}
+    log = trilat_net.simulate(path, settings, duration_s=2.0)
+    assert log.scenario.open_hands == ("m1", "m2")
+    assert abs(log["s"].q - log["s"].q[0]).max() < 1e-9  # no arm sinks
+
+
 def test_a_gamepad_says_what_it_lacks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "evdev", None)
     with pytest.raises(SystemExit, match="pip install evdev"):

@@ -76,6 +76,7 @@ class TrilatRobot(Robot):
     def __init__(self, config: TrilatRobotConfig) -> None:
         super().__init__(config)
         self.config = config
+        self.cameras: dict[str, Any] = {}  # lerobot-record reads how many there are
         scenario = tn.load_scenario(config.scenario or config.session)
         mode = _find_hand_mode(scenario, config.site)
         self._command, quantity = _HAND_COMMANDS[mode]
@@ -118,8 +119,12 @@ class TrilatRobot(Robot):
 
     @property
     def is_connected(self) -> bool:
-        """True between `connect` and the end of the session."""
-        return self._hand is not None and not self._hand.over
+        """True between `connect` and `disconnect`.
+
+        It stays true after the end of the session, because LeRobot disconnects a device only if
+        it is connected, and a device that is not disconnected keeps the process alive.
+        """
+        return self._hand is not None
 
     @property
     def is_calibrated(self) -> bool:
@@ -192,7 +197,7 @@ class TrilatRobot(Robot):
         Returns:
             Numbers with the keys of `observation_features`.
         """
-        hand = self._require_hand()
+        hand = self._require_running_hand()
         self._receive_newest()
         values: list[float] = []
         for site in self._sites:
@@ -215,7 +220,7 @@ class TrilatRobot(Robot):
             The command that was sent.
         """
         goal = {key: float(action[key]) for key in self._action_keys}
-        command = getattr(self._require_hand(), self._command)
+        command = getattr(self._require_running_hand(), self._command)
         command(*goal.values())
         return goal
 
@@ -224,6 +229,21 @@ class TrilatRobot(Robot):
         self._require_hand()
         self._hand = None
         self._stack.close()
+
+    def _require_running_hand(self) -> Any:
+        """Returns the connection of the operator while the session runs.
+
+        After its end the newest record would be observed again and again.
+
+        Raises:
+            DeviceNotConnectedError: The robot is not connected, or the session has ended.
+        """
+        hand = self._require_hand()
+        if hand.over:
+            raise DeviceNotConnectedError(
+                f"the session {self.config.session} has ended: start it again, for longer"
+            )
+        return hand
 
     def _require_hand(self) -> Any:
         """Returns the connection of the operator.

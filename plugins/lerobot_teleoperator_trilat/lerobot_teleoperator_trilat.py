@@ -113,8 +113,12 @@ class TrilatTeleoperator(Teleoperator):
 
     @property
     def is_connected(self) -> bool:
-        """True between `connect` and the end of the session."""
-        return self._hand is not None and not self._hand.over
+        """True between `connect` and `disconnect`.
+
+        It stays true after the end of the session, because LeRobot disconnects a device only if
+        it is connected, and a device that is not disconnected keeps the process alive.
+        """
+        return self._hand is not None
 
     @property
     def is_calibrated(self) -> bool:

@@ -143,3 +143,32 @@ def test_with_keys_all_stop_an_arm_only_the_operator_enables(stage: Stage) -> No
     executed_again(log)
     changes = [change for state in log["s"].states for change in state.cmd]
     assert [change.rpartition(":")[2] for change in changes] == ['"stop"}', '"enable"}'] * 2
+
+
+class Joined(Keyed):
+    """Every computer has a router of its own, as on docs/two-operators.md; all of them know the public one."""
+
+    def __init__(self, stage: Stage, duration: str) -> None:
+        super().__init__(stage, duration)
+        self.local = {
+            name: place.replace("tcp", "tls")
+            for name, place in zip(SITES, self.endpoints, strict=True)
+        }
+
+    def ways(self, name: str) -> list[str]:
+        """The recorder runs beside the slave."""
+        return ["--router", self.local.get(name, self.local["s"]), *self.network(name)]
+
+    def routers(self) -> None:
+        _ = self.router("public")
+        for name, place in self.local.items():
+            words = ("--listen", place, "--connect", self.endpoint, *self.network(ROUTER))
+            self.stage.start(f"router of {name}", "router", *words)
+
+
+@pytest.mark.long
+def test_members_behind_routers_of_their_own_meet(stage: Stage) -> None:
+    session = Joined(stage, "2")
+    session.routers()
+    session.all()
+    session.is_reproduced()

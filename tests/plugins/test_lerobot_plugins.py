@@ -76,6 +76,25 @@ def test_features_follow_from_the_scenario_before_any_connection(
         robot.get_observation()
 
 
+def test_robot_has_no_cameras_and_ends_with_its_session(found: dict[str, ModuleType]) -> None:
+    """`lerobot-record` counts the cameras, and disconnects only what is connected."""
+    robot = make_device(found[ROBOT].TrilatRobotConfig())
+    assert robot.cameras == {}
+    closed: list[str] = []
+    robot._stack.callback(closed.append, "closed")
+    robot._hand = SimpleNamespace(over=True)
+    for call in (
+        robot.get_observation,
+        lambda: robot.send_action({"x.pos": 0.9, "y.pos": 1.1}),
+    ):
+        with pytest.raises(ConnectionError, match="the session play has ended"):
+            call()
+    assert robot.is_connected
+    robot.disconnect()
+    assert closed == ["closed"]
+    assert not robot.is_connected
+
+
 SPACE = Path(__file__).parents[1] / "reporting" / "cases" / "tool_down.toml"
 
 

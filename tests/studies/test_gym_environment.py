@@ -296,6 +296,41 @@ def test_flat_observations_are_the_same_numbers() -> None:
         flat, seen = env.step(action)[0], parts.step(action)[0]
 
 
+@pytest.mark.parametrize("mode", ["tip", "force"])
+def test_scaled_observations_are_of_order_one(mode: str) -> None:
+    env = tn.make_env("paper", BENT, mode=mode, duration_s=1, vary=VARY, flat=True)
+    limits = env.scenario.sites["m2"].limits
+    scales = dict(zip(env.observation_names, env.observation_scales.tolist(), strict=True))
+    assert scales["qd[0]"] == limits.qd_limit_rad_s
+    assert scales["tau_x[1]"] == limits.tau_limit_nm
+    space = env.observation_space
+    bounds = dict(
+        zip(env.observation_names, zip(space.low, space.high, strict=True), strict=True)
+    )
+    assert bounds["pose[0]"][1] == pytest.approx(2.0)  # two links of 1 m
+    assert bounds["grip[0]"] == (0.0, 1.0)
+    env.action_space.seed(4)
+    for seed in range(3):
+        seen, ended = env.reset(seed=seed)[0], False
+        while not ended:
+            assert seen in space
+            assert np.abs(seen / env.observation_scales).max() < 3.0
+            seen, _, terminated, truncated, _ = env.step(env.action_space.sample())
+            ended = terminated or truncated
+
+
+def test_gymnasiums_wrappers_scale_actions_and_observations() -> None:
+    env = tn.make_env("paper", BENT, duration_s=1, flat=True)
+    scaled = gymnasium.wrappers.RescaleAction(env, np.float32(-1.0), np.float32(1.0))
+    wrapped = gymnasium.wrappers.TransformObservation(
+        scaled, lambda seen: seen / env.observation_scales, None
+    )
+    seen, _ = wrapped.reset(seed=1)
+    assert np.abs(seen).max() < 3.0
+    assert wrapped.action_space.high.tolist() == [1.0, 1.0]
+    wrapped.step(wrapped.action_space.sample())
+
+
 class BufferedEnvs:
     """Several environments as Stable-Baselines3 runs them: one buffer, and a reset where an episode ends."""
 

@@ -55,6 +55,10 @@ ENV_ID = "trilat_net/Teleoperation-v0"
 """Name of the environment in the registry of Gymnasium."""
 FAR = 1e6
 """Bound of observed numbers that have no tighter bound, in rad, rad/s, m, N m or s."""
+NEVER_NEGATIVE = ("alpha", "grip", "age_s")
+"""Parts of an observation whose numbers are at least 0."""
+WITH_ROUNDING = 1.000001
+"""Factor of a bound that a number can reach exactly."""
 MOST_DRAWS = {False: 1000, True: 100}
 """Largest number of random positions that a task tries until one is within reach.
 
@@ -291,6 +295,10 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
     Attributes:
         observation_names: With `flat`, the name of each number of an observation, as in
             "q[0]". A number of a matrix has two indices, its row and its column.
+        observation_scales: Typical size of each number of an observation: a dictionary of
+            arrays, or with `flat` one array. An observation divided by it is of the order of 1.
+            The sizes come from the reach of the arms and from the scenario's limits of speed
+            and torque.
 
     Raises:
         ScenarioError: The scenario or an override is not valid.
@@ -355,9 +363,13 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         self._dict_space = self._build_dict_space(scene_with_goal)
         self.observation_space: Any = self._dict_space
         self.observation_names: list[str] = []
+        scales = self._scale_parts(scene_with_goal)
+        self.observation_scales: Any = scales
         if flat:
             self.observation_space = _flatten_space(self._dict_space)
             self.observation_names = _name_numbers(self._dict_space)
+            flat_scales = [np.ravel(scales[name]) for name in self._dict_space]
+            self.observation_scales = np.concatenate(flat_scales).astype(np.float32)
         self._flat = flat
 
     def _build_dict_space(self, scene: Scene) -> spaces.Dict:
@@ -366,13 +378,49 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         Args:
             scene: Any state of an episode. All observations have the shapes of its observation.
         """
+        hand = self._build_hand_site(self._base).describe()
+        arm = self._base.arms[self._user]
         bounds = {"alpha": 1.0, "grip": 1.0, "goal": self.task.bound}
+        if hand.mode != "joint" and arm.chain is None:
+            # No point of a planar arm is farther from its base than its length. The margin is
+            # for rounding.
+            bounds["pose"] = WITH_ROUNDING * sum(arm.lengths_m)
+            bounds["target"] = WITH_ROUNDING * self._action_limit
         boxes: dict[str, Any] = {}
         parts = self._observe(scene)
         for name, values in parts.items():
             bound = bounds.get(name, FAR)
-            boxes[name] = spaces.Box(-bound, bound, values.shape, np.float64)
+            low = 0.0 if name in NEVER_NEGATIVE else -bound
+            boxes[name] = spaces.Box(low, bound, values.shape, np.float64)
         return spaces.Dict(boxes)
+
+    def _scale_parts(self, scene: Scene) -> dict[str, Array]:
+        """Returns the typical size of each number of an observation, by the parts' names.
+
+        An arm can pass its limit of speed in the last step of an episode, which it ends, and
+        can turn any number of times. Therefore these sizes are not bounds of the space.
+
+        Args:
+            scene: Any state of an episode.
+        """
+        base = self._base
+        parts = self._observe(scene)
+        scales = {name: np.ones(values.shape) for name, values in parts.items()}
+        user_limits = base.sites[self._user].limits
+        scales["qd"][:] = user_limits.qd_limit_rad_s
+        scales["tau_x"][:] = user_limits.tau_limit_nm
+        for index, peer in enumerate(base.peers(self._user)):
+            limits = base.sites[peer].limits
+            if not base.arms[peer].shares_pose:
+                scales["peer_qd"][index] = limits.qd_limit_rad_s
+                scales["peer_tau_x"][index] = limits.tau_limit_nm
+        if not base.arms[self._user].shares_pose:
+            scales["q_des"][:] = math.pi
+            scales["peer_q"][:] = math.pi
+        scales["q"][:] = math.pi
+        scales["target"][:] = self._action_limit
+        scales["pose"][:] = self._find_reach()
+        return scales
 
     def _prepare(self, scenario: Scenario) -> Scenario:
         """Returns a scenario in which only the policy operates the user's arm.
