@@ -62,6 +62,7 @@ CHAINS = [
         "trilat log view seen.mcap",
         "trilat keys new keys m1 m2 s recorder",
         "trilat keys renew keys",
+        "trilat keys add keys probe",
         "trilat keys info keys/m1",
         "trilat doctor",
     ],

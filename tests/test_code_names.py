@@ -8,7 +8,7 @@ from .code_names import Reference, is_defined, iterate_references
 
 FOREIGN = frozenset({
     "CompileResult._reduce", "ZBytes", "__del__", "activate", "fping", "jupytext", "rmw_zenoh", "scipy.signal.csd", "pwr.t.test",
-    "to_parquet",
+    "to_parquet", "observation.environment_state",
 })  # fmt: skip
 """Names of Python and of other people's programs."""
 

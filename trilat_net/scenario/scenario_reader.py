@@ -268,9 +268,9 @@ def find_site(scenario: Scenario, name: str) -> SiteSpec:
     if name not in scenario.sites:
         hint = suggest_nearest(name, scenario.names)
         # A question mark ends a sentence.
-        separator = " The" if hint else "; the"
+        known = f"{' The' if hint else '; the'} sites are {', '.join(scenario.names)}"
         raise ScenarioError(
-            f"there is no site {name!r}{hint}{separator} sites are {', '.join(scenario.names)}",
+            f"there is no site {name!r}{hint}{known}",
             source=scenario.name,
         )
     return scenario.sites[name]
