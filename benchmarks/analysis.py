@@ -30,7 +30,7 @@ def lap(what):
     now = time.process_time()
     print(f"{what}={now - last:.3f}")
     last = now
-from trilat_net.reporting.page import write_report
+from trilat_net.presentation.page import write_report
 from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net import open_log, verify
 from trilat_net.execution.virtual_comparison import simulate_without_operators

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from trilat_net.core.site_step import Site
-from trilat_net.core.ticks import Arrival, TickInput
+from trilat_net.core.step.site_step import Site
+from trilat_net.core.step.ticks import Arrival, TickInput
 from trilat_net.scenario import load_scenario
 
 from .stopwatch import each_us

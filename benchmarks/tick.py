@@ -4,9 +4,9 @@ import gc
 
 import numpy as np
 
-from trilat_net.core.kernel import site_tick
-from trilat_net.core.site_step import Site
-from trilat_net.core.ticks import Arrival, TickInput, TickRecord
+from trilat_net.core.step.kernel import site_tick
+from trilat_net.core.step.site_step import Site
+from trilat_net.core.step.ticks import Arrival, TickInput, TickRecord
 from trilat_net.net.messages import PeerSample
 from trilat_net.net.offset import OffsetEstimator, exact_offset
 from trilat_net.net.timing import PeerClock, SiteTiming

@@ -7,7 +7,7 @@ from typing import Any
 
 from mcap.writer import CompressionType, Writer
 
-from trilat_net.core.ticks import Arrival
+from trilat_net.core.step.ticks import Arrival
 from trilat_net.execution import virtual
 from trilat_net.log.log_writer import LogWriter
 from trilat_net.log.mcap_writer import McapWriter

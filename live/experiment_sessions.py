@@ -23,8 +23,8 @@ from pathlib import Path
 
 from rich.console import Console
 
-from sites.demo_session import SessionResult, compile_core, run_demo
-from trilat_net.core.ticks import NS_PER_S
+from trilat_net.app.demo_session import SessionResult, compile_core, run_demo
+from trilat_net.core.step.ticks import NS_PER_S
 from trilat_net.errors import LogError, LogRefused, RunFailed
 from trilat_net.files import describe_write_error, make_subfolder
 from trilat_net.net.bus import Bus

@@ -22,7 +22,7 @@ from typing import Any
 
 import msgspec
 
-from trilat_net.core.ticks import NS_PER_S, tick_ns
+from trilat_net.core.step.ticks import NS_PER_S, tick_ns
 from trilat_net.errors import UsageError
 from trilat_net.net.clock import Clock
 from trilat_net.net.messages import HALTED_MODES

@@ -93,7 +93,7 @@ class PageFiles:
 
 def _list_assets() -> dict[str, tuple[str, bytes]]:
     """Returns the media type and the content of the page's own files, by their addresses."""
-    plot_assets = (resources.files("trilat_net.reporting") / "assets").iterdir()
+    plot_assets = (resources.files("trilat_net.presentation") / "assets").iterdir()
     page_assets = (resources.files("live") / "assets").iterdir()
     assets = {}
     for file in [*page_assets, *plot_assets]:

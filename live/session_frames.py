@@ -34,9 +34,9 @@ from trilat_net.analysis.arm_rows import (
 )
 from trilat_net.analysis.body_turns import BodyTurns
 from trilat_net.analysis.torque_sources import TorqueSplit, list_walls, split_torque, wall_force
-from trilat_net.core.live_hand import HandInForce
-from trilat_net.core.ticks import NS_PER_S, LifeAlarm
-from trilat_net.core.vectors import Array
+from trilat_net.core.life.live_hand import HandInForce
+from trilat_net.core.step.ticks import NS_PER_S, LifeAlarm
+from trilat_net.core.step.vectors import Array
 from trilat_net.net.messages import Event
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.event_text import describe_event

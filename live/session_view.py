@@ -31,8 +31,8 @@ from trilat_net.analysis.certificate.running_energy import (
     RecordWindow,
     RunningEnergy,
 )
-from trilat_net.core.live_hand import TAKEN
-from trilat_net.core.ticks import NS_PER_S, LifeAlarm, find_alarm
+from trilat_net.core.life.live_hand import TAKEN
+from trilat_net.core.step.ticks import NS_PER_S, LifeAlarm, find_alarm
 from trilat_net.errors import ScenarioError, WireError
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus

@@ -14,8 +14,14 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 
 from rich.console import Console
 
-from sites.monitor import HEADS, SessionDisplay, SiteRow, describe_angles, describe_site
-from trilat_net.core.ticks import NS_PER_S, LifeAlarm
+from trilat_net.app.monitor import (
+    HEADS,
+    SessionDisplay,
+    SiteRow,
+    describe_angles,
+    describe_site,
+)
+from trilat_net.core.step.ticks import NS_PER_S, LifeAlarm
 from trilat_net.errors import SessionError
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock

@@ -27,8 +27,8 @@ from contextlib import suppress
 import msgspec
 from msgspec import UNSET
 
-from trilat_net.core.site_arrays import MAX_CHANGES, MAX_RAMPS
-from trilat_net.core.ticks import CoreChange, Mode, first_tick_at, tick_ns
+from trilat_net.core.step.site_arrays import MAX_CHANGES, MAX_RAMPS
+from trilat_net.core.step.ticks import CoreChange, Mode, first_tick_at, tick_ns
 from trilat_net.errors import ScenarioError, WireError
 from trilat_net.net.bus import Query, QueryInbox
 from trilat_net.net.messages import MODE_WORDS

@@ -26,7 +26,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from trilat_net.core.live_hand import GRIP_NS, SILENCE_NS, HandReach
+from trilat_net.core.life.live_hand import GRIP_NS, SILENCE_NS, HandReach
 from trilat_net.errors import count_nouns
 from trilat_net.net.arm_client import Hand
 from trilat_net.net.clock import Clock

@@ -22,8 +22,8 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from trilat_net.core.site_step import Site
-from trilat_net.core.ticks import LifeReason, Mode, PlantState
+from trilat_net.core.step.site_step import Site
+from trilat_net.core.step.ticks import LifeReason, Mode, PlantState
 from trilat_net.errors import SessionError, WireError
 from trilat_net.files import find_page
 from trilat_net.net.bus import StampedInbox

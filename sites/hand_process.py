@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from trilat_net.core.own_hand import HandProgram, HandView
-from trilat_net.core.user_law import PeerView
+from trilat_net.core.life.own_hand import HandProgram, HandView
+from trilat_net.core.plug.user_law import PeerView
 from trilat_net.errors import RunFailed, SessionError, UsageError, count_nouns
 from trilat_net.net import topics
 from trilat_net.net.arm_client import SiteClient, make_hand_sender

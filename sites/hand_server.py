@@ -20,11 +20,16 @@ from typing import Any
 
 import numpy as np
 
-from trilat_net.core.live_hand import HandCommand, HandMemory, advance_hand, empty_hand_vector
-from trilat_net.core.site_arrays import SiteArrays
-from trilat_net.core.site_setup import MotionLimits
-from trilat_net.core.site_step import Site
-from trilat_net.core.ticks import tick_ns
+from trilat_net.core.life.live_hand import (
+    HandCommand,
+    HandMemory,
+    advance_hand,
+    empty_hand_vector,
+)
+from trilat_net.core.step.site_arrays import SiteArrays
+from trilat_net.core.step.site_setup import MotionLimits
+from trilat_net.core.step.site_step import Site
+from trilat_net.core.step.ticks import tick_ns
 from trilat_net.errors import SessionError, WireError, count_nouns
 from trilat_net.net.bus import Inbox
 from trilat_net.net.clock import Clock

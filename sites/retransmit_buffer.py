@@ -13,8 +13,8 @@ Invariant (law L6 of docs/design.md):
 
 from array import array
 
-from trilat_net.core.site_setup import Layout
-from trilat_net.core.site_step import Site
+from trilat_net.core.step.site_setup import Layout
+from trilat_net.core.step.site_step import Site
 from trilat_net.net import topics
 from trilat_net.net.bus import QueryInbox
 from trilat_net.net.pinging import answer_backfill

@@ -25,12 +25,12 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from trilat_net.core.delay import DelayKind
-from trilat_net.core.link import AHEAD_LIMIT_NS
-from trilat_net.core.live_hand import HandInForce
-from trilat_net.core.site_setup import LinkSetup, SiteSetup
-from trilat_net.core.site_step import Site
-from trilat_net.core.ticks import (
+from trilat_net.core.life.live_hand import HandInForce
+from trilat_net.core.links.delay import DelayKind
+from trilat_net.core.links.link import AHEAD_LIMIT_NS
+from trilat_net.core.step.site_setup import LinkSetup, SiteSetup
+from trilat_net.core.step.site_step import Site
+from trilat_net.core.step.ticks import (
     MAX_ARRIVALS,
     NS_PER_S,
     Arrival,

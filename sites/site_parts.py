@@ -15,9 +15,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from trilat_net.core.site_setup import SiteSetup
-from trilat_net.core.site_step import Site
-from trilat_net.core.ticks import (
+from trilat_net.core.step.site_setup import SiteSetup
+from trilat_net.core.step.site_step import Site
+from trilat_net.core.step.ticks import (
     Arrival,
     CoreChange,
     PlantState,

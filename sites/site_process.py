@@ -25,8 +25,8 @@ import msgspec
 import numpy as np
 from msgspec.structs import asdict
 
-from trilat_net.core.site_setup import StaleAction
-from trilat_net.core.ticks import (
+from trilat_net.core.step.site_setup import StaleAction
+from trilat_net.core.step.ticks import (
     NS_PER_S,
     Arrival,
     LifeReason,

@@ -2,7 +2,7 @@
 
 from typing import ClassVar
 
-from trilat_net.core.user_law import LawContext, LawInput
+from trilat_net.core.plug.user_law import LawContext, LawInput
 
 
 class Talking:

@@ -21,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import trilat_net.core.site  # noqa: F401
 
 with atheris.instrument_imports(
-    include=["trilat_net.log", "trilat_net.execution", "recorder.play", "mcap"]
+    include=["trilat_net.log", "trilat_net.execution", "trilat_net.app.play", "mcap"]
 ):
     from tests.log.hostility import mangled, read_by_all
     from tests.log_editing import edited, recorded

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from trilat_net.core import control
-from trilat_net.core.two_link_arm import regressor
-from trilat_net.core.user_law import LawContext, LawInput
+from trilat_net.core.arms.two_link_arm import regressor
+from trilat_net.core.plug.user_law import LawContext, LawInput
+from trilat_net.core.step import control
 
 
 class Adaptive:

@@ -31,7 +31,7 @@ PARTS = {
     "studies": r"^trilat_net/studies/",
     "kernel": r"^trilat_net/(core|laws)/|^trilat_net/(fields|errors|files|process|results)\.py",
     "analysis": r"^trilat_net/(analysis|theory)/",
-    "app": r"^trilat_net/(cli|reporting)/|^trilat_net/(api|__init__|__main__)\.py|^recorder/play/"
+    "app": r"^trilat_net/(cli|reporting)/|^trilat_net/(api|__init__|__main__)\.py|^trilat_net/app/play/"
     r"|sites/(doctor|network_benchmark|session_ping|running_session|monitor|demo_session)\.py",
     "session": r"^trilat_net/(scenario|net|log|execution)/|^sites/|^recorder/",
 }

@@ -4,8 +4,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from trilat_net.core.law_energy import LawEnergies, LawRecords
-from trilat_net.core.user_law import LawContext, LawInput
+from trilat_net.core.plug.law_energy import LawEnergies, LawRecords
+from trilat_net.core.plug.user_law import LawContext, LawInput
 
 
 class Line:

@@ -1,7 +1,7 @@
 """Laws of one's own that say once more what built-in ones do, and a few that go beyond them."""
 
 import trilat_net
-from trilat_net.core.user_law import LawContext, LawInput
+from trilat_net.core.plug.user_law import LawContext, LawInput
 
 
 class PD:

@@ -3,7 +3,7 @@
 from typing import Any, ClassVar
 
 from trilat_net import compiled
-from trilat_net.core.user_law import LawContext, LawInput
+from trilat_net.core.plug.user_law import LawContext, LawInput
 
 
 class Line:

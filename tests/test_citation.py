@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import trilat_net
-from trilat_net.reporting.citation import compose_citation
+from trilat_net.presentation.citation import compose_citation
 
 ROOT = Path(trilat_net.__file__).parents[1]
 CITATION = (ROOT / "CITATION.cff").read_text(encoding="utf-8")

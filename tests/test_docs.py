@@ -10,7 +10,6 @@ from typing import get_args
 import pytest
 
 from recorder import backfill, record_process, site_reception
-from recorder.play import player
 from sites import (
     change_server,
     code_watchdog,
@@ -20,23 +19,28 @@ from sites import (
     site_process,
 )
 from sites.devices import haply_inverse3, spacemouse
-from trilat_net.analysis import (
-    arm_rows,
-    envelope_trend,
-    run_end,
-    site_signals,
-    stability_decision,
-    twin_growth,
-)
+from trilat_net.analysis import arm_rows, run_end, site_signals, stability_decision
 from trilat_net.analysis.certificate import observed_energy, premises
 from trilat_net.analysis.certificate import stability_certificate as certificates
 from trilat_net.analysis.metrics import measured_impedance, motion_metrics, static_windows
-from trilat_net.core import delay, link, live_hand, session_life, site_arrays, ticks, user_law
+from trilat_net.analysis.theory import (
+    characteristic_roots,
+    equilibrium,
+    floquet,
+    linear_analysis,
+    linear_edge,
+    port_response,
+)
+from trilat_net.analysis.twins import envelope_trend, twin_growth
+from trilat_net.app.play import player
+from trilat_net.core.life import live_hand, session_life
+from trilat_net.core.links import delay, link
+from trilat_net.core.plug import user_law
+from trilat_net.core.step import site_arrays, ticks
 from trilat_net.execution import twins, verify
 from trilat_net.log import accounting, log_file, mcap_reader, mcap_records, site_log
 from trilat_net.net import arm_client, offset, requests, session, timing, zenoh_config
 from trilat_net.scenario import delay_period, laws, operators, resolve
-from trilat_net.studies import dask_cluster, executor
 from trilat_net.studies.bench import bench_plan, bench_results, bench_run
 from trilat_net.studies.sweep import (
     live_confirmation,
@@ -46,14 +50,7 @@ from trilat_net.studies.sweep import (
     sweep_run,
 )
 from trilat_net.studies.tuning import candidate, search_space, tuning_plan
-from trilat_net.theory import (
-    characteristic_roots,
-    equilibrium,
-    floquet,
-    linear_analysis,
-    linear_edge,
-    port_response,
-)
+from trilat_net.work import dask_cluster, executor
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted((ROOT / "docs").rglob("*.md"))

@@ -286,7 +286,7 @@ PYTHON_PAGES = {
 OF_THEIR_OWN = {"docs/live-hands.md", "docs/sweep-results.md"}
 """Pages whose code needs a session or a sweep, which a test of their own makes."""
 AT_HAND = {
-    "docs/observed-energy.md": "import numpy as np\nfrom trilat_net.core.law_energy import *\n",
+    "docs/observed-energy.md": "import numpy as np\nfrom trilat_net.core.plug.law_energy import *\n",
     "docs/rerun.md": "import trilat_net\n",
 }
 """What a page takes for granted in its code."""

@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 
 import trilat_net
-from sites.running_session import open_hand
 from tests.log_editing import recorded
 from tests.net.waiting import until
 from tests.sites.devices import CapReports, HaplyService
 from tests.sites.relay import RelayClock
 from tests.sites.sessions import SESSION, Session, reached
+from trilat_net.app.running_session import open_hand
 from trilat_net.net.arm_client import SwitchClient
 from trilat_net.net.bus import Bus
 from trilat_net.scenario import load_scenario

@@ -31,7 +31,7 @@ from trilat_net.files import (
     write_whole,
 )
 from trilat_net.log.log_file import LogFile
-from trilat_net.reporting.export import EXPORT_MANIFEST
+from trilat_net.presentation.export import EXPORT_MANIFEST
 
 
 def everything(folder: Path) -> dict[str, str]:

@@ -8,7 +8,7 @@ import pytest
 
 from . import house, line_figures, reading_walk
 
-ARM_STAGES = ("trilat_net/core/chain_stages.py", "trilat_net/core/two_link_stages.py")
+ARM_STAGES = ("trilat_net/core/arms/chain_stages.py", "trilat_net/core/arms/two_link_stages.py")
 PLUG_INS = {
     "main",
     *set.intersection(*(house.definitions(house.ROOT / path) for path in ARM_STAGES)),

@@ -8,7 +8,7 @@ import pytest
 
 import trilat_net
 from tests.cli.running import trilat
-from trilat_net.theory import iterate_linear_edges
+from trilat_net.analysis.theory import iterate_linear_edges
 
 SHEET = (Path(__file__).parents[1] / "docs" / "lab.md").read_text()
 BLOCKS = re.findall(r"^```sh\n(.*?)^```", SHEET, re.S | re.M)

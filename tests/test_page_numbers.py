@@ -27,6 +27,12 @@ from tests.theory.figures_of_runs import measured, value
 from tests.theory.loops import RODS
 from tests.virtual_runs import sampled
 from trilat_net.analysis.certificate.energy_balance import EnergyBalance, compute_energy_balance
+from trilat_net.analysis.theory import (
+    analyse_linear_loop,
+    find_equilibrium,
+    iterate_linear_edges,
+)
+from trilat_net.analysis.theory.port_analysis import PortAnalysis, analyse_ports
 from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.delay_models import DELAY_MODELS
@@ -37,8 +43,6 @@ from trilat_net.studies.tuning.search_space import (
     build_model_information,
     select_search_spaces,
 )
-from trilat_net.theory import analyse_linear_loop, find_equilibrium, iterate_linear_edges
-from trilat_net.theory.port_analysis import PortAnalysis, analyse_ports
 
 ROOT = Path(__file__).parents[1]
 NUMBER = r"([-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?)"

@@ -12,7 +12,7 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from trilat_net.core.ticks import NS_PER_S
+from trilat_net.core.step.ticks import NS_PER_S
 from trilat_net.log.log_reader import Log
 from trilat_net.net.messages import Event
 from trilat_net.net.offset import SLEW_NS

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tests.log_editing import Record, edited, opened
-from trilat_net.core.vectors import Array
+from trilat_net.core.step.vectors import Array
 from trilat_net.execution.virtual import write_virtual_log
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, load_scenario

@@ -20,36 +20,36 @@ from typing import TYPE_CHECKING as _TYPE_CHECKING
 from typing import Any as _Any
 
 if _TYPE_CHECKING:
-    from sites.demo_session import run as run
     from sites.devices import Device as Device
     from sites.devices import DeviceState as DeviceState
     from sites.devices.haply_inverse3 import HaplyInverse3 as HaplyInverse3
     from sites.devices.spacemouse import SpaceMouse as SpaceMouse
-    from sites.doctor import doctor as doctor
-    from sites.network_benchmark import ping_benchmark as ping_benchmark
-    from sites.running_session import hand as hand
-    from sites.running_session import session as session
-    from sites.running_session import start as start
+    from trilat_net.app.demo_session import run as run
+    from trilat_net.app.doctor import doctor as doctor
+    from trilat_net.app.network_benchmark import ping_benchmark as ping_benchmark
+    from trilat_net.app.running_session import hand as hand
+    from trilat_net.app.running_session import session as session
+    from trilat_net.app.running_session import start as start
 
     from .analysis.file_overview import info as info
-    from .analysis.twin_growth import twin as twin
-    from .api import bench as bench
-    from .api import certify as certify
-    from .api import export as export
-    from .api import linear as linear
-    from .api import margin as margin
-    from .api import metrics as metrics
-    from .api import report as report
-    from .api import simulate as simulate
-    from .api import sweep as sweep
-    from .api import tune as tune
-    from .api import verify as verify
-    from .api import view as view
-    from .core.compiled_law import compiled as compiled
-    from .core.own_hand import HandContext as HandContext
-    from .core.own_hand import HandView as HandView
-    from .core.user_law import LawContext as LawContext
-    from .core.user_law import LawInput as LawInput
+    from .analysis.twins.twin_growth import twin as twin
+    from .app.api import bench as bench
+    from .app.api import certify as certify
+    from .app.api import export as export
+    from .app.api import linear as linear
+    from .app.api import margin as margin
+    from .app.api import metrics as metrics
+    from .app.api import report as report
+    from .app.api import simulate as simulate
+    from .app.api import sweep as sweep
+    from .app.api import tune as tune
+    from .app.api import verify as verify
+    from .app.api import view as view
+    from .core.life.own_hand import HandContext as HandContext
+    from .core.life.own_hand import HandView as HandView
+    from .core.plug.compiled_law import compiled as compiled
+    from .core.plug.user_law import LawContext as LawContext
+    from .core.plug.user_law import LawInput as LawInput
     from .execution.rerun import rerun as rerun
     from .log.log_reader import open_log as open_log
     from .log.log_signature import create_signing_keys as create_signing_keys
@@ -63,8 +63,8 @@ if _TYPE_CHECKING:
     from .net.member_keys import create_keys as create_keys
     from .net.member_keys import read_member_keys as read_member_keys
     from .net.member_keys import renew_keys as renew_keys
+    from .presentation.figures.registry import figure as figure
     from .process import request_real_time_scheduling as request_real_time_scheduling
-    from .reporting.figures.registry import figure as figure
     from .scenario import Scenario as Scenario
     from .scenario import list_shipped as list_shipped
     from .scenario import load_scenario as load_scenario
@@ -94,20 +94,20 @@ if _TYPE_CHECKING:
     __version__: str
 
 _NAMES = {
-    "sites.demo_session": "run",
+    "trilat_net.app.demo_session": "run",
     "sites.devices": "Device DeviceState",
     "sites.devices.haply_inverse3": "HaplyInverse3",
     "sites.devices.spacemouse": "SpaceMouse",
-    "sites.doctor": "doctor",
-    "sites.network_benchmark": "ping_benchmark",
-    "sites.running_session": "hand session start",
+    "trilat_net.app.doctor": "doctor",
+    "trilat_net.app.network_benchmark": "ping_benchmark",
+    "trilat_net.app.running_session": "hand session start",
     "trilat_net.analysis.file_overview": "info",
-    "trilat_net.analysis.twin_growth": "twin",
-    "trilat_net.api": "bench certify export linear margin metrics report simulate sweep tune "
+    "trilat_net.analysis.twins.twin_growth": "twin",
+    "trilat_net.app.api": "bench certify export linear margin metrics report simulate sweep tune "
     "verify view",
-    "trilat_net.core.compiled_law": "compiled",
-    "trilat_net.core.own_hand": "HandContext HandView",
-    "trilat_net.core.user_law": "LawContext LawInput",
+    "trilat_net.core.plug.compiled_law": "compiled",
+    "trilat_net.core.life.own_hand": "HandContext HandView",
+    "trilat_net.core.plug.user_law": "LawContext LawInput",
     "trilat_net.execution.rerun": "rerun",
     "trilat_net.log.log_reader": "open_log",
     "trilat_net.log.log_signature": "create_signing_keys sign_log",
@@ -117,7 +117,7 @@ _NAMES = {
     "trilat_net.net.arm_client": "ArmClient SwitchClient",
     "trilat_net.net.member_keys": "add_keys create_keys read_member_keys renew_keys",
     "trilat_net.process": "request_real_time_scheduling",
-    "trilat_net.reporting.figures.registry": "figure",
+    "trilat_net.presentation.figures.registry": "figure",
     "trilat_net.scenario": "Scenario list_shipped load_scenario read_template",
     "trilat_net.scenario.describe": "describe_scenario",
     "trilat_net.scenario.delay_traces": "import_trace",

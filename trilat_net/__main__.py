@@ -61,14 +61,14 @@ def _run() -> None:
         if isinstance(remaining_arguments, int):
             sys.exit(remaining_arguments)
         sys.argv[2:] = remaining_arguments
-    from .cli import main as run
+    from .app.cli import main as run
 
     match sys.argv[1:]:
         case ["start-processes", number, scenario_file] if number.isdecimal():
             # Loaded once here, these modules need not be loaded in each forked process.
             from recorder import record_process  # noqa: F401
             from sites import site_process  # noqa: F401
-            from sites.demo_session import run_starter
+            from trilat_net.app.demo_session import run_starter
 
             arguments = run_starter(int(number), scenario_file)
             if arguments is None:

@@ -22,8 +22,8 @@ from typing import Annotated, Any, NamedTuple, TypeGuard, TypeVar, get_type_hint
 import msgspec
 from msgspec import Meta
 
-from .core.chain import LINK_PARAMETERS, MAX_JOINTS
-from .core.two_link_arm import JOINTS, PARAMETERS
+from .core.arms.chain import LINK_PARAMETERS, MAX_JOINTS
+from .core.arms.two_link_arm import JOINTS, PARAMETERS
 from .errors import ScenarioError, count_nouns, suggest_nearest
 
 

@@ -23,9 +23,9 @@ import numpy as np
 
 import trilat_net as tn
 from trilat_net.analysis.dominance_history import trace_dominance
-from trilat_net.core.vectors import Array
+from trilat_net.core.step.vectors import Array
 from trilat_net.log.log_reader import Log
-from trilat_net.reporting.appearance import (
+from trilat_net.presentation.appearance import (
     DARK_SITE_COLOURS,
     SITE_COLOURS,
     list_site_colours,

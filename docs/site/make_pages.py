@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import trilat_net as tn
-from trilat_net.reporting.figures.registry import write_figures
+from trilat_net.presentation.figures.registry import write_figures
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
@@ -63,7 +63,7 @@ def list_commands() -> str:
         sys.executable,
         "-m",
         "typer",
-        "trilat_net.cli",
+        "trilat_net.app.cli",
         "utils",
         "docs",
         "--name",

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 
 import trilat_net
-from trilat_net.core.ticks import LinkCounts
+from trilat_net.core.step.ticks import LinkCounts
 from trilat_net.execution import virtual
 from trilat_net.execution.virtual_network import RecordedNetwork
 from trilat_net.log.log_reader import Log, open_log

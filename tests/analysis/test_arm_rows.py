@@ -17,8 +17,8 @@ from trilat_net.analysis.arm_rows import (
     find_pseudo_inertias,
     stack_regressors,
 )
-from trilat_net.core.chain import ChainJoint, build_chain, find_acceleration, place_joints
-from trilat_net.core.site_setup import ChainSetup
+from trilat_net.core.arms.chain import ChainJoint, build_chain, find_acceleration, place_joints
+from trilat_net.core.step.site_setup import ChainSetup
 from trilat_net.scenario.arms import Arm, Task, build_arm
 
 Array = NDArray[np.float64]

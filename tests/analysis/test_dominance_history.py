@@ -19,9 +19,9 @@ from trilat_net.analysis.dominance_history import (
     left_perron_vector,
     trace_dominance,
 )
-from trilat_net.core.dominance import apply_ramps
-from trilat_net.core.link import link_dtype
-from trilat_net.core.ticks import DominanceRamp
+from trilat_net.core.links.dominance import apply_ramps
+from trilat_net.core.links.link import link_dtype
+from trilat_net.core.step.ticks import DominanceRamp
 from trilat_net.errors import LogError
 
 RATE_HZ = 50

@@ -8,7 +8,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from trilat_net.analysis.envelope_trend import (
+from trilat_net.analysis.twins.envelope_trend import (
     FLOOR_RAD,
     EnvelopeFit,
     EnvelopeTrend,

@@ -20,9 +20,9 @@ from trilat_net.analysis.link_summary import (
     predict_delivery,
     summarise_links,
 )
-from trilat_net.core.channel import LOST
-from trilat_net.core.site_step import Site
-from trilat_net.core.ticks import first_tick_at
+from trilat_net.core.links.channel import LOST
+from trilat_net.core.step.site_step import Site
+from trilat_net.core.step.ticks import first_tick_at
 from trilat_net.errors import LogError
 from trilat_net.scenario import load_scenario, parse_scenario
 from trilat_net.scenario import sample_uses as module

@@ -17,8 +17,8 @@ from trilat_net.analysis.run_end import (
     classify_run_end,
     reduce_to_buckets,
 )
-from trilat_net.core.ticks import BUCKETS_PER_S
-from trilat_net.core.vectors import Array
+from trilat_net.core.step.ticks import BUCKETS_PER_S
+from trilat_net.core.step.vectors import Array
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import load_scenario
 

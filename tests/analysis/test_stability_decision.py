@@ -4,7 +4,6 @@ import math
 
 import pytest
 
-from trilat_net.analysis.envelope_trend import EnvelopeFit, EnvelopeTrend
 from trilat_net.analysis.run_end import EndBehaviour, RunEnd, Stability
 from trilat_net.analysis.stability_decision import (
     LoopRoots,
@@ -12,7 +11,8 @@ from trilat_net.analysis.stability_decision import (
     StabilityDecision,
     decide_stability,
 )
-from trilat_net.analysis.twin_growth import PushGrowth, RestDeparture, TwinGrowth
+from trilat_net.analysis.twins.envelope_trend import EnvelopeFit, EnvelopeTrend
+from trilat_net.analysis.twins.twin_growth import PushGrowth, RestDeparture, TwinGrowth
 from trilat_net.execution.twins import choose_pushes
 from trilat_net.scenario import load_scenario
 

@@ -13,8 +13,8 @@ from trilat_net.analysis.torque_sources import (
     compute_operator_script,
     compute_source_torque,
 )
-from trilat_net.core import exogenous
-from trilat_net.core.exogenous import TorqueKind, TorqueSource, torque_source_rows
+from trilat_net.core.arms import exogenous
+from trilat_net.core.arms.exogenous import TorqueKind, TorqueSource, torque_source_rows
 
 real = st.floats(-2.0, 2.0)
 pairs = st.tuples(real, real)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import trilat_net as tn
-from trilat_net.analysis.envelope_trend import EnvelopeTrend
-from trilat_net.analysis.twin_growth import (
+from trilat_net.analysis.twins.envelope_trend import EnvelopeTrend
+from trilat_net.analysis.twins.twin_growth import (
     CLEAR_GROWTH,
     PushedTwins,
     TwinGrowth,

@@ -27,21 +27,18 @@ import numpy as np
 
 import trilat_net
 from trilat_net.analysis.certificate.premises import explain_no_functional
-from trilat_net.core.ticks import BUCKETS_PER_S, NS_PER_S
-from trilat_net.core.two_link_arm import JOINTS
-from trilat_net.core.vectors import Array
+from trilat_net.analysis.judge import judge_virtual_run
+from trilat_net.analysis.theory.equilibrium import extend_scenario, follow_equilibrium
+from trilat_net.analysis.theory.linear_edge import find_contact_growth, find_rightmost_root
+from trilat_net.analysis.theory.operating_point import Equilibrium, derive_operating_conditions
+from trilat_net.core.arms.two_link_arm import JOINTS
+from trilat_net.core.step.ticks import BUCKETS_PER_S, NS_PER_S
+from trilat_net.core.step.vectors import Array
 from trilat_net.errors import ScenarioError
 from trilat_net.execution.fused import FusedRun
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.studies.sweep.sweep_cell import classify_cell
-from trilat_net.theory.equilibrium import extend_scenario, follow_equilibrium
-from trilat_net.theory.linear_edge import find_contact_growth, find_rightmost_root
-from trilat_net.theory.operating_point import (
-    Equilibrium,
-    derive_operating_conditions,
-)
-from trilat_net.theory.run_certificate import judge_virtual_run
 
 from .drawn_loops import (
     SAMPLED,

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from trilat_net.core.vectors import Array
+from trilat_net.core.step.vectors import Array
 from trilat_net.scenario import Scenario, parse_scenario
 
 from ..unit_arm import ARM as UNIT_ARM

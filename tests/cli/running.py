@@ -13,9 +13,9 @@ from unittest import mock
 
 from typer.main import get_command
 
-from trilat_net.cli import app, main
-from trilat_net.core.jit import compiling_notice
-from trilat_net.reporting import terminal_output
+from trilat_net.app.cli import app, main
+from trilat_net.core.step.jit import compiling_notice
+from trilat_net.presentation import terminal_output
 from trilat_net.scenario.imported_code import allowed_code
 
 COMMAND = [sys.executable, "-m", "trilat_net"]

@@ -14,7 +14,7 @@ from rich.table import Table
 
 from tests.chains import six_joints
 from tests.task_arms import planar_task
-from trilat_net.reporting.terminal_output import TextConsole, print_json, print_line
+from trilat_net.presentation.terminal_output import TextConsole, print_json, print_line
 from trilat_net.scenario.resolve import SHIPPED_FOLDER
 
 from .running import trilat

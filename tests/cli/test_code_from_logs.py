@@ -17,9 +17,9 @@ import typer
 import trilat_net as tn
 from tests.cli.running import COMMAND, PLAIN, shorten, trilat
 from tests.log_editing import edited, opened
-from trilat_net.cli import app
+from trilat_net.app.cli import app
 from trilat_net.errors import CodeWithheld, ScenarioError, UsageError
-from trilat_net.reporting.figures.registry import list_drawable_figures
+from trilat_net.presentation.figures.registry import list_drawable_figures
 from trilat_net.scenario.code_consent import list_imported_code
 from trilat_net.scenario.imported_code import (
     CodeKey,

@@ -55,7 +55,7 @@ import contextlib, io, json, os, sys
 os.environ["COLUMNS"] = "200"
 import trilat_net
 trilat_net.__path__.insert(0, sys.argv[1])
-from trilat_net.cli import app
+from trilat_net.app.cli import app
 
 def run(*words):
     said = io.StringIO()

@@ -122,7 +122,7 @@ def test_shapes_of_page_are_what_a_law_gets(tmp_path: Path) -> None:
 
 
 def test_what_page_says_of_law_is_what_law_gets() -> None:
-    from trilat_net.core.user_law import LawContext, LawInput
+    from trilat_net.core.plug.user_law import LawContext, LawInput
 
     with INPUTS.open(newline="", encoding="utf-8") as stream:
         rows = [(row["object"], row["field"]) for row in csv.DictReader(stream)]

@@ -13,7 +13,8 @@ import pytest
 
 from tests.net.waiting import until
 from tests.other_systems import prepare_process, replace_os
-from trilat_net import __main__, cli
+from trilat_net import __main__
+from trilat_net.app import cli
 from trilat_net.files import STUDY_LIBRARIES
 from trilat_net.net.connection import find_free_endpoints
 from trilat_net.net.zenoh_bus import ZenohBus
@@ -199,7 +200,7 @@ from importlib import import_module
 from pkgutil import walk_packages
 for name in {blocked!r}:
     sys.modules[name] = None
-from trilat_net.cli import main
+from trilat_net.app.cli import main
 for top in {rooms!r}:
     for found in walk_packages(import_module(top).__path__, top + "."):
         import_module(found.name)
@@ -256,7 +257,7 @@ def test_a_robot_needs_no_library_of_studies(tmp_path: Path) -> None:
 
 def test_help_imports_nothing_heavy(tmp_path: Path) -> None:
     program = (
-        "import sys, trilat_net.cli\n"
+        "import sys, trilat_net.app.cli\n"
         "heavy = {'numba', 'numpy', 'zenoh', 'mcap', 'matplotlib', 'msgspec'} & set(sys.modules)\n"
         "sys.exit(str(heavy) if heavy else 0)"
     )

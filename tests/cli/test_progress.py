@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from trilat_net.reporting import terminal_output
+from trilat_net.presentation import terminal_output
 
 from .running import simulated, trilat
 

@@ -14,8 +14,8 @@ from typing import Any
 
 import pytest
 
-from sites.running_session import hand, session
 from tests.cli.running import COMMAND, PLAIN, trilat
+from trilat_net.app.running_session import hand, session
 from trilat_net.errors import LogRefused, TrilatError, UsageError
 from trilat_net.net import member_keys
 from trilat_net.net.arm_client import ArmClient, SwitchClient

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.cli.running import COMMAND, PLAIN, trilat
-from trilat_net.core.jit import COMPILING
+from trilat_net.core.step.jit import COMPILING
 from trilat_net.process import ENDING_SIGNALS, Interrupt, end_process_at_signals
 
 LOG = Path(__file__).parents[1] / "golden" / "v3.mcap"

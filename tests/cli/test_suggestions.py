@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from trilat_net.cli import _SYNONYMS
+from trilat_net.app.cli import _SYNONYMS
 from trilat_net.errors import find_nearest, suggest_nearest
 
 from .running import trilat, whole_command

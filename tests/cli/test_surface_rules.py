@@ -65,7 +65,7 @@ def test_the_version_is_that_of_the_package() -> None:
 )
 def test_a_shell_completes(words: str, found: set[str]) -> None:
     asked = {"_TRILAT_COMPLETE": "complete_fish", "_TYPER_COMPLETE_FISH_ACTION": "get-args"}
-    code = "from trilat_net.cli import app; app(prog_name='trilat')"
+    code = "from trilat_net.app.cli import app; app(prog_name='trilat')"
     done = subprocess.run(
         [sys.executable, "-c", code],
         env={**PLAIN, **asked, "_TYPER_COMPLETE_ARGS": f"trilat {words}"},

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.studies.sweep.quick import SHORT
-from trilat_net.cli.sweep import parse_seed_count
+from trilat_net.app.cli.sweep import parse_seed_count
 
 from .running import trilat
 

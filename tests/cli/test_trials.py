@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from tests.net.waiting import until
 from tests.studies.trials.results import QUICK
-from trilat_net.cli.studies import parse_seeds
+from trilat_net.app.cli.studies import parse_seeds
 from trilat_net.errors import UsageError
 from trilat_net.scenario import list_shipped, load_scenario
 
@@ -89,7 +89,7 @@ def test_bad_input_is_2_before_anything_runs(words: tuple[str, ...], folder: Pat
 
 
 def test_without_arguments_every_shipped_scenario_that_expects_something_is_meant() -> None:
-    from trilat_net.cli.studies import _list_trials
+    from trilat_net.app.cli.studies import _list_trials
 
     named = [trial.source for trial in _list_trials([], [1, 2], [], live=False)]
     assert set(named) == {

@@ -10,7 +10,7 @@ import pytest
 import trilat_net as tn
 from tests.cli.running import simulated, trilat
 from tests.execution.logs import without_records
-from trilat_net.cli.runs import certify_command
+from trilat_net.app.cli.runs import certify_command
 from trilat_net.errors import NotRepeatable
 from trilat_net.execution.fused import explain_not_repeatable
 

@@ -15,12 +15,12 @@ from trilat_net.analysis.certificate.energy_balance import (
     compute_site_energies,
 )
 from trilat_net.analysis.certificate.energy_terms import compute_dissipation, compute_work
-from trilat_net.core.control import ROBUST_RESIDUE, robust_torque
+from trilat_net.analysis.theory.equilibrium import find_equilibrium
+from trilat_net.analysis.theory.linear_loop import linearise_loop
+from trilat_net.analysis.theory.operating_point import derive_operating_conditions
+from trilat_net.core.step.control import ROBUST_RESIDUE, robust_torque
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import parse_scenario
-from trilat_net.theory.equilibrium import find_equilibrium
-from trilat_net.theory.linear_loop import linearise_loop
-from trilat_net.theory.operating_point import derive_operating_conditions
 
 RHO_NM, WIDTH_RAD_S = 3.0, 0.03
 SHAKEN = """name = "shaken"

@@ -8,7 +8,7 @@ import pytest
 
 from tests.unit_arm import CLAMP, H50, hand, last_rows, unit_scenario
 from trilat_net.analysis.arm_rows import PlacedArm
-from trilat_net.core.elementary import tanh
+from trilat_net.core.arms.elementary import tanh
 from trilat_net.errors import ScenarioError
 from trilat_net.laws.six_channel import complementary_shares
 from trilat_net.scenario import Scenario, load_scenario

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trilat_net.core import chain_stages, two_link_arm, two_link_stages
-from trilat_net.core.chain import friction_torque, inverse_dynamics
-from trilat_net.core.site_arrays import SiteArrays, build_site_arrays
-from trilat_net.core.vectors import Array
+from trilat_net.core.arms import chain_stages, two_link_arm, two_link_stages
+from trilat_net.core.arms.chain import friction_torque, inverse_dynamics
+from trilat_net.core.step.site_arrays import SiteArrays, build_site_arrays
+from trilat_net.core.step.vectors import Array
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.laws import BUILT_IN
 

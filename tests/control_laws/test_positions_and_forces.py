@@ -13,13 +13,13 @@ from tests.transmission import PAIR, TABLE, VARIANTS, printed, rightmost_root, t
 from tests.unit_arm import DRIVE, WALL, last_rows, two_sites, unit_scenario
 from tests.virtual_runs import trajectories
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
+from trilat_net.analysis.theory.delay_margin import set_common_delay
+from trilat_net.analysis.theory.linear_analysis import analyse_linear_loop
 from trilat_net.errors import ScenarioError
 from trilat_net.execution.virtual import write_virtual_log
 from trilat_net.laws.six_channel import complementary_shares, complementary_weights
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.describe import describe_law_conditions
-from trilat_net.theory.delay_margin import set_common_delay
-from trilat_net.theory.linear_analysis import analyse_linear_loop
 
 SHARED = {  # factor: user 1 and user 2 at 0.1 and 1 Hz without and with qdd; rightmost root; beta_s / beta
     0.0: ((0.201, 0.278, 0.201, 0.278), (0.999, 0.921, 1.0, 1.0), -5.858, (np.inf, 1.0)),

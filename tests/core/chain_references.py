@@ -13,8 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 import trilat_net
-from trilat_net.core.chain import inverse_dynamics, mass_matrix, place_joints, propagate_motion
-from trilat_net.core.vectors import RowArray
+from trilat_net.core.arms.chain import (
+    inverse_dynamics,
+    mass_matrix,
+    place_joints,
+    propagate_motion,
+)
+from trilat_net.core.step.vectors import RowArray
 from trilat_net.scenario.urdf import UrdfChain, UrdfJoint
 
 Array = NDArray[np.float64]

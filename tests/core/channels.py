@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from trilat_net.core.channel import schedule_deliveries
-from trilat_net.core.delay import LINK_MODEL_DTYPE, LinkModel
-from trilat_net.core.link import link_dtype
-from trilat_net.core.philox import link_key
-from trilat_net.core.vectors import Points
+from trilat_net.core.links.channel import schedule_deliveries
+from trilat_net.core.links.delay import LINK_MODEL_DTYPE, LinkModel
+from trilat_net.core.links.link import link_dtype
+from trilat_net.core.links.philox import link_key
+from trilat_net.core.step.vectors import Points
 from trilat_net.scenario.delay_models import LinkBase
 
 Ints = NDArray[np.int64]

@@ -6,7 +6,7 @@
 import re
 from pathlib import Path
 
-from trilat_net.core.row_fields import FIELDS, Field
+from trilat_net.core.step.row_fields import FIELDS, Field
 
 README = Path(__file__).parents[2] / "trilat_net" / "core" / "README.md"
 _HEAD = "| field | shape | unit | meaning | written by |\n|---|---|---|---|---|\n"

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from trilat_net.core.ticks import CoreChange, LifeReason, find_life_reason, tick_ns
+from trilat_net.core.step.ticks import CoreChange, LifeReason, find_life_reason, tick_ns
 from trilat_net.execution import virtual
 from trilat_net.execution.resumption import read_output
 from trilat_net.log.log_reader import Log, open_log

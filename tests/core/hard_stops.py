@@ -17,9 +17,9 @@ import numpy as np
 
 import trilat_net
 from trilat_net.analysis.arm_rows import build_arm_rows
-from trilat_net.core.site_setup import Law
-from trilat_net.core.site_step import Site
-from trilat_net.core.ticks import CoreChange, LifeOrder, TickInput, TickRecord
+from trilat_net.core.step.site_setup import Law
+from trilat_net.core.step.site_step import Site
+from trilat_net.core.step.ticks import CoreChange, LifeOrder, TickInput, TickRecord
 from trilat_net.execution.resumption import read_output
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, load_scenario

@@ -3,8 +3,8 @@
 import numpy as np
 
 from tests.core.channels import Ints, channel, due
-from trilat_net.core.channel import LOST
-from trilat_net.core.delay import DelayKind, LinkModel, TraceEnd
+from trilat_net.core.links.channel import LOST
+from trilat_net.core.links.delay import DelayKind, LinkModel, TraceEnd
 
 KINDS: dict[str, LinkModel] = {
     "constant": LinkModel(location=200_000.0),

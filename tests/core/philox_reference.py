@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from trilat_net.core.jit import leaf
-from trilat_net.core.philox import standard_gamma, standard_normal, uniforms
+from trilat_net.core.links.philox import standard_gamma, standard_normal, uniforms
+from trilat_net.core.step.jit import leaf
 
 U32 = 2**32 - 1
 

@@ -7,7 +7,7 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from trilat_net.core.two_link_arm import ArmLinks
+from trilat_net.core.arms.two_link_arm import ArmLinks
 
 Array = NDArray[np.float64]
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from trilat_net.core.resting import REST_RATE_1_S
-from trilat_net.core.site_setup import LEAST_STOP_S, RestGains
-from trilat_net.core.vectors import Array
+from trilat_net.core.life.resting import REST_RATE_1_S
+from trilat_net.core.step.site_setup import LEAST_STOP_S, RestGains
+from trilat_net.core.step.vectors import Array
 from trilat_net.log.site_log import SiteLog
 
 

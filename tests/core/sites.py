@@ -4,12 +4,12 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from tests.core.channels import LINK_NAME
-from trilat_net.core.delay import LinkModel
-from trilat_net.core.philox import link_key
-from trilat_net.core.site_setup import LinkSetup, SiteSetup
-from trilat_net.core.site_step import Site
-from trilat_net.core.ticks import Arrival, TickInput, TickRecord
-from trilat_net.core.vectors import Points
+from trilat_net.core.links.delay import LinkModel
+from trilat_net.core.links.philox import link_key
+from trilat_net.core.step.site_setup import LinkSetup, SiteSetup
+from trilat_net.core.step.site_step import Site
+from trilat_net.core.step.ticks import Arrival, TickInput, TickRecord
+from trilat_net.core.step.vectors import Points
 from trilat_net.execution import virtual
 from trilat_net.scenario import load_scenario
 

@@ -3,9 +3,9 @@
 import numpy as np
 
 from tests.core.chain_references import chain_references
-from trilat_net.core.chain import ChainJoint
-from trilat_net.core.site_arrays import SiteArrays, build_site_arrays
-from trilat_net.core.site_setup import (
+from trilat_net.core.arms.chain import ChainJoint
+from trilat_net.core.step.site_arrays import SiteArrays, build_site_arrays
+from trilat_net.core.step.site_setup import (
     ChainSetup,
     Gains,
     Law,

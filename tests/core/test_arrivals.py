@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from tests.core.channels import channel, due
 from tests.core.kinds import KINDS, POINTS
 from tests.core.sites import linked, sample, stepped
-from trilat_net.core.channel import LOST
-from trilat_net.core.delay import DelayKind, LinkModel
-from trilat_net.core.site_step import Site
-from trilat_net.core.ticks import (
+from trilat_net.core.links.channel import LOST
+from trilat_net.core.links.delay import DelayKind, LinkModel
+from trilat_net.core.step.site_step import Site
+from trilat_net.core.step.ticks import (
     Arrival,
     CoreChange,
     TickInput,

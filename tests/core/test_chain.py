@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.core.chain_references import Arm, chain_references, full_matrix, moving, torque_for
-from trilat_net.core.chain import (
+from trilat_net.core.arms.chain import (
     LINK_PARAMETERS,
     MAX_JOINTS,
     ChainJoint,
@@ -14,7 +14,7 @@ from trilat_net.core.chain import (
     place_end_effector,
     place_joints,
 )
-from trilat_net.core.vectors import Array
+from trilat_net.core.step.vectors import Array
 
 REFERENCES = chain_references()
 EPS = np.finfo(float).eps

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from tests.core.chain_references import Arm, ChainState, chain_references, moving, torque_for
-from trilat_net.core.chain import ChainJoint
-from trilat_net.core.chain_stages import place_chain, update_errors, update_torque
-from trilat_net.core.site_arrays import SiteArrays, build_site_arrays
-from trilat_net.core.site_setup import ChainSetup, Gains, Law, LinkSetup, Scheme, SiteSetup
-from trilat_net.core.vectors import Array
+from trilat_net.core.arms.chain import ChainJoint
+from trilat_net.core.arms.chain_stages import place_chain, update_errors, update_torque
+from trilat_net.core.step.site_arrays import SiteArrays, build_site_arrays
+from trilat_net.core.step.site_setup import ChainSetup, Gains, Law, LinkSetup, Scheme, SiteSetup
+from trilat_net.core.step.vectors import Array
 
 REFERENCES = chain_references()
 each = pytest.mark.parametrize("name", ["arm6", "arm7", "random3"])

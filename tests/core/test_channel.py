@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from tests.core.channels import SEEDS, Ints, channel, due, stamps
 from tests.core.compiled import printed
 from tests.core.kinds import KINDS, POINTS, fates
-from trilat_net.core.channel import LOST
+from trilat_net.core.links.channel import LOST
 from trilat_net.scenario.delay_models import LinkBase
 from trilat_net.scenario.delay_models.kernel_delays import (
     ConstantDelay,

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from tests.core import physical_arms as physics
 from tests.core.physical_arms import Array, angles, links, speeds
-from trilat_net.core import control
-from trilat_net.core.two_link_arm import ArmLinks, regressor, theta_from_links
+from trilat_net.core.arms.two_link_arm import ArmLinks, regressor, theta_from_links
+from trilat_net.core.step import control
 
 gains = physics.vectors(st.floats(0.1, 20.0))
 NO_LIMIT = 1e300

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from tests.core.core_readme import README, insert_tables, render_table
-from trilat_net.core.link import link_dtype, sample_dtype
-from trilat_net.core.row_fields import FIELDS
-from trilat_net.core.site_arrays import arrival_dtype, site_dtype
-from trilat_net.core.site_setup import Layout
-from trilat_net.core.ticks import LinkCounts
-from trilat_net.core.user_law import PeerView
+from trilat_net.core.links.link import link_dtype, sample_dtype
+from trilat_net.core.plug.user_law import PeerView
+from trilat_net.core.step.row_fields import FIELDS
+from trilat_net.core.step.site_arrays import arrival_dtype, site_dtype
+from trilat_net.core.step.site_setup import Layout
+from trilat_net.core.step.ticks import LinkCounts
 
 TEXT = README.read_text(encoding="utf-8")
 CHAIN = Layout(joints=6, shared=3, parameters=60, chain=True, task=True)

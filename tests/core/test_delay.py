@@ -11,7 +11,7 @@ from scipy import stats
 
 from tests.core.channels import LINK_NAME, SEEDS, Ints, channel, delays_us, due
 from tests.core.philox_reference import philox_in_integers
-from trilat_net.core.delay import (
+from trilat_net.core.links.delay import (
     MAX_DELAY_US,
     DelayKind,
     LinkModel,
@@ -19,7 +19,7 @@ from trilat_net.core.delay import (
     clamp_delay_us,
     trace_delay_us,
 )
-from trilat_net.core.philox import link_key
+from trilat_net.core.links.philox import link_key
 from trilat_net.scenario.delay_models import LinkBase
 from trilat_net.scenario.delay_models.kernel_delays import (
     CorrelatedDelay,

@@ -9,11 +9,11 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from tests.core.sites import setup, stepped
-from trilat_net.core.dominance import apply_ramps, fold_ramps
-from trilat_net.core.link import link_dtype
-from trilat_net.core.site_setup import LinkSetup
-from trilat_net.core.site_step import MAX_RAMPS, Site
-from trilat_net.core.ticks import Arrival, CoreChange, DominanceRamp, TickInput, TickRecord
+from trilat_net.core.links.dominance import apply_ramps, fold_ramps
+from trilat_net.core.links.link import link_dtype
+from trilat_net.core.step.site_setup import LinkSetup
+from trilat_net.core.step.site_step import MAX_RAMPS, Site
+from trilat_net.core.step.ticks import Arrival, CoreChange, DominanceRamp, TickInput, TickRecord
 
 S = 10**9
 PEERS = 3

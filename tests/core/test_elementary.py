@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trilat_net.core.elementary import LARGEST_RAD, sincos
+from trilat_net.core.arms.elementary import LARGEST_RAD, sincos
 
 
 @given(st.floats(-1e5, 1e5))

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy import signal
 
 from tests.core.physical_arms import Array, angles, speeds
-from trilat_net.core.exogenous import (
+from trilat_net.core.arms.exogenous import (
     OWN_KINDS,
     TorqueKind,
     TorqueSource,

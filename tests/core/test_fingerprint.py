@@ -3,11 +3,9 @@
 import pytest
 
 from tests.core.compiled import printed
-from trilat_net.core.fingerprint import compute_fingerprint
+from trilat_net.core.step.fingerprint import compute_fingerprint
 
-PROGRAM = (
-    "from trilat_net.core.fingerprint import compute_fingerprint; print(compute_fingerprint())"
-)
+PROGRAM = "from trilat_net.core.step.fingerprint import compute_fingerprint; print(compute_fingerprint())"
 
 
 @pytest.mark.parametrize("compiled", [False, True])

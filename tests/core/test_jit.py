@@ -13,8 +13,8 @@ from tests.core.compiled import printed
 SYMBOLS = """
 import numba, numpy as np
 from numba.core.itanium_mangler import mangle
-from trilat_net.core.site_arrays import site_dtype
-from trilat_net.core.site_setup import Layout
+from trilat_net.core.step.site_arrays import site_dtype
+from trilat_net.core.step.site_setup import Layout
 for n in {}:
     site = numba.typeof(np.zeros(1, site_dtype(Layout(n, n, 10 * n, True))))
     print(n, mangle("leaf", [site, site.dtype]))
@@ -35,7 +35,7 @@ def test_symbols_of_leaves_tell_layouts_apart() -> None:
 
 CLOSURES = """
 import sys, numba, numpy as np
-from trilat_net.core.jit import compile_named
+from trilat_net.core.step.jit import compile_named
 for factor in map(float, sys.argv[1:]):
     def call(values):
         for i in range(values.shape[0]):

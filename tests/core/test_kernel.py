@@ -7,9 +7,9 @@ from scipy.integrate import solve_ivp
 
 from tests.core import physical_arms as physics
 from tests.core.physical_arms import Array, angles, speeds
-from trilat_net.core.exogenous import TorqueKind, TorqueSource, torque_source_rows
-from trilat_net.core.two_link_arm import ArmLinks, theta_from_links
-from trilat_net.core.two_link_stages import rk4_step
+from trilat_net.core.arms.exogenous import TorqueKind, TorqueSource, torque_source_rows
+from trilat_net.core.arms.two_link_arm import ArmLinks, theta_from_links
+from trilat_net.core.arms.two_link_stages import rk4_step
 
 ARM = ArmLinks(1.0, 1.1, 0.5, 0.09, 0.9, 0.8, 0.4, 0.05)
 LENGTHS = np.array([1.0, 0.9])

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from trilat_net.core.user_law import read_memory, write_memory
+from trilat_net.core.plug.user_law import read_memory, write_memory
 
 reals = st.floats(-1e6, 1e6)
 shapes = st.sampled_from([(2,), (3, 2), (1, 2, 2)])

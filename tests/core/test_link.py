@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from tests.core.sites import one_link, sample, stepped
 from tests.virtual_runs import run
-from trilat_net.core.link import calendar_pages
-from trilat_net.core.ticks import TickInput
+from trilat_net.core.links.link import calendar_pages
+from trilat_net.core.step.ticks import TickInput
 
 rates = st.sampled_from([1, 3, 50, 333, 700, 999, 1000, 1001, 4096, 20_000])
 S = 10**9

@@ -10,9 +10,9 @@ from tests.chains import six_joints
 from tests.core.kinds import KINDS
 from tests.core.sites import linked, one_link, sample, stepped
 from tests.task_arms import planar_task
-from trilat_net.core.delay import LinkModel
-from trilat_net.core.link import AHEAD_LIMIT_S, calendar_pages
-from trilat_net.core.site_arrays import (
+from trilat_net.core.links.delay import LinkModel
+from trilat_net.core.links.link import AHEAD_LIMIT_S, calendar_pages
+from trilat_net.core.step.site_arrays import (
     MAX_LINKS_BYTES,
     CalendarSizer,
     SiteArrays,
@@ -20,8 +20,8 @@ from trilat_net.core.site_arrays import (
     needed_pages,
     widen_calendars,
 )
-from trilat_net.core.site_step import Site
-from trilat_net.core.ticks import CoreChange, TickInput
+from trilat_net.core.step.site_step import Site
+from trilat_net.core.step.ticks import CoreChange, TickInput
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import load_scenario, parse_embedded, parse_scenario
 from trilat_net.scenario.run_changes import LinkTables, resolve_change

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from trilat_net.core.live_hand import (
+from trilat_net.core.life.live_hand import (
     ANOTHER_HOLDS,
     GRIP_NS,
     OUT_OF_ORDER,

@@ -14,8 +14,8 @@ from trilat_net.analysis.certificate.energy_balance import (
     compute_site_energies,
 )
 from trilat_net.analysis.dominance_history import list_losses, trace_dominance
-from trilat_net.core.lost_peers import BACK_NS
-from trilat_net.core.ticks import LifeReason
+from trilat_net.core.links.lost_peers import BACK_NS
+from trilat_net.core.step.ticks import LifeReason
 from trilat_net.errors import ScenarioError
 from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trilat_net.core.live_hand import HandInForce, HandRules
-from trilat_net.core.own_hand import PROGRAM, OwnHand
+from trilat_net.core.life.live_hand import HandInForce, HandRules
+from trilat_net.core.life.own_hand import PROGRAM, OwnHand
 
 PLACE = (0.5, -0.25)
 EVERY, DELAY, TICKS = 20, 30, 400

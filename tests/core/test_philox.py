@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from tests.core.philox_reference import U32, philox_in_integers, table
-from trilat_net.core.philox import link_key, philox, uniforms, unit_interval
+from trilat_net.core.links.philox import link_key, philox, uniforms, unit_interval
 
 words = st.integers(0, U32)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.virtual_runs import Run, run, trajectories
-from trilat_net.core.ticks import TickRecord
+from trilat_net.core.step.ticks import TickRecord
 from trilat_net.execution import virtual
 from trilat_net.scenario import load_scenario
 

@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import trilat_net
-from trilat_net.core.law_channel import LawChannel, SentVector, join_received
-from trilat_net.core.site_step import Site
-from trilat_net.core.ticks import Arrival, TickInput, TickRecord
-from trilat_net.core.user_law import LawVector
+from trilat_net.core.plug.law_channel import LawChannel, SentVector, join_received
+from trilat_net.core.plug.user_law import LawVector
+from trilat_net.core.step.site_step import Site
+from trilat_net.core.step.ticks import Arrival, TickInput, TickRecord
 from trilat_net.errors import LawFailed, ScenarioError
 from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import Scenario, load_scenario

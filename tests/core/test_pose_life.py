@@ -15,11 +15,11 @@ from trilat_net.analysis.certificate.energy_balance import (
     compute_site_energies,
 )
 from trilat_net.analysis.certificate.energy_terms import measure_torque_error
-from trilat_net.core.resting import rests
-from trilat_net.core.session_life import update_session_life
-from trilat_net.core.site_setup import StaleAction
-from trilat_net.core.ticks import Mode, tick_ns
-from trilat_net.core.vectors import Array, Row
+from trilat_net.core.life.resting import rests
+from trilat_net.core.life.session_life import update_session_life
+from trilat_net.core.step.site_setup import StaleAction
+from trilat_net.core.step.ticks import Mode, tick_ns
+from trilat_net.core.step.vectors import Array, Row
 from trilat_net.execution.verify import verify
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import parse_scenario

@@ -22,13 +22,13 @@ from tests.core.guarded_runs import (
 from tests.core.hard_stops import CHAINS, RULE, THREE, TWO
 from tests.core.rests import gravity_of, integrals, reference, rest_torque
 from trilat_net.analysis.arm_rows import PlanarArmRows, build_arm_rows
-from trilat_net.core.resting import limit_torque_rate
-from trilat_net.core.site_arrays import build_site_arrays
-from trilat_net.core.site_setup import RestGains
-from trilat_net.core.site_step import Site
-from trilat_net.core.ticks import CoreChange, LifeOrder, Mode, TickInput
-from trilat_net.core.user_law import LawContext, LawInput
-from trilat_net.core.vectors import Array
+from trilat_net.core.life.resting import limit_torque_rate
+from trilat_net.core.plug.user_law import LawContext, LawInput
+from trilat_net.core.step.site_arrays import build_site_arrays
+from trilat_net.core.step.site_setup import RestGains
+from trilat_net.core.step.site_step import Site
+from trilat_net.core.step.ticks import CoreChange, LifeOrder, Mode, TickInput
+from trilat_net.core.step.vectors import Array
 from trilat_net.execution.resumption import read_output
 from trilat_net.execution.verify import verify
 from trilat_net.log.log_reader import Log

@@ -22,7 +22,7 @@ from tests.core.chain_references import (
     to_chain,
     torque_for,
 )
-from trilat_net.core.chain import (
+from trilat_net.core.arms.chain import (
     LINK_PARAMETERS,
     MAX_JOINTS,
     ChainJoint,

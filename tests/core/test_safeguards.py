@@ -22,9 +22,9 @@ from trilat_net.analysis.certificate.energy_balance import (
     compute_energy_balance,
     compute_site_energies,
 )
-from trilat_net.core.safeguards import BLEND_S
-from trilat_net.core.ticks import LifeReason
-from trilat_net.core.user_law import LawContext, LawInput
+from trilat_net.core.life.safeguards import BLEND_S
+from trilat_net.core.plug.user_law import LawContext, LawInput
+from trilat_net.core.step.ticks import LifeReason
 from trilat_net.errors import ScenarioError
 from trilat_net.execution.rerun import rerun
 from trilat_net.execution.verify import verify

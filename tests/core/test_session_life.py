@@ -6,8 +6,8 @@ import pytest
 import trilat_net
 from tests.core.guarded_runs import TEXT
 from tests.virtual_runs import sampled, trajectories
-from trilat_net.core.session_life import MIN_ALIGN_NS
-from trilat_net.core.ticks import LifeReason
+from trilat_net.core.life.session_life import MIN_ALIGN_NS
+from trilat_net.core.step.ticks import LifeReason
 from trilat_net.errors import ScenarioError
 from trilat_net.execution.verify import verify
 from trilat_net.log.log_reader import Log

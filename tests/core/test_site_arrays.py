@@ -6,10 +6,10 @@ import pytest
 from tests.core.channels import channel, due
 from tests.core.kinds import KINDS, POINTS
 from tests.core.sites import setup
-from trilat_net.core.channel import LOST
-from trilat_net.core.delay import MAX_DELAY_US, max_delay_us
-from trilat_net.core.link import calendar_pages
-from trilat_net.core.site_arrays import build_site_arrays, stack_site_arrays
+from trilat_net.core.links.channel import LOST
+from trilat_net.core.links.delay import MAX_DELAY_US, max_delay_us
+from trilat_net.core.links.link import calendar_pages
+from trilat_net.core.step.site_arrays import build_site_arrays, stack_site_arrays
 from trilat_net.scenario import load_scenario
 
 

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from tests.core.compiled import printed
 from tests.core.sites import VECTORS, bits, sample, setup, stepped
-from trilat_net.core.site_step import Site
-from trilat_net.core.ticks import MAX_ARRIVALS, Arrival, Mode, TickInput, TickRecord
+from trilat_net.core.step.site_step import Site
+from trilat_net.core.step.ticks import MAX_ARRIVALS, Arrival, Mode, TickInput, TickRecord
 from trilat_net.errors import ScenarioError
 from trilat_net.execution import virtual
 from trilat_net.scenario import load_scenario

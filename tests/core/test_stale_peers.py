@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 
 from tests.core.sites import setup, stepped
 from tests.virtual_runs import trajectories
-from trilat_net.core.delay import LinkModel
-from trilat_net.core.site_setup import LinkSetup, StaleAction, StaleRule
-from trilat_net.core.site_step import Site
-from trilat_net.core.ticks import Arrival, Mode, TickInput, TickRecord
+from trilat_net.core.links.delay import LinkModel
+from trilat_net.core.step.site_setup import LinkSetup, StaleAction, StaleRule
+from trilat_net.core.step.site_step import Site
+from trilat_net.core.step.ticks import Arrival, Mode, TickInput, TickRecord
 from trilat_net.scenario import load_scenario
 
 MS = 1_000_000

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from tests.core.task_sites import PLACE, POSE, build
-from trilat_net.core.chain import place_joints
-from trilat_net.core.rotation import (
+from trilat_net.core.arms.chain import place_joints
+from trilat_net.core.arms.rotation import (
     angular_velocity,
     arctan,
     relative_rotation,
@@ -16,10 +16,10 @@ from trilat_net.core.rotation import (
     rotation_vector,
     rotation_vector_rate,
 )
-from trilat_net.core.site_arrays import SiteArrays
-from trilat_net.core.site_setup import TaskSetup
-from trilat_net.core.task_space import update_pose, update_task_errors, update_wrench
-from trilat_net.core.vectors import Array, Row
+from trilat_net.core.arms.task_space import update_pose, update_task_errors, update_wrench
+from trilat_net.core.step.site_arrays import SiteArrays
+from trilat_net.core.step.site_setup import TaskSetup
+from trilat_net.core.step.vectors import Array, Row
 
 vectors = st.tuples(*[st.floats(-3.0, 3.0)] * 3)
 seeds = st.integers(0, 2**32 - 1)

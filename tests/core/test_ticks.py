@@ -5,7 +5,7 @@ from fractions import Fraction
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trilat_net.core.ticks import first_tick_at, tick_ns
+from trilat_net.core.step.ticks import first_tick_at, tick_ns
 
 rates = st.integers(1, 20_000)
 DAY_NS = 86_400 * 10**9

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from tests.core import physical_arms as physics
 from tests.core.physical_arms import Array, angles, links, speeds
-from trilat_net.core import two_link_arm
-from trilat_net.core.two_link_arm import ArmLinks, theta_from_links
+from trilat_net.core.arms import two_link_arm
+from trilat_net.core.arms.two_link_arm import ArmLinks, theta_from_links
 
 g_values = st.sampled_from([0.0, 1.62, 9.81])
 

@@ -8,7 +8,7 @@ import pytest
 
 from tests.execution.deliveries import TICKS
 from tests.log_editing import SHORT, edited, opened, recorded
-from trilat_net.core.ticks import PlantState
+from trilat_net.core.step.ticks import PlantState
 from trilat_net.execution import virtual
 from trilat_net.execution.rerun import Rerun
 from trilat_net.log.log_reader import Log

@@ -13,7 +13,7 @@ from tests.execution.deliveries import SITES, TICKS, delivered
 from tests.execution.logs import without_records
 from tests.log_editing import edited, opened, recorded, without
 from tests.log_surgery import Pieces, Stored, repacked, taken_apart
-from trilat_net.cli import options
+from trilat_net.app.cli import options
 from trilat_net.errors import LogError, ScenarioError
 from trilat_net.execution.log_checks import run_log_checks
 from trilat_net.execution.rerun import rerun

@@ -9,7 +9,7 @@ import pytest
 
 from tests.chains import six_joints
 from tests.log_editing import Record, edited, opened
-from trilat_net.core.chain import LINK_PARAMETERS
+from trilat_net.core.arms.chain import LINK_PARAMETERS
 from trilat_net.errors import LogError
 from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual import simulate_scenario, write_virtual_log

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tests.core.compiled import printed
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
 from trilat_net.analysis.metrics.measures import quantities
-from trilat_net.core.ticks import BUCKETS_PER_S, Mode, TickRecord
+from trilat_net.core.step.ticks import BUCKETS_PER_S, Mode, TickRecord
 from trilat_net.errors import LawFailed, ScenarioError
 from trilat_net.execution import virtual
 from trilat_net.execution.fused import FusedRun

@@ -10,8 +10,8 @@ from trilat_net.analysis.certificate.energy_balance import (
     compute_site_energies,
 )
 from trilat_net.analysis.torque_sources import compute_live_torque, split_torque
-from trilat_net.core.live_hand import HandCommand, HandMemory, advance_hand
-from trilat_net.core.site_step import Site
+from trilat_net.core.life.live_hand import HandCommand, HandMemory, advance_hand
+from trilat_net.core.step.site_step import Site
 from trilat_net.errors import ScenarioError
 from trilat_net.execution.rerun import rerun
 from trilat_net.execution.verify import verify

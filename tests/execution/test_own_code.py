@@ -8,8 +8,8 @@ import pytest
 
 import trilat_net as tn
 from tests.own_code import Follower
-from trilat_net.core.own_hand import HandView
-from trilat_net.core.site_step import Site
+from trilat_net.core.life.own_hand import HandView
+from trilat_net.core.step.site_step import Site
 from trilat_net.errors import CodeWithheld, PlantFailed, ScenarioError
 from trilat_net.execution.fused import FusedRun
 from trilat_net.execution.virtual import SimulatedLog, record_virtual, simulate_scenario

@@ -7,8 +7,8 @@ import pytest
 from tests.execution.deliveries import TICKS
 from tests.execution.logs import OTHER_PLATFORM, without_records
 from tests.log_editing import opened, recorded
-from trilat_net.core.site_step import Site
-from trilat_net.core.ticks import TickInput
+from trilat_net.core.step.site_step import Site
+from trilat_net.core.step.ticks import TickInput
 from trilat_net.execution.rerun import rerun
 from trilat_net.execution.resumption import RecordedInputs, read_output
 from trilat_net.execution.verify import verify

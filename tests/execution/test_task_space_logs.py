@@ -9,7 +9,7 @@ from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
 from trilat_net.analysis.run_end import classify_log_end
 from trilat_net.execution.fused import FusedRun
 from trilat_net.log.log_reader import Log
-from trilat_net.reporting.figures.registry import list_drawable_figures
+from trilat_net.presentation.figures.registry import list_drawable_figures
 from trilat_net.scenario import load_scenario, parse_scenario
 
 pytestmark = pytest.mark.long  # compiled for arms of seven joints that follow places

@@ -8,7 +8,7 @@ import pytest
 
 import trilat_net as tn
 from tests.certificate.adversaries import p_d, two_pairs
-from trilat_net.analysis.twin_growth import judge_twins
+from trilat_net.analysis.twins.twin_growth import judge_twins
 from trilat_net.errors import NotRepeatable, UsageError
 from trilat_net.execution.twins import (
     LARGEST,

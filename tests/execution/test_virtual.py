@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from tests.execution.deliveries import DUE, PEERS, SCENARIO, Sample, delivered
 from tests.log_editing import edited, opened, recorded
 from trilat_net import simulate
-from trilat_net.core.ticks import Arrival, TickRecord
+from trilat_net.core.step.ticks import Arrival, TickRecord
 from trilat_net.execution import virtual
 from trilat_net.execution.virtual_comparison import (
     compare_with_virtual,

@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trilat_net.core.ticks import MAX_ARRIVALS, Arrival, Mode, TickRecord
+from trilat_net.core.step.ticks import MAX_ARRIVALS, Arrival, Mode, TickRecord
 from trilat_net.execution.virtual_network import (
     Deliveries,
     RecordedNetwork,

@@ -10,9 +10,9 @@ from unittest import mock
 from sites.peer_monitor import PeerMonitor
 from sites.site_loop import PeerInbox
 from sites.site_process import RunningSite
-from trilat_net.core.site_setup import RestGains, SiteSetup, StaleAction
-from trilat_net.core.site_step import Site
-from trilat_net.core.ticks import Arrival, TickRecord
+from trilat_net.core.step.site_setup import RestGains, SiteSetup, StaleAction
+from trilat_net.core.step.site_step import Site
+from trilat_net.core.step.ticks import Arrival, TickRecord
 from trilat_net.log.log_writer import LogParts
 from trilat_net.net.membership import Epoch
 
@@ -60,7 +60,7 @@ def jumps_back() -> Iterator[None]:
             limits=unlimited, on_stale=setup.on_stale._replace(align_speed=1e9)
         )
 
-    with _with_setups(faster), mock.patch("trilat_net.core.session_life.MIN_ALIGN_NS", 1):
+    with _with_setups(faster), mock.patch("trilat_net.core.life.session_life.MIN_ALIGN_NS", 1):
         yield
 
 

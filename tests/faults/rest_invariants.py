@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from trilat_net.analysis.arm_rows import PlanarArmRows
-from trilat_net.core.site_setup import LEAST_STOP_S, SiteSetup
+from trilat_net.core.step.site_setup import LEAST_STOP_S, SiteSetup
 from trilat_net.net.messages import State
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.rest_bounds import find_rest_bounds

@@ -21,7 +21,7 @@ def options(command: click.Command, path: str = "trilat") -> dict[str, list[str]
 
 def all_options() -> dict[str, list[str]]:
     """Returns what `trilat` offers."""
-    from trilat_net.cli import app
+    from trilat_net.app.cli import app
 
     return options(typer.main.get_command(app))
 

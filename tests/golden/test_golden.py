@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trilat_net.api import simulate
-from trilat_net.core.fingerprint import compute_fingerprint
+from trilat_net.app.api import simulate
+from trilat_net.core.step.fingerprint import compute_fingerprint
 from trilat_net.execution.verify import TOLERANCE, verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import open_log

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from trilat_net.core.fingerprint import compute_fingerprint
+from trilat_net.core.step.fingerprint import compute_fingerprint
 
 from .digests import COMMAND, channel_digests
 

@@ -4,7 +4,7 @@ import pytest
 
 import trilat_net as tn
 from tests.cli.running import trilat
-from trilat_net.core.ticks import Mode
+from trilat_net.core.step.ticks import Mode
 from trilat_net.errors import RunFailed
 
 from .processes import PAPER, Session, Stage, connections, executed_again, whole

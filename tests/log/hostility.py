@@ -12,9 +12,9 @@ import lz4.frame
 import msgpack
 import zstandard
 
-from recorder.play.session_reader import PlaySelection, preload_messages
 from tests.log_editing import edited
 from trilat_net.analysis.file_overview import info
+from trilat_net.app.play.session_reader import PlaySelection, preload_messages
 from trilat_net.errors import TrilatError
 from trilat_net.execution.verify import verify
 from trilat_net.log.log_reader import open_log

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-from trilat_net.core.ticks import TickRecord
+from trilat_net.core.step.ticks import TickRecord
 from trilat_net.execution import virtual
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.log_writer import LogParts, LogStorage, LogWriter
@@ -11,7 +11,7 @@ from trilat_net.log.mcap_writer import Sink
 from trilat_net.log.recover import recover
 from trilat_net.net.messages import Event, LinkStats, State
 from trilat_net.net.wire import decode, encode, encode_state
-from trilat_net.reporting.exports.ros2 import export_ros2
+from trilat_net.presentation.exports.ros2 import export_ros2
 from trilat_net.scenario import load_scenario
 
 EPOCH_NS = 1_700_000_000_000_000_000

@@ -13,8 +13,8 @@ import pytest
 from tests.analysis import logs
 from tests.log.dealt import a_file, changed, messages
 from tests.log_editing import edited, opened, recorded
-from trilat_net.core.site_setup import Layout
-from trilat_net.core.ticks import NS_PER_S
+from trilat_net.core.step.site_setup import Layout
+from trilat_net.core.step.ticks import NS_PER_S
 from trilat_net.errors import LogError, UsageError
 from trilat_net.files import format_extra_install
 from trilat_net.log.data_tables import (

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from tests.log_editing import edited
-from trilat_net.core.site_step import Site
-from trilat_net.core.ticks import first_tick_at, tick_ns
+from trilat_net.core.step.site_step import Site
+from trilat_net.core.step.ticks import first_tick_at, tick_ns
 from trilat_net.errors import ScenarioError
 from trilat_net.execution import virtual
 from trilat_net.execution.virtual_network import RecordedNetwork

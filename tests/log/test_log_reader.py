@@ -13,7 +13,7 @@ from mcap.writer import Writer
 
 from tests.log.dealt import foreign
 from tests.log_editing import edited, opened, recorded
-from trilat_net.core.fingerprint import compute_fingerprint
+from trilat_net.core.step.fingerprint import compute_fingerprint
 from trilat_net.errors import LogError
 from trilat_net.execution import virtual
 from trilat_net.log.log_reader import open_log

@@ -16,7 +16,7 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 
-from trilat_net.core.ticks import Mode
+from trilat_net.core.step.ticks import Mode
 from trilat_net.log.log_reader import Log, open_log
 
 from .dealt import messages

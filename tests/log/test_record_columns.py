@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from trilat_net.core.site_setup import Layout
-from trilat_net.core.ticks import Mode
+from trilat_net.core.step.site_setup import Layout
+from trilat_net.core.step.ticks import Mode
 from trilat_net.errors import WireError
 from trilat_net.log import record_columns
 from trilat_net.log.site_log import SiteLog

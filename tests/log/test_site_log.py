@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from trilat_net.core.site_setup import Layout
+from trilat_net.core.step.site_setup import Layout
 from trilat_net.log import site_log
 from trilat_net.log.site_log import LazyRecords, RecordsByTick, compute_task_errors
 from trilat_net.net.messages import State

@@ -17,7 +17,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from tests.log.dealt import messages
-from trilat_net.core.ticks import Mode, TickRecord
+from trilat_net.core.step.ticks import Mode, TickRecord
 from trilat_net.execution import virtual
 from trilat_net.log.log_writer import LogWriter
 from trilat_net.log.ros2.ros2_messages import stack_signals

@@ -8,8 +8,8 @@ import msgspec
 import pytest
 
 from sites.change_server import ChangeServer
-from sites.running_session import RunningSession
 from tests.net.manual_clock import ManualClock
+from trilat_net.app.running_session import RunningSession
 from trilat_net.errors import SessionError
 from trilat_net.net import discovery, topics
 from trilat_net.net.clock import SystemClock

@@ -19,7 +19,7 @@ import pytest
 from cryptography import x509
 
 from tests.cli.running import trilat
-from trilat_net.cli.options import check_session_name
+from trilat_net.app.cli.options import check_session_name
 from trilat_net.errors import LogRefused, ScenarioError, UsageError
 from trilat_net.net import member_keys, topics
 from trilat_net.net.bus import Bus

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.net.manual_clock import ManualClock
-from trilat_net.core.ticks import tick_ns
+from trilat_net.core.step.ticks import tick_ns
 from trilat_net.net.clock import SkewedClock
 from trilat_net.net.messages import VERSION, LinkStats, PeerSample
 from trilat_net.net.offset import OffsetEstimate, OffsetEstimator, exact_offset

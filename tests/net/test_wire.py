@@ -13,8 +13,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from trilat_net.core.site_setup import Layout
-from trilat_net.core.ticks import Arrival, Mode, TickRecord
+from trilat_net.core.step.site_setup import Layout
+from trilat_net.core.step.ticks import Arrival, Mode, TickRecord
 from trilat_net.errors import WireError
 from trilat_net.net.bus import BoundedRing
 from trilat_net.net.membership import read_records

@@ -8,8 +8,8 @@ from typing import Any
 from live.experiment_sessions import ExperimentSessions
 from live.experiment_stage import Stage, TrialWatch
 from live.page_orders import DoStep
-from sites.demo_session import SessionResult
 from tests.net.manual_clock import ManualClock
+from trilat_net.app.demo_session import SessionResult
 from trilat_net.studies.experiment.experiment_run import Experiment
 from trilat_net.studies.experiment.trial_run import SyntheticTrial
 

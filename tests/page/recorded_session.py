@@ -15,11 +15,11 @@ from playwright.sync_api import Browser, Page, WebSocketRoute
 from live.experiment_stage import Stage
 from live.session_frames import SessionFrames, render_event
 from live.session_view import SessionView
-from sites.running_session import open_hand
 from tests.live.page_client import with_query
 from tests.net.waiting import until
 from tests.sites.relay import RelayClock
 from tests.sites.sessions import SESSION, Session
+from trilat_net.app.running_session import open_hand
 from trilat_net.net.bus import Bus
 from trilat_net.scenario import Scenario, load_scenario
 

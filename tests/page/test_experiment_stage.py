@@ -10,14 +10,14 @@ import pytest
 from live.experiment_stage import END_DELAY_NS, MAX_ABSENCE_NS, Stage, TrialWatch
 from live.page_orders import AbortTrial, DoStep
 from live.page_server import PageServer
-from sites.demo_session import SessionResult
 from tests.live.page_client import page_client, with_query
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from tests.net.waiting import until
 from tests.studies.experiment.experiments import APART, REACH, write_protocol
 from trilat_net.analysis.certificate.running_energy import RecordWindow
-from trilat_net.core.ticks import NS_PER_S
+from trilat_net.app.demo_session import SessionResult
+from trilat_net.core.step.ticks import NS_PER_S
 from trilat_net.errors import LogRefused, UsageError
 from trilat_net.execution.verify import verify
 from trilat_net.log.log_reader import open_log

@@ -10,7 +10,7 @@ from tests.live.browsers import needs_browser
 from tests.live.page_client import with_query
 from tests.net.local_bus import LocalNetwork
 from tests.net.waiting import until
-from trilat_net.core.ticks import LifeReason, find_alarm
+from trilat_net.core.step.ticks import LifeReason, find_alarm
 from trilat_net.net.clock import SystemClock
 
 from .recorded_session import ROLES, SCREENS, RecordedSession, record_session

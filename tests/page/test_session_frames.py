@@ -10,11 +10,11 @@ import pytest
 from live.session_frames import SessionFrames
 from live.session_view import SessionView
 from live.terminal_watch import SessionWatch
-from sites.monitor import describe_angles
-from sites.running_session import RunningSession
 from tests.sites.relay import RelayClock
 from tests.sites.sessions import SESSION, Session
 from trilat_net.analysis.arm_rows import build_arm_rows, joint_positions_m
+from trilat_net.app.monitor import describe_angles
+from trilat_net.app.running_session import RunningSession
 from trilat_net.log.log_reader import Log
 from trilat_net.net.bus import Bus
 from trilat_net.net.connection import Connection

@@ -5,7 +5,7 @@ from recorder.site_reception import AWAY_NS
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from trilat_net.analysis.certificate.running_energy import RecordWindow
-from trilat_net.core.ticks import NS_PER_S
+from trilat_net.core.step.ticks import NS_PER_S
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
 from trilat_net.net.membership import liveliness_token

@@ -5,7 +5,7 @@ from pathlib import Path
 from playwright.sync_api import Browser
 
 from tests.live.browsers import needs_browser
-from trilat_net import reporting
+from trilat_net import presentation as reporting
 
 from .whole_pages import watched_page
 

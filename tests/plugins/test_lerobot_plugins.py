@@ -13,9 +13,9 @@ import polars as pl
 import pytest
 
 import trilat_net
-from sites.running_session import open_hand
 from tests.sites.relay import RelayClock
 from tests.sites.sessions import SESSION, Session, reached
+from trilat_net.app.running_session import open_hand
 from trilat_net.net.bus import Bus
 from trilat_net.scenario import load_scenario
 

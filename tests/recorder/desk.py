@@ -12,8 +12,8 @@ from recorder.site_reception import InboundQueue
 from tests.net import parties
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
-from trilat_net.core.site_step import Site
-from trilat_net.core.ticks import TickInput
+from trilat_net.core.step.site_step import Site
+from trilat_net.core.step.ticks import TickInput
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.log.log_writer import LogWriter
 from trilat_net.net import topics

@@ -13,8 +13,8 @@ from recorder.session_recording import LAST_NS, RECONNECT_NS, SETTLE_NS
 from recorder.site_reception import AWAY_NS, EVENT_BYTES
 from tests.net.local_bus import LocalNetwork
 from tests.sites.relay import Relay, RelayClock
-from trilat_net.core.site_step import Site
-from trilat_net.core.ticks import TickInput
+from trilat_net.core.step.site_step import Site
+from trilat_net.core.step.ticks import TickInput
 from trilat_net.execution.verify import verify
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.log_writer import LogStorage

@@ -6,9 +6,9 @@ from tests.analysis import logs
 from tests.analysis.certificate import runs
 from trilat_net.analysis.metrics.log_metrics import LogMetrics, compute_log_metrics
 from trilat_net.analysis.metrics.measures import Metric, quantities
-from trilat_net.reporting import brief_text
-from trilat_net.reporting.certificate_text import CertificateLine, describe_certificate
-from trilat_net.reporting.result_text import TextTable, compose
+from trilat_net.presentation import brief_text
+from trilat_net.presentation.certificate_text import CertificateLine, describe_certificate
+from trilat_net.presentation.result_text import TextTable, compose
 
 
 def key_rows(metrics: LogMetrics) -> dict[str, list[str]]:

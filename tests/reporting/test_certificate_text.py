@@ -9,8 +9,8 @@ import pytest
 from tests.analysis import logs
 from tests.analysis.certificate import runs
 from trilat_net.analysis.certificate.stability_certificate import certify
-from trilat_net.reporting.certificate_text import describe_certificate, list_energies
-from trilat_net.reporting.figures.certificate_energy import draw_functional
+from trilat_net.presentation.certificate_text import describe_certificate, list_energies
+from trilat_net.presentation.figures.certificate_energy import draw_functional
 
 LOGS = {
     "free": lambda: runs.run("free", {"duration_s": 4.0, "rate_hz": 200}).log,

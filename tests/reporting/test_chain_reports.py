@@ -12,10 +12,10 @@ from tests.core.chain_references import chain_references
 from trilat_net.execution.virtual import simulate_scenario
 from trilat_net.log.log_reader import Log
 from trilat_net.log.ros2.ros2_messages import Ros2SiteChannels
-from trilat_net.reporting import charts
-from trilat_net.reporting.appearance import REPORT_SIZE, make_print_size
-from trilat_net.reporting.figures import arm_poses, joint_motion
-from trilat_net.reporting.style import arrange_joints
+from trilat_net.presentation import charts
+from trilat_net.presentation.appearance import REPORT_SIZE, make_print_size
+from trilat_net.presentation.figures import arm_poses, joint_motion
+from trilat_net.presentation.style import arrange_joints
 from trilat_net.scenario import parse_scenario
 
 from .drawn_words import misplaced

@@ -10,8 +10,8 @@ import trilat_net as tn
 from tests.analysis import logs
 from tests.task_arms import planar_task
 from trilat_net.errors import UnknownName, UsageError
-from trilat_net.reporting import style
-from trilat_net.reporting.column_plot import DEFAULT_QUANTITIES
+from trilat_net.presentation import style
+from trilat_net.presentation.column_plot import DEFAULT_QUANTITIES
 
 
 def titles(figure):

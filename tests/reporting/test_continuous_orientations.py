@@ -19,7 +19,6 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 import trilat_net as tn
-from sites.ros2_topics import BridgeEnds, SiteTopics
 from tests.turning import (
     ALLOWED,
     CASE,
@@ -33,7 +32,8 @@ from tests.turning import (
     turn,
 )
 from trilat_net.analysis.body_turns import BodyTurns
-from trilat_net.core.vectors import Array
+from trilat_net.app.ros2_topics import BridgeEnds, SiteTopics
+from trilat_net.core.step.vectors import Array
 from trilat_net.log.data_tables import to_pandas_frame
 from trilat_net.log.log_reader import Log
 from trilat_net.log.orientations import (

@@ -19,7 +19,7 @@ from tests.analysis import logs
 from tests.log_editing import opened, recorded
 from trilat_net.log.log_reader import Log
 from trilat_net.net.messages import Event
-from trilat_net.reporting.export import Exporter
+from trilat_net.presentation.export import Exporter
 from trilat_net.scenario import parse_scenario
 
 

@@ -13,9 +13,9 @@ from tests.task_arms import planar_task
 from trilat_net.analysis import site_signals
 from trilat_net.analysis.timeline import find_mode_intervals
 from trilat_net.errors import UsageError
-from trilat_net.reporting import style
-from trilat_net.reporting.appearance import SITE_COLOURS, list_site_colours
-from trilat_net.reporting.figures import (
+from trilat_net.presentation import style
+from trilat_net.presentation.appearance import SITE_COLOURS, list_site_colours
+from trilat_net.presentation.figures import (
     age_and_lateness,
     arm_poses,
     joint_motion,

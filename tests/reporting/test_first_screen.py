@@ -9,11 +9,11 @@ from playwright.sync_api import Browser, Page
 from tests.analysis import logs
 from tests.live.browsers import needs_browser
 from tests.page.whole_pages import grave_findings, watched_page
-from trilat_net import reporting
+from trilat_net import presentation as reporting
 from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net.log.findings import Finding
-from trilat_net.reporting.appearance import DARK_SITE_COLOURS, SITE_COLOURS
-from trilat_net.reporting.page import write_report
+from trilat_net.presentation.appearance import DARK_SITE_COLOURS, SITE_COLOURS
+from trilat_net.presentation.page import write_report
 
 from .varied_runs import VARIED
 

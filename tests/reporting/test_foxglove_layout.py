@@ -13,7 +13,7 @@ import trilat_net as tn
 from tests.cli.running import trilat
 from tests.task_arms import planar_task
 from trilat_net.errors import UsageError
-from trilat_net.reporting.viewer_files import write_foxglove_layout
+from trilat_net.presentation.viewer_files import write_foxglove_layout
 
 PATH = re.compile(r"(?P<topic>(/\w+)+)\.(?P<fields>[\w.]+)(\[(?P<index>\d+)\])?")
 """What our layouts use of the syntax of message paths: /topic.field.field[0]."""

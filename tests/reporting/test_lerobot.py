@@ -20,7 +20,7 @@ from tests.task_arms import planar_task, posed_arms
 from trilat_net.errors import LogError, UsageError
 from trilat_net.log.log_reader import Log
 from trilat_net.net.messages import State
-from trilat_net.reporting.export import Exporter
+from trilat_net.presentation.export import Exporter
 from trilat_net.scenario import parse_scenario
 
 FILE = "chunk-000/file-000.parquet"

@@ -5,14 +5,14 @@ from pathlib import Path
 import pytest
 
 from tests.dropped_files import look
-from trilat_net.reporting.figures.figure_entry import draws
-from trilat_net.reporting.figures.registry import FIGURES
+from trilat_net.presentation.figures.figure_entry import draws
+from trilat_net.presentation.figures.registry import FIGURES
 
 FIGURE = """
 import numpy as np
 
-from trilat_net.reporting import style
-from trilat_net.reporting.figures.figure_entry import draws
+from trilat_net.presentation import style
+from trilat_net.presentation.figures.figure_entry import draws
 
 
 @draws("haste", "speeds over time", in_report=True)
@@ -24,7 +24,7 @@ def draw_haste(log, form):
     return plot.figure
 """
 FORMAT = """
-from trilat_net.reporting.export import ExportFormat
+from trilat_net.presentation.export import ExportFormat
 
 
 def _write(log, path, written):
@@ -38,13 +38,13 @@ LOOK = """
 import contextlib, io, json, os, sys
 from pathlib import Path
 os.environ["COLUMNS"] = "200"
-import trilat_net.reporting.exports
-import trilat_net.reporting.figures
-for room in (trilat_net.reporting.exports, trilat_net.reporting.figures):
+import trilat_net.presentation.exports
+import trilat_net.presentation.figures
+for room in (trilat_net.presentation.exports, trilat_net.presentation.figures):
     room.__path__.append(sys.argv[1] + "/" + room.__name__.rsplit(".", 1)[1])
 import trilat_net as tn
-from trilat_net.cli import app
-from trilat_net.cli.options import complete_figures
+from trilat_net.app.cli import app
+from trilat_net.app.cli.options import complete_figures
 
 def run(*words):
     said = io.StringIO()

@@ -15,13 +15,13 @@ from trilat_net.analysis import site_signals
 from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net.analysis.file_overview import summarise_run
 from trilat_net.log.findings import Finding
-from trilat_net.reporting.figures.registry import (
+from trilat_net.presentation.figures.registry import (
     FIGURES,
     list_drawable_figures,
     write_report_figures,
 )
-from trilat_net.reporting.page import render_report, write_report
-from trilat_net.reporting.result_text import TextTable
+from trilat_net.presentation.page import render_report, write_report
+from trilat_net.presentation.result_text import TextTable
 
 VERDICTS = [
     Finding("records", "all <b>there</b>", True),

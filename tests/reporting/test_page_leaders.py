@@ -16,9 +16,9 @@ from tests.page.whole_pages import watched_page
 from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net.analysis.dominance_history import trace_dominance
 from trilat_net.log.log_reader import Log
-from trilat_net.reporting.charts import ChartBuilder
-from trilat_net.reporting.page import write_report
-from trilat_net.reporting.page_leaders import (
+from trilat_net.presentation.charts import ChartBuilder
+from trilat_net.presentation.page import write_report
+from trilat_net.presentation.page_leaders import (
     describe_leads,
     describe_phases,
     render_lead_bars,

@@ -15,7 +15,7 @@ from trilat_net.analysis.site_signals import SETTLED_ERROR_RAD
 from trilat_net.analysis.stability_decision import LoopRoots
 from trilat_net.log.findings import Finding
 from trilat_net.log.log_reader import Log
-from trilat_net.reporting.page_summary import (
+from trilat_net.presentation.page_summary import (
     describe_basis,
     find_error_peak,
     render_checks,

@@ -4,7 +4,7 @@ from tests.analysis import logs
 from tests.core.guarded_runs import stopped_log
 from trilat_net.analysis.file_overview import summarise_run
 from trilat_net.log.log_reader import Log
-from trilat_net.reporting.page_timeline import MAX_SHOWN, list_moments, render_timeline
+from trilat_net.presentation.page_timeline import MAX_SHOWN, list_moments, render_timeline
 
 
 def sentences(log: Log) -> list[str]:

@@ -5,10 +5,13 @@ import numpy as np
 import pytest
 
 from tests.theory.analysed_ports import section_of
-from trilat_net.reporting.appearance import REPORT_SIZE, FigureSize, make_print_size
-from trilat_net.reporting.figures.linear_figures import draw_port_impedance, draw_port_passivity
-from trilat_net.reporting.linear_text import describe_ports
-from trilat_net.theory.port_analysis import ports_to_json
+from trilat_net.analysis.theory.port_analysis import ports_to_json
+from trilat_net.presentation.appearance import REPORT_SIZE, FigureSize, make_print_size
+from trilat_net.presentation.figures.linear_figures import (
+    draw_port_impedance,
+    draw_port_passivity,
+)
+from trilat_net.presentation.linear_text import describe_ports
 
 
 def test_what_is_passive_is_said_in_a_word_each() -> None:

@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 
 from tests.analysis.certificate import runs
+from trilat_net.analysis.judge import certify_run
 from trilat_net.analysis.stability_decision import LoopRoots
-from trilat_net.reporting.certificate_text import describe_certificate, describe_theorem
-from trilat_net.theory.run_certificate import certify_run
+from trilat_net.presentation.certificate_text import describe_certificate, describe_theorem
 
 
 @pytest.mark.parametrize(

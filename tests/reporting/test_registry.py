@@ -11,15 +11,15 @@ from matplotlib.text import Text
 import trilat_net
 from tests.analysis import logs
 from trilat_net.errors import UsageError
-from trilat_net.reporting.appearance import COLUMN_IN, PAGE_IN, make_print_size
-from trilat_net.reporting.figures import age_and_lateness, joint_motion
-from trilat_net.reporting.figures.registry import (
+from trilat_net.presentation.appearance import COLUMN_IN, PAGE_IN, make_print_size
+from trilat_net.presentation.figures import age_and_lateness, joint_motion
+from trilat_net.presentation.figures.registry import (
     FIGURES,
     figure,
     list_drawable_figures,
     write_figures,
 )
-from trilat_net.reporting.style import FIGURE_FORMATS, write_figure
+from trilat_net.presentation.style import FIGURE_FORMATS, write_figure
 
 from .drawn_words import misplaced
 

@@ -13,7 +13,7 @@ from tests.page.whole_pages import WatchedPage, watched_page
 from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net.analysis.file_overview import summarise_run
 from trilat_net.log.log_reader import Log
-from trilat_net.reporting.page import render_report, write_report
+from trilat_net.presentation.page import render_report, write_report
 from trilat_net.scenario.delay_models import DELAY_MODELS
 from trilat_net.scenario.laws import LAWS
 

@@ -17,8 +17,8 @@ from trilat_net.files import format_extra_install
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.log.ros2.cdr import JOINT_STATE
 from trilat_net.log.ros2.ros2_messages import Ros2Channel, read_ros2_channels
-from trilat_net.reporting import rerun_viewer
-from trilat_net.reporting.rerun_viewer import (
+from trilat_net.presentation import rerun_viewer
+from trilat_net.presentation.rerun_viewer import (
     PlotLayout,
     ViewerOptions,
     build_plot_layout,

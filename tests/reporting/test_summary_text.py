@@ -13,13 +13,13 @@ import trilat_net
 from tests.analysis import logs
 from tests.core.guarded_runs import stopped_log
 from trilat_net.analysis.link_summary import summarise_clock
-from trilat_net.core.site_setup import Layout
-from trilat_net.core.ticks import LifeReason, find_alarm
+from trilat_net.core.step.site_setup import Layout
+from trilat_net.core.step.ticks import LifeReason, find_alarm
 from trilat_net.net.messages import Event, LinkStats
-from trilat_net.reporting import summary_text
-from trilat_net.reporting.page_summary import render_alarms
-from trilat_net.reporting.result_text import TextTable
-from trilat_net.reporting.summary_text import (
+from trilat_net.presentation import summary_text
+from trilat_net.presentation.page_summary import render_alarms
+from trilat_net.presentation.result_text import TextTable
+from trilat_net.presentation.summary_text import (
     MOST_LINE_CHARACTERS,
     format_clock_lines,
     format_link_lines,

@@ -25,9 +25,9 @@ from trilat_net.execution.virtual import write_virtual_log
 from trilat_net.log.data_tables import to_data_frame
 from trilat_net.log.log_reader import Log
 from trilat_net.log.ros2.ros2_messages import read_ros2_channels
-from trilat_net.reporting.export import Exporter
-from trilat_net.reporting.exports.ros2 import export_ros2
-from trilat_net.reporting.rerun_viewer import ViewerOptions, open_rerun
+from trilat_net.presentation.export import Exporter
+from trilat_net.presentation.exports.ros2 import export_ros2
+from trilat_net.presentation.rerun_viewer import ViewerOptions, open_rerun
 from trilat_net.scenario import parse_scenario
 
 HEADS = {

@@ -13,7 +13,7 @@ import trilat_net
 from tests.core.chain_references import chain_references
 from tests.scenario.chains import SIX, six
 from trilat_net.analysis.arm_rows import joint_positions_m
-from trilat_net.core.site_setup import MotionLimits
+from trilat_net.core.step.site_setup import MotionLimits
 from trilat_net.errors import ScenarioError
 from trilat_net.execution.verify import verify
 from trilat_net.scenario import load_scenario, parse_embedded

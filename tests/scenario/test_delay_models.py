@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from tests.core.channels import Ints, channel, due
 from tests.scenario.links import links
-from trilat_net.core.channel import LOST
-from trilat_net.core.delay import MAX_DELAY_US, DelayKind
+from trilat_net.core.links.channel import LOST
+from trilat_net.core.links.delay import MAX_DELAY_US, DelayKind
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.delay_models import DELAY_MODELS, LinkBase

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trilat_net.core.channel import LOST
-from trilat_net.core.delay import MAX_DELAY_US, TraceEnd
+from trilat_net.core.links.channel import LOST
+from trilat_net.core.links.delay import MAX_DELAY_US, TraceEnd
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import load_scenario, parse_scenario
 from trilat_net.scenario.delay_traces import (

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 import tests.laws
-from trilat_net.core.law_channel import LawChannel, SentVector
-from trilat_net.core.site_step import Site
+from trilat_net.core.plug.law_channel import LawChannel, SentVector
+from trilat_net.core.step.site_step import Site
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import Scenario, load_scenario, parse_scenario
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.scenario.chains import six
-from trilat_net.core.chain import Matrix
+from trilat_net.core.arms.chain import Matrix
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import Scenario, load_scenario, parse_embedded
 from trilat_net.scenario.describe import describe_scenario, list_arm_notes

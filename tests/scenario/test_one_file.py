@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from tests.core.channels import channel, due
 from tests.dropped_files import look, put_beside
-from trilat_net.core.exogenous import torque_on_arm, torque_source_rows
+from trilat_net.core.arms.exogenous import torque_on_arm, torque_source_rows
 from trilat_net.scenario.delay_models import DELAY_MODELS
 from trilat_net.scenario.delay_models.low_orbit import LowOrbit
 from trilat_net.scenario.operators import ENVIRONMENTS, OPERATORS, OwnActor
@@ -21,7 +21,7 @@ OPERATOR = """
 import numpy as np
 
 from trilat_net import fields
-from trilat_net.core.elementary import sincos
+from trilat_net.core.arms.elementary import sincos
 from trilat_net.scenario.operators import OwnActor
 
 
@@ -42,7 +42,7 @@ class Tremor(OwnActor, frozen=True, kw_only=True, tag="tremor"):
         return np.array(self.stiffness_nm_rad) * (target - at)
 """
 DELAY = """
-from trilat_net.core.delay import draw_pair
+from trilat_net.core.links.delay import draw_pair
 from trilat_net.scenario.delay_models import Milliseconds, OwnDelay
 
 

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.scenario.links import links
-from trilat_net.core.delay import DelayKind, LinkModel
-from trilat_net.core.ticks import DominanceRamp, first_tick_at
+from trilat_net.core.links.delay import DelayKind, LinkModel
+from trilat_net.core.step.ticks import DominanceRamp, first_tick_at
 from trilat_net.errors import ScenarioError
 from trilat_net.execution import virtual
 from trilat_net.scenario import (

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import trilat_net as tn
-from trilat_net.core.philox import link_key
+from trilat_net.core.links.philox import link_key
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.sample_uses import PictureDelay, draw_used_samples

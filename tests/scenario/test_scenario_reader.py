@@ -9,9 +9,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from trilat_net.core.delay import LinkModel
-from trilat_net.core.exogenous import TorqueKind, TorqueSource
-from trilat_net.core.site_setup import Gains, Law, StaleAction, StaleRule
+from trilat_net.core.arms.exogenous import TorqueKind, TorqueSource
+from trilat_net.core.links.delay import LinkModel
+from trilat_net.core.step.site_setup import Gains, Law, StaleAction, StaleRule
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import (
     apply_overrides,

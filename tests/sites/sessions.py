@@ -10,10 +10,10 @@ import msgpack
 
 from recorder.record_process import Recorder
 from sites import realtime
-from sites.running_session import RunningSession
 from sites.site_parts import SiteOptions, SiteParts
 from sites.site_process import join_and_run
 from tests.net.local_bus import LocalNetwork
+from trilat_net.app.running_session import RunningSession
 from trilat_net.errors import LogRefused, RunFailed, SessionError
 from trilat_net.execution import virtual
 from trilat_net.log.log_reader import Log, open_log

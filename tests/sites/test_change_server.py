@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from sites.change_server import AHEAD_MS, MARKS_WAITING, MIN_RAMP_S, ChangeServer
 from tests.net.local_bus import LocalNetwork
-from trilat_net.core.site_arrays import MAX_CHANGES, MAX_RAMPS
-from trilat_net.core.site_step import Site
-from trilat_net.core.ticks import CoreChange, Mode, TickInput
+from trilat_net.core.step.site_arrays import MAX_CHANGES, MAX_RAMPS
+from trilat_net.core.step.site_step import Site
+from trilat_net.core.step.ticks import CoreChange, Mode, TickInput
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus, Inbox
 from trilat_net.net.requests import ChangeReply, ChangeRequest

@@ -16,8 +16,8 @@ from sites.code_watchdog import (
 )
 from tests.core.sites import setup
 from tests.net.manual_clock import ManualClock
-from trilat_net.core.site_step import Site
-from trilat_net.core.ticks import TickInput
+from trilat_net.core.step.site_step import Site
+from trilat_net.core.step.ticks import TickInput
 from trilat_net.errors import LawFailed
 from trilat_net.net.clock import SystemClock
 

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from sites.demo_session import ProcessStarter, SessionProcess
 from tests.cli.running import trilat
 from tests.live.processes import is_running
 from tests.net.waiting import until
+from trilat_net.app.demo_session import ProcessStarter, SessionProcess
 from trilat_net.scenario.scenario_reader import read_shipped
 from trilat_net.scenario.skeletons import name_skeleton_class
 

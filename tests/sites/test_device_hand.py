@@ -11,7 +11,7 @@ import pytest
 from sites.devices import DeviceState
 from sites.devices.haply_inverse3 import SILENCE_S
 from tests.documentation import find_blocks
-from trilat_net.core.live_hand import SILENCE_NS
+from trilat_net.core.life.live_hand import SILENCE_NS
 from trilat_net.errors import UsageError
 from trilat_net.execution.verify import verify
 from trilat_net.log.log_reader import Log

@@ -12,17 +12,17 @@ from types import SimpleNamespace
 
 import pytest
 
-from sites import doctor
-from sites.doctor import (
+from tests.cli.running import trilat
+from tests.net.manual_clock import ManualClock
+from tests.other_systems import replace_os
+from trilat_net.app import doctor
+from trilat_net.app.doctor import (
     examine_clock,
     examine_keys,
     examine_links,
     examine_machine,
     examine_room,
 )
-from tests.cli.running import trilat
-from tests.net.manual_clock import ManualClock
-from tests.other_systems import replace_os
 from trilat_net.net.clock import SystemClock
 from trilat_net.net.connection import Connection, find_free_endpoints
 from trilat_net.net.member_keys import create_keys, read_member_keys

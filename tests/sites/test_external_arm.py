@@ -24,8 +24,8 @@ from sites.external_arm import (
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
 from tests.scenario.chains import six
-from trilat_net.core.site_step import Site
-from trilat_net.core.ticks import LifeReason, Mode, TickInput
+from trilat_net.core.step.site_step import Site
+from trilat_net.core.step.ticks import LifeReason, Mode, TickInput
 from trilat_net.errors import ScenarioError, SessionError
 from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual

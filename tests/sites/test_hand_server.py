@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from sites.hand_server import MESSAGES_KEPT, HandServer
-from sites.running_session import open_hand
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
-from trilat_net.core.live_hand import ANOTHER_HOLDS, HandInForce, empty_hand_vector
+from trilat_net.app.running_session import open_hand
+from trilat_net.core.life.live_hand import ANOTHER_HOLDS, HandInForce, empty_hand_vector
 from trilat_net.errors import UsageError
 from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual

@@ -9,8 +9,8 @@ import pytest
 
 from sites.site_loop import PeerInbox, StateBlock, run_loop
 from tests.net.manual_clock import ManualClock
-from trilat_net.core.site_step import Site
-from trilat_net.core.ticks import Arrival, Mode, TickInput, TickRecord
+from trilat_net.core.step.site_step import Site
+from trilat_net.core.step.ticks import Arrival, Mode, TickInput, TickRecord
 from trilat_net.errors import SessionError
 from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual

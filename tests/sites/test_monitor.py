@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 
 import trilat_net
-from sites.monitor import LINES_NS, SessionDisplay, SessionMonitor
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
-from trilat_net.core.site_step import Site
-from trilat_net.core.ticks import TickInput
+from trilat_net.app.monitor import LINES_NS, SessionDisplay, SessionMonitor
+from trilat_net.core.step.site_step import Site
+from trilat_net.core.step.ticks import TickInput
 from trilat_net.net import topics
 from trilat_net.net.messages import Event
 from trilat_net.net.timing import LoopStats
 from trilat_net.net.wire import encode
-from trilat_net.reporting.terminal_output import TextConsole
+from trilat_net.presentation.terminal_output import TextConsole
 from trilat_net.scenario import load_scenario
 
 SCENARIO = load_scenario("paper")

@@ -6,7 +6,10 @@ import threading
 import pytest
 
 import trilat_net as tn
-from sites.network_benchmark import (
+from tests.cli.running import trilat
+from tests.json_outline import is_documented
+from tests.net.local_bus import LocalNetwork
+from trilat_net.app.network_benchmark import (
     SESSION,
     NearEnd,
     NetworkBenchmark,
@@ -16,9 +19,6 @@ from sites.network_benchmark import (
     ping_benchmark,
     run_far_end,
 )
-from tests.cli.running import trilat
-from tests.json_outline import is_documented
-from tests.net.local_bus import LocalNetwork
 from trilat_net.net import topics
 from trilat_net.net.connection import find_free_endpoints
 from trilat_net.results import Result

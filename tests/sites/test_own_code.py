@@ -8,7 +8,7 @@ import pytest
 
 from sites.hand_process import HandProcess
 from tests.own_code import Circle, Failing, Follower
-from trilat_net.core.own_hand import HandProgram, HandView
+from trilat_net.core.life.own_hand import HandProgram, HandView
 from trilat_net.errors import PlantFailed, RunFailed
 from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual import simulate_scenario

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from sites.site_loop import PeerInbox, make_sample_readers
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
-from trilat_net.core.link import AHEAD_LIMIT_NS
-from trilat_net.core.site_setup import LinkSetup
-from trilat_net.core.ticks import MAX_ARRIVALS
+from trilat_net.core.links.link import AHEAD_LIMIT_NS
+from trilat_net.core.step.site_setup import LinkSetup
+from trilat_net.core.step.ticks import MAX_ARRIVALS
 from trilat_net.net.messages import VERSION
 from trilat_net.net.offset import exact_offset
 from trilat_net.net.timing import LinkTimingMonitor, PeerClock, SentStamps

@@ -14,7 +14,7 @@ from sites.retransmit_buffer import (
     RetransmitBuffer,
 )
 from tests.net.local_bus import LocalNetwork
-from trilat_net.core.site_setup import Layout
+from trilat_net.core.step.site_setup import Layout
 from trilat_net.net import topics
 from trilat_net.net.bus import Inbox
 from trilat_net.net.messages import VERSION

@@ -20,7 +20,13 @@ from ruamel.yaml import YAML
 from scipy.spatial.transform import Rotation
 
 import trilat_net
-from sites.ros2_bridge import (
+from tests.log.standard_files import made
+from tests.net.local_bus import LocalNetwork
+from tests.net.manual_clock import ManualClock
+from tests.net.waiting import drained, until
+from tests.task_arms import posed_arms
+from trilat_net.analysis.dominance_history import evaluate_ramps, list_scripted_ramps
+from trilat_net.app.ros2_bridge import (
     SAFE_PERIOD_NS,
     SENDER_TIMEOUT_NS,
     SILENCE_NS,
@@ -33,15 +39,9 @@ from sites.ros2_bridge import (
     refuse_other_robots,
     write_session_config,
 )
-from sites.ros2_topics import BridgeEnds, SiteTopics
-from sites.running_session import ShareHistory
-from tests.log.standard_files import made
-from tests.net.local_bus import LocalNetwork
-from tests.net.manual_clock import ManualClock
-from tests.net.waiting import drained, until
-from tests.task_arms import posed_arms
-from trilat_net.analysis.dominance_history import evaluate_ramps, list_scripted_ramps
-from trilat_net.core.ticks import Mode, TickRecord
+from trilat_net.app.ros2_topics import BridgeEnds, SiteTopics
+from trilat_net.app.running_session import ShareHistory
+from trilat_net.core.step.ticks import Mode, TickRecord
 from trilat_net.errors import RunFailed, UsageError
 from trilat_net.log.ros2 import cdr
 from trilat_net.log.ros2.published import list_topics

@@ -2,10 +2,10 @@
 
 import pytest
 
-from sites.session_ping import GATHERING_NS, ping_topic
 from tests.json_outline import is_documented
 from tests.net.manual_clock import ManualClock
 from tests.net.parties import SESSION, Member, Party, told
+from trilat_net.app.session_ping import GATHERING_NS, ping_topic
 from trilat_net.errors import RunFailed
 from trilat_net.net import topics
 from trilat_net.net.clock import SkewedClock

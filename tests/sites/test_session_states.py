@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from sites.running_session import RunningSession
+from trilat_net.app.running_session import RunningSession
 from trilat_net.log.log_reader import open_log
 from trilat_net.net.connection import Connection
 from trilat_net.net.messages import State

@@ -10,10 +10,10 @@ from rich.console import Console
 
 from live.session_frames import SessionFrames, render_event
 from live.terminal_watch import SessionWatch
-from sites.monitor import SiteRow, describe_row, frame_alarms
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
-from trilat_net.core.ticks import LifeAlarm, LifeReason
+from trilat_net.app.monitor import SiteRow, describe_row, frame_alarms
+from trilat_net.core.step.ticks import LifeAlarm, LifeReason
 from trilat_net.errors import SessionError
 from trilat_net.execution.verify import verify
 from trilat_net.net.bus import Bus

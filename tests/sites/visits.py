@@ -3,9 +3,9 @@
 from collections.abc import Callable
 from functools import partial
 
-from sites.session_ping import PingReport, SessionPing, TopicDelays, ping_topic
 from tests.net.manual_clock import ManualClock
 from tests.net.parties import SESSION, Party
+from trilat_net.app.session_ping import PingReport, SessionPing, TopicDelays, ping_topic
 from trilat_net.net import topics
 from trilat_net.net.clock import SkewedClock
 from trilat_net.net.messages import VERSION, LinkStats

@@ -17,15 +17,15 @@ from tests.cli.running import trilat
 from tests.net.waiting import until
 from trilat_net.errors import UsageError
 from trilat_net.files import format_extra_install
-from trilat_net.studies import dask_cluster
-from trilat_net.studies.dask_cluster import (
+from trilat_net.studies.sweep import prepare_sweep_folder, run_sweep
+from trilat_net.studies.sweep.sweep_results import RESULTS_FILE
+from trilat_net.work import dask_cluster
+from trilat_net.work.dask_cluster import (
     WorkerRequirements,
     describe_worker,
     explain_unfit_worker,
 )
-from trilat_net.studies.executor import open_worker_pool
-from trilat_net.studies.sweep import prepare_sweep_folder, run_sweep
-from trilat_net.studies.sweep.sweep_results import RESULTS_FILE
+from trilat_net.work.executor import open_worker_pool
 
 from .sweep.quick import SHORT
 from .sweep.quick import asked as plan

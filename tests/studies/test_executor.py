@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from trilat_net.errors import RunFailed, UsageError
-from trilat_net.studies.executor import (
+from trilat_net.work.executor import (
     MAX_LOSSES,
     WorkerPool,
     _Feed,

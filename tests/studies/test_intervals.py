@@ -11,7 +11,6 @@ import pytest
 from tests.cli.running import trilat
 from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import load_scenario
-from trilat_net.studies.intervals import mean_interval
 from trilat_net.studies.sweep import plan_sweep, prepare_sweep_folder, run_sweep
 from trilat_net.studies.sweep.sweep_results import collect_grid_points, list_totals
 from trilat_net.studies.trials import run_trials, trials
@@ -22,6 +21,7 @@ from trilat_net.studies.tuning.candidate import (
     average_scores,
     measure_candidate,
 )
+from trilat_net.work.intervals import mean_interval
 
 DRAWN = """
 name = "drawn"

@@ -4,12 +4,16 @@ from functools import cache
 from typing import Any
 
 from tests.theory.networks import Network
+from trilat_net.analysis.theory.equilibrium import find_equilibrium
+from trilat_net.analysis.theory.frequency_search import (
+    Minima,
+    build_frequency_grid,
+    find_minima,
+)
+from trilat_net.analysis.theory.port_analysis import PortAnalysis, analyse_ports
+from trilat_net.analysis.theory.port_passivity import llewellyn_parameter, llewellyn_rounding
+from trilat_net.analysis.theory.port_response import build_admittance
 from trilat_net.scenario import load_scenario
-from trilat_net.theory.equilibrium import find_equilibrium
-from trilat_net.theory.frequency_search import Minima, build_frequency_grid, find_minima
-from trilat_net.theory.port_analysis import PortAnalysis, analyse_ports
-from trilat_net.theory.port_passivity import llewellyn_parameter, llewellyn_rounding
-from trilat_net.theory.port_response import build_admittance
 
 POSE = (-0.6, 1.8)
 

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trilat_net.core.exogenous import TorqueKind, TorqueSource
-from trilat_net.core.site_setup import Gains, Law, Scheme, SiteSetup
-from trilat_net.core.two_link_arm import ArmLinks, theta_from_links
-from trilat_net.theory.linear_loop import DelayedTerm, LinearLoop
+from trilat_net.analysis.theory.linear_loop import DelayedTerm, LinearLoop
+from trilat_net.core.arms.exogenous import TorqueKind, TorqueSource
+from trilat_net.core.arms.two_link_arm import ArmLinks, theta_from_links
+from trilat_net.core.step.site_setup import Gains, Law, Scheme, SiteSetup
 
 Array = NDArray[np.float64]
 

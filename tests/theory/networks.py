@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from trilat_net.theory.linear_loop import DelayedTerm, LinearLoop
-from trilat_net.theory.port_response import find_site_ports
+from trilat_net.analysis.theory.linear_loop import DelayedTerm, LinearLoop
+from trilat_net.analysis.theory.port_response import find_site_ports
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]

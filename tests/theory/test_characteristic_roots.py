@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from scipy.special import lambertw
 
 from tests.theory.loops import loop, residual, roots_within
-from trilat_net.theory import characteristic_roots
-from trilat_net.theory.characteristic_roots import (
+from trilat_net.analysis.theory import characteristic_roots
+from trilat_net.analysis.theory.characteristic_roots import (
     chebyshev_differentiation,
     chebyshev_interpolation,
     chebyshev_nodes,

@@ -8,16 +8,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.theory.loops import loop
-from trilat_net.scenario import load_scenario
-from trilat_net.theory import find_equilibrium
-from trilat_net.theory.characteristic_roots import compute_delay_spectrum
-from trilat_net.theory.delay_margin import (
+from trilat_net.analysis.theory import find_equilibrium
+from trilat_net.analysis.theory.characteristic_roots import compute_delay_spectrum
+from trilat_net.analysis.theory.delay_margin import (
     MAX_COMMON_DELAY_S,
     find_delay_margin,
     set_common_delay,
 )
-from trilat_net.theory.linear_loop import linearise_loop
-from trilat_net.theory.operating_point import derive_operating_conditions
+from trilat_net.analysis.theory.linear_loop import linearise_loop
+from trilat_net.analysis.theory.operating_point import derive_operating_conditions
+from trilat_net.scenario import load_scenario
 
 
 @given(a=st.floats(0.2, 5.0))

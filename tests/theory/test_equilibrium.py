@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from trilat_net.errors import ScenarioError, UsageError
-from trilat_net.scenario import load_scenario
-from trilat_net.theory.equilibrium import (
+from trilat_net.analysis.theory.equilibrium import (
     MAX_EQUILIBRIUM_RESIDUAL,
     compute_equilibrium_residual,
     find_equilibrium,
     follow_equilibrium,
     predict_equilibrium,
 )
-from trilat_net.theory.operating_point import derive_operating_conditions
+from trilat_net.analysis.theory.operating_point import derive_operating_conditions
+from trilat_net.errors import ScenarioError, UsageError
+from trilat_net.scenario import load_scenario
 
 TRIO = {"rate_hz": 200}
 

@@ -19,7 +19,7 @@ from tests.theory.symbols import (
     pair,
     plain,
 )
-from trilat_net.core.two_link_arm import ArmLinks, regressor, theta_from_links
+from trilat_net.core.arms.two_link_arm import ArmLinks, regressor, theta_from_links
 
 
 def lagrange() -> tuple[sp.Matrix, dict[str, Any]]:

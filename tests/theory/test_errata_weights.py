@@ -14,7 +14,7 @@ from trilat_net.analysis.dominance_history import (
     find_closed_groups,
     left_perron_vector,
 )
-from trilat_net.core.exogenous import (
+from trilat_net.core.arms.exogenous import (
     TorqueKind,
     TorqueSource,
     torque_on_arm,

@@ -10,17 +10,17 @@ import pytest
 
 from tests.theory.loops import Array
 from tests.theory.tick_recursion import build_recursion
-from trilat_net.execution.fused import FusedRun
-from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.scenario.sample_uses import draw_used_samples
-from trilat_net.theory import find_equilibrium, floquet
-from trilat_net.theory.characteristic_roots import Spectrum
-from trilat_net.theory.floquet import (
+from trilat_net.analysis.theory import find_equilibrium, floquet
+from trilat_net.analysis.theory.characteristic_roots import Spectrum
+from trilat_net.analysis.theory.floquet import (
     CoupledTicks,
     compute_sampled_spectrum,
     find_samples_in_use,
 )
-from trilat_net.theory.operating_point import derive_operating_conditions
+from trilat_net.analysis.theory.operating_point import derive_operating_conditions
+from trilat_net.execution.fused import FusedRun
+from trilat_net.scenario import Scenario, load_scenario
+from trilat_net.scenario.sample_uses import draw_used_samples
 
 POSE = (0.1, 0.4)
 

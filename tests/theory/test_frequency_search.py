@@ -4,14 +4,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.theory.networks import Array, Network, pair
-from trilat_net.theory.frequency_search import (
+from trilat_net.analysis.theory.frequency_search import (
     build_frequency_grid,
     cache_response,
     find_minima,
     find_resolved_hz,
     refine_frequencies,
 )
-from trilat_net.theory.port_response import build_admittance
+from trilat_net.analysis.theory.port_response import build_admittance
 
 HZ = 2.0 * np.pi
 

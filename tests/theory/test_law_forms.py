@@ -14,16 +14,16 @@ import pytest
 
 from tests.transmission import PAIR, TABLE, VARIANTS, balance, printed, transmitted
 from tests.unit_arm import CLAMP, hand, two_sites, unit_scenario
+from trilat_net.analysis.theory.characteristic_roots import compute_delay_spectrum
+from trilat_net.analysis.theory.delay_margin import set_common_delay
+from trilat_net.analysis.theory.equilibrium import find_equilibrium
+from trilat_net.analysis.theory.linear_analysis import analyse_linear_loop
+from trilat_net.analysis.theory.linear_loop import LinearLoop, linearise_loop
+from trilat_net.analysis.theory.operating_point import derive_operating_conditions
+from trilat_net.analysis.theory.port_response import clamp_site, evaluate_transfer
 from trilat_net.errors import ScenarioError
 from trilat_net.laws.six_channel import complementary_shares
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.theory.characteristic_roots import compute_delay_spectrum
-from trilat_net.theory.delay_margin import set_common_delay
-from trilat_net.theory.equilibrium import find_equilibrium
-from trilat_net.theory.linear_analysis import analyse_linear_loop
-from trilat_net.theory.linear_loop import LinearLoop, linearise_loop
-from trilat_net.theory.operating_point import derive_operating_conditions
-from trilat_net.theory.port_response import clamp_site, evaluate_transfer
 
 ALONG = np.array([1.0, 0.5])
 b, K, T = 10.0, 100.0, 0.2

@@ -9,9 +9,12 @@ import math
 import pytest
 
 import trilat_net as tn
+from trilat_net.analysis.theory import analyse_linear_loop
+from trilat_net.analysis.theory.linear_analysis import LinearAnalysis
+from trilat_net.analysis.theory.loop_roots import find_log_roots
 from trilat_net.errors import UsageError
-from trilat_net.reporting.figures.linear_figures import draw_root_map
-from trilat_net.reporting.linear_text import (
+from trilat_net.presentation.figures.linear_figures import draw_root_map
+from trilat_net.presentation.linear_text import (
     describe_effective_delays,
     describe_equilibrium,
     describe_linear_verdict,
@@ -19,9 +22,6 @@ from trilat_net.reporting.linear_text import (
     tabulate_roots,
 )
 from trilat_net.scenario import load_scenario
-from trilat_net.theory import analyse_linear_loop
-from trilat_net.theory.linear_analysis import LinearAnalysis
-from trilat_net.theory.loop_roots import find_log_roots
 
 POSE = (-0.1729, 0.0874)
 

@@ -12,7 +12,25 @@ from scipy.linalg import eigvals
 from tests.chains import two_arms
 from tests.core.chain_references import ARMS
 from tests.theory.loops import Array, residual, roots_within
-from trilat_net.core.chain import (
+from trilat_net.analysis.theory import find_equilibrium, iterate_linear_edges
+from trilat_net.analysis.theory.characteristic_roots import compute_delay_spectrum
+from trilat_net.analysis.theory.delay_margin import set_common_delay
+from trilat_net.analysis.theory.equilibrium import predict_equilibrium
+from trilat_net.analysis.theory.floquet import compute_sampled_spectrum
+from trilat_net.analysis.theory.linear_loop import LinearLoop, linearise_loop
+from trilat_net.analysis.theory.operating_point import (
+    Equilibrium,
+    OperatingConditions,
+    derive_operating_conditions,
+)
+from trilat_net.analysis.theory.port_analysis import analyse_ports, linearise_teleoperator
+from trilat_net.analysis.theory.port_response import build_admittance
+from trilat_net.analysis.theory.site_dynamics import (
+    ArgumentLayout,
+    differentiate_site_rates,
+    evaluate_site_rates,
+)
+from trilat_net.core.arms.chain import (
     MAX_JOINTS,
     build_chain,
     find_acceleration,
@@ -21,37 +39,19 @@ from trilat_net.core.chain import (
     place_joints,
     propagate_motion,
 )
-from trilat_net.core.exogenous import (
+from trilat_net.core.arms.exogenous import (
     TorqueKind,
     TorqueSource,
     put_torque_on_chain,
     torque_source_rows,
 )
-from trilat_net.core.site_setup import SiteSetup
+from trilat_net.core.step.site_setup import SiteSetup
 from trilat_net.errors import UsageError
 from trilat_net.execution.fused import FusedRun
-from trilat_net.reporting.linear_text import describe_ports
+from trilat_net.presentation.linear_text import describe_ports
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.scenario_reader import parse_scenario
 from trilat_net.studies.sweep.stability_map import evaluate_criterion
-from trilat_net.theory import find_equilibrium, iterate_linear_edges
-from trilat_net.theory.characteristic_roots import compute_delay_spectrum
-from trilat_net.theory.delay_margin import set_common_delay
-from trilat_net.theory.equilibrium import predict_equilibrium
-from trilat_net.theory.floquet import compute_sampled_spectrum
-from trilat_net.theory.linear_loop import LinearLoop, linearise_loop
-from trilat_net.theory.operating_point import (
-    Equilibrium,
-    OperatingConditions,
-    derive_operating_conditions,
-)
-from trilat_net.theory.port_analysis import analyse_ports, linearise_teleoperator
-from trilat_net.theory.port_response import build_admittance
-from trilat_net.theory.site_dynamics import (
-    ArgumentLayout,
-    differentiate_site_rates,
-    evaluate_site_rates,
-)
 
 POSE = (0.0, -1.1, 1.2, -0.4, 0.3, 0.1)
 LOADED = [2, 3, 4, 5, 6]

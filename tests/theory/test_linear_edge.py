@@ -13,17 +13,21 @@ from scipy.linalg import eigvalsh
 from scipy.optimize import brentq
 
 from tests.theory.loops import Array
-from trilat_net.core.two_link_arm import inertia
-from trilat_net.errors import ScenarioError, UsageError
-from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.theory import analyse_linear_loop, find_equilibrium, iterate_linear_edges
-from trilat_net.theory.equilibrium import predict_equilibrium
-from trilat_net.theory.linear_edge import (
+from trilat_net.analysis.theory import (
+    analyse_linear_loop,
+    find_equilibrium,
+    iterate_linear_edges,
+)
+from trilat_net.analysis.theory.equilibrium import predict_equilibrium
+from trilat_net.analysis.theory.linear_edge import (
     ASSUMED_EQUILIBRIUM_REMARK,
     LinearEdge,
     compute_growth_column,
     find_root_crossings,
 )
+from trilat_net.core.arms.two_link_arm import inertia
+from trilat_net.errors import ScenarioError, UsageError
+from trilat_net.scenario import Scenario, load_scenario
 
 
 def least_damping(scenario: Scenario, K: float, T: float, share: float) -> float:

@@ -8,15 +8,15 @@ import pytest
 
 from tests.theory.loops import RODS
 from tests.virtual_runs import trajectories
-from trilat_net.core.ticks import BUCKETS_PER_S
+from trilat_net.analysis.theory import analyse_linear_loop, find_equilibrium
+from trilat_net.analysis.theory.characteristic_roots import compute_delay_spectrum
+from trilat_net.analysis.theory.delay_margin import set_common_delay
+from trilat_net.analysis.theory.equilibrium import follow_equilibrium
+from trilat_net.analysis.theory.linear_loop import linearise_loop
+from trilat_net.analysis.theory.operating_point import derive_operating_conditions
+from trilat_net.core.step.ticks import BUCKETS_PER_S
 from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import load_scenario
-from trilat_net.theory import analyse_linear_loop, find_equilibrium
-from trilat_net.theory.characteristic_roots import compute_delay_spectrum
-from trilat_net.theory.delay_margin import set_common_delay
-from trilat_net.theory.equilibrium import follow_equilibrium
-from trilat_net.theory.linear_loop import linearise_loop
-from trilat_net.theory.operating_point import derive_operating_conditions
 
 POSE = (-0.1236, 0.3373)
 

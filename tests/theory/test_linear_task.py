@@ -9,19 +9,26 @@ from tests.core.chain_references import ARMS
 from tests.task_arms import planar_task, posed_arms
 from tests.theory.loops import Array
 from tests.theory.tick_recursion import build_recursion
+from trilat_net.analysis.theory import (
+    analyse_linear_loop,
+    find_equilibrium,
+    iterate_linear_edges,
+)
+from trilat_net.analysis.theory.characteristic_roots import (
+    compute_delay_spectrum,
+    find_moving_part,
+)
+from trilat_net.analysis.theory.delay_margin import set_common_delay
+from trilat_net.analysis.theory.equilibrium import find_mean_pose
+from trilat_net.analysis.theory.floquet import compute_sampled_spectrum
+from trilat_net.analysis.theory.linear_loop import linearise_loop
+from trilat_net.analysis.theory.operating_point import Equilibrium, derive_operating_conditions
+from trilat_net.analysis.theory.port_analysis import analyse_ports, linearise_teleoperator
+from trilat_net.analysis.theory.port_response import build_admittance
 from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.execution.fused import FusedRun
-from trilat_net.reporting.linear_text import describe_ports
+from trilat_net.presentation.linear_text import describe_ports
 from trilat_net.scenario import Scenario, load_scenario, parse_scenario
-from trilat_net.theory import analyse_linear_loop, find_equilibrium, iterate_linear_edges
-from trilat_net.theory.characteristic_roots import compute_delay_spectrum, find_moving_part
-from trilat_net.theory.delay_margin import set_common_delay
-from trilat_net.theory.equilibrium import find_mean_pose
-from trilat_net.theory.floquet import compute_sampled_spectrum
-from trilat_net.theory.linear_loop import linearise_loop
-from trilat_net.theory.operating_point import Equilibrium, derive_operating_conditions
-from trilat_net.theory.port_analysis import analyse_ports, linearise_teleoperator
-from trilat_net.theory.port_response import build_admittance
 
 SLIDERS = """<robot name="sliders"><link name="base"/>
 {links}

@@ -11,13 +11,17 @@ from hypothesis import strategies as st
 
 import trilat_net as tn
 from tests.virtual_runs import simulate_with_commands
+from trilat_net.analysis.judge import certify_run
 from trilat_net.analysis.run_end import classify_log_end
+from trilat_net.analysis.theory.loop_roots import (
+    find_log_roots,
+    find_run_roots,
+    resolve_final_scenario,
+)
 from trilat_net.analysis.timeline import list_effective_commands
 from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.delay_period import find_burst_interval_s, find_final_delay_period
-from trilat_net.theory.loop_roots import find_log_roots, find_run_roots, resolve_final_scenario
-from trilat_net.theory.run_certificate import certify_run
 
 PAIR = {
     "arm.g_m_s2": 0.0,

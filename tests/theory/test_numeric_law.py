@@ -10,13 +10,13 @@ from tests.laws import Adaptive
 from tests.own_laws import PD, Backward, CompiledPD, Forces, PeerPD, Remembering
 from tests.plugged_laws import Line
 from tests.unit_arm import CLAMP
-from trilat_net.core.vectors import Array
+from trilat_net.analysis.theory.characteristic_roots import Spectrum
+from trilat_net.analysis.theory.equilibrium import find_equilibrium, follow_equilibrium
+from trilat_net.analysis.theory.floquet import compute_sampled_spectrum
+from trilat_net.analysis.theory.linear_analysis import LinearAnalysis
+from trilat_net.analysis.theory.operating_point import derive_operating_conditions
+from trilat_net.core.step.vectors import Array
 from trilat_net.errors import ScenarioError
-from trilat_net.theory.characteristic_roots import Spectrum
-from trilat_net.theory.equilibrium import find_equilibrium, follow_equilibrium
-from trilat_net.theory.floquet import compute_sampled_spectrum
-from trilat_net.theory.linear_analysis import LinearAnalysis
-from trilat_net.theory.operating_point import derive_operating_conditions
 
 POSE = (0.3, 0.2)
 

@@ -9,13 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.virtual_runs import trajectories
-from trilat_net.errors import ScenarioError
-from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.theory.equilibrium import extend_scenario
-from trilat_net.theory.operating_point import (
+from trilat_net.analysis.theory.equilibrium import extend_scenario
+from trilat_net.analysis.theory.operating_point import (
     compute_effective_delay,
     derive_operating_conditions,
 )
+from trilat_net.errors import ScenarioError
+from trilat_net.scenario import Scenario, load_scenario
 
 
 def test_shares_and_links_are_those_at_the_end() -> None:

@@ -7,8 +7,8 @@ from scipy.optimize import brentq
 
 from tests.theory.analysed_ports import criterion
 from tests.theory.networks import Complex, Network, Wire, pair
-from trilat_net.theory.frequency_search import build_frequency_grid
-from trilat_net.theory.port_passivity import (
+from trilat_net.analysis.theory.frequency_search import build_frequency_grid
+from trilat_net.analysis.theory.port_passivity import (
     MAX_LLEWELLYN,
     clamp_ports,
     find_best_weights,
@@ -16,7 +16,7 @@ from trilat_net.theory.port_passivity import (
     llewellyn_parameter,
     weight_response,
 )
-from trilat_net.theory.port_response import build_admittance
+from trilat_net.analysis.theory.port_response import build_admittance
 
 POSITIVE = st.floats(0.1, 10.0)
 SEEDS = st.integers(0, 2**32 - 1)

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from tests.theory.analysed_ports import POSE, section_of
+from trilat_net.analysis.theory.equilibrium import find_equilibrium
+from trilat_net.analysis.theory.port_analysis import analyse_ports
 from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.scenario import load_scenario
-from trilat_net.theory.equilibrium import find_equilibrium
-from trilat_net.theory.port_analysis import analyse_ports
 
 
 @pytest.mark.parametrize("name", ["p_d_margin_two", "p_d_margin"])

@@ -4,10 +4,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.theory.networks import Network, Wire, hold_by_spring, pair
-from trilat_net.errors import UsageError
-from trilat_net.theory.frequency_search import build_frequency_grid, refine_frequencies
-from trilat_net.theory.linear_loop import LinearLoop
-from trilat_net.theory.port_passivity import (
+from trilat_net.analysis.theory.frequency_search import build_frequency_grid, refine_frequencies
+from trilat_net.analysis.theory.linear_loop import LinearLoop
+from trilat_net.analysis.theory.port_passivity import (
     HandMatrices,
     Passivity,
     check_against_hands,
@@ -16,7 +15,12 @@ from trilat_net.theory.port_passivity import (
     find_least_eigenvalue,
     weight_response,
 )
-from trilat_net.theory.port_response import build_admittance, clamp_site, find_longest_delay_s
+from trilat_net.analysis.theory.port_response import (
+    build_admittance,
+    clamp_site,
+    find_longest_delay_s,
+)
+from trilat_net.errors import UsageError
 
 POSITIVE = st.floats(0.1, 10.0)
 OR_NONE = st.just(0.0) | POSITIVE

@@ -4,8 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.theory.networks import Network, Wire, hold_by_spring, pair
-from trilat_net.errors import RuntimeFault, UsageError
-from trilat_net.theory.port_response import (
+from trilat_net.analysis.theory.port_response import (
     LoopOutput,
     Transparency,
     build_admittance,
@@ -19,6 +18,7 @@ from trilat_net.theory.port_response import (
     select_ports,
     to_imaginary_axis,
 )
+from trilat_net.errors import RuntimeFault, UsageError
 
 W = np.geomspace(1e-3, 1e3, 61)
 POSITIVE = st.floats(0.1, 10.0)

@@ -7,11 +7,11 @@ import pytest
 
 from tests.theory.networks import Array, Complex, hold_by_spring
 from tests.virtual_runs import trajectories
+from trilat_net.analysis.theory.equilibrium import find_equilibrium
+from trilat_net.analysis.theory.operating_point import derive_operating_conditions
+from trilat_net.analysis.theory.port_analysis import linearise_teleoperator
+from trilat_net.analysis.theory.port_response import build_admittance
 from trilat_net.scenario import load_scenario
-from trilat_net.theory.equilibrium import find_equilibrium
-from trilat_net.theory.operating_point import derive_operating_conditions
-from trilat_net.theory.port_analysis import linearise_teleoperator
-from trilat_net.theory.port_response import build_admittance
 
 POSE = (-0.6, 1.8)
 AMPLITUDE_NM = 0.02

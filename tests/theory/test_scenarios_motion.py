@@ -16,10 +16,10 @@ import pytest
 
 from tests.theory.figures_of_runs import Overrides, measured, peak, printed, value
 from tests.virtual_runs import sampled
-from trilat_net.analysis.envelope_trend import EnvelopeTrend
+from trilat_net.analysis.theory import analyse_linear_loop
+from trilat_net.analysis.twins.envelope_trend import EnvelopeTrend
 from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import load_scenario
-from trilat_net.theory import analyse_linear_loop
 
 NO_BOX = {"control.law": "adaptive", "control.theta_hat0": [0.0, 0.0, 0.0, 1.9, 0.95]}
 EDGE = {

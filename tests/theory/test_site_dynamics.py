@@ -6,21 +6,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.theory.loops import Array, actors, site
-from trilat_net.core import control
-from trilat_net.core.exogenous import (
-    TorqueKind,
-    TorqueSource,
-    torque_on_arm,
-    torque_source_rows,
-)
-from trilat_net.core.site_setup import SiteSetup
-from trilat_net.core.two_link_arm import forward_dynamics, regressor
-from trilat_net.theory.site_dynamics import (
+from trilat_net.analysis.theory.site_dynamics import (
     ArgumentLayout,
     describe_switching_points,
     differentiate_site_rates,
     evaluate_site_rates,
 )
+from trilat_net.core.arms.exogenous import (
+    TorqueKind,
+    TorqueSource,
+    torque_on_arm,
+    torque_source_rows,
+)
+from trilat_net.core.arms.two_link_arm import forward_dynamics, regressor
+from trilat_net.core.step import control
+from trilat_net.core.step.site_setup import SiteSetup
 
 LATE_S = 100.0
 AT = ArgumentLayout(2, 5)

@@ -10,15 +10,15 @@ from hypothesis import strategies as st
 
 from tests.theory.analysed_ports import criterion
 from tests.theory.networks import Network, Wire
-from trilat_net.core.control import project_estimate
-from trilat_net.core.dominance import find_balancing_weights
+from trilat_net.analysis.theory.characteristic_roots import compute_delay_spectrum
+from trilat_net.analysis.theory.frequency_search import build_frequency_grid
+from trilat_net.analysis.theory.port_passivity import EIGENVALUE_ROUNDING, find_best_weights
+from trilat_net.analysis.theory.port_response import build_admittance
+from trilat_net.core.links.dominance import find_balancing_weights
+from trilat_net.core.step.control import project_estimate
 from trilat_net.laws.conditions import COMMON_MOTION_SHARE
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.describe import lacks_detailed_balance
-from trilat_net.theory.characteristic_roots import compute_delay_spectrum
-from trilat_net.theory.frequency_search import build_frequency_grid
-from trilat_net.theory.port_passivity import EIGENVALUE_ROUNDING, find_best_weights
-from trilat_net.theory.port_response import build_admittance
 
 
 def one_factor(a: float) -> Any:

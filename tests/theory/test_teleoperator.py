@@ -5,23 +5,22 @@ import numpy as np
 import pytest
 
 from tests.theory.networks import hold_by_spring
-from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.theory.equilibrium import find_equilibrium
-from trilat_net.theory.frequency_search import build_frequency_grid, refine_frequencies
-from trilat_net.theory.linear_loop import LinearLoop, linearise_loop
-from trilat_net.theory.operating_point import (
+from trilat_net.analysis.theory.equilibrium import find_equilibrium
+from trilat_net.analysis.theory.frequency_search import build_frequency_grid, refine_frequencies
+from trilat_net.analysis.theory.linear_loop import LinearLoop, linearise_loop
+from trilat_net.analysis.theory.operating_point import (
     Equilibrium,
     OperatingConditions,
     derive_operating_conditions,
 )
-from trilat_net.theory.port_analysis import (
+from trilat_net.analysis.theory.port_analysis import (
     build_proof_output,
     compute_proof_weights,
     freeze_external_torques,
     linearise_teleoperator,
 )
-from trilat_net.theory.port_passivity import Passivity, check_passivity
-from trilat_net.theory.port_response import (
+from trilat_net.analysis.theory.port_passivity import Passivity, check_passivity
+from trilat_net.analysis.theory.port_response import (
     build_admittance,
     clamp_site,
     evaluate_transfer,
@@ -31,6 +30,7 @@ from trilat_net.theory.port_response import (
     parse_port_site,
     to_imaginary_axis,
 )
+from trilat_net.scenario import Scenario, load_scenario
 
 BARE: dict[str, Any] = {
     "sites.m1.hands": [],

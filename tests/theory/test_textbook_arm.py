@@ -13,10 +13,10 @@ from tests.core.chain_references import chain_references
 from tests.core.physical_arms import angles, links, speeds
 from tests.theory.loops import Array
 from trilat_net.analysis.arm_rows import PlacedArm
-from trilat_net.core.chain import ChainJoint, build_chain, find_acceleration, place_joints
-from trilat_net.core.site_setup import ChainSetup
-from trilat_net.core.two_link_arm import ArmLinks, theta_from_links
-from trilat_net.theory.textbook_arm import PlacedChain
+from trilat_net.analysis.theory.textbook_arm import PlacedChain
+from trilat_net.core.arms.chain import ChainJoint, build_chain, find_acceleration, place_joints
+from trilat_net.core.arms.two_link_arm import ArmLinks, theta_from_links
+from trilat_net.core.step.site_setup import ChainSetup
 
 
 def placed(q: Array) -> PlacedArm:

@@ -10,12 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.core.chain_references import ARMS
 from tests.task_arms import planar_task, posed_arms
-from trilat_net.core.kernel import site_tick
-from trilat_net.core.site_arrays import build_site_arrays, build_tick_buffers
-from trilat_net.core.site_setup import SiteSetup
-from trilat_net.core.vectors import Array
-from trilat_net.scenario import parse_scenario
-from trilat_net.theory.site_dynamics import (
+from trilat_net.analysis.theory.site_dynamics import (
     COMPLEX_STEP,
     SiteRates,
     differentiate_site_rates,
@@ -23,12 +18,17 @@ from trilat_net.theory.site_dynamics import (
     lay_out_arguments,
     place_arm,
 )
-from trilat_net.theory.textbook_arm import (
+from trilat_net.analysis.theory.textbook_arm import (
     PlacedChain,
     evaluate_reference,
     rotation_from_vector,
     vector_from_rotation,
 )
+from trilat_net.core.step.kernel import site_tick
+from trilat_net.core.step.site_arrays import build_site_arrays, build_tick_buffers
+from trilat_net.core.step.site_setup import SiteSetup
+from trilat_net.core.step.vectors import Array
+from trilat_net.scenario import parse_scenario
 
 angles = st.one_of(
     st.floats(0.0, np.pi), st.floats(0.0, 1e-3), st.floats(np.pi - 1e-3, np.pi - 1e-9)

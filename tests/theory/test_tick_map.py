@@ -10,12 +10,15 @@ from numpy.typing import NDArray
 from tests.theory.loops import Array
 from tests.theory.tick_recursion import build_recursion
 from tests.virtual_runs import trajectories
+from trilat_net.analysis.theory import find_equilibrium
+from trilat_net.analysis.theory.characteristic_roots import Spectrum, compute_delay_spectrum
+from trilat_net.analysis.theory.floquet import (
+    compute_sampled_spectrum,
+    discretise_zero_order_hold,
+)
+from trilat_net.analysis.theory.linear_loop import linearise_loop
+from trilat_net.analysis.theory.operating_point import derive_operating_conditions
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.theory import find_equilibrium
-from trilat_net.theory.characteristic_roots import Spectrum, compute_delay_spectrum
-from trilat_net.theory.floquet import compute_sampled_spectrum, discretise_zero_order_hold
-from trilat_net.theory.linear_loop import linearise_loop
-from trilat_net.theory.operating_point import derive_operating_conditions
 
 POSE = (-0.1729, 0.0874)
 

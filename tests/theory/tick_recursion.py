@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tests.theory.loops import Array
-from trilat_net.theory.floquet import couple_ticks
-from trilat_net.theory.operating_point import Equilibrium, OperatingConditions
+from trilat_net.analysis.theory.floquet import couple_ticks
+from trilat_net.analysis.theory.operating_point import Equilibrium, OperatingConditions
 
 
 class TickRecursion(NamedTuple):

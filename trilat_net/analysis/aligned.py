@@ -22,10 +22,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.safeguards import BLEND_S
-from ..core.task_space import POSE, POSITION
-from ..core.ticks import NS_PER_S
-from ..core.vectors import Array
+from ..core.arms.task_space import POSE, POSITION
+from ..core.life.safeguards import BLEND_S
+from ..core.step.ticks import NS_PER_S
+from ..core.step.vectors import Array
 from ..log.log_reader import Log
 from ..log.orientations import choose_nearest_vectors
 from ..log.record_columns import Ints

@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.chain import (
+from ..core.arms.chain import (
     COULOMB_SPEED,
     LINK_PARAMETERS,
     MAX_JOINTS,
@@ -41,10 +41,10 @@ from ..core.chain import (
     rotate,
     three,
 )
-from ..core.jit import leaf
-from ..core.site_setup import ChainSetup, TaskSetup
-from ..core.two_link_arm import JOINTS, forward_kinematics
-from ..core.vectors import Array, Row, RowArray
+from ..core.arms.two_link_arm import JOINTS, forward_kinematics
+from ..core.step.jit import leaf
+from ..core.step.site_setup import ChainSetup, TaskSetup
+from ..core.step.vectors import Array, Row, RowArray
 from ..scenario import Scenario
 from ..scenario.arms import ArmModel
 

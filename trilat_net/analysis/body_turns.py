@@ -8,8 +8,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..core.task_space import POSITION
-from ..core.vectors import Array
+from ..core.arms.task_space import POSITION
+from ..core.step.vectors import Array
 from ..log.orientations import QUATERNION_AXES, QuaternionSigns
 
 

@@ -22,9 +22,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.dominance import find_reach, perron_vector
-from ..core.ticks import DominanceRamp
-from ..core.vectors import Array
+from ..core.links.dominance import find_reach, perron_vector
+from ..core.step.ticks import DominanceRamp
+from ..core.step.vectors import Array
 from ..errors import UsageError
 from ..log.log_reader import Log
 from ..log.record_columns import Ints

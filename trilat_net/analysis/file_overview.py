@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.ticks import NS_PER_S
+from ..core.step.ticks import NS_PER_S
 from ..errors import LogError, count_nouns
 from ..files import reading
 from ..log.accounting import Account

@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.vectors import Array
+from ..core.step.vectors import Array
 from ..log.record_columns import Ints
 from .arm_rows import ArmRows, Numbers, PlanarArmRows, multiply_columns
 

@@ -23,11 +23,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.channel import LOST
-from ..core.delay import DelayKind
-from ..core.link import AHEAD_LIMIT_NS
-from ..core.ticks import NS_PER_S
-from ..core.vectors import Array
+from ..core.links.channel import LOST
+from ..core.links.delay import DelayKind
+from ..core.links.link import AHEAD_LIMIT_NS
+from ..core.step.ticks import NS_PER_S
+from ..core.step.vectors import Array
 from ..log.log_reader import Log
 from ..log.record_columns import Ints
 from ..log.site_log import SiteLog

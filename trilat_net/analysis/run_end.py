@@ -30,19 +30,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.dominance import find_reach
-from ..core.exogenous import LIVE_KINDS, OWN_KINDS, TorqueKind
-from ..core.ticks import BUCKETS_PER_S
-from ..core.vectors import Array
+from ..core.arms.exogenous import LIVE_KINDS, OWN_KINDS, TorqueKind
+from ..core.links.dominance import find_reach
+from ..core.step.ticks import BUCKETS_PER_S
+from ..core.step.vectors import Array
 from ..log.log_reader import Log
 from ..log.record_columns import Ints
 from ..log.site_log import SiteLog
 from ..scenario import Scenario
 from .arm_rows import HANGING_RAD, build_arm_rows
-from .envelope_trend import FLOOR_RAD, EnvelopeFit, EnvelopeTrend, fit_envelopes
 from .site_signals import SETTLED_ERROR_RAD
 from .timeline import list_effective_commands
 from .torque_sources import compute_operator_script
+from .twins.envelope_trend import FLOOR_RAD, EnvelopeFit, EnvelopeTrend, fit_envelopes
 
 SETTLED_SPEED_RAD_S = 1e-2
 """Largest speed in the last second of a run whose arms have come to rest, in rad/s."""

@@ -16,8 +16,8 @@ from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 
-from ..core.exogenous import TorqueSource
-from ..core.task_space import POSE, POSITION
+from ..core.arms.exogenous import TorqueSource
+from ..core.arms.task_space import POSE, POSITION
 from ..log.log_reader import Log
 from ..log.orientations import compute_continuous_vectors
 from ..scenario import Scenario

@@ -30,10 +30,10 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from .envelope_trend import FLOOR_RAD, EnvelopeTrend
 from .run_end import EndBehaviour, RunEnd, Stability
 from .site_signals import SETTLED_ERROR_RAD
-from .twin_growth import DOUBLES, TwinGrowth
+from .twins.envelope_trend import FLOOR_RAD, EnvelopeTrend
+from .twins.twin_growth import DOUBLES, TwinGrowth
 
 NEAR_REST_RAD = 0.02
 """Largest distance of a run from a rest whose unstable roots refute the run, in rad.

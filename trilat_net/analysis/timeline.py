@@ -17,8 +17,8 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from ..core.session_life import HELD_OVERRUN_TICKS
-from ..core.ticks import find_alarm
+from ..core.life.session_life import HELD_OVERRUN_TICKS
+from ..core.step.ticks import find_alarm
 from ..errors import count_nouns
 from ..log.log_reader import Log
 from ..log.site_log import SiteLog

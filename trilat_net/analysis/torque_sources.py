@@ -19,8 +19,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.exogenous import LIVE_KINDS, OWN_KINDS, SCRIPTED_KINDS, TorqueKind, TorqueSource
-from ..core.vectors import Array
+from ..core.arms.exogenous import (
+    LIVE_KINDS,
+    OWN_KINDS,
+    SCRIPTED_KINDS,
+    TorqueKind,
+    TorqueSource,
+)
+from ..core.step.vectors import Array
 from ..log.log_reader import Log
 from ..scenario import Scenario, SiteSpec
 from ..scenario.operators import ActorBase

@@ -26,10 +26,11 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.compiled_law import CompiledLaw, plug_law
-from ..core.delay import max_delay_us
-from ..core.exogenous import LIVE_KINDS
-from ..core.fused_run import (
+from ..core.arms.exogenous import LIVE_KINDS
+from ..core.links.delay import max_delay_us
+from ..core.plug.compiled_law import CompiledLaw, plug_law
+from ..core.plug.law_view import PlainLaw
+from ..core.step.fused_run import (
     NEVER_NS,
     PROGRESS_DTYPE,
     LawArrays,
@@ -41,11 +42,10 @@ from ..core.fused_run import (
     sense_site,
     sums_dtype,
 )
-from ..core.law_view import PlainLaw
-from ..core.site_arrays import SiteArrays, apply_change, select_site, stack_site_arrays
-from ..core.site_setup import SiteSetup
-from ..core.ticks import BUCKETS_PER_S, MAX_ARRIVALS, NS_PER_S, CoreChange, Mode, tick_ns
-from ..core.vectors import Array, IntArray, Row, RowArray
+from ..core.step.site_arrays import SiteArrays, apply_change, select_site, stack_site_arrays
+from ..core.step.site_setup import SiteSetup
+from ..core.step.ticks import BUCKETS_PER_S, MAX_ARRIVALS, NS_PER_S, CoreChange, Mode, tick_ns
+from ..core.step.vectors import Array, IntArray, Row, RowArray
 from ..errors import LawFailed, ScenarioError, count_nouns
 from ..log.log_reader import Log
 from ..scenario import Scenario

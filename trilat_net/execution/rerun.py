@@ -27,9 +27,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .. import process
-from ..core.fingerprint import compute_fingerprint
-from ..core.ticks import NS_PER_S, Mode
-from ..core.vectors import Array
+from ..core.step.fingerprint import compute_fingerprint
+from ..core.step.ticks import NS_PER_S, Mode
+from ..core.step.vectors import Array
 from ..errors import LogError, count_nouns
 from ..files import digest_file
 from ..log.log_file import LogFile

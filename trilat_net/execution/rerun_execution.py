@@ -25,8 +25,8 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from ..core.site_step import Site
-from ..core.ticks import MAX_ARRIVALS, NS_PER_S, Arrival, Mode, TickInput, TickRecord
+from ..core.step.site_step import Site
+from ..core.step.ticks import MAX_ARRIVALS, NS_PER_S, Arrival, Mode, TickInput, TickRecord
 from ..errors import LogError, ScenarioError, UsageError
 from ..log.log_reader import Log
 from ..log.mcap_reader import Progress

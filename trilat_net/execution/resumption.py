@@ -20,10 +20,10 @@ from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from ..core.delay import MAX_DELAY_US
-from ..core.site_setup import LinkSetup
-from ..core.site_step import Site
-from ..core.ticks import MAX_ARRIVALS, NS_PER_S, Arrival, CoreChange, TickRecord
+from ..core.links.delay import MAX_DELAY_US
+from ..core.step.site_setup import LinkSetup
+from ..core.step.site_step import Site
+from ..core.step.ticks import MAX_ARRIVALS, NS_PER_S, Arrival, CoreChange, TickRecord
 from ..log.site_log import SiteLog
 from ..net.messages import MODES, RESTING_MODES, State
 

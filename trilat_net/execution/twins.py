@@ -24,9 +24,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.site_setup import Law
-from ..core.ticks import BUCKETS_PER_S, NS_PER_S
-from ..core.vectors import Array
+from ..core.step.site_setup import Law
+from ..core.step.ticks import BUCKETS_PER_S, NS_PER_S
+from ..core.step.vectors import Array
 from ..errors import NotRepeatable, UsageError, count_nouns
 from ..log.log_reader import Log
 from ..log.record_columns import Ints

@@ -25,12 +25,12 @@ from typing import Any, NamedTuple
 import msgspec
 
 from .. import process
-from ..core.fingerprint import compute_fingerprint
-from ..core.law_channel import LawChannel
-from ..core.site_arrays import MAX_RAMPS
-from ..core.site_setup import StaleAction
-from ..core.site_step import Site
-from ..core.ticks import MAX_ARRIVALS, CoreChange, PlantState, TickInput, TickRecord
+from ..core.plug.law_channel import LawChannel
+from ..core.step.fingerprint import compute_fingerprint
+from ..core.step.site_arrays import MAX_RAMPS
+from ..core.step.site_setup import StaleAction
+from ..core.step.site_step import Site
+from ..core.step.ticks import MAX_ARRIVALS, CoreChange, PlantState, TickInput, TickRecord
 from ..errors import LawFailed, ScenarioError
 from ..files import digest_file
 from ..log.accounting import MIN_COVERAGE, Coverage

@@ -22,8 +22,8 @@ from typing import Any, NamedTuple
 import msgspec
 
 from .. import process
-from ..core.site_step import Site
-from ..core.ticks import (
+from ..core.step.site_step import Site
+from ..core.step.ticks import (
     NS_PER_S,
     Arrival,
     CoreChange,

@@ -21,8 +21,8 @@ import msgspec
 import numpy as np
 
 from .. import process
-from ..core.site_step import Site
-from ..core.ticks import NS_PER_S, PlantState, TickRecord
+from ..core.step.site_step import Site
+from ..core.step.ticks import NS_PER_S, PlantState, TickRecord
 from ..errors import LawFailed, LogError
 from ..log.log_reader import Log
 from ..log.mcap_reader import Progress

@@ -25,7 +25,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from ..core.ticks import MAX_ARRIVALS, NS_PER_S, Arrival, TickRecord
+from ..core.step.ticks import MAX_ARRIVALS, NS_PER_S, Arrival, TickRecord
 from ..errors import LogError, count_nouns
 from ..log.site_log import SiteLog
 from .resumption import ArrivalEntry, make_arrival

@@ -23,8 +23,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..core.site_setup import Gains, Law
-from ..core.vectors import Array
+from ..core.step.site_setup import Gains, Law
+from ..core.step.vectors import Array
 from ..fields import (
     NotNegativeCoordinates,
     NotNegativeParameters,

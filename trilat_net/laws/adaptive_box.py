@@ -15,8 +15,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..core.site_setup import Gains
-from ..core.vectors import Array
+from ..core.step.site_setup import Gains
+from ..core.step.vectors import Array
 from ..errors import ScenarioError
 from ..fields import MAX_QUANTITY, Parameters
 from .adaptive import Adaptive

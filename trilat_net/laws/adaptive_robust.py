@@ -14,9 +14,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..core.control import ROBUST_RESIDUE
-from ..core.site_setup import Gains
-from ..core.vectors import Array
+from ..core.step.control import ROBUST_RESIDUE
+from ..core.step.site_setup import Gains
+from ..core.step.vectors import Array
 from ..fields import NotNegative, NotNegativeJoints, PositiveJoints
 from .adaptive_box import AdaptiveBox
 from .conditions import LawSituation, StabilityCondition

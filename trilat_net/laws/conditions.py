@@ -20,8 +20,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..core.dominance import find_balancing_weights
-from ..core.vectors import Array
+from ..core.links.dominance import find_balancing_weights
+from ..core.step.vectors import Array
 
 PASSIVE_OUTSIDE = "operators and environments are passive (*sufficient*)"
 """The premise of each law that balances energy, as part of a sentence."""

@@ -24,10 +24,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..core.compiled_law import compiled
-from ..core.site_setup import Gains, Law
-from ..core.user_law import LawContext, LawInput
-from ..core.vectors import Array
+from ..core.plug.compiled_law import compiled
+from ..core.plug.user_law import LawContext, LawInput
+from ..core.step.site_setup import Gains, Law
+from ..core.step.vectors import Array
 from ..fields import NotNegativeJoints, PositiveJoints
 from .conditions import (
     ArmLoad,

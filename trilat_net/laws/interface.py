@@ -25,9 +25,9 @@ from typing import Any, ClassVar, NamedTuple, cast, get_origin
 import msgspec
 from msgspec.structs import asdict
 
-from ..core.site_setup import Gains, Law
-from ..core.user_law import LawContext, UserLaw, UserLawFactory
-from ..core.vectors import Array
+from ..core.plug.user_law import LawContext, UserLaw, UserLawFactory
+from ..core.step.site_setup import Gains, Law
+from ..core.step.vectors import Array
 from ..errors import ScenarioError, count_nouns
 from ..fields import Frozen, KeyProblem, NotNegative
 from ..files import find_page

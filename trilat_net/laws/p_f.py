@@ -15,8 +15,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..core.site_setup import Gains, Law
-from ..core.vectors import Array
+from ..core.step.site_setup import Gains, Law
+from ..core.step.vectors import Array
 from ..errors import ScenarioError, count_nouns
 from ..fields import NotNegative, NotNegativeCoordinates, NotNegativeJoints
 from .conditions import LawSituation

@@ -20,9 +20,9 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from ..core.chain import MAX_JOINTS
-from ..core.law_channel import MAX_RECORD_SENT, MAX_SENT, LawChannel, SentVector
-from ..core.site_setup import Layout
+from ..core.arms.chain import MAX_JOINTS
+from ..core.plug.law_channel import MAX_RECORD_SENT, MAX_SENT, LawChannel, SentVector
+from ..core.step.site_setup import Layout
 from ..errors import ScenarioError, count_nouns
 from ..fields import Frozen, reword_problem, split_refusal
 

@@ -25,7 +25,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any, NamedTuple
 
-from ..core.ticks import tick_ns
+from ..core.step.ticks import tick_ns
 from ..errors import WireError
 from ..net import messages, topics
 from ..net.topics import number_message

@@ -32,9 +32,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.chain import LINK_PARAMETERS
-from ..core.task_space import POSE, POSITION
-from ..core.ticks import NS_PER_S
+from ..core.arms.chain import LINK_PARAMETERS
+from ..core.arms.task_space import POSE, POSITION
+from ..core.step.ticks import NS_PER_S
 from ..errors import LogError
 from ..files import import_extra
 from ..net.messages import Event, LinkStats, State, json_schema

@@ -24,7 +24,7 @@ from pathlib import Path
 
 import msgspec
 
-from ..core.fingerprint import compute_fingerprint
+from ..core.step.fingerprint import compute_fingerprint
 from ..errors import UsageError
 from ..files import find_version
 from ..net import topics

@@ -37,8 +37,8 @@ from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar
 
 import numpy as np
 
-from ..core.delay import MAX_DELAY_US
-from ..core.ticks import NS_PER_S, CoreChange
+from ..core.links.delay import MAX_DELAY_US
+from ..core.step.ticks import NS_PER_S, CoreChange
 from ..errors import (
     LogError,
     ScenarioError,
@@ -90,7 +90,7 @@ if TYPE_CHECKING:
 
 M = TypeVar("M", Event, LinkStats, RecorderStats)
 
-_COLUMN_PLOT = "trilat_net.reporting.column_plot"
+_COLUMN_PLOT = "trilat_net.presentation.column_plot"
 """Module that draws a log. Imported only for a figure, because it needs Matplotlib."""
 
 

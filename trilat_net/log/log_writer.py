@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..core.ticks import TickRecord
+from ..core.step.ticks import TickRecord
 from ..errors import LogRefused, UsageError
 from ..files import refuse_existing
 from ..net import topics

@@ -24,8 +24,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..core.task_space import POSE, POSITION
-from ..core.vectors import Array
+from ..core.arms.task_space import POSE, POSITION
+from ..core.step.vectors import Array
 from ..scenario.arms import TASK_AXES
 
 QUATERNION_AXES = ("qw", "qx", "qy", "qz")

@@ -21,8 +21,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.site_setup import Layout
-from ..core.vectors import Array
+from ..core.step.site_setup import Layout
+from ..core.step.vectors import Array
 from ..errors import WireError
 from ..net.messages import MODES, READABLE, Stamp, State, TickNumber
 from ..net.wire import MAX_BYTES, decode

@@ -22,7 +22,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from ..core.ticks import NS_PER_S
+from ..core.step.ticks import NS_PER_S
 from ..errors import LogError, ScenarioError, WireError, count_nouns
 from ..files import open_regular
 from ..net import messages, topics

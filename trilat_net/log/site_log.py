@@ -20,11 +20,11 @@ from typing import Any, Generic, NamedTuple, TypeVar, overload
 import numpy as np
 
 from .. import process
-from ..core.law_channel import LawChannel
-from ..core.site_setup import Layout
-from ..core.task_space import POSE, POSITION
-from ..core.ticks import NS_PER_S
-from ..core.vectors import Array
+from ..core.arms.task_space import POSE, POSITION
+from ..core.plug.law_channel import LawChannel
+from ..core.step.site_setup import Layout
+from ..core.step.ticks import NS_PER_S
+from ..core.step.vectors import Array
 from ..errors import LogError, WireError, count_nouns
 from ..net.messages import READABLE, State
 from ..net.wire import decode
@@ -299,7 +299,7 @@ class _RecordVector(cached_property[Array]):
         self.__doc__ = meaning
 
 
-_HTML = "trilat_net.reporting.site_html"
+_HTML = "trilat_net.presentation.site_html"
 """Module that renders the records of a site as HTML. Imported only when a notebook needs it."""
 
 

@@ -33,9 +33,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Self, TypeVar
 
-from ..core.exogenous import TorqueKind, TorqueSource
-from ..core.live_hand import GRIP_NS, SILENCE_NS, HandInForce
-from ..core.ticks import LifeReason
+from ..core.arms.exogenous import TorqueKind, TorqueSource
+from ..core.life.live_hand import GRIP_NS, SILENCE_NS, HandInForce
+from ..core.step.ticks import LifeReason
 from ..errors import UsageError, WireError
 from . import topics
 from .bus import Bus

@@ -32,8 +32,8 @@ from typing import NamedTuple
 
 import msgspec
 
-from ..core.fingerprint import compute_fingerprint
-from ..core.site_setup import Layout
+from ..core.step.fingerprint import compute_fingerprint
+from ..core.step.site_setup import Layout
 from ..errors import SessionError, WireError
 from . import topics
 from .bus import Bus, Inbox

@@ -23,10 +23,10 @@ from typing import Annotated, Any, NamedTuple
 import msgspec
 from msgspec import Meta
 
-from ..core.chain import MAX_JOINTS
-from ..core.site_setup import Layout
-from ..core.ticks import Mode
-from ..core.user_law import MAX_LAW_MEMORY
+from ..core.arms.chain import MAX_JOINTS
+from ..core.plug.user_law import MAX_LAW_MEMORY
+from ..core.step.site_setup import Layout
+from ..core.step.ticks import Mode
 
 VERSION = 4
 """Version of the schema of sent messages. Messages of other versions are not accepted."""

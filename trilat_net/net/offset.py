@@ -39,8 +39,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.ticks import NS_PER_S
-from ..core.vectors import Array
+from ..core.step.ticks import NS_PER_S
+from ..core.step.vectors import Array
 
 WINDOWS_KEPT = 60
 """Number of windows whose limits are stored."""

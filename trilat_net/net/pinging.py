@@ -12,7 +12,7 @@ a query is repeated, and replies to the last QUERIES_KEPT copies are accepted.
 from collections import deque
 from collections.abc import Callable, Collection, Mapping
 
-from ..core.ticks import NS_PER_S
+from ..core.step.ticks import NS_PER_S
 from ..errors import WireError
 from . import topics
 from .bus import Bus, Inbox, Query

@@ -30,7 +30,7 @@ Invariant:
 
 from collections.abc import Mapping, Sequence
 
-from ..core.ticks import first_tick_at, tick_ns
+from ..core.step.ticks import first_tick_at, tick_ns
 from ..errors import SessionError
 from . import topics
 from .bus import Bus

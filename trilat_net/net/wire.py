@@ -26,9 +26,9 @@ from typing import Any, TypeVar
 import msgpack
 import msgspec
 
-from ..core.chain import MAX_JOINTS
-from ..core.site_setup import Layout
-from ..core.ticks import Arrival, TickRecord
+from ..core.arms.chain import MAX_JOINTS
+from ..core.step.site_setup import Layout
+from ..core.step.ticks import Arrival, TickRecord
 from ..errors import WireError, count_nouns
 from .messages import (
     MODE_WORDS,

@@ -23,7 +23,7 @@ import msgspec
 import numpy as np
 
 from .. import fields
-from ..core.chain import (
+from ..core.arms.chain import (
     ChainJoint,
     Three,
     apply,
@@ -33,11 +33,11 @@ from ..core.chain import (
     place_end_effector,
     place_joints,
 )
-from ..core.live_hand import HandReach
-from ..core.rotation import relative_rotation, rotation_matrix
-from ..core.site_setup import ChainSetup, Gains, Law, MotionLimits, RestGains, TaskSetup
-from ..core.two_link_arm import ArmLinks, is_positive_definite, theta_from_links
-from ..core.vectors import Array, RowArray, Vector
+from ..core.arms.rotation import relative_rotation, rotation_matrix
+from ..core.arms.two_link_arm import ArmLinks, is_positive_definite, theta_from_links
+from ..core.life.live_hand import HandReach
+from ..core.step.site_setup import ChainSetup, Gains, Law, MotionLimits, RestGains, TaskSetup
+from ..core.step.vectors import Array, RowArray, Vector
 from ..errors import ScenarioError, count_nouns
 from .link_inertia import LinkInertia, TensorEntries, ThreeReals
 from .urdf import UrdfChain, UrdfJoint, UrdfPayload, read_urdf

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.delay import DelayKind, TraceEnd
+from ..core.links.delay import DelayKind, TraceEnd
 from .delay_models import LinkBase
 from .scenario_types import Scenario, scheduled_links
 

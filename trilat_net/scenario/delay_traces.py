@@ -36,9 +36,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..core.channel import LOST
-from ..core.delay import MAX_DELAY_US
-from ..core.vectors import Array, Points
+from ..core.links.channel import LOST
+from ..core.links.delay import MAX_DELAY_US
+from ..core.step.vectors import Array, Points
 from ..errors import ScenarioError, UsageError, count_nouns
 from ..files import decode_text, open_regular
 from ..results import Result

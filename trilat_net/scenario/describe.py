@@ -20,11 +20,11 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from ..core.chain import ChainJoint
-from ..core.delay import DelayKind
-from ..core.dominance import ROW_SUM_TOLERANCE, find_balancing_weights
-from ..core.philox import link_key
-from ..core.vectors import Array
+from ..core.arms.chain import ChainJoint
+from ..core.links.delay import DelayKind
+from ..core.links.dominance import ROW_SUM_TOLERANCE, find_balancing_weights
+from ..core.links.philox import link_key
+from ..core.step.vectors import Array
 from ..errors import count_nouns
 from ..laws.conditions import ArmLoad, LawSituation, StabilityCondition
 from ..laws.interface import LawSettings

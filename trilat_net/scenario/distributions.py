@@ -20,8 +20,8 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from ..core.chain import MAX_JOINTS
-from ..core.philox import link_key
+from ..core.arms.chain import MAX_JOINTS
+from ..core.links.philox import link_key
 from ..errors import ScenarioError
 from ..fields import Frozen, NotNegative, Real, TomlTable, is_distribution, is_number
 

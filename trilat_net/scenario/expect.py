@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from ..core.chain import MAX_JOINTS
+from ..core.arms.chain import MAX_JOINTS
 from ..errors import ScenarioError, count_nouns, suggest_nearest
 from ..fields import (
     Joints,

@@ -30,7 +30,7 @@ from typing import Annotated, Any, ClassVar, NamedTuple, Protocol, cast
 
 from msgspec import Meta, field
 
-from ..core.user_law import LawContext, UserLaw, UserLawFactory
+from ..core.plug.user_law import LawContext, UserLaw, UserLawFactory
 from ..errors import CodeWithheld, ScenarioError, suggest_nearest
 from ..files import find_page, open_regular
 from ..laws.interface import LawSettings, check_law_class

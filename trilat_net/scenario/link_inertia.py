@@ -20,7 +20,7 @@ from typing import Annotated
 from msgspec import Meta
 
 from .. import fields
-from ..core.chain import Matrix
+from ..core.arms.chain import Matrix
 
 JACOBI_SWEEPS = 12
 """Number of sweeps of Jacobi's method.

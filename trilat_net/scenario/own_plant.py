@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Protocol
 import numpy as np
 from msgspec import Meta, field
 
-from ..core.ticks import PlantState
-from ..core.vectors import Array
+from ..core.step.ticks import PlantState
+from ..core.step.vectors import Array
 from ..errors import PlantFailed, ScenarioError, count_nouns
 from ..fields import Frozen, is_number
 from .class_arguments import make_own_instance

@@ -32,8 +32,8 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
-from ..core import dominance
-from ..core.two_link_arm import ArmLinks
+from ..core.arms.two_link_arm import ArmLinks
+from ..core.links import dominance
 from ..errors import ScenarioError, count_nouns, suggest_nearest
 from ..fields import (
     Frozen,

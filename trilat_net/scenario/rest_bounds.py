@@ -20,11 +20,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.chain import build_chain, inverse_dynamics, place_joints, propagate_motion
-from ..core.resting import REST_RATE_1_S
-from ..core.site_setup import Law, SiteSetup
-from ..core.two_link_arm import theta_from_links
-from ..core.vectors import Array
+from ..core.arms.chain import build_chain, inverse_dynamics, place_joints, propagate_motion
+from ..core.arms.two_link_arm import theta_from_links
+from ..core.life.resting import REST_RATE_1_S
+from ..core.step.site_setup import Law, SiteSetup
+from ..core.step.vectors import Array
 from .arms import Arm, ArmModel
 from .scenario_types import Scenario
 

@@ -23,7 +23,7 @@ from typing import Any
 
 import msgspec
 
-from ..core.ticks import NS_PER_S, CoreChange, LifeOrder
+from ..core.step.ticks import NS_PER_S, CoreChange, LifeOrder
 from ..errors import ScenarioError
 from .delay_models import LinkBase
 from .resolve import resolve_dominance_row, resolve_target

@@ -16,13 +16,13 @@ from functools import lru_cache
 
 import numpy as np
 
-from ..core.channel import LOST, schedule_deliveries
-from ..core.delay import LINK_MODEL_DTYPE, LinkModel
-from ..core.link import link_dtype
-from ..core.philox import link_key
-from ..core.site_setup import LinkSetup
-from ..core.ticks import NS_PER_S
-from ..core.vectors import IntArray, Row
+from ..core.links.channel import LOST, schedule_deliveries
+from ..core.links.delay import LINK_MODEL_DTYPE, LinkModel
+from ..core.links.link import link_dtype
+from ..core.links.philox import link_key
+from ..core.step.site_setup import LinkSetup
+from ..core.step.ticks import NS_PER_S
+from ..core.step.vectors import IntArray, Row
 from .delay_models import LinkBase
 from .scenario_types import Scenario
 

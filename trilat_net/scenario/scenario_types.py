@@ -27,13 +27,14 @@ import numpy as np
 import tomli_w
 from msgspec import Meta
 
-from ..core import dominance, site_setup
-from ..core.chain import MAX_JOINTS
-from ..core.law_channel import LawChannel
-from ..core.philox import link_key
-from ..core.ticks import DominanceRamp
-from ..core.two_link_arm import ArmLinks
-from ..core.vectors import Array
+from ..core.arms.chain import MAX_JOINTS
+from ..core.arms.two_link_arm import ArmLinks
+from ..core.links import dominance
+from ..core.links.philox import link_key
+from ..core.plug.law_channel import LawChannel
+from ..core.step import site_setup
+from ..core.step.ticks import DominanceRamp
+from ..core.step.vectors import Array
 from ..errors import ScenarioError
 from ..fields import Frozen, Joints, Positive, PositiveJoints, RateHz, Real
 from ..laws.sent_vectors import SentVectorSpecs, build_channel

@@ -11,8 +11,8 @@ Invariant:
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.chain import MAX_JOINTS, build_chain, find_acceleration, place_joints
-from ..core.vectors import Array
+from ..core.arms.chain import MAX_JOINTS, build_chain, find_acceleration, place_joints
+from ..core.step.vectors import Array
 from . import Scenario, find_site
 from .arms import build_arm
 

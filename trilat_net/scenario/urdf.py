@@ -28,8 +28,8 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from ..core.chain import MAX_JOINTS, Matrix, Three, apply, multiply
-from ..core.elementary import sincos
+from ..core.arms.chain import MAX_JOINTS, Matrix, Three, apply, multiply
+from ..core.arms.elementary import sincos
 from ..errors import ScenarioError, count_nouns, suggest_nearest
 from ..fields import MAX_QUANTITY
 from .link_inertia import LinkInertia, balance_tensor, fill_tensor

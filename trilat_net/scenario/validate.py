@@ -21,8 +21,8 @@ from typing import Any, get_args
 import msgspec
 import numpy as np
 
-from ..core.dominance import is_irreducible
-from ..core.site_arrays import MAX_LINKS_BYTES, links_bytes, needed_pages
+from ..core.links.dominance import is_irreducible
+from ..core.step.site_arrays import MAX_LINKS_BYTES, links_bytes, needed_pages
 from ..errors import ScenarioError, count_nouns
 from ..fields import TomlTable, reword_problem, split_refusal
 from ..files import find_page

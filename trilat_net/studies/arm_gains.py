@@ -40,26 +40,26 @@ import msgspec
 import numpy as np
 from scipy.optimize import brentq
 
-from ..analysis.envelope_trend import EnvelopeTrend, fit_envelopes
-from ..core.ticks import BUCKETS_PER_S
-from ..core.vectors import Array
-from ..errors import UsageError
-from ..execution.fused import FusedRun
-from ..log.log_reader import open_log, read_link_delays
-from ..reporting.result_text import MARKS, Block, MarkedText, TextTable
-from ..results import Result, finite_or_none
-from ..scenario import Scenario, load_scenario
-from ..scenario.arms import read_arm
-from ..scenario.laws import BUILT_IN
-from ..theory.characteristic_roots import CharacteristicRoot
-from ..theory.floquet import find_samples_in_use
-from ..theory.linear_edge import find_rightmost_root
-from ..theory.operating_point import (
+from ..analysis.theory.characteristic_roots import CharacteristicRoot
+from ..analysis.theory.floquet import find_samples_in_use
+from ..analysis.theory.linear_edge import find_rightmost_root
+from ..analysis.theory.operating_point import (
     Equilibrium,
     OperatingConditions,
     derive_operating_conditions,
 )
-from .executor import Progress, ignore_progress
+from ..analysis.twins.envelope_trend import EnvelopeTrend, fit_envelopes
+from ..core.step.ticks import BUCKETS_PER_S
+from ..core.step.vectors import Array
+from ..errors import UsageError
+from ..execution.fused import FusedRun
+from ..log.log_reader import open_log, read_link_delays
+from ..presentation.result_text import MARKS, Block, MarkedText, TextTable
+from ..results import Result, finite_or_none
+from ..scenario import Scenario, load_scenario
+from ..scenario.arms import read_arm
+from ..scenario.laws import BUILT_IN
+from ..work.executor import Progress, ignore_progress
 
 TUNED_LAWS = tuple(
     name

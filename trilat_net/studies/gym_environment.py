@@ -26,10 +26,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import numpy as np
 from msgspec.structs import replace
 
-from ..core.own_hand import HandView
-from ..core.site_arrays import SiteArrays
-from ..core.ticks import tick_ns
-from ..core.vectors import Array
+from ..core.life.own_hand import HandView
+from ..core.step.site_arrays import SiteArrays
+from ..core.step.ticks import tick_ns
+from ..core.step.vectors import Array
 from ..errors import UsageError, count_nouns
 from ..execution.fused import FusedRun
 from ..execution.virtual import record_virtual
@@ -42,7 +42,7 @@ from ..scenario.own_plant import make_plant_players
 from .reachable_places import can_reach
 
 if TYPE_CHECKING:
-    from ..reporting.episode_picture import EpisodePicture
+    from ..presentation.episode_picture import EpisodePicture
 
 try:
     import gymnasium
@@ -743,7 +743,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         if not (self._runs or self._actions):
             raise EpisodeError("there is no episode to draw: call reset first")
         # imported here, because the import of Matplotlib takes a second
-        from ..reporting.episode_picture import EpisodePicture, is_position
+        from ..presentation.episode_picture import EpisodePicture, is_position
 
         if self._picture is None:
             self._picture = EpisodePicture(self.scenario, self._leads)

@@ -41,17 +41,17 @@ from scipy.optimize import least_squares
 from scipy.special import stdtrit
 
 from ..analysis.aligned import AlignedRecords, align_records
+from ..analysis.theory.characteristic_roots import Complex
+from ..analysis.theory.port_passivity import HandMatrices
 from ..analysis.torque_sources import compute_operator_script, split_torque
-from ..core.exogenous import SCRIPTED_KINDS
-from ..core.vectors import Array
+from ..core.arms.exogenous import SCRIPTED_KINDS
+from ..core.step.vectors import Array
 from ..errors import UsageError, count_nouns
 from ..log.log_reader import Log, open_log
-from ..reporting.result_text import Block, TextTable
+from ..presentation.result_text import Block, TextTable
 from ..results import Result
 from ..scenario import Scenario, find_site
 from ..scenario.operators.kernel_operators import Multisine
-from ..theory.characteristic_roots import Complex
-from ..theory.port_passivity import HandMatrices
 
 MIN_SEGMENTS = 5
 """Smallest number of segments for confidence intervals."""

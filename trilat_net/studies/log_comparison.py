@@ -12,17 +12,17 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+from ..analysis.judge import certify_run
 from ..analysis.metrics.log_metrics import MetricComparison, compare_metrics, comparison_to_json
 from ..errors import UsageError, count_nouns
 from ..log.log_reader import Log, open_log
-from ..reporting.certificate_text import describe_judgement
-from ..reporting.result_text import Block, MarkedText, TextTable, format_number
+from ..presentation.certificate_text import describe_judgement
+from ..presentation.result_text import Block, MarkedText, TextTable, format_number
 from ..results import Result
 from ..scenario.code_consent import may_run_user_laws
 from ..scenario.describe import ScenarioDifference, compare_scenarios
 from ..scenario.scenario_reader import reseed_scenario
-from ..theory.run_certificate import certify_run
-from .intervals import MeanInterval, mean_interval
+from ..work.intervals import MeanInterval, mean_interval
 from .tuning.candidate import check_final_posture
 
 _MOST_REASONS = 6

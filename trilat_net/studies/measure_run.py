@@ -37,9 +37,9 @@ from ..analysis.run_end import (
     reduce_to_buckets,
 )
 from ..analysis.torque_sources import list_walls, wall_force
-from ..core.site_step import Site
-from ..core.ticks import BUCKETS_PER_S, NS_PER_S, Mode, TickRecord
-from ..core.vectors import Array
+from ..core.step.site_step import Site
+from ..core.step.ticks import BUCKETS_PER_S, NS_PER_S, Mode, TickRecord
+from ..core.step.vectors import Array
 from ..execution import virtual
 from ..execution.fused import FusedRun
 from ..execution.virtual import simulate_scenario

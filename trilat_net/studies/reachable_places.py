@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..core.vectors import Array
+from ..core.step.vectors import Array
 from ..scenario.arms import ArmModel
 
 PLANAR_MARGIN = 0.01

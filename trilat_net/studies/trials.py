@@ -44,20 +44,21 @@ from typing import Any, NamedTuple
 from msgspec.structs import asdict
 
 from ..analysis.metrics.log_metrics import find_quantity
-from ..core.jit import is_core_cached
+from ..core.step.jit import is_core_cached
 from ..errors import LawFailed, LogError, ScenarioError, TrilatError, count_nouns
 from ..execution import virtual
 from ..execution.verify import verify
 from ..fields import is_distribution
 from ..log.log_reader import open_log
 from ..net.clock import SystemClock
-from ..reporting.result_text import Block, MarkedText, TextTable
+from ..presentation.result_text import Block, MarkedText, TextTable
 from ..results import Result
 from ..scenario import Scenario, load_scenario
 from ..scenario.code_consent import list_imported_code
 from ..scenario.scenario_reader import read_experiment, reseed_scenario
-from .executor import MAX_LOSSES, WorkerPool, Workers, open_worker_pool
-from .intervals import MeanInterval, mean_interval
+from ..work.executor import MAX_LOSSES, WorkerPool, Workers, open_worker_pool
+from ..work.intervals import MeanInterval, mean_interval
+from ..work.study_folder import format_command, format_toml_value, set_options
 from .measure_run import (
     ExpectationResult,
     RunMetrics,
@@ -65,7 +66,6 @@ from .measure_run import (
     measure_log,
     measure_virtual_run,
 )
-from .study_folder import format_command, format_toml_value, set_options
 
 
 class TrialResult(NamedTuple):

@@ -13,7 +13,7 @@ from trilat_net.analysis.certificate.stability_certificate import (
     certify,
 )
 from trilat_net.errors import ScenarioError
-from trilat_net.reporting.certificate_text import describe_certificate, list_energies
+from trilat_net.presentation.certificate_text import describe_certificate, list_energies
 from trilat_net.scenario import load_scenario
 
 SCENARIOS = (

@@ -24,8 +24,8 @@ from trilat_net.errors import LogError
 from trilat_net.execution.virtual import simulate_scenario
 from trilat_net.files import find_page
 from trilat_net.log.log_reader import Log
-from trilat_net.reporting.certificate_text import describe_certificate
-from trilat_net.reporting.figures.registry import figure
+from trilat_net.presentation.certificate_text import describe_certificate
+from trilat_net.presentation.figures.registry import figure
 from trilat_net.scenario import load_scenario
 from trilat_net.studies.tuning.tuning_report import list_energy_notes
 

@@ -17,7 +17,7 @@ from trilat_net.analysis.certificate.premises import (
     gather_facts,
 )
 from trilat_net.analysis.torque_sources import find_wall_energies
-from trilat_net.core.vectors import Array
+from trilat_net.core.step.vectors import Array
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import load_scenario
 

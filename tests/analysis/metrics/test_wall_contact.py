@@ -9,7 +9,7 @@ from trilat_net.analysis.aligned import align_records
 from trilat_net.analysis.arm_rows import build_arm_rows
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
 from trilat_net.analysis.torque_sources import wall_force
-from trilat_net.core.two_link_arm import JOINTS
+from trilat_net.core.arms.two_link_arm import JOINTS
 
 from .written import pair, simulated
 

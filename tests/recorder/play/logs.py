@@ -6,8 +6,8 @@ from typing import Any
 
 from mcap.reader import make_reader
 
-from recorder.play.batch import MessageBatch
-from recorder.play.session_reader import PlaySelection, SessionHeader, preload_messages
+from trilat_net.app.play.batch import MessageBatch
+from trilat_net.app.play.session_reader import PlaySelection, SessionHeader, preload_messages
 from trilat_net.log.log_writer import LogWriter
 from trilat_net.net import topics
 from trilat_net.net.messages import Event

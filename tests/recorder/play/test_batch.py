@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recorder.play.batch import BatchBuilder, MessageBatch
+from trilat_net.app.play.batch import BatchBuilder, MessageBatch
 
 messages = st.lists(
     st.tuples(

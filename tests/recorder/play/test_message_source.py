@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recorder.play.batch import BatchBuilder, MessageBatch, PlayedMessage
-from recorder.play.message_source import MessageSource, feed_player, sort_messages
-from recorder.play.session_reader import PlaySelection, SessionHeader, preload_messages
 from tests.net.waiting import until
+from trilat_net.app.play.batch import BatchBuilder, MessageBatch, PlayedMessage
+from trilat_net.app.play.message_source import MessageSource, feed_player, sort_messages
+from trilat_net.app.play.session_reader import PlaySelection, SessionHeader, preload_messages
 from trilat_net.errors import LogError, RuntimeFault
 
 from .logs import loaded, write

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recorder.play.player import (
+from trilat_net.app.play.player import (
     LATENESS_LIMIT_US,
     SPIN_NS,
     LatenessHistogram,

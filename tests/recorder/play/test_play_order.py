@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recorder.play.batch import order_for_play
+from trilat_net.app.play.batch import order_for_play
 
 Messages = list[tuple[int, int, int]]
 messages = st.lists(

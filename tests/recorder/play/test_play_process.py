@@ -9,19 +9,19 @@ from pathlib import Path
 
 import pytest
 
-from recorder.play.message_source import MessageSource
-from recorder.play.play_process import (
+from tests.net.local_bus import LocalNetwork
+from tests.net.parties import told
+from tests.net.waiting import drained
+from trilat_net.app.play.message_source import MessageSource
+from trilat_net.app.play.play_process import (
     LINGER_NS,
     Playback,
     PlaybackSummary,
     PlayOptions,
     map_key_to_session,
 )
-from recorder.play.player import PlayProgress
-from recorder.play.session_reader import PlaySelection, preload_messages
-from tests.net.local_bus import LocalNetwork
-from tests.net.parties import told
-from tests.net.waiting import drained
+from trilat_net.app.play.player import PlayProgress
+from trilat_net.app.play.session_reader import PlaySelection, preload_messages
 from trilat_net.errors import SessionError
 from trilat_net.execution.virtual import compute_boot
 from trilat_net.log.log_layout import ChannelFilter

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recorder.play.batch import BatchBuilder, MessageBatch
-from recorder.play.message_source import MessageSource
-from recorder.play.player import (
+from trilat_net.app.play.batch import BatchBuilder, MessageBatch
+from trilat_net.app.play.message_source import MessageSource
+from trilat_net.app.play.player import (
     CUT_NS,
     LOOP_PAUSE_NS,
     SERVICE_EVERY_NS,
@@ -18,8 +18,8 @@ from recorder.play.player import (
     Player,
     PlayProgress,
 )
-from recorder.play.session_reader import SessionHeader
-from recorder.play.site_stand_ins import PlayedHistory
+from trilat_net.app.play.session_reader import SessionHeader
+from trilat_net.app.play.site_stand_ins import PlayedHistory
 from trilat_net.scenario import load_scenario
 
 from .clocks import LookedAt

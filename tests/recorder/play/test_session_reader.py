@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recorder.play.session_reader import PlaySelection, preload_messages
+from trilat_net.app.play.session_reader import PlaySelection, preload_messages
 from trilat_net.errors import LogError, UsageError
 from trilat_net.execution.virtual import compute_boot
 from trilat_net.log.log_layout import ChannelFilter

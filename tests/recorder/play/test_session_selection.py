@@ -2,7 +2,7 @@
 
 import pytest
 
-from recorder.play.session_reader import parse_selection
+from trilat_net.app.play.session_reader import parse_selection
 from trilat_net.errors import UsageError
 
 SITES = ("m1", "m2", "s")

@@ -3,9 +3,9 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recorder.play.batch import BatchBuilder
-from recorder.play.site_stand_ins import PlayedHistory
 from sites.retransmit_buffer import ChannelBuffer
+from trilat_net.app.play.batch import BatchBuilder
+from trilat_net.app.play.site_stand_ins import PlayedHistory
 from trilat_net.net.requests import BACKFILL_BYTES, BACKFILL_MESSAGES
 
 CHANNEL, OTHER = 3, 4

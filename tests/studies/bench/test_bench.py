@@ -11,11 +11,11 @@ import pytest
 from scipy import optimize, stats
 
 import trilat_net
-from trilat_net.analysis.envelope_trend import EnvelopeFit, EnvelopeTrend
 from trilat_net.analysis.run_end import EndBehaviour, RunEnd, Stability
 from trilat_net.analysis.stability_decision import LoopRoots
-from trilat_net.analysis.twin_growth import TwinGrowth
-from trilat_net.core.vectors import Array
+from trilat_net.analysis.twins.envelope_trend import EnvelopeFit, EnvelopeTrend
+from trilat_net.analysis.twins.twin_growth import TwinGrowth
+from trilat_net.core.step.vectors import Array
 from trilat_net.errors import UsageError
 from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import load_scenario
@@ -66,7 +66,6 @@ from trilat_net.studies.bench.bench_run import (
     run_bench_task,
 )
 from trilat_net.studies.measure_run import RecordBatch
-from trilat_net.studies.study_folder import encode_csv
 from trilat_net.studies.tuning import plan_tuning
 from trilat_net.studies.tuning.candidate import (
     CandidateClass,
@@ -74,6 +73,7 @@ from trilat_net.studies.tuning.candidate import (
     measure_candidate,
 )
 from trilat_net.studies.tuning.search_space import SEARCH_SPACES
+from trilat_net.work.study_folder import encode_csv
 
 LEVEL = {"laws": ["p_d"], "study": "round-trips"}
 

@@ -150,7 +150,7 @@ def test_killed_experiment_goes_on_whole(done: Experiment, kills: int, tmp_path:
     """SIGKILL at random moments: nothing twice, nothing lost, the same bytes in the end."""
     folder, moment = tmp_path / "out", random.Random(1)
     begin_experiment(write_protocol(tmp_path), folder)
-    code = "from trilat_net.cli import main; main()"
+    code = "from trilat_net.app.cli import main; main()"
     words = [sys.executable, "-c", code, "experiment", "run", str(folder), "--jobs", "1"]
     ends = []
     for _ in range(kills):

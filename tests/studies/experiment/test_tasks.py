@@ -9,7 +9,7 @@ import pytest
 
 import trilat_net as tn
 from trilat_net.analysis.arm_rows import build_arm_rows
-from trilat_net.core.vectors import Array
+from trilat_net.core.step.vectors import Array
 from trilat_net.log.log_reader import Log
 from trilat_net.studies.experiment.experiment_run import Experiment, begin_experiment
 from trilat_net.studies.experiment.protocol import PlannedTrial

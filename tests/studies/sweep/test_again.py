@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from tests.cli.running import trilat
+from trilat_net.analysis.judge import certify_run
 from trilat_net.analysis.run_end import classify_log_end
 from trilat_net.log.log_reader import open_log
 from trilat_net.studies.sweep import prepare_sweep_folder, run_sweep
 from trilat_net.studies.sweep.sweep_cell import classify_decision
 from trilat_net.studies.sweep.sweep_results import SweepResults, build_reproduce_command
-from trilat_net.theory.run_certificate import certify_run
 
 from .quick import SHORT, asked
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.studies.sweep.quick import Judge, asked
-from trilat_net.cli.options import load_chosen_scenario
+from trilat_net.app.cli.options import load_chosen_scenario
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import load_scenario, parse_scenario
 from trilat_net.studies.sweep import sweep_cell

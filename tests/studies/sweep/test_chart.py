@@ -10,6 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from trilat_net.analysis.theory.linear_edge import (
+    GrowthColumn,
+    compute_growth_column,
+    iterate_linear_edges,
+)
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.studies.sweep.stability_map import (
@@ -29,11 +34,6 @@ from trilat_net.studies.sweep.sweep_plan import (
     plan_sweep,
 )
 from trilat_net.studies.sweep.sweep_results import SweepResults
-from trilat_net.theory.linear_edge import (
-    GrowthColumn,
-    compute_growth_column,
-    iterate_linear_edges,
-)
 
 from .maps import KEYS, rows
 

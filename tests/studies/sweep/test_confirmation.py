@@ -191,7 +191,7 @@ def test_a_session_over_zenoh_has_the_verdict_of_virtual_time(
 ) -> None:
     from rich.console import Console
 
-    from sites.demo_session import run_demo
+    from trilat_net.app.demo_session import run_demo
 
     def run(wanted: Scenario, _: str) -> tuple[Path, Sequence[str]]:
         outcome = run_demo(wanted, tmp_path, Console(quiet=True))

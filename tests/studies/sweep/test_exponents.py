@@ -8,8 +8,9 @@ import pytest
 from matplotlib.collections import QuadMesh
 from matplotlib.colors import to_hex
 
+from trilat_net.analysis.theory.linear_edge import compute_growth_column
 from trilat_net.errors import UsageError
-from trilat_net.reporting.appearance import make_print_size
+from trilat_net.presentation.appearance import make_print_size
 from trilat_net.studies.sweep import prepare_sweep_folder, run_sweep
 from trilat_net.studies.sweep.map_page import draw_stability_map, tabulate_edges
 from trilat_net.studies.sweep.stability_map import (
@@ -19,7 +20,6 @@ from trilat_net.studies.sweep.stability_map import (
 )
 from trilat_net.studies.sweep.sweep_plan import build_sweep_command, plan_from_json, plan_sweep
 from trilat_net.studies.sweep.sweep_results import SweepResults, read_results
-from trilat_net.theory.linear_edge import compute_growth_column
 
 from .maps import KEYS, P_D, rows
 from .quick import asked

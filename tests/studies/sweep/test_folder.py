@@ -10,17 +10,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from trilat_net.core.fingerprint import compute_fingerprint
+from trilat_net.core.step.fingerprint import compute_fingerprint
 from trilat_net.errors import LogRefused, UsageError
 from trilat_net.log.log_layout import collect_provenance
-from trilat_net.studies import study_folder as folders
-from trilat_net.studies.study_folder import RunJournal
 from trilat_net.studies.sweep.sweep_cell import CellRun
 from trilat_net.studies.sweep.sweep_run import (
     PLAN_FILE,
     open_sweep_folder,
     prepare_sweep_folder,
 )
+from trilat_net.work import study_folder as folders
+from trilat_net.work.study_folder import RunJournal
 
 from .quick import DAMPING, SHORT, asked, outcome_of
 

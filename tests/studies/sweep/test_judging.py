@@ -8,6 +8,7 @@ import msgspec
 import pytest
 
 import trilat_net
+from trilat_net.analysis.judge import certify_run
 from trilat_net.analysis.run_end import EndBehaviour, Stability
 from trilat_net.execution import virtual
 from trilat_net.execution.fused import FusedRun
@@ -21,7 +22,6 @@ from trilat_net.studies.sweep.sweep_cell import (
     classify_decision,
     is_conclusive,
 )
-from trilat_net.theory.run_certificate import certify_run
 
 RUNS: dict[str, tuple[str, dict[str, Any]]] = {
     "converged": ("two_sites", {"duration_s": 20.0}),

@@ -11,7 +11,7 @@ from matplotlib.colors import rgb_to_hsv, to_hex, to_rgb
 from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
 
-from trilat_net.reporting.appearance import make_print_size
+from trilat_net.presentation.appearance import make_print_size
 from trilat_net.studies.sweep.fixed_gains import describe_fixed_gains
 from trilat_net.studies.sweep.map_page import (
     CLASS_COLOURS,

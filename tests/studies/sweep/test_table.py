@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from trilat_net.errors import UsageError
-from trilat_net.studies.intervals import wilson_interval
 from trilat_net.studies.sweep import prepare_sweep_folder, read_results, run_sweep, sweep_cell
 from trilat_net.studies.sweep.sweep_cell import CellClass, CellRun, diff_lines
 from trilat_net.studies.sweep.sweep_plan import plan_sweep
@@ -24,6 +23,7 @@ from trilat_net.studies.sweep.sweep_results import (
     encode_results,
     reproduction_duration_s,
 )
+from trilat_net.work.intervals import wilson_interval
 
 from .quick import DELAYS, Judge, asked, outcome_of
 

@@ -4,8 +4,8 @@ from typing import Any
 
 import msgspec
 
-from trilat_net.analysis.envelope_trend import EnvelopeFit, EnvelopeTrend
 from trilat_net.analysis.run_end import EndBehaviour, RunEnd
+from trilat_net.analysis.twins.envelope_trend import EnvelopeFit, EnvelopeTrend
 from trilat_net.scenario import Scenario, parse_scenario
 from trilat_net.scenario.code_consent import allow_own_code
 from trilat_net.studies.measure_run import ExpectationResult, LinkAge, RunMetrics

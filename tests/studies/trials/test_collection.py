@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import trilat_net
 from tests.log_editing import edited, opened, recorded, without
-from trilat_net.core.two_link_arm import end_effector_jacobian
+from trilat_net.core.arms.two_link_arm import end_effector_jacobian
 from trilat_net.errors import ScenarioError
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, load_scenario

@@ -229,7 +229,7 @@ def test_a_session_has_the_delay_of_its_slowest_link(
     one_joint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     report = ping_sites()  # of a party on the party's clock
-    monkeypatch.setattr("sites.session_ping.ping_session", lambda *_, **__: report)
+    monkeypatch.setattr("trilat_net.app.session_ping.ping_session", lambda *_, **__: report)
     words = ("tune", "--arm", one_joint.name, "--delay", "measured:paper", "--json")
     told = json.loads(trilat(*words, cwd=tmp_path).succeeds())
     assert told["delay"] == f"{1e-3 * report.links[0]['delay_us']:g} ms each way"

@@ -5,9 +5,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from trilat_net.analysis.envelope_trend import EnvelopeFit, EnvelopeTrend
 from trilat_net.analysis.run_end import EndBehaviour, RunEnd, Stability
-from trilat_net.api import simulate
+from trilat_net.analysis.twins.envelope_trend import EnvelopeFit, EnvelopeTrend
+from trilat_net.app.api import simulate
 from trilat_net.execution.virtual import record_virtual
 from trilat_net.log.log_reader import open_log
 from trilat_net.studies.tuning.candidate import (

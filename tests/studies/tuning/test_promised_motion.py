@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from trilat_net.core.vectors import Array
+from trilat_net.core.step.vectors import Array
 from trilat_net.laws.impedance import move_impedance
 from trilat_net.laws.interface import LawSettings, TuningRun
 from trilat_net.scenario.laws import BUILT_IN

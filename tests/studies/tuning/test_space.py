@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from tests.core.chain_references import ChainState, chain_references
 from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.scenario import load_scenario
-from trilat_net.studies.study_folder import format_toml_value
 from trilat_net.studies.tuning.candidate import TuningScenario, load_tuning_scenario
 from trilat_net.studies.tuning.search_space import (
     DEFAULT_LAWS,
@@ -18,6 +17,7 @@ from trilat_net.studies.tuning.search_space import (
     select_search_spaces,
     weigh_joints,
 )
+from trilat_net.work.study_folder import format_toml_value
 
 from .experiments import trio
 

@@ -38,8 +38,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...core.site_setup import Scheme
-from ...core.vectors import Array
+from ...core.step.site_setup import Scheme
+from ...core.step.vectors import Array
 from ...log.record_columns import Ints
 from ...scenario import Scenario
 from ..aligned import AlignedRecords, Bools, DelayedPeer, hold_torque

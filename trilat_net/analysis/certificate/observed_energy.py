@@ -22,9 +22,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...core.law_energy import LawEnergies, LawRecords, PeerRecords, sum_work
-from ...core.site_setup import Scheme, StaleAction
-from ...core.vectors import Array
+from ...core.plug.law_energy import LawEnergies, LawRecords, PeerRecords, sum_work
+from ...core.step.site_setup import Scheme, StaleAction
+from ...core.step.vectors import Array
 from ...errors import count_nouns
 from ...log.log_reader import Log
 from ...results import JsonObject

@@ -29,13 +29,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...core.vectors import Array
+from ...core.step.vectors import Array
 from ...log.accounting import MIN_COVERAGE
 from ...log.log_reader import Log
 from ...results import JsonObject, Result, finite_or_none
 from ..run_end import EndBehaviour, RunEnd, Stability, classify_log_end
 from ..stability_decision import LoopRoots, RunFindings, StabilityDecision, decide_stability
-from ..twin_growth import TwinGrowth
+from ..twins.twin_growth import TwinGrowth
 from . import energy_terms
 from .energy_balance import (
     EXTERNAL_SOURCES,

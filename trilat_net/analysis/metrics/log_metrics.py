@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...core.task_space import POSITION
+from ...core.arms.task_space import POSITION
 from ...errors import count_nouns, suggest_nearest
 from ...log.log_reader import Log
 from ...results import Result

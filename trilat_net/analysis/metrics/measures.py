@@ -18,8 +18,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...core.task_space import POSITION
-from ...core.vectors import Array
+from ...core.arms.task_space import POSITION
+from ...core.step.vectors import Array
 from ..run_view import RunView
 
 

@@ -22,9 +22,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...core.site_setup import Law
-from ...core.task_space import POSE, POSITION
-from ...core.vectors import Array
+from ...core.arms.task_space import POSE, POSITION
+from ...core.step.site_setup import Law
+from ...core.step.vectors import Array
 from ...log.orientations import choose_nearest_vectors
 from ...log.site_log import compute_task_errors
 from ...results import JsonObject

@@ -19,8 +19,8 @@ each law, and the sources.
 
 import numpy as np
 
-from ...core.site_setup import Gains, Law, Scheme
-from ...core.vectors import Array
+from ...core.step.site_setup import Gains, Law, Scheme
+from ...core.step.vectors import Array
 from ...scenario import Scenario
 from ...scenario.laws import identify_law
 from ..aligned import (

@@ -28,9 +28,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...core.exogenous import TorqueKind
-from ...core.site_setup import Law
-from ...core.vectors import Array
+from ...core.arms.exogenous import TorqueKind
+from ...core.step.site_setup import Law
+from ...core.step.vectors import Array
 from ...log.record_columns import Ints
 from ...scenario import Scenario
 from ...scenario.laws import identify_law

@@ -15,7 +15,7 @@ Invariant:
 
 from collections.abc import Callable, Iterable, Sequence
 
-from ...core.task_space import POSE, POSITION
+from ...core.arms.task_space import POSE, POSITION
 from ...net.messages import LinkStats, State
 from ...scenario import Scenario
 from ..orientations import QuaternionSigns

@@ -22,8 +22,8 @@ import numpy as np
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
-from ...core.task_space import POSITION
-from ...core.ticks import Mode, TickRecord
+from ...core.arms.task_space import POSITION
+from ...core.step.ticks import Mode, TickRecord
 from ...files import reading
 from ...net.messages import MODE_WORDS, Event, LinkStats, State
 from ...scenario import Scenario

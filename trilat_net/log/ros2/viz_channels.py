@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterable, Sequence
 from operator import attrgetter
 from typing import Any
 
-from ...core.ticks import NS_PER_S
+from ...core.step.ticks import NS_PER_S
 from ...errors import UsageError
 from ...net import topics
 from ...net.messages import Event, LinkStats

@@ -17,11 +17,11 @@ from typing import Annotated, Literal
 import numpy as np
 from msgspec import Meta
 
-from ...core.delay import DelayKind, LinkModel, TraceEnd
-from ...core.vectors import Points
+from ...core.links.delay import DelayKind, LinkModel, TraceEnd
+from ...core.step.vectors import Points
 from ...fields import KeyProblem, TomlTable, is_number
-from ..delay_models import MAX_DELAY_MS, LinkBase, Milliseconds, Probability, ms_to_us
 from ..delay_traces import parse_trace
+from . import MAX_DELAY_MS, LinkBase, Milliseconds, Probability, ms_to_us
 
 PositiveMilliseconds = Annotated[float, Meta(gt=0.0, le=MAX_DELAY_MS)]
 Deviation = Annotated[float, Meta(ge=0.001, le=MAX_DELAY_MS)]

@@ -10,8 +10,8 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
-from ...core.delay import draw_pair
-from ..delay_models import Milliseconds, OwnDelay
+from ...core.links.delay import draw_pair
+from . import Milliseconds, OwnDelay
 
 
 class LowOrbit(OwnDelay, frozen=True, kw_only=True, tag="low_orbit"):

@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Union
 import msgspec
 
 from ... import fields
-from ...core.exogenous import TorqueKind, TorqueSource
-from ...core.vectors import Array
+from ...core.arms.exogenous import TorqueKind, TorqueSource
+from ...core.step.vectors import Array
 from ...errors import ScenarioError
 from ..distributions import Draws
 

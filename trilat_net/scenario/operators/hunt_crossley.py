@@ -12,8 +12,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ... import fields
-from ...core.vectors import Array
-from ..operators import OwnActor
+from ...core.step.vectors import Array
+from . import OwnActor
 
 
 class HuntCrossley(OwnActor, frozen=True, kw_only=True, tag="hunt_crossley"):

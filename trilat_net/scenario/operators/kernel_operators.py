@@ -22,13 +22,13 @@ import numpy as np
 from msgspec import Meta
 
 from ... import fields
-from ...core.chain import MAX_JOINTS
-from ...core.exogenous import TorqueKind, TorqueSource
-from ...core.live_hand import HandReach, HandRules
-from ...core.site_setup import MotionLimits
+from ...core.arms.chain import MAX_JOINTS
+from ...core.arms.exogenous import TorqueKind, TorqueSource
+from ...core.life.live_hand import HandReach, HandRules
+from ...core.step.site_setup import MotionLimits
 from ...errors import ScenarioError, count_nouns
 from ..arms import ArmModel
-from ..operators import ActorBase, HeldArm, SampledActor, TimedActor
+from . import ActorBase, HeldArm, SampledActor, TimedActor
 
 Frequency = Annotated[float, Meta(gt=0.0, le=1000.0)]
 RecordedPoint = Annotated[

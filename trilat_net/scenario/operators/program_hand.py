@@ -19,11 +19,11 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
 from msgspec import Meta, field
 
 from ... import fields
-from ...core.own_hand import HandContext, HandProgram, HandView, OwnHand
-from ...core.site_arrays import SiteArrays
-from ...core.site_step import Site
-from ...core.ticks import NS_PER_S, tick_ns
-from ...core.vectors import Array
+from ...core.life.own_hand import HandContext, HandProgram, HandView, OwnHand
+from ...core.step.site_arrays import SiteArrays
+from ...core.step.site_step import Site
+from ...core.step.ticks import NS_PER_S, tick_ns
+from ...core.step.vectors import Array
 from ..class_arguments import make_own_instance
 from ..imported_code import (
     CLASS_PATTERN,
@@ -33,7 +33,7 @@ from ..imported_code import (
     import_class,
     read_code,
 )
-from ..operators import HeldArm
+from . import HeldArm
 from .kernel_operators import LiveHand
 
 if TYPE_CHECKING:

@@ -22,12 +22,12 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from ...analysis.run_end import Stability
-from ...core.vectors import Array
+from ...core.step.vectors import Array
 from ...files import write_whole
-from ...reporting import style
-from ...reporting.appearance import make_print_size
-from ..intervals import MeanInterval
-from ..study_folder import encode_csv
+from ...presentation import style
+from ...presentation.appearance import make_print_size
+from ...work.intervals import MeanInterval
+from ...work.study_folder import encode_csv
 from .bench_results import (
     BenchCellResult,
     BenchResults,

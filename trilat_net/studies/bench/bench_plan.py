@@ -33,15 +33,15 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from ...core import control
+from ...core.step import control
 from ...errors import UsageError, suggest_nearest
 from ...files import write_whole
 from ...laws.interface import ControlLaw
 from ...laws.six_channel import complementary_shares
 from ...scenario.laws import BUILT_IN
 from ...scenario.resolve import GRID_LOSSES_PERCENT, GRID_ROUND_TRIPS_MS
-from ..executor import Progress, Workers, ignore_progress
-from ..study_folder import format_toml_value
+from ...work.executor import Progress, Workers, ignore_progress
+from ...work.study_folder import format_toml_value
 from ..tuning.candidate import (
     CandidateClass,
     TuningScenario,

@@ -21,10 +21,10 @@ import numpy as np
 
 from ...analysis.run_end import EndBehaviour, Stability
 from ...errors import count_nouns
-from ...reporting.result_text import Block, TextTable, format_number
+from ...presentation.result_text import Block, TextTable, format_number
 from ...results import Result
-from ..intervals import MeanInterval, mean_interval, wilson_interval
-from ..study_folder import encode_csv
+from ...work.intervals import MeanInterval, mean_interval, wilson_interval
+from ...work.study_folder import encode_csv
 from .bench_plan import STUDIES, TASKS, BenchCell, BenchPlan, TunedGains, explain_no_cell
 
 LEAST_CONTACT_N = 1.0

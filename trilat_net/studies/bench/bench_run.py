@@ -29,21 +29,21 @@ import numpy as np
 
 from ...analysis.arm_rows import build_arm_rows
 from ...analysis.dominance_history import evaluate_ramps, list_scripted_ramps
+from ...analysis.judge import judge_virtual_run
 from ...analysis.run_end import THROWN_RAD, EndBehaviour, RunEnd, Stability
 from ...analysis.site_signals import SETTLED_ERROR_RAD
 from ...analysis.stability_decision import LoopRoots
 from ...analysis.torque_sources import list_walls, wall_force
-from ...analysis.twin_growth import TwinGrowth
-from ...core.ticks import NS_PER_S
-from ...core.vectors import Array
+from ...analysis.twins.twin_growth import TwinGrowth
+from ...core.step.ticks import NS_PER_S
+from ...core.step.vectors import Array
 from ...errors import UsageError
 from ...files import make_results_folder, refuse_link, write_whole
 from ...scenario import Scenario
 from ...scenario.operators.kernel_operators import ViscousEnvironment
-from ...theory.run_certificate import judge_virtual_run
-from ..executor import Progress, Workers, ignore_progress, open_worker_pool
+from ...work.executor import Progress, Workers, ignore_progress, open_worker_pool
+from ...work.study_folder import RunJournal, StudyFolder, build_resume_hint, describe_program
 from ..measure_run import RecordBatch, run_whole
-from ..study_folder import RunJournal, StudyFolder, build_resume_hint, describe_program
 from ..tuning.candidate import load_tuning_scenario
 from .bench_plan import (
     SHORTER_REACH,

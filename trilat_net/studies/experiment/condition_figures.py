@@ -20,8 +20,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from ...fields import split_unit
-from ...reporting import style
-from ...reporting.appearance import COLUMN_IN, SITE_COLOURS, make_print_size
+from ...presentation import style
+from ...presentation.appearance import COLUMN_IN, SITE_COLOURS, make_print_size
 from .completion_times import COMPLETION, find_median, find_unit_medians, summarise_times
 from .statistics import ConditionMean, Row, average_trials, summarise_conditions
 

@@ -26,13 +26,13 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from ...core.vectors import Array
+from ...core.step.vectors import Array
 from ...errors import UsageError, count_nouns
 from ...files import find_version, make_folder, make_subfolder, write_whole
-from ...reporting import style
-from ...reporting.result_text import Block, TextTable, compose, format_number
+from ...presentation import style
+from ...presentation.result_text import Block, TextTable, compose, format_number
 from ...results import Result
-from ..study_folder import encode_csv
+from ...work.study_folder import encode_csv
 from .completion_times import (
     COMPLETION,
     CompletionComparison,

@@ -24,11 +24,11 @@ import msgspec
 
 from ...errors import UsageError, count_nouns
 from ...files import digest_file, make_results_folder, make_subfolder, write_whole
-from ...reporting.result_text import Block, TextTable
+from ...presentation.result_text import Block, TextTable
 from ...results import Result
 from ...scenario import parse_scenario
-from ..executor import Progress, Workers, ignore_progress, open_worker_pool
-from ..study_folder import RunJournal, build_resume_hint, encode_csv
+from ...work.executor import Progress, Workers, ignore_progress, open_worker_pool
+from ...work.study_folder import RunJournal, build_resume_hint, encode_csv
 from .completion_times import COMPLETION, find_median, is_completed
 from .protocol import Choices, ExperimentPlan, PlannedTrial, plan_experiment, read_protocol
 from .questionnaires import CHOICE, find_form

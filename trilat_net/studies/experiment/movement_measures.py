@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...core.vectors import Array
+from ...core.step.vectors import Array
 from ...errors import UsageError, count_nouns
 
 ONSET_SHARE = 0.05

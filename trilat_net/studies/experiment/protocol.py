@@ -28,7 +28,7 @@ from msgspec.structs import replace
 
 from ...errors import ScenarioError, TrilatError, UsageError, count_nouns
 from ...fields import Frozen, Positive
-from ...reporting.result_text import Block, TextTable
+from ...presentation.result_text import Block, TextTable
 from ...results import Result
 from ...scenario import Scenario, load_scenario
 from .questionnaires import Name, Questionnaire, find_form

@@ -25,11 +25,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...core.vectors import Array
+from ...core.step.vectors import Array
 from ...errors import UsageError, count_nouns
 from ...fields import split_unit
 from ...files import import_extra
-from ..intervals import mean_interval, wilson_interval
+from ...work.intervals import mean_interval, wilson_interval
 
 Row = Mapping[str, Any]
 """A trial: its participant, pair and condition, and its measures by name."""

@@ -22,9 +22,9 @@ import numpy as np
 from msgspec import Meta
 from msgspec.structs import replace
 
-from ...core.own_hand import HandContext, HandView
-from ...core.user_law import PeerView
-from ...core.vectors import Array
+from ...core.life.own_hand import HandContext, HandView
+from ...core.plug.user_law import PeerView
+from ...core.step.vectors import Array
 from ...fields import Frozen
 from .tasks import TrialGoal, place_slave
 

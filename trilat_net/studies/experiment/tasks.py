@@ -20,7 +20,7 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 import numpy as np
 from msgspec import Meta
 
-from ...core.vectors import Array
+from ...core.step.vectors import Array
 from ...fields import Frozen
 
 Metres = Annotated[float, Meta(gt=0.0, le=10.0)]

@@ -26,8 +26,8 @@ from ...analysis.aligned import AlignedRecords, align_records
 from ...analysis.arm_rows import EndEffectorRows, build_arm_rows
 from ...analysis.link_summary import sample_ages_ns
 from ...analysis.torque_sources import split_torque
-from ...core.ticks import NS_PER_S
-from ...core.vectors import Array
+from ...core.step.ticks import NS_PER_S
+from ...core.step.vectors import Array
 from ...errors import LogError
 from ...execution.fused import FusedRun
 from ...execution.verify import verify

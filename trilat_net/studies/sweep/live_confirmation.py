@@ -22,7 +22,7 @@ import numpy as np
 from ...analysis.run_end import EndBehaviour, classify_log_end
 from ...errors import LogError, UsageError
 from ...log.log_reader import open_log
-from ...reporting.result_text import TextTable
+from ...presentation.result_text import TextTable
 from ...scenario import Scenario, parse_scenario
 from .sweep_cell import CellClass, classify_decision
 from .sweep_plan import label_axis

@@ -38,11 +38,11 @@ from matplotlib.patches import Patch
 from matplotlib.patheffects import Normal, Stroke
 from matplotlib.ticker import FixedFormatter, FixedLocator, MaxNLocator
 
-from ...core.vectors import Array
+from ...core.step.vectors import Array
 from ...files import write_whole
-from ...reporting import style
-from ...reporting.appearance import COLUMN_IN, FigureSize, make_print_size
-from ...reporting.result_text import TextTable
+from ...presentation import style
+from ...presentation.appearance import COLUMN_IN, FigureSize, make_print_size
+from ...presentation.result_text import TextTable
 from .fixed_gains import FAIR_COMPARISON
 from .stability_map import (
     CELL_CLASSES,

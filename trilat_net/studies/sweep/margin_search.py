@@ -22,14 +22,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ...analysis.theory.linear_edge import find_root_crossings
 from ...errors import ScenarioError, UsageError, count_nouns
 from ...files import write_whole
-from ...reporting.result_text import TextTable
+from ...presentation.result_text import TextTable
 from ...results import Result
 from ...scenario import Scenario
 from ...scenario.code_consent import list_imported_code
-from ...theory.linear_edge import find_root_crossings
-from ..executor import Progress, Workers, ignore_progress, open_worker_pool
+from ...work.executor import Progress, Workers, ignore_progress, open_worker_pool
 from . import sweep_cell
 from .fixed_gains import FAIR_COMPARISON, describe_fixed_gains
 from .stability_map import StabilityEdge, evaluate_criterion, find_criterion_edge

@@ -36,7 +36,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...analysis.arm_rows import PlacedArm
-from ...core.vectors import Array
+from ...analysis.theory.linear_edge import GrowthColumn, compute_growth_column
+from ...core.step.vectors import Array
 from ...errors import ScenarioError, UsageError
 from ...fields import is_number
 from ...laws.adaptive import Adaptive
@@ -46,8 +47,7 @@ from ...scenario import Scenario, SiteSpec
 from ...scenario.arms import ArmModel
 from ...scenario.delay_models import LinkBase
 from ...scenario.delay_models.kernel_delays import ConstantDelay, NoDelay
-from ...theory.linear_edge import GrowthColumn, compute_growth_column
-from ..executor import Progress, Workers, ignore_progress, open_worker_pool
+from ...work.executor import Progress, Workers, ignore_progress, open_worker_pool
 from .fixed_gains import describe_fixed_gains
 from .sweep_cell import CellClass
 from .sweep_plan import SweepPlan, format_override, label_axis, label_setting

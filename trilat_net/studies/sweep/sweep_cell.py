@@ -20,15 +20,15 @@ from itertools import chain
 
 import msgspec
 
+from ...analysis.judge import judge_virtual_run
 from ...analysis.run_end import EndBehaviour, RunTrace, Stability, classify_run_end
 from ...analysis.site_signals import SETTLED_ERROR_RAD
-from ...analysis.twin_growth import measure_virtual_twins
+from ...analysis.theory.loop_roots import find_run_roots
+from ...analysis.twins.twin_growth import measure_virtual_twins
 from ...execution.fused import FusedRun, RunTotals, check_fusable
 from ...results import finite_or_none
 from ...scenario import Scenario, parse_scenario
 from ...scenario.validate import refuse_live_only
-from ...theory.loop_roots import find_run_roots
-from ...theory.run_certificate import judge_virtual_run
 
 
 class CellClass(StrEnum):

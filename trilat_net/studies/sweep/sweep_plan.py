@@ -33,7 +33,7 @@ from ...scenario.code_consent import allow_own_code
 from ...scenario.imported_code import name_law_classes
 from ...scenario.laws import LAWS, identify_law
 from ...scenario.scenario_reader import ExperimentText, read_experiment
-from ..study_folder import format_command, format_toml_value, set_options
+from ...work.study_folder import format_command, format_toml_value, set_options
 from . import sweep_cell
 
 _ON_GRID = Decimal("1e-9")

@@ -34,8 +34,8 @@ from ...execution.fused import RunTotals
 from ...files import write_whole
 from ...results import Result
 from ...scenario.scenario_reader import read_source
-from ..intervals import MeanInterval, mean_interval, wilson_interval
-from ..study_folder import encode_csv, format_command, set_options
+from ...work.intervals import MeanInterval, mean_interval, wilson_interval
+from ...work.study_folder import encode_csv, format_command, set_options
 from .sweep_cell import CellClass, CellResult, CellRun, apply_diff, diff_lines
 from .sweep_plan import SweepPlan, plan_from_json
 

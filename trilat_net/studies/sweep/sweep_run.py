@@ -30,8 +30,8 @@ from ...net.clock import SystemClock
 from ...process import count_cores
 from ...scenario.code_consent import list_imported_code
 from ...scenario.laws import identify_law
-from .. import executor
-from ..study_folder import RunJournal, StudyFolder, build_resume_hint, describe_program
+from ...work import executor
+from ...work.study_folder import RunJournal, StudyFolder, build_resume_hint, describe_program
 from . import sweep_cell
 from .sweep_cell import CellResult, CellRun
 from .sweep_plan import JUDGES, SweepCell, SweepPlan, plan_from_json

@@ -54,8 +54,8 @@ from ...analysis.dominance_history import (
 from ...analysis.run_end import EndBehaviour, RunEnd, Stability, find_hanging_sites
 from ...analysis.site_signals import SETTLED_ERROR_RAD
 from ...analysis.torque_sources import compute_target_motion
-from ...core.ticks import NS_PER_S
-from ...core.vectors import Array
+from ...core.step.ticks import NS_PER_S
+from ...core.step.vectors import Array
 from ...errors import ScenarioError
 from ...laws.interface import LawSettings, TuningRun
 from ...log.log_reader import Log
@@ -64,9 +64,9 @@ from ...scenario.expect import END_WINDOW_S
 from ...scenario.operators.kernel_operators import JointSpring, Wall
 from ...scenario.scenario_reader import ExperimentText, read_experiment
 from ...scenario.validate import refuse_live_only
-from ..intervals import mean_interval
+from ...work.intervals import mean_interval
+from ...work.study_folder import format_command, format_toml_value, set_options
 from ..measure_run import RecordBatch, run_whole
-from ..study_folder import format_command, format_toml_value, set_options
 from .search_space import GainValues, ModelInformation, SearchSpace, SiteControls
 
 CONFLICT_RAD = 0.02

@@ -30,8 +30,8 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from ...core.jit import is_core_cached
-from ...core.vectors import Array
+from ...core.step.jit import is_core_cached
+from ...core.step.vectors import Array
 from ...errors import ScenarioError, UsageError, count_nouns
 from ...execution.fused import FusedRun
 from ...net.clock import SystemClock
@@ -39,7 +39,7 @@ from ...process import count_cores
 from ...results import Result
 from ...scenario import Scenario
 from ...scenario.imported_code import name_law_classes
-from ..executor import Progress, Workers, ignore_progress, open_worker_pool
+from ...work.executor import Progress, Workers, ignore_progress, open_worker_pool
 from .candidate import (
     CLASS_MEANINGS,
     CandidateClass,

@@ -28,11 +28,11 @@ from matplotlib.lines import Line2D
 from ...analysis.certificate.observed_energy import NEGATIVE_ENERGY_MEANING
 from ...errors import count_nouns
 from ...files import write_whole
-from ...reporting import style
-from ...reporting.appearance import REPORT_SIZE, SITE_COLOURS
-from ...reporting.result_text import Block, TextTable, format_number
+from ...presentation import style
+from ...presentation.appearance import REPORT_SIZE, SITE_COLOURS
+from ...presentation.result_text import Block, TextTable, format_number
 from ...scenario.laws import BUILT_IN
-from ..intervals import MeanInterval
+from ...work.intervals import MeanInterval
 from .candidate import CLASS_MEANINGS, CandidateClass, CandidateScore
 from .search_space import SEARCH_SPACES, weigh_joints
 from .tuning_plan import MAX_BUDGET, CandidateSearch, Objective, TuningPlan, TuningResult

@@ -1,0 +1,133 @@
+"""Decides about the stability of recorded and simulated runs, with all that is known.
+
+A recorded run is certified by V, the energy function of the stability proof, by twins, which
+are repeated runs with a small push, and by the characteristic roots of its final loop. A
+simulated run without a log, as in a sweep, is decided in the same way. Its V is computed only
+if roots and pushes leave the decision open to it.
+
+Invariant:
+    - All commands decide by `analysis.stability_decision.decide_stability`, with roots from
+      `loop_roots`.
+"""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import msgspec
+
+from ..execution.fused import FusedRun
+from ..execution.virtual import simulate_scenario
+from ..log.accounting import MIN_COVERAGE
+from ..log.log_reader import Log
+from ..scenario import Scenario
+from ..scenario.describe import describe_law_conditions, list_law_proofs
+from .certificate.stability_certificate import Certificate, certify
+from .run_end import RunEnd, RunTrace, Stability, classify_run_end
+from .stability_decision import (
+    LoopRoots,
+    RunFindings,
+    StabilityDecision,
+    decide_stability,
+    is_decided_by_roots,
+)
+from .theory.loop_roots import find_log_roots, find_run_roots, resolve_final_scenario
+from .theory.operating_point import has_lasting_delays
+from .twins.twin_growth import TwinGrowth, measure_twins, measure_virtual_twins
+
+
+def certify_run(
+    log: Log,
+    *,
+    min_coverage: float = MIN_COVERAGE,
+    own_laws: bool = False,
+    twins: int | None = None,
+) -> Certificate:
+    """Certifies whether a recorded run was stable, with all available checks.
+
+    In addition to the checks of `certify`, the run is repeated with small pushes, to see
+    whether disturbances grow. The characteristic roots of the coupled arms are computed at the
+    end pose.
+
+    Args:
+        log: The log of the run.
+        min_coverage: Least fraction of the ticks (periods of the control loop) of each arm's
+            process that must be recorded.
+        own_laws: True if the code of users' control laws may be executed.
+        twins: Number of repeated runs with a push. None for one of every joint, 0 for none.
+
+    Raises:
+        LogError: A record cannot be read, or names a change that does not exist.
+    """
+    certificate = certify(log, min_coverage=min_coverage, own_laws=own_laws)
+    growth = None
+    if twins != 0:
+        growth = measure_twins(log, certificate.end, twins, own_laws=own_laws)
+    final_scenario = resolve_final_scenario(log)
+    return replace(
+        certificate,
+        roots=find_log_roots(log, own_laws=own_laws),
+        twins=growth,
+        law_proofs=tuple(list_law_proofs(final_scenario)),
+        law_conditions=tuple(describe_law_conditions(final_scenario)),
+        has_lasting_delays=has_lasting_delays(final_scenario),
+    )
+
+
+class VirtualJudgement(NamedTuple):
+    """Judgement of a simulated run without a log.
+
+    Attributes:
+        end: How the motion ends.
+        roots: Roots of the loop at the end of the run.
+        twins: How small pushes in repeated runs develop. None if the roots decide without them.
+        decision: The decision.
+    """
+
+    end: RunEnd
+    roots: LoopRoots
+    twins: TwinGrowth | None
+    decision: StabilityDecision
+
+
+def judge_virtual_run(
+    scenario: Scenario, run: FusedRun, end: RunEnd | None = None
+) -> VirtualJudgement:
+    """Judges a simulated run as its certificate would, without a log.
+
+    Twins, one for every joint, are executed only if they may change the decision. The run is
+    repeated with all its records only if it has settled or is open. The energy function V,
+    which needs them, may then prove that the run is stable, or contradict that it settled.
+
+    Args:
+        scenario: Scenario of the run. Its duration may be shorter than that of the run.
+        run: The run in the fused loop.
+        end: How the motion ends. None to find it from the run.
+    """
+    ended = scenario
+    if run.diverged_s is None:
+        ended = msgspec.structs.replace(scenario, duration_s=run.ran_s)
+    if end is None:
+        trace = RunTrace(run.buckets, run.tau_x, run.diverged_s)
+        end = classify_run_end(ended, trace)
+    findings = RunFindings(
+        end=end,
+        roots=find_run_roots(ended, run),
+        proofs=list_law_proofs(ended),
+    )
+    twins = None
+    if not is_decided_by_roots(findings):
+        twins = measure_virtual_twins(ended, end, run.ran_s)
+        findings = findings._replace(twins=twins)
+    decision = decide_stability(findings)
+    if decision.stability in (Stability.SETTLED, Stability.OPEN):
+        recorded = certify(simulate_scenario(ended), own_laws=True)
+        certificate = replace(
+            recorded,
+            roots=findings.roots,
+            twins=twins,
+            law_proofs=tuple(findings.proofs),
+            has_lasting_delays=has_lasting_delays(ended),
+        )
+        decision = certificate.decision
+    assert findings.roots is not None
+    return VirtualJudgement(end, findings.roots, twins, decision)

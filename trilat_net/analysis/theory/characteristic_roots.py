@@ -1,0 +1,769 @@
+"""Computes the characteristic roots of a linear control loop with delays.
+
+A motion v exp(s t) with a constant vector v is possible in the loop if Delta(s) v = 0, where
+Delta(s) is the characteristic matrix of the loop. These numbers s are the roots. The loop is
+stable if all roots have a negative real part. A loop with delays has infinitely many roots;
+this module computes the rightmost ones, in two steps:
+
+1. Guesses for the continuous loop are eigenvalues of a matrix that approximates the loop
+   together with its stored past (the Chebyshev pseudospectral discretisation of the
+   infinitesimal generator). The order of the approximation doubles until the wanted roots
+   agree. Breda, Maset and Vermiglio, "Pseudospectral differencing methods for characteristic
+   roots of delay differential equations", SIAM J. Scientific Computing 27 (2005); nodes after
+   Trefethen, "Spectral Methods in MATLAB" (2000).
+2. Newton's method refines each guess by a sequence of linear problems: solve
+   Delta(s) v = mu Delta'(s) v, where Delta' is the derivative of Delta, and subtract the
+   smallest eigenvalue mu from s. The method converges quadratically for simple roots. It also
+   does so for multiple roots that have as many vectors v, as in loops of identical arms. Ruhe,
+   "Algorithms for the nonlinear eigenvalue problem", SIAM J. Numerical Analysis 10 (1973).
+
+`limit_blas_threads` keeps OpenBLAS on one thread for these small matrices. OpenBLAS otherwise
+divides products of a hundred rows among all cores and waits for them actively, which takes a
+hundred times as long if another process occupies a core.
+
+Invariant:
+    - A root solves the equation to rounding, for every discretisation that supplies its guess.
+    - Some roots are zero for every delay, because the equations do not change if all arms are
+      shifted, or if a parameter estimate changes that no motion affects. Such roots are
+      counted, and never called the rightmost.
+"""
+
+import ctypes
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.linalg
+from numpy.polynomial.chebyshev import chebder, chebvander
+from numpy.typing import NDArray
+from scipy.linalg import eigvals
+
+from ...core.step.vectors import Array
+from .linear_loop import LinearLoop
+
+Complex = NDArray[np.complex128]
+
+SAME_ROOT_TOLERANCE = 1e-8
+"""Largest difference of two guesses of the same root, relative to 1 + abs(s)."""
+STABILITY_EDGE_PER_S = 1e-6
+"""Largest distance from the imaginary axis of a root that counts as on the axis, in 1/s."""
+EDGE_DEVIATIONS = 2.0
+"""Standard deviations within which a root of random delays counts as zero."""
+ROOT_RESIDUAL_TOLERANCE = 1e-12
+"""Largest residual of a root, relative to the norms of the terms of Delta."""
+_MAX_NEWTON_STEPS = 30
+"""Largest number of Newton steps from one guess."""
+_STEP_TOLERANCE = 1e-9
+"""Size of a step after which Newton's method stops, relative to 1 + abs(s).
+
+The remaining error is about the square of the step.
+"""
+_SAME_VALUE = 1e-11
+"""Largest singular value of Delta at a root, relative to the norms of the terms of Delta.
+
+The number of singular values below this limit is the multiplicity of the root.
+"""
+_MAX_DISTANCE_PER_S = 1e6
+"""Distance from the guess at which Newton's method has failed, in 1/s."""
+ZERO_SHARE = 1e-12
+"""Largest singular value that counts as zero, relative to the largest one."""
+_LONGEST_CHAIN = 4
+"""Length of the longest Jordan chain of roots at zero that is searched."""
+NAMED_SHARE = 0.3
+"""Least participation of a state that is named with a root, relative to the largest one."""
+_INITIAL_ORDER = 12
+"""Degree of the polynomials in the first discretisation."""
+MAX_GENERATOR_SIZE = 1600
+"""Number of rows of the largest discretisation, whose eigenvalues take some seconds."""
+_ROOT_AGREEMENT = 1e-9
+"""Largest difference of roots of two orders that agree, relative to 1 + abs(s)."""
+_BLAS_SYMBOLS = (
+    "scipy_openblas_{}_num_threads64_",
+    "openblas_{}_num_threads64_",
+    "openblas_{}_num_threads",
+)
+"""Names of OpenBLAS's functions in the builds of NumPy; "{}" stands for "get" or "set"."""
+
+
+@contextmanager
+def limit_blas_threads() -> Iterator[None]:
+    """Limits NumPy's linear algebra to one thread while the context is active."""
+    functions = _find_blas_functions()
+    if functions is None:
+        yield
+        return
+    get_threads, set_threads = functions
+    previous_count = get_threads()
+    set_threads(1)
+    try:
+        yield
+    finally:
+        set_threads(previous_count)
+
+
+@cache
+def _find_blas_functions() -> tuple[Callable[[], int], Callable[[int], None]] | None:
+    """Returns the functions that read and set the number of threads of OpenBLAS.
+
+    Returns:
+        The two functions. None if NumPy uses another library.
+    """
+    module = getattr(numpy.linalg, "_umath_linalg", None)
+    try:
+        library = ctypes.CDLL(module.__file__)  # type: ignore[union-attr]
+    except (AttributeError, OSError, TypeError):
+        return None
+    for name in _BLAS_SYMBOLS:
+        try:
+            get_threads = getattr(library, name.format("get"))
+            set_threads = getattr(library, name.format("set"))
+        except AttributeError:
+            continue
+        return get_threads, set_threads
+    return None
+
+
+class Pencil(NamedTuple):
+    """The matrices of a linear loop with delays, which determine its stability.
+
+    The loop is E x' = A x + sum_k A_k x(t - T_k) with the state x. Its characteristic matrix is
+    Delta(s) = s E - A - sum_k A_k exp(-s T_k). The characteristic roots s, at which Delta(s) is
+    singular, give the rates and frequencies of the loop's modes.
+
+    Attributes:
+        A: Matrix of the terms without delay, shape (n, n).
+        delays: Delays T_k, in s, shape (K,).
+        Ad: Matrices A_k of the delayed terms, shape (K, n, n).
+        E: Diagonal of E, shape (n,): 1 for a state with a rate, 0 for a state that an algebraic
+            equation determines. None if every state has a rate.
+    """
+
+    A: Array
+    delays: NDArray[Any]
+    Ad: Array
+    E: Array | None = None
+
+    @property
+    def rate_matrix(self) -> Array:
+        """The matrix E of the loop E x' = A x + sum_k A_k x(t - T_k), shape (n, n).
+
+        x is the state, with n entries, and T_k are the delays. E is diagonal. An entry is 1 if
+        the state has a rate of change, and 0 if an algebraic equation determines the state.
+        """
+        if self.E is None:
+            return np.eye(len(self.A))
+        return np.diag(self.E)
+
+    def evaluate(self, s: complex) -> tuple[Complex, Complex]:
+        """Evaluates the characteristic matrix Delta(s) and its derivative.
+
+        Args:
+            s: Complex frequency, in 1/s.
+
+        Returns:
+            Delta(s), shape (n, n).
+            Its derivative with respect to s, shape (n, n).
+        """
+        E = self.rate_matrix
+        exponentials = np.exp(-s * self.delays)
+        delayed = exponentials[:, np.newaxis, np.newaxis] * self.Ad
+        delta = s * E - self.A - delayed.sum(axis=0)
+        delays = self.delays[:, np.newaxis, np.newaxis]
+        weighted = delays * delayed
+        derivative = E + weighted.sum(axis=0)
+        return delta.astype(np.complex128), derivative.astype(np.complex128)
+
+    def sum_term_norms(self, s: complex) -> float:
+        """Returns the sum of the norms of the terms of the characteristic matrix Delta(s).
+
+        A residual of Delta(s) counts as zero if it is small compared with this sum.
+
+        Args:
+            s: Complex frequency, in 1/s.
+        """
+        growth = np.exp(-s.real * self.delays)
+        delayed = growth @ np.linalg.norm(self.Ad, axis=(1, 2))
+        undelayed = np.linalg.norm(self.A)
+        return float(abs(s) + undelayed + delayed)
+
+    def compute_taylor_coefficient(self, power: int) -> Array:
+        """Returns a coefficient of the Taylor series of the characteristic matrix at s = 0.
+
+        The characteristic matrix is Delta(s) = s E - A - sum_k A_k exp(-s T_k), with the
+        matrices E, A and A_k and the delays T_k of the loop. Its n rows and columns belong to
+        the n states.
+
+        Args:
+            power: Power of s to which the coefficient belongs, from 0.
+
+        Returns:
+            The coefficient, shape (n, n).
+        """
+        undelayed: Array | float = 0.0
+        if power == 0:
+            undelayed = -self.A
+        elif power == 1:
+            undelayed = self.rate_matrix
+        moments = (-self.delays) ** power
+        derivative = np.einsum("k,kab->ab", moments, self.Ad)
+        delayed = derivative / math.factorial(power)
+        coefficient: Array = undelayed - delayed
+        return coefficient
+
+    @property
+    def delayed_states(self) -> NDArray[np.intp]:
+        """Indices of the states whose delayed values act on the loop.
+
+        An arm, for example, follows the angles that another arm had some time ago.
+        """
+        effects = np.abs(self.Ad).sum(axis=(0, 1))
+        return np.flatnonzero(effects)
+
+
+MovingPart = tuple[Pencil, tuple[str, ...], int]
+"""A loop without its constant states and its states without effect.
+
+The entries are the matrices of the loop, the names of its states, and the number of omitted
+states, each of which has a root at zero.
+"""
+
+
+def extract_moving_part(pencil: Pencil, names: Sequence[str]) -> MovingPart:
+    """Removes the states of a linear loop that are constant or act on no other state.
+
+    These states do not influence the other modes of the loop. Each of them only adds a
+    characteristic root at zero.
+
+    Args:
+        pencil: Matrices and delays of the loop.
+        names: Names of the states.
+
+    Returns:
+        The matrices of the remaining states, the names of these states, and the number of
+        removed states.
+    """
+    # entry (i, j): effect of state j on the rate of state i
+    delayed_effects = np.abs(pencil.Ad).sum(axis=0)
+    effects = np.abs(pencil.A) + delayed_effects
+
+    kept = list(range(len(names)))
+    while True:
+        inner = effects[np.ix_(kept, kept)]
+        is_constant = ~inner.any(axis=1)
+        has_no_effect = ~inner.any(axis=0)
+        idle = np.flatnonzero(is_constant | has_no_effect)
+        if not len(idle):
+            break
+        # one state at a time: its removal may leave others without an effect
+        del kept[int(idle[0])]
+
+    rows, columns = np.ix_(kept, kept)
+    Ad = pencil.Ad[:, rows, columns]
+    is_used = Ad.any(axis=(1, 2))
+    moving = pencil._replace(
+        A=pencil.A[rows, columns],
+        delays=pencil.delays[is_used],
+        Ad=Ad[is_used],
+        E=None if pencil.E is None else pencil.E[kept],
+    )
+    kept_names = tuple(names[n] for n in kept)
+    omitted = len(names) - len(kept)
+    return moving, kept_names, omitted
+
+
+class CharacteristicRoot(NamedTuple):
+    """A characteristic root, or a pair of conjugate roots.
+
+    Attributes:
+        s: The root with a non-negative imaginary part, in 1/s.
+        multiplicity: Number of modes that share the root.
+        states: Names of the states that participate most, the largest first.
+    """
+
+    s: complex
+    multiplicity: int
+    states: tuple[str, ...]
+
+    @property
+    def damping(self) -> float:
+        """Damping ratio of the mode, -re(s) / abs(s). It is negative if the mode grows."""
+        return -self.s.real / abs(self.s)
+
+    @property
+    def description(self) -> str:
+        """Names of the states that move most in this mode, for the user.
+
+        A state of a site (a process that runs one arm) is called "m1.q2", for example. Sites
+        with the same state are grouped: "q2 of m1, m2, s" stands for the second joint angle of
+        three sites.
+        """
+        sites: dict[str, list[str]] = {}
+        for state in self.states:
+            site, _, name = state.partition(".")
+            sites.setdefault(name, []).append(site)
+        phrases = []
+        for name, owners in sites.items():
+            phrases.append(f"{name} of {', '.join(sorted(owners))}")
+        return "; ".join(phrases)
+
+
+class Spectrum(NamedTuple):
+    """The rightmost characteristic roots of a loop, which decide its stability.
+
+    Some roots are zero by structure, because all arms can rest in other poses too, or because
+    nothing excites an estimate. They say nothing about stability.
+
+    Attributes:
+        roots: The rightmost roots that are not zero by structure, by falling real part.
+        zeros: Number of roots that are zero by structure.
+        drifting: Number of those zeros without an eigenvector of their own. Their modes grow
+            with time.
+        dropped: Number of guesses from which Newton's method reached no root.
+        order: Order of the discretisation that gave the guesses. 0 if none was needed.
+        span_s: Time over which the roots are computed, in s: the period after which delays and
+            tick rates repeat, or the analysed span of delays that do not repeat. None if all
+            ticks are alike.
+        deviation_per_s: Standard deviation of the rightmost root between parts of the span, in
+            1/s. None if delays repeat.
+        is_exact: False if the delays of the loop do not repeat exactly after the span.
+    """
+
+    roots: tuple[CharacteristicRoot, ...]
+    zeros: int
+    drifting: int
+    dropped: int
+    order: int
+    span_s: float | None = None
+    deviation_per_s: float | None = None
+    is_exact: bool = True
+
+    @property
+    def basis(self) -> str:
+        """A phrase for the user that names the span of time for which the roots were computed.
+
+        If the controllers compute in ticks (periods of the control loop) that are not all
+        alike, the roots belong to a span of several ticks. The phrase is empty if the roots do
+        not belong to such a span.
+        """
+        if self.span_s is None:
+            return ""
+        if self.is_exact:
+            return f", over the period of {self.span_s:.6g} s"
+        if self.deviation_per_s is None:
+            return f", over {self.span_s:.6g} s, after which the delays nearly repeat"
+        deviation = f"+- {self.deviation_per_s:.1g} /s"
+        return f", over {self.span_s:.4g} s of the delays in use, {deviation}"
+
+    @property
+    def rightmost(self) -> CharacteristicRoot | None:
+        """The characteristic root with the largest real part, which determines stability.
+
+        Roots that are zero because of the structure of the loop are not considered: they exist,
+        for example, because all arms can rest in other poses too. None if there are no other
+        roots.
+        """
+        return self.roots[0] if self.roots else None
+
+    @property
+    def verdict(self) -> str:
+        """The stability of the loop: "stable", "unstable" or "at the edge"."""
+        rightmost_per_s = -math.inf
+        if self.roots:
+            rightmost_per_s = self.roots[0].s.real
+        uncertainty_per_s = EDGE_DEVIATIONS * (self.deviation_per_s or 0.0)
+        edge_per_s = max(STABILITY_EDGE_PER_S, uncertainty_per_s)
+        if rightmost_per_s > edge_per_s:
+            return "unstable"
+        if rightmost_per_s >= -edge_per_s or self.drifting:
+            return "at the edge"
+        return "stable"
+
+
+def _solve_for_root(
+    pencil: Pencil,
+    guess: complex,
+    names: Sequence[str],
+) -> CharacteristicRoot | None:
+    """Returns the root to which Newton's method converges from a guess.
+
+    Args:
+        pencil: Matrices of the loop.
+        guess: First guess of the root, in 1/s.
+        names: Names of the states.
+
+    Returns:
+        The root, with its multiplicity and its states. None if the method does not converge.
+    """
+    s = complex(guess)
+    with np.errstate(all="ignore"):
+        for _ in range(_MAX_NEWTON_STEPS):
+            step = _compute_newton_step(pencil, s)
+            if step is None:
+                return None
+            s -= step
+            distance = abs(s - guess)
+            if not np.isfinite(s) or distance > _MAX_DISTANCE_PER_S:
+                return None
+            if abs(step) <= _STEP_TOLERANCE * (1.0 + abs(s)):
+                break
+        measured = _measure_participation(pencil, s)
+
+    if measured is None:
+        return None
+    multiplicity, participation = measured
+    relative = participation / participation.max()
+    # rounded, so that equal shares stay in their order
+    shares = np.round(relative, 6)
+    falling = np.argsort(-shares, kind="stable")
+    states = tuple(names[n] for n in falling if shares[n] >= NAMED_SHARE)
+
+    imaginary_part = abs(s.imag)
+    if imaginary_part <= SAME_ROOT_TOLERANCE:
+        imaginary_part = 0.0
+    root = complex(s.real, imaginary_part)
+    return CharacteristicRoot(root, multiplicity, states)
+
+
+def _compute_newton_step(pencil: Pencil, s: complex) -> complex | None:
+    """Returns the smallest mu of Delta(s) v = mu Delta'(s) v.
+
+    Returns:
+        The step. None if there is no finite mu.
+    """
+    delta, derivative = pencil.evaluate(s)
+    # far to the left, exp(-s T) overflows
+    if not np.isfinite(delta).all() or not np.isfinite(derivative).all():
+        return None
+
+    try:
+        if pencil.E is None:
+            matrix = np.linalg.solve(derivative, delta)
+            mu = np.linalg.eigvals(matrix)
+        else:
+            # algebraic states make the derivative singular, with infinite eigenvalues
+            mu = eigvals(delta, derivative)
+            mu = mu[np.isfinite(mu)]
+    except np.linalg.LinAlgError:
+        return None
+
+    if not len(mu):
+        return None
+    smallest = np.argmin(np.abs(mu))
+    return complex(mu[smallest])
+
+
+def _measure_participation(pencil: Pencil, s: complex) -> tuple[int, Array] | None:
+    """Returns the multiplicity of a root, and the participation of each state in its mode.
+
+    Participation is the modulus of the diagonal of the residue of Delta(s)^-1, which is
+    V (W' Delta'(s) V)^-1 W' with the null vectors V and W of Delta(s). It does not depend on
+    the units of the states.
+
+    Returns:
+        The number of null vectors, and the participation, shape (n,). None if s is not a root.
+    """
+    delta, derivative = pencil.evaluate(s)
+    if not np.isfinite(delta).all():
+        return None
+    left, values, right = np.linalg.svd(delta)
+    scale = pencil.sum_term_norms(s)
+    residual = float(values[-1]) / scale
+    if not residual <= ROOT_RESIDUAL_TOLERANCE:
+        return None
+
+    is_null = values <= _SAME_VALUE * scale
+    count = int(np.sum(is_null))
+    W = left[:, -count:]
+    W_transposed = W.conj().T
+    V = right[-count:].conj().T
+    inner = W_transposed @ derivative @ V
+    try:
+        residue = V @ np.linalg.solve(inner, W_transposed)
+    except np.linalg.LinAlgError:
+        return None
+    return count, np.abs(np.diag(residue))
+
+
+def count_zero_roots(pencil: Pencil) -> tuple[int, int]:
+    """Counts the roots that are zero by structure, and how many of them drift.
+
+    The characteristic matrix has the Taylor series Delta(s) = D_0 + s D_1 + s^2 D_2 + .... A
+    root at zero can belong to a Jordan chain, a sequence of modes of which each drives the
+    next. The block Toeplitz matrix of D_0 ... D_(m-1) has as many null vectors as there are
+    roots at zero, with each chain counted up to length m. When the number no longer rises with
+    m, all roots are counted. Roots in chains longer than 1 drift: their modes grow with time.
+
+    Args:
+        pencil: Matrices of the loop.
+
+    Returns:
+        The number of roots at zero.
+        The number of those that drift.
+    """
+    counts = [0]
+    for length in range(1, _LONGEST_CHAIN + 1):
+        blocks = []
+        for power in range(length):
+            D = pencil.compute_taylor_coefficient(power)
+            if not len(D):
+                return 0, 0
+            # D_k stands on the k-th diagonal below the main diagonal
+            diagonal = np.eye(length, k=-power)
+            blocks.append(np.kron(diagonal, D))
+
+        toeplitz = np.sum(blocks, axis=0)
+        values = np.linalg.svd(toeplitz, compute_uv=False)
+        is_zero = values <= ZERO_SHARE * values[0]
+        counts.append(int(np.sum(is_zero)))
+        if counts[-1] == counts[-2]:
+            break
+
+    zeros = counts[-1]
+    vectors = counts[1]
+    return zeros, zeros - vectors
+
+
+def refine_roots(
+    pencil: Pencil,
+    candidates: Complex,
+    names: Sequence[str],
+    wanted: int,
+) -> tuple[list[CharacteristicRoot], int]:
+    """Refines guesses of the rightmost roots by Newton's method.
+
+    Two more roots than wanted are refined, because the method may change their order. The
+    remaining guesses are skipped.
+
+    Args:
+        pencil: Matrices of the loop.
+        candidates: Guesses of nonzero roots, shape (K,), by falling real part.
+        names: Names of the states.
+        wanted: Number of roots. A conjugate pair counts once.
+
+    Returns:
+        The `wanted` rightmost roots, or fewer if there are not as many.
+        The number of guesses from which no root was reached.
+    """
+    roots: list[CharacteristicRoot] = []
+    dropped = 0
+    for guess in candidates:
+        # the conjugate of another guess
+        if guess.imag < -SAME_ROOT_TOLERANCE * (1.0 + abs(guess)):
+            continue
+
+        if len(roots) >= wanted + 2:
+            break
+        root = _solve_for_root(pencil, complex(guess), names)
+        if root is None or abs(root.s) < SAME_ROOT_TOLERANCE:
+            dropped += 1
+            continue
+
+        tolerance = SAME_ROOT_TOLERANCE * (1.0 + abs(root.s))
+        distances = [abs(root.s - known.s) for known in roots]
+        if min(distances, default=math.inf) >= tolerance:
+            roots.append(root)
+
+    def rank(root: CharacteristicRoot) -> tuple[float, float]:
+        return -round(root.s.real, 9), root.s.imag
+
+    roots.sort(key=rank)
+    return roots[:wanted], dropped
+
+
+def find_moving_part(loop: LinearLoop) -> MovingPart:
+    """Reduces a linear loop to the states that can influence its stability.
+
+    States that are constant, and states that act on no other state, are left out. Each of them
+    only adds a characteristic root at zero.
+
+    Args:
+        loop: Linear model of the coupled arms.
+
+    Returns:
+        The matrices of the remaining states, the names of these states, and the number of
+        omitted states.
+    """
+    delayed_matrices = np.array([term.A for term in loop.delayed])
+    # without delays, an empty array of the right shape
+    Ad = delayed_matrices.reshape(-1, *loop.A.shape)
+    delays_s = np.array([term.delay_s for term in loop.delayed])
+    pencil = Pencil(loop.A, delays_s, Ad, E=loop.E)
+    moving, names, idle_count = extract_moving_part(pencil, loop.names)
+    return moving, names, idle_count + loop.omitted_states
+
+
+def compute_delay_spectrum(loop: LinearLoop, wanted: int = 6) -> Spectrum:
+    """Computes the rightmost roots of a continuous loop.
+
+    Args:
+        loop: The loop.
+        wanted: Number of roots. A conjugate pair or a multiple root counts once.
+    """
+    with limit_blas_threads():
+        pencil, names, idle_count = find_moving_part(loop)
+        zeros, drifting = count_zero_roots(pencil)
+        if not len(names):
+            return Spectrum(
+                roots=(),
+                zeros=idle_count + zeros,
+                drifting=drifting,
+                dropped=0,
+                order=0,
+            )
+
+        has_delays = len(pencil.delays) > 0
+        order = _INITIAL_ORDER if has_delays else 0
+        previous_roots = None
+        while True:
+            guesses = _guess_roots(pencil, order, zeros)
+            roots, dropped = refine_roots(pencil, guesses, names, wanted)
+            next_size = len(names) + 2 * order * len(pencil.delayed_states)
+            is_converged = previous_roots is not None and _agree(previous_roots, roots)
+            if not has_delays or next_size > MAX_GENERATOR_SIZE or is_converged:
+                return Spectrum(
+                    roots=tuple(roots),
+                    zeros=idle_count + zeros,
+                    drifting=drifting,
+                    dropped=dropped,
+                    order=order,
+                )
+            previous_roots = roots
+            order = 2 * order
+
+
+def _guess_roots(pencil: Pencil, order: int, zeros: int) -> Complex:
+    """Returns guesses of the nonzero roots, by falling real part.
+
+    Args:
+        pencil: Matrices of the loop.
+        order: Order of the discretisation. 0 for a loop without delays.
+        zeros: Number of roots at zero.
+    """
+    matrix = discretise_generator(pencil, order) if order else pencil.A
+    if pencil.E is not None:
+        matrix = _eliminate_states(matrix, pencil.E)
+    values = np.linalg.eigvals(matrix).astype(np.complex128)
+    # the eigenvalues of smallest modulus approximate the roots at zero
+    by_modulus = np.argsort(np.abs(values), kind="stable")
+    nonzero = values[by_modulus][zeros:]
+    rounded_real_part = np.round(nonzero.real, 9)
+    falling = np.lexsort((np.abs(nonzero.imag), -rounded_real_part))
+    return nonzero[falling]
+
+
+def _eliminate_states(matrix: Array, E: Array) -> Array:
+    """Eliminates the states that algebraic equations determine from a matrix.
+
+    From 0 = M_aa x_a + M_ar x_r follows the Schur complement M_rr - M_ra M_aa^-1 M_ar, where a
+    stands for the algebraic states and r for those with a rate.
+
+    Args:
+        matrix: Matrix M of all states. The discretised history follows the loop's states.
+        E: 1 for a state with a rate, 0 for an algebraic state, of the loop's states.
+    """
+    algebraic = np.flatnonzero(E == 0.0)
+    kept = np.setdiff1d(np.arange(len(matrix)), algebraic)
+    M_aa = matrix[np.ix_(algebraic, algebraic)]
+    M_ar = matrix[np.ix_(algebraic, kept)]
+    M_ra = matrix[np.ix_(kept, algebraic)]
+    M_rr = matrix[np.ix_(kept, kept)]
+    algebraic_by_kept = np.linalg.solve(M_aa, M_ar)
+    return M_rr - M_ra @ algebraic_by_kept
+
+
+def _agree(previous: list[CharacteristicRoot], roots: list[CharacteristicRoot]) -> bool:
+    """Returns True if every root is close to a root of the previous order."""
+    if len(roots) < len(previous):
+        return False
+    for root in roots:
+        tolerance = _ROOT_AGREEMENT * (1.0 + abs(root.s))
+        distances = [abs(root.s - known.s) for known in previous]
+        if not min(distances, default=math.inf) <= tolerance:
+            return False
+    return True
+
+
+def discretise_generator(pencil: Pencil, order: int) -> Array:
+    """Approximates a loop with delays by a system of ordinary differential equations.
+
+    The state of a loop with delays includes its history over the longest delay T_max. The
+    history of the delayed states is represented by its values at Chebyshev nodes in the time
+    from -T_max to 0. The eigenvalues of the resulting matrix approximate the rightmost
+    characteristic roots.
+
+    Args:
+        pencil: Matrices of the loop, with at least one delay.
+        order: Degree of the interpolating polynomials.
+
+    Returns:
+        The matrix. Its states are the states of the loop, and then the history.
+    """
+    delayed = pencil.delayed_states
+    longest_s = float(pencil.delays.max())
+    n = len(pencil.A)
+    c = len(delayed)
+
+    size = n + order * c
+    generator = np.zeros((size, size))
+    generator[:n, :n] = pencil.A
+
+    # x in [-1, 1] stands for the time from -T_max to 0
+    x = 1.0 - 2.0 * pencil.delays / longest_s
+    interpolation = chebyshev_interpolation(order, x)
+    for weights, Ad in zip(interpolation, pencil.Ad, strict=True):
+        delayed_columns = Ad[:, delayed]
+        generator[:n, delayed] += weights[0] * delayed_columns
+        generator[:n, n:] += np.kron(weights[1:], delayed_columns)
+
+    # the history moves along the nodes: its rate is its derivative by time
+    differentiation = chebyshev_differentiation(order)
+    transport = differentiation[1:] * (2.0 / longest_s)
+    generator[n:, n:] = np.kron(transport[:, 1:], np.eye(c))
+    for column, state in enumerate(delayed):
+        generator[n + column :: c, state] = transport[:, 0]
+    return generator
+
+
+def chebyshev_nodes(order: int) -> Array:
+    """Returns the extremal nodes cos(pi k / order) from 1 to -1, shape (order + 1,)."""
+    angles = np.pi * np.arange(order + 1) / order
+    return np.cos(angles)
+
+
+def chebyshev_interpolation(order: int, x: Array) -> Array:
+    """Returns the matrix that interpolates values at the Chebyshev nodes at other points.
+
+    Args:
+        order: Degree of the polynomial.
+        x: Points in [-1, 1], shape (K,).
+
+    Returns:
+        Matrix of shape (K, order + 1).
+    """
+    nodes = chebyshev_nodes(order)
+    basis_at_nodes = chebvander(nodes, order)
+    basis_at_x = chebvander(x, order)
+    transposed = np.linalg.solve(basis_at_nodes.T, basis_at_x.T)
+    return transposed.T.astype(np.float64)
+
+
+def chebyshev_differentiation(order: int) -> Array:
+    """Returns the matrix that differentiates a polynomial given at the Chebyshev nodes.
+
+    It turns the values at the nodes into the derivatives at the nodes.
+
+    Args:
+        order: Degree of the polynomial.
+
+    Returns:
+        Matrix of shape (order + 1, order + 1).
+    """
+    nodes = chebyshev_nodes(order)
+    basis_at_nodes = chebvander(nodes, order)
+    derivatives = chebder(np.eye(order + 1))
+    slopes = chebvander(nodes, order - 1) @ derivatives
+    transposed = np.linalg.solve(basis_at_nodes.T, slopes.T)
+    return transposed.T.astype(np.float64)

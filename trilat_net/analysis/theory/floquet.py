@@ -1,0 +1,880 @@
+"""Computes the stability of coupled arms whose controllers compute once per tick.
+
+A site is a process that runs one arm. Its controller computes once per tick, while the arm
+moves continuously. In each tick the site sends a sample, its state, to the other sites. Tick
+rates and delays may differ between sites, but the whole pattern repeats after a period T. Such
+a periodic system is analysed by Floquet theory. Each site is linearised over one tick:
+
+    X_i[k + 1] = P_i X_i[k] + sum_j P_ij X_j[m_ij(k)]
+
+X_i[k] is the state of site i at its tick k, P_i and P_ij are constant matrices, and m_ij(k) is
+the number of the sample of site j that site i uses at tick k. Over a period, these equations
+form a linear map. Its eigenvalues mu, the multipliers, give the characteristic roots s = ln(mu)
+/ T. The loop is stable if all roots have a negative real part. The largest multipliers are
+approximated in a block Krylov space (block Arnoldi; Saad, "Numerical Methods for Large
+Eigenvalue Problems", second edition (2011), chapter 6).
+
+The integration scheme of the scenario defines how a controller updates its parameter estimates
+and which torque it applies. Let f_k be the rate of the estimates at tick k, tau_k the computed
+torque, and h the tick. Both schemes store a number eta with eta_{k+1} = eta_k + h f_k:
+
+- The scheme `digital` uses the estimate eta_k and applies tau_k.
+- The scheme `second_order` uses the estimate eta_k + h/2 f_k and applies
+  1.5 tau_k - 0.5 tau_{k-1}.
+
+The law `sync` uses the estimate eta_k + h/2 f_k in either scheme.
+
+A control law that a user wrote may have a memory, the numbers m_k that it stores at tick k. The
+memory takes the place of eta, with the rate f_k = (m_k - m_{k-1}) / h.
+
+Invariant:
+    - Delays are never replaced by their mean. The roots are exact if delays and ticks repeat
+      after T.
+    - If delays are random or recorded, the roots are computed as though a span of length T
+      repeated forever. The deviation of the roots between parts of the span is reported.
+    - Motions that stay constant for any delays, such as a shift of all arms to another common
+      pose, are removed before the roots are computed.
+    - Between ticks the torque is held (zero-order hold), and the motion of the linearised arm
+      is computed exactly.
+"""
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag, expm
+
+from ...core.step.site_setup import Law, Scheme, SiteSetup
+from ...core.step.vectors import Array, IntArray
+from ...scenario.delay_models import LinkBase
+from ...scenario.delay_period import MAX_NEAR_PERIOD_S, find_delay_period
+from ...scenario.sample_uses import draw_used_samples
+from .characteristic_roots import (
+    NAMED_SHARE,
+    ZERO_SHARE,
+    CharacteristicRoot,
+    Complex,
+    Pencil,
+    Spectrum,
+    extract_moving_part,
+    limit_blas_threads,
+)
+from .characteristic_roots import STABILITY_EDGE_PER_S as _STILL_PER_S
+from .linear_loop import SiteJacobian, compute_couplings, differentiate_rates
+from .operating_point import Equilibrium, OperatingConditions
+
+
+def discretise_zero_order_hold(A: Array, B: Array, h_s: float) -> tuple[Array, Array]:
+    """Returns the matrices Phi and Gamma of x' = A x + B u over a period in which u is held.
+
+    The state after the period is Phi x + Gamma u, with Phi = exp(A h) and
+    Gamma = int_0^h exp(A s) ds B. Both are computed as one matrix exponential: Van Loan,
+    "Computing integrals involving the matrix exponential", IEEE Trans. Automatic Control 23
+    (1978).
+
+    Args:
+        A: Matrix of the states, shape (n, n).
+        B: Matrix of the inputs, shape (n, m).
+        h_s: The period h, in s.
+    """
+    n, m = B.shape
+    augmented = np.zeros((n + m, n + m))
+    augmented[:n, :n] = A * h_s
+    augmented[:n, n:] = B * h_s
+    exponential = expm(augmented)
+    return exponential[:n, :n], exponential[:n, n:]
+
+
+class SiteTickMap(NamedTuple):
+    """Linear model of one site over one tick (period of its control loop): X' = P X + Q w.
+
+    X contains the n states of the site at a tick, and X' the states at the next tick. w
+    contains what the site receives from the other sites.
+
+    Attributes:
+        P: Effect of the states, shape (n, n). The states are the joint angles and velocities,
+            the stored parameter estimates, and, for the scheme `second_order`, the torque of
+            the previous tick.
+        Q: Effect of the received values, shape (n, inputs).
+        output: Matrix that computes the values for the other sites from X, shape (3 m, n). They
+            are the pose, its velocity and the reflected torque, with m numbers each.
+        names: Names of the states.
+    """
+
+    P: Array
+    Q: Array
+    output: Array
+    names: tuple[str, ...]
+
+
+def linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian) -> SiteTickMap:
+    """Builds the linear model of one site over one tick, from a model in continuous time.
+
+    A site is a process that runs one arm, and a tick is one period of its control loop.
+
+    Args:
+        site: Setup of the site.
+        jacobian: Linear model of the site in continuous time, from `differentiate_rates`.
+
+    Returns:
+        The matrices that map the states and inputs at one tick to the states at the next tick.
+    """
+    layout = jacobian.layout
+    rates = jacobian.rates
+    joints = layout.joints
+    h_s = 1.0 / site.rate_hz
+    is_second_order = site.scheme is Scheme.SECOND_ORDER
+    # The law `sync` integrates its estimates by the trapezoid rule in either scheme.
+    has_estimates = site.gains.law is Law.ADAPTIVE
+    uses_trapezoid = has_estimates and (is_second_order or site.gains.absolute)
+    motion = slice(0, layout.qd.stop)
+    # the same slice of the arguments and of X
+    memory = layout.estimate
+    states = list(jacobian.states)
+    if is_second_order:
+        states += [f"tau{joint + 1}" for joint in range(joints)]
+    first_input = layout.inputs.start
+    input_count = layout.inputs.stop - first_input
+    arguments_by_inputs = np.eye(layout.arguments, input_count, -first_input)
+    arguments_by_X = np.eye(layout.arguments, len(states))
+    arguments_by_X[layout.states :] = 0.0
+    Phi, Gamma = _discretise_arm(jacobian, h_s)
+
+    def compute_control(arguments: Array) -> Array:
+        """Returns what the controller adds to the state of a site during one tick.
+
+        Its torque moves the arm, and its parameter estimates change. The torque of this tick is
+        kept for the next tick if the integration scheme needs it. All quantities are linear.
+
+        Args:
+            arguments: States and inputs of the site, in the order of `ArgumentLayout`, shape
+                (arguments, columns).
+
+        Returns:
+            The contribution to the state at the next tick, shape (n, columns), with the n
+            states of the site.
+        """
+        f = rates.estimate @ arguments
+        correction: Array | float = 0.0
+        if uses_trapezoid:
+            correction = 0.5 * h_s * rates.tau[:, memory] @ f
+        tau = rates.tau @ arguments + correction
+        factor = 1.5 if is_second_order else 1.0
+        u = factor * tau + rates.held @ arguments
+        rows = [Gamma @ u, h_s * f]
+        if is_second_order:
+            rows.append(tau)
+        return np.vstack(rows)
+
+    P = compute_control(arguments_by_X)
+    Q = compute_control(arguments_by_inputs)
+    P[motion, motion] += Phi
+    P[memory, memory] += np.eye(layout.parameters)
+    if is_second_order:
+        P[motion, memory.stop :] -= 0.5 * Gamma
+    output = np.zeros((3 * layout.coordinates, len(states)))
+    output[:, : layout.states] = jacobian.output
+    names = tuple(f"{site.name}.{state}" for state in states)
+    return SiteTickMap(P, Q, output, names)
+
+
+def _discretise_arm(jacobian: SiteJacobian, h_s: float) -> tuple[Array, Array]:
+    """Returns the matrices of an arm over a tick in which the torque is held.
+
+    Args:
+        jacobian: Derivatives of the site's rates.
+        h_s: Length of a tick, in s.
+    """
+    layout = jacobian.layout
+    rates = jacobian.rates
+    joints = layout.joints
+    motion = slice(0, layout.qd.stop)
+    external = layout.external_torque
+    # an imported law may use the external torque, which then acts on the arm twice
+    torque_by_external = np.eye(joints) + rates.tau[:, external]
+    qdd_by_external = rates.qdd[:, external]
+    inverse_inertia = np.linalg.solve(torque_by_external.T, qdd_by_external.T).T
+
+    # the torque that is held over the tick does not act on the free arm
+    torque = rates.tau + rates.held
+    qdd_by_torque = inverse_inertia @ torque[:, motion]
+    free_qdd = rates.qdd[:, motion] - qdd_by_torque
+
+    zero = np.zeros((joints, joints))
+    A = np.block([[zero, np.eye(joints)], [free_qdd]])
+    B = np.vstack([zero, inverse_inertia])
+    return discretise_zero_order_hold(A, B, h_s)
+
+
+class CoupledTicks(NamedTuple):
+    """Linear model of all sites over one tick (period of their control loops).
+
+    The model has n states, which belong to the sites (processes that each run one arm).
+
+    Attributes:
+        S: Matrix that maps the states of all sites to their next tick, without the effects of
+            sites on each other, shape (n, n). It is block diagonal.
+        effects: For each pair (i, j), the effect of the states of site j on the states of site
+            i, shape (n, n). Pairs without an effect are missing.
+        names: Names of the states.
+        owners: Index of the site to which each state belongs, shape (n,).
+        constant: Number of omitted states that are constant or have no effect.
+    """
+
+    S: Array
+    effects: dict[tuple[int, int], Array]
+    names: tuple[str, ...]
+    owners: NDArray[np.int64]
+    constant: int
+
+
+def couple_ticks(conditions: OperatingConditions, rest: Equilibrium) -> CoupledTicks:
+    """Builds the linear model of all coupled sites over one tick of their control loops.
+
+    The model contains each site by itself, and the effects of the sites on each other. States
+    that are constant, and states without an effect, are left out.
+
+    Args:
+        conditions: The sites (processes that each run one arm), gains and delays.
+        rest: The pose of rest about which the sites are linearised.
+
+    Returns:
+        The model, with the number of omitted states.
+    """
+    jacobians = differentiate_rates(conditions, rest)
+    maps = []
+    for site, jacobian in zip(conditions.sites, jacobians, strict=True):
+        maps.append(linearise_site_tick(site, jacobian))
+    sizes = [len(tick_map.P) for tick_map in maps]
+    owners = np.repeat(np.arange(len(maps)), sizes)
+    names = [name for tick_map in maps for name in tick_map.names]
+
+    couplings = compute_couplings(conditions, rest, jacobians)
+    effects = np.zeros((len(couplings), len(owners), len(owners)))
+    for effect, ((i, j), coupling) in zip(effects, couplings.items(), strict=True):
+        block = np.ix_(owners == i, owners == j)
+        effect[block] = maps[i].Q @ coupling @ maps[j].output
+
+    # the moving part is found as for rates; numbers of pairs stand in for their delays
+    S = block_diag(*(tick_map.P for tick_map in maps))
+    changes = S - np.eye(len(owners))
+    pair_numbers = np.arange(len(effects))
+    changes_pencil = Pencil(changes, pair_numbers, effects)
+    moving, moving_names, constant = extract_moving_part(changes_pencil, names)
+    pairs = list(couplings)
+    moving_effects = {}
+    for n, effect in zip(moving.delays, moving.Ad, strict=True):
+        moving_effects[pairs[int(n)]] = effect
+    moving_states = [names.index(name) for name in moving_names]
+    omitted = sum(jacobian.omitted_states for jacobian in jacobians)
+    return CoupledTicks(
+        S=moving.A + np.eye(len(moving_names)),
+        effects=moving_effects,
+        names=moving_names,
+        owners=owners[moving_states],
+        constant=constant + omitted,
+    )
+
+
+DRAWN_SPAN_S = 30.0
+"""Analysed span of delays that are drawn at random, in s."""
+_LEAST_SPAN_S = 0.5
+"""Shortest analysed span, in s.
+
+Shorter periods, and periods shorter than twice the ages, are repeated.
+"""
+_PART_TICKS = 100
+"""Ticks of the fastest site after which columns are scaled.
+
+Columns may grow a thousandfold in each tick.
+"""
+_COLUMNS = 8
+"""Number of columns of a block of the Krylov space."""
+_MAX_COLUMNS = 240
+"""Largest dimension of the Krylov space."""
+_RESIDUAL = 1e-9
+"""Largest residual of an exact multiplier, relative to its modulus."""
+_LOOSE_RESIDUAL = 1e-4
+"""Largest residual once the Krylov space has its largest dimension."""
+_SMALLEST = 1e-7
+"""Smallest multiplier that is searched, as a share of the largest."""
+_SAME_ROOT = 1e-6
+"""Largest absolute or relative difference of roots that count as equal."""
+
+
+class SamplesInUse(NamedTuple):
+    """Which samples of the other sites each site uses, in every tick of a span of time.
+
+    A tick is one period of a site's control loop. A sample is the state that a site sends in
+    one tick. At the beginning of the span, all sites have a tick.
+
+    Attributes:
+        span_s: Length of the span, in s.
+        used: For each pair (i, j), the numbers of the samples of site j that site i uses, with
+            an entry for each tick of site i. The sample that site j sends at the beginning of
+            the span has the number 0.
+        period_s: Time after which the pattern of ticks and delays repeats, in s. The span
+            contains it a whole number of times. None if the pattern does not repeat.
+        is_exact: True if the pattern repeats exactly, False if it repeats to within half a tick
+            or not at all.
+    """
+
+    span_s: float
+    used: Mapping[tuple[int, int], IntArray]
+    period_s: float | None = None
+    is_exact: bool = False
+
+
+def find_samples_in_use(conditions: OperatingConditions) -> SamplesInUse:
+    """Finds which samples of the other sites each site uses, in every tick of a span of time.
+
+    A sample is the state that a site sends in one tick (period of its control loop). The
+    pattern of used samples repeats after some time, and the span consists of whole repetitions.
+    Random delays never repeat. A span of fixed length with drawn delays is used for them.
+
+    Args:
+        conditions: The sites, their tick rates, and the links between them.
+
+    Returns:
+        The used samples, and the length of the span.
+    """
+    rates_hz = [site.rate_hz for site in conditions.sites]
+    common_hz = math.gcd(*rates_hz)
+    links: list[LinkBase] = []
+    if conditions.varying:
+        links = [link for link, _ in conditions.links.values()]
+    period = find_delay_period(links, rates_hz)
+    period_s = period.span_s
+    delays_ms = [sum(link.moments()) + link.playout_ms for link in links]
+    reach_ms = max(delays_ms, default=0.0)
+    if period_s is not None:
+        age_s = float(conditions.age_s.max())
+        least_s = max(_LEAST_SPAN_S, 2.0 * age_s, 2e-3 * reach_ms)
+        periods = math.ceil(least_s / period_s)
+        span_s = period_s * periods
+    else:
+        is_drawn = any(link.random for link in links)
+        longest_s = DRAWN_SPAN_S if is_drawn else MAX_NEAR_PERIOD_S
+        span_s = math.ceil(longest_s * common_hz) / common_hz
+    # the span starts when samples no longer depend on the start of the run
+    settled_s = 4e-3 * reach_ms + 0.1
+    start_s = math.ceil(settled_s * common_hz) / common_hz
+
+    used = {}
+    for i, j in conditions.coupled_pairs:
+        hz = rates_hz[i]
+        peer_hz = rates_hz[j]
+        ticks = np.arange(round(span_s * hz))
+        if conditions.varying:
+            link, key = conditions.links[i, j]
+            drawn = draw_used_samples(link, key, hz, peer_hz, start_s + span_s)
+            first_tick = round(start_s * hz)
+            first_sample = round(start_s * peer_hz)
+            samples = drawn[first_tick + ticks]
+            used[i, j] = np.maximum(samples, 0) - first_sample
+        else:
+            sample_times_s = ticks / hz - conditions.age_s[i, j]
+            used[i, j] = np.rint(sample_times_s * peer_hz).astype(np.int64)
+    return SamplesInUse(span_s, used, period_s, is_exact=period.is_exact)
+
+
+class _TickRun(NamedTuple):
+    """Consecutive ticks of one site that depend on known samples only."""
+
+    site: int
+    first: int
+    ticks: int
+
+
+class _SpanPart(NamedTuple):
+    """A part of a span, after which columns are scaled.
+
+    Attributes:
+        runs: Ticks in an order in which every sample is known before its use.
+        stops: Tick of each site after the part.
+    """
+
+    runs: list[_TickRun]
+    stops: list[int]
+
+
+def _plan_parts(
+    ticks: Sequence[int],
+    used: Mapping[tuple[int, int], IntArray],
+    count: int,
+) -> list[_SpanPart]:
+    """Returns an order of all ticks of a span, in parts.
+
+    Args:
+        ticks: Number of ticks of each site.
+        used: By (i, j) the sample of site j at each tick of site i.
+        count: Number of parts.
+    """
+    # entry n: number of ticks of site i that depend on samples of site j up to n only
+    computable = {}
+    for (i, j), samples in used.items():
+        newest = np.maximum.accumulate(samples)
+        known = np.arange(ticks[j] + 1)
+        limits = np.searchsorted(newest, known, side="right")
+        computable[i, j] = limits.tolist()
+    peers: list[list[int]] = [[] for _ in ticks]
+    for i, j in used:
+        peers[i].append(j)
+
+    done = [0] * len(ticks)
+    parts = []
+    for n in range(1, count + 1):
+        runs = []
+        # rounded up
+        stops = [-(-total * n // count) for total in ticks]
+        while done != stops:
+            for i, stop in enumerate(stops):
+                known_until = [computable[i, j][done[j]] for j in peers[i]]
+                until = min([stop, *known_until])
+                first = done[i]
+                if until > first:
+                    runs.append(_TickRun(i, first, until - first))
+                    done[i] = until
+        parts.append(_SpanPart(runs, stops))
+    return parts
+
+
+class _PeerEffect(NamedTuple):
+    """The effect of one peer on a site.
+
+    Attributes:
+        peer: Index of the peer.
+        rows: Row of the peer's track that each tick of the site uses.
+        effect: Effect of the peer's state on the site's next state, shape (n_i, n_j).
+    """
+
+    peer: int
+    rows: IntArray
+    effect: Array
+
+
+class _SpanMap:
+    """The linear loop over a span of time, as an operator on columns.
+
+    A column contains the states of each site at its last ticks, as far back as a peer uses
+    them.
+
+    Attributes:
+        neutral: Constant motions, orthonormal, shape (size, zeros).
+        scales: Factors by which columns are multiplied after each part. The first application
+            chooses them so that its columns have size 1.
+    """
+
+    def __init__(self, loop: CoupledTicks, rates_hz: Sequence[int], uses: SamplesInUse) -> None:
+        sites = range(len(rates_hz))
+        self._states = [np.flatnonzero(loop.owners == i) for i in sites]
+        self._P = [loop.S[np.ix_(states, states)] for states in self._states]
+        # rows of each site's track before the tick at the start of the span, and that tick
+        self._rows = [2] * len(rates_hz)
+        used = {}
+        for i, j in loop.effects:
+            samples = uses.used[i, j]
+            ticks = np.arange(len(samples))
+            # the newest sample at a tick is the last sample before it; rounded up
+            now = -(-ticks * rates_hz[j] // rates_hz[i])
+            used[i, j] = np.minimum(samples, now - 1)
+            oldest = int((now - used[i, j]).max())
+            self._rows[j] = max(self._rows[j], 1 + oldest)
+
+        self._peer_effects: list[list[_PeerEffect]] = [[] for _ in rates_hz]
+        for (i, j), samples in used.items():
+            block = np.ix_(self._states[i], self._states[j])
+            effect = loop.effects[i, j][block]
+            rows = samples + self._rows[j] - 1
+            self._peer_effects[i].append(_PeerEffect(j, rows, effect))
+
+        self._ticks = [round(uses.span_s * hz) for hz in rates_hz]
+        part_count = -(-max(self._ticks) // _PART_TICKS)
+        self._parts = _plan_parts(self._ticks, used, part_count)
+        self.scales: list[float] = []
+        self.neutral = self._find_constant_motions(loop)
+
+    def _find_constant_motions(self, loop: CoupledTicks) -> Array:
+        """Returns an orthonormal basis of the motions that stay constant for any delays."""
+        identity = np.eye(len(loop.names))
+        static_map = identity - loop.S - sum(loop.effects.values())
+        _, values, right = np.linalg.svd(static_map)
+        is_zero = values <= ZERO_SHARE * values[0]
+        constant_states = right[is_zero].T
+        columns = self.build_constant_columns(constant_states)
+        return np.linalg.qr(columns)[0]
+
+    def build_constant_columns(self, X: Array) -> Array:
+        """Returns columns for motions in which all states have been constant.
+
+        Each column contains the states of all sites at their last ticks, as far back as they
+        are used. Here every past tick of a site has the same states.
+
+        Args:
+            X: The constant states, shape (n, columns), with the n states of all sites.
+
+        Returns:
+            The columns, shape (size, columns).
+        """
+        blocks = []
+        for states, rows in zip(self._states, self._rows, strict=True):
+            blocks.append(np.tile(X[states], (rows, 1)))
+        return np.vstack(blocks)
+
+    def divide_out_constant(self, V: Array) -> Array:
+        """Returns columns less their constant motions."""
+        constant_part = self.neutral @ (self.neutral.T @ V)
+        return V - constant_part
+
+    def _build_tracks(self, V: Array) -> list[Array]:
+        """Returns the track of each site: its past states, and room for the states of the span.
+
+        Args:
+            V: Columns with the past states.
+
+        Returns:
+            Tracks of shape (rows + ticks, n_i, columns).
+        """
+        columns = V.shape[1]
+        tracks = []
+        first = 0
+        for states, rows, ticks in zip(self._states, self._rows, self._ticks, strict=True):
+            size = rows * len(states)
+            past = V[first : first + size].reshape(rows, len(states), columns)
+            future = np.empty((ticks, len(states), columns))
+            tracks.append(np.concatenate([past, future]))
+            first += size
+        return tracks
+
+    def apply(
+        self,
+        V: Array,
+        *,
+        divided: bool = True,
+        sizes: list[Array] | None = None,
+    ) -> tuple[Array, list[Array]]:
+        """Computes how small motions develop over the analysed span of time.
+
+        A column contains the states of all sites at their last ticks, as far back as they are
+        used. For computation the span is split into parts.
+
+        Args:
+            V: Motions at the start of the span, shape (size, columns).
+            divided: True to remove motions that stay constant, and to scale the columns after
+                each part.
+            sizes: List to which the norm of each column after each part is appended.
+
+        Returns:
+            The motions at the end of the span, shape (size, columns).
+            For each site i, its n_i states from the start of the span on, shape (ticks + 1,
+            n_i, columns).
+        """
+        columns = V.shape[1]
+        tracks = self._build_tracks(V)
+        for n, part in enumerate(self._parts):
+            for run in part.runs:
+                self._run_ticks(tracks, run)
+            last_states = []
+            for track, stop, rows in zip(tracks, part.stops, self._rows, strict=True):
+                last_states.append(track[stop : stop + rows])
+            V = np.concatenate([states.reshape(-1, columns) for states in last_states])
+
+            if divided:
+                V = self.divide_out_constant(V)
+                if n == len(self.scales):
+                    size = float(np.abs(V).max())
+                    self.scales.append(1.0 / max(1e-300, size))
+                V *= self.scales[n]
+                _split_into(V, last_states)
+            if sizes is not None:
+                sizes.append(np.linalg.norm(V, axis=0))
+
+        from_start = []
+        for track, rows in zip(tracks, self._rows, strict=True):
+            from_start.append(track[rows - 1 :])
+        return V, from_start
+
+    def _run_ticks(self, tracks: Sequence[Array], run: _TickRun) -> None:
+        """Computes the states of one site over consecutive ticks, in its track."""
+        track = tracks[run.site]
+        P = self._P[run.site]
+        now = run.first + self._rows[run.site] - 1
+        state = track[now]
+        next_states = track[now + 1 : now + 1 + run.ticks]
+        next_states[:] = 0.0
+        end = run.first + run.ticks
+        for peer, rows, effect in self._peer_effects[run.site]:
+            used_rows = rows[run.first : end]
+            samples = tracks[peer][used_rows]
+            next_states += effect @ samples
+        for next_state in next_states:
+            next_state += P @ state
+            state = next_state
+
+
+def _split_into(V: Array, blocks: Sequence[Array]) -> None:
+    """Writes the rows of V into arrays, one after the other."""
+    first = 0
+    for block in blocks:
+        rows = block.shape[0] * block.shape[1]
+        block[:] = V[first : first + rows].reshape(block.shape)
+        first += rows
+
+
+def _find_multipliers(
+    span: _SpanMap,
+    n: int,
+    wanted: int,
+) -> tuple[Complex, Complex, NDArray[np.bool_]]:
+    """Returns the largest multipliers of a span map, by the block Arnoldi method.
+
+    Args:
+        span: The map.
+        n: Number of states of the loop.
+        wanted: Number of distinct moduli. Fewer result if the others are too close to zero.
+
+    Returns:
+        The multipliers, by falling modulus.
+        Their vectors, as columns.
+        True for each multiplier that is exact to `_RESIDUAL`.
+    """
+    random = np.random.default_rng(0)
+    start_states = random.standard_normal((n, min(n, _COLUMNS)))
+    start = span.build_constant_columns(start_states)
+    block = np.linalg.qr(span.divide_out_constant(start))[0]
+    basis = block
+    # the map in the basis
+    H = np.zeros((block.shape[1], 0))
+    while True:
+        width = block.shape[1]
+        W, _ = span.apply(block)
+        new_columns = np.zeros((basis.shape[1], width))
+        H = np.hstack([H, new_columns])
+        # Gram-Schmidt twice: once loses orthogonality to rounding
+        for _ in range(2):
+            projection = basis.T @ W
+            W -= basis @ projection
+            H[:, -width:] += projection
+        left, lengths, right = np.linalg.svd(W, full_matrices=False)
+        is_new = lengths > ZERO_SHARE * np.abs(H).max()
+        left = left[:, is_new]
+        remainder = (lengths[:, np.newaxis] * right)[is_new]
+
+        mu, y = np.linalg.eig(H)
+        order = _order_multipliers(mu, wanted)
+        mu = mu[order]
+        y = y[:, order]
+        errors = np.linalg.norm(remainder @ y[-width:], axis=0)
+        residual = errors / np.abs(mu)
+        is_full = len(H) >= _MAX_COLUMNS
+        limit = _LOOSE_RESIDUAL if is_full else _RESIDUAL
+        exact = residual <= limit
+        if exact.all() or not is_new.any() or is_full:
+            vectors = basis @ y
+            return mu.astype(np.complex128), vectors.astype(np.complex128), exact
+
+        block, R = np.linalg.qr(left - basis @ (basis.T @ left))
+        zeros = np.zeros((len(remainder), len(H) - width))
+        new_rows = np.hstack([zeros, R @ remainder])
+        H = np.vstack([H, new_rows])
+        basis = np.hstack([basis, block])
+
+
+def _order_multipliers(mu: Complex, wanted: int) -> NDArray[np.int64]:
+    """Returns the indices of the largest multipliers, by falling modulus.
+
+    Args:
+        mu: The multipliers.
+        wanted: Number of distinct moduli.
+    """
+    order = np.argsort(-np.abs(mu), kind="stable")
+    moduli = np.abs(mu[order])
+    # conjugate multipliers have the same modulus and count once
+    is_smaller = moduli[1:] < (1.0 - _SAME_ROOT) * moduli[:-1]
+    rank = np.cumsum(np.append(0, is_smaller))
+    is_large = moduli > _SMALLEST * moduli[0]
+    selected: NDArray[np.int64] = order[(rank < wanted) & is_large]
+    return selected
+
+
+def compute_sampled_spectrum(
+    conditions: OperatingConditions,
+    rest: Equilibrium,
+    wanted: int = 6,
+    uses: SamplesInUse | None = None,
+) -> Spectrum | None:
+    """Computes the rightmost characteristic roots of coupled arms with controllers in ticks.
+
+    A tick is one period of the control loop. A small motion is followed over a span of T
+    seconds, after which the pattern of delays and ticks repeats. This gives a linear map of the
+    states. Each eigenvalue z of the map corresponds to a root s with z = exp(s T).
+
+    Args:
+        conditions: The sites (processes that each run one arm), gains and delays.
+        rest: The pose of rest about which the loop is linearised.
+        wanted: Number of roots. Fewer result if the others are too close to -infinity.
+        uses: Which samples of the other sites each site uses. None to derive this from the
+            links.
+
+    Returns:
+        The roots. None if a control law can be linearised in continuous time only.
+    """
+    if conditions.has_forms:
+        return None
+    rates_hz = [site.rate_hz for site in conditions.sites]
+    uses = uses or find_samples_in_use(conditions)
+    span_s: float | None = uses.period_s or uses.span_s
+    if uses.period_s is not None and uses.period_s * max(rates_hz) < 1.5:
+        # every tick is like the tick before
+        span_s = None
+
+    loop = couple_ticks(conditions, rest)
+    deviation_per_s = None
+    if not loop.names:
+        return Spectrum(
+            roots=(),
+            zeros=loop.constant,
+            drifting=0,
+            dropped=0,
+            order=0,
+            span_s=span_s,
+            is_exact=uses.is_exact,
+        )
+    with limit_blas_threads():
+        span = _SpanMap(loop, rates_hz, uses)
+        mu, vectors, exact = _find_multipliers(span, len(loop.names), wanted + 1)
+
+        log_scale = np.log(span.scales).sum()
+        s = (np.log(mu) - log_scale) / uses.span_s
+        is_still = exact & (np.abs(s) <= _STILL_PER_S)
+        # of two conjugate roots the upper one is described
+        is_upper = exact & ~is_still & (s.imag >= -_SAME_ROOT)
+        s = s[is_upper]
+        upper_vectors = vectors[:, is_upper]
+        modes = np.hstack([upper_vectors.real, upper_vectors.imag])
+        roots: list[CharacteristicRoot] = []
+        if len(s):
+            if uses.period_s is None:
+                rightmost = modes[:, :: len(s)]
+                deviation_per_s = _estimate_deviation(span, rightmost, uses.span_s)
+            # fast modes overflow; their late ticks are unused
+            with np.errstate(all="ignore"):
+                _, tracks = span.apply(modes, divided=False)
+                roots = _describe_modes(s, tracks, loop, rates_hz)
+
+    drifting = int(is_still.sum())
+    return Spectrum(
+        roots=tuple(roots[:wanted]),
+        zeros=loop.constant + span.neutral.shape[1] + drifting,
+        drifting=drifting,
+        dropped=int((~exact).sum()),
+        order=0,
+        span_s=span_s,
+        deviation_per_s=deviation_per_s,
+        is_exact=uses.is_exact,
+    )
+
+
+def _estimate_deviation(span: _SpanMap, mode: Array, span_s: float) -> float:
+    """Estimates the standard deviation of a root over the parts of a span, in 1/s.
+
+    The logarithm of the mode's size over the parts is treated as a random walk. The mean
+    variance of the walk's Brownian bridge is a twelfth of the variance of the walk's end.
+
+    Args:
+        span: The map.
+        mode: Real and imaginary part of the mode as columns, shape (size, 2).
+        span_s: Length of the span, in s.
+    """
+    sizes: list[Array] = []
+    span.apply(mode, sizes=sizes)
+    real_sizes, imaginary_sizes = np.transpose(sizes)
+    mode_sizes = np.hypot(real_sizes, imaginary_sizes)
+    log_scales = np.cumsum(np.log(span.scales))
+    growth = np.log(mode_sizes) - log_scales
+    steady_growth = np.linspace(growth[0], growth[-1], len(growth))
+    bridge = growth - steady_growth
+    return math.sqrt(12.0) * float(np.std(bridge)) / span_s
+
+
+def _describe_modes(
+    s: Complex,
+    tracks: Sequence[Array],
+    loop: CoupledTicks,
+    rates_hz: Sequence[int],
+) -> list[CharacteristicRoot]:
+    """Returns the roots of modes, with their frequencies and their fastest joints.
+
+    A multiplier determines a frequency only up to multiples of 2 pi / T. The multiple is that
+    of the strongest line in the spectrum of the mode's fastest joint.
+
+    Args:
+        s: Principal values of the roots, shape (K,), in 1/s.
+        tracks: States of each site from the start of the span on, with K columns of real parts
+            and then K of imaginary parts.
+        loop: The loop.
+        rates_hz: Tick rate of each site.
+    """
+    count = len(s)
+    roots: list[CharacteristicRoot] = []
+    # 2 pi / T
+    ticks = len(tracks[0]) - 1
+    turn = 2.0 * np.pi * rates_hz[0] / ticks
+    first_states = []
+    for track in tracks:
+        first = track[0]
+        first_states.append(first[:, :count] + 1j * first[:, count:])
+    amplitudes = np.abs(np.concatenate(first_states))
+    velocities = []
+    for state, name in enumerate(loop.names):
+        quantity = name.rpartition(".")[2]
+        if re.fullmatch(r"qd\d+", quantity):
+            velocities.append(state)
+    for n, principal in enumerate(s):
+        falling = sorted(velocities, key=lambda state: -amplitudes[state, n])
+        fastest = falling[0]
+        i = int(loop.owners[fastest])
+        first_state = int(np.argmax(loop.owners == i))
+        joint_track = tracks[i][:, fastest - first_state]
+        velocity = joint_track[:, n] + 1j * joint_track[:, n + count]
+        offset = _find_strongest_offset(velocity, principal, rates_hz[i])
+        omega = abs(principal.imag + turn * round(offset / turn))
+        root = complex(principal.real, omega if omega > _SAME_ROOT else 0.0)
+        match = _find_root(roots, root)
+        if match is not None:
+            multiplicity = roots[match].multiplicity + 1
+            roots[match] = roots[match]._replace(multiplicity=multiplicity)
+            continue
+        least = NAMED_SHARE * amplitudes[fastest, n]
+        names = [loop.names[state] for state in falling if amplitudes[state, n] >= least]
+        roots.append(CharacteristicRoot(root, 1, tuple(names)))
+    return sorted(roots, key=lambda root: -root.s.real)
+
+
+def _find_strongest_offset(velocity: Complex, principal: complex, hz: int) -> float:
+    """Returns how far a mode's strongest frequency is from its principal value, in rad/s.
+
+    Args:
+        velocity: Velocity of a joint in the mode, with one value per tick.
+        principal: Principal value of the root, in 1/s.
+        hz: Tick rate of the joint's site.
+    """
+    # beyond fifteen time constants the track consists of rounding errors
+    usable = 2 + int(15.0 * hz / max(1e-9, abs(principal.real)))
+    ticks = min(len(velocity) - 1, usable)
+    decay = np.exp(-principal * np.arange(ticks) / hz)
+    spectrum = np.abs(np.fft.fft(velocity[:ticks] * decay))
+    frequencies_hz = np.fft.fftfreq(ticks, 1.0 / hz)
+    offset: float = 2.0 * np.pi * frequencies_hz[spectrum.argmax()]
+    return offset
+
+
+def _find_root(roots: Sequence[CharacteristicRoot], s: complex) -> int | None:
+    """Returns the index of the first root that equals s within `_SAME_ROOT`, or None."""
+    for index, known in enumerate(roots):
+        if abs(known.s - s) <= _SAME_ROOT * (1.0 + abs(s)):
+            return index
+    return None

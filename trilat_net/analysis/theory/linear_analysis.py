@@ -1,0 +1,413 @@
+"""Predicts whether small motions of coupled arms die away, for a scenario or a log.
+
+The control loop is linearised about an equilibrium, a pose in which all arms rest. Its
+characteristic roots decide: the loop is stable if all roots have a negative real part. They are
+computed for the sampled loop, whose controllers compute once per tick (period of the control
+loop), and for its continuous approximation. The analysis also contains the delay margin and, if
+requested, the settings at the edge of stability and what operators feel.
+
+Without a given pose, the loop is the one whose roots a stability certificate states: that of
+`loop_roots`, at the rest nearest to the end of a run. If delays are random or measured, the
+sampled loop uses the delays that occurred in the last quarter of the run, and the continuous
+loop uses their means. For a log, the loop is that after all commands, and the recorded run is
+not executed again. For a scenario, its run is simulated. Only if this run diverges, or if there
+is no rest near its end, the equilibrium is predicted, or that of a longer run.
+
+Invariant:
+    - The verdict is based on the sampled loop, at any tick rates and delays. If a control law
+      can be linearised in continuous time only, the verdict is based on the continuous loop.
+    - The verdict holds for small motions about the equilibrium only.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...core.step.vectors import Array
+from ...errors import ScenarioError, UsageError
+from ...execution.fused import FusedRun
+from ...log.log_reader import Log
+from ...results import Result
+from ...scenario import Scenario, load_scenario
+from ...scenario.describe import (
+    IRREVERSIBLE_SHARES,
+    describe_law_conditions,
+    lacks_detailed_balance,
+)
+from ..stability_decision import NEAR_REST_RAD
+from .characteristic_roots import CharacteristicRoot, Spectrum, compute_delay_spectrum
+from .delay_margin import DelayMargin, find_delay_margin
+from .equilibrium import add_limit_notes, find_equilibrium
+from .floquet import SamplesInUse, compute_sampled_spectrum
+from .linear_edge import EdgeScan, iterate_linear_edges, parse_edge_range
+from .linear_loop import LinearLoop, compute_shared_poses, linearise_loop
+from .loop_roots import find_log_loop, find_run_loop, resolve_final_scenario
+from .numeric_law import NumericLaw
+from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
+from .port_analysis import PortAnalysis, analyse_ports, ports_to_json
+from .port_passivity import HandMatrices
+
+DEFAULT_ROOTS = 6
+"""Number of roots that are computed unless another number is requested."""
+MAX_ROOTS = 60
+"""Largest number of roots that can be requested."""
+SAMPLED_ROOT_DIFFERENCE = 0.01
+"""Largest difference of a continuous and a sampled root that is ignored, relative to abs(s)."""
+
+
+@dataclass(frozen=True, repr=False)
+class LinearAnalysis(Result):
+    """Result of the linear stability analysis of a scenario, see `analyse_linear_loop`.
+
+    Attributes:
+        scenario: The description of the experiment.
+        conditions: The numbers from which the loop is built: dominance factors, delays,
+            operators and environments in force.
+        rest: The equilibrium about which the loop is linearised.
+        loop: The loop linearised at the equilibrium.
+        continuous: Characteristic roots of the continuous loop, a delay-differential equation.
+        sampled: Characteristic roots of the loop with its ticks. None if a law can be
+            linearised in continuous time only.
+        margin: The delays, common to all links, for which the continuous loop is stable.
+        scans: For each requested key of the scenario, the values at which the loop becomes
+            stable or unstable.
+        ports: Analysis of the joints at which operators act, the haptic ports. None if it was
+            not requested.
+        distance_rad: Largest difference between the last angle of a joint in the run and its
+            angle at the equilibrium, in rad. None if the equilibrium was not sought next to the
+            end of a run.
+    """
+
+    scenario: Scenario
+    conditions: OperatingConditions
+    rest: Equilibrium
+    loop: LinearLoop
+    continuous: Spectrum
+    sampled: Spectrum | None
+    margin: DelayMargin
+    scans: tuple[EdgeScan, ...] = ()
+    ports: PortAnalysis | None = None
+    distance_rad: float | None = None
+
+    @property
+    def end_effectors(self) -> tuple[Array, ...]:
+        """The pose of each end effector at the equilibrium, if end effectors follow each other.
+
+        There is an array for each site (process that runs one arm), with the pose that the site
+        sends to the other sites. The arrays are empty if joints follow each other instead.
+        """
+        sites = self.conditions.sites
+        if not sites[0].layout.task:
+            return (np.zeros(0),) * len(sites)
+        return tuple(compute_shared_poses(self.conditions, self.rest))
+
+    @property
+    def decisive(self) -> Spectrum:
+        """The characteristic roots on which the verdict about stability is based.
+
+        They belong to the sampled loop, whose controllers compute once per tick. If a control
+        law can be linearised in continuous time only, they belong to the continuous loop.
+        """
+        return self.continuous if self.sampled is None else self.sampled
+
+    @property
+    def verdict(self) -> str:
+        """Stability of small motions: "stable", "unstable" or "at the edge"."""
+        return self.decisive.verdict
+
+    @property
+    def is_far_from_rest(self) -> bool:
+        """True if the run ends so far from the equilibrium that the verdict is not about it."""
+        return self.distance_rad is not None and self.distance_rad > NEAR_REST_RAD
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Remarks for the user that qualify the verdict of the linear analysis.
+
+        They concern the analysed conditions (such as delays and operators), the pose of rest
+        about which the arms are linearised, and the characteristic roots.
+        """
+        notes = [*self.conditions.notes, *self.rest.notes]
+        if self.is_far_from_rest:
+            notes.append(
+                f"the run of {self.scenario.duration_s:g} s ends {self.distance_rad:.3g} rad "
+                "away from this rest: the verdict does not say whether it gets there"
+            )
+        if self.sampled is not None and self.sampled.verdict != self.continuous.verdict:
+            decides = "ticks and delays decide"
+            if self.sampled.span_s is None:
+                decides = "the tick rate decides"
+            notes.append(
+                f"the continuous loop is {self.continuous.verdict}, the sampled loop is "
+                f"{self.sampled.verdict}: {decides}"
+            )
+
+        if self.decisive.drifting:
+            notes.append(
+                f"{self.decisive.drifting} of the roots at zero only drift: "
+                "their modes keep their speed"
+            )
+        if lacks_detailed_balance(self.scenario):
+            notes.append(IRREVERSIBLE_SHARES)
+        return (*notes, *describe_law_conditions(self.scenario))
+
+    def headline(self) -> str:
+        """Returns the verdict and the delay margin in one line."""
+        return f"{self.scenario.name}: {self.verdict}; delay margin {self.margin.description}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns the analysis as plain values, with the keys of `trilat linear --json`."""
+        sampled = None
+        if self.sampled is not None:
+            sampled = _spectrum_to_json(self.sampled)
+        ports = None
+        if self.ports is not None:
+            ports = ports_to_json(self.ports)
+        edges = {}
+        for scan in self.scans:
+            edges[scan.key] = [edge._asdict() for edge in scan.edges]
+
+        return {
+            "scenario": self.scenario.name,
+            "scenario_sha256": self.scenario.sha256,
+            "verdict": self.verdict,
+            "rest": self._rest_to_json(),
+            "delay_in_use_ms": self._delays_to_json(),
+            "continuous": _spectrum_to_json(self.continuous),
+            "as_computed": sampled,
+            "margin": _margin_to_json(self.margin),
+            "notes": list(self.notes),
+            "ports": ports,
+            "edges": edges,
+        }
+
+    def _rest_to_json(self) -> dict[str, Any]:
+        """Returns the equilibrium as plain values, without the zeros that pad its arrays."""
+        rest = self.rest
+        q = {}
+        theta_hat = {}
+        for n, site in enumerate(self.conditions.sites):
+            q[site.name] = rest.q[n][: site.layout.joints].tolist()
+            # the memory of an imported law is no estimate
+            is_imported = isinstance(site.law_factory, NumericLaw)
+            parameters = 0 if is_imported else site.layout.parameters
+            theta_hat[site.name] = rest.theta_hat[n][:parameters].tolist()
+
+        values: dict[str, Any] = {
+            "how": rest.how,
+            "residual": rest.residual,
+            "run_ends_away_rad": self.distance_rad,
+            "q_rad": q,
+            "theta_hat": theta_hat,
+        }
+        if self.conditions.sites[0].layout.task:
+            poses = [pose.tolist() for pose in self.end_effectors]
+            values["x"] = dict(zip(self.scenario.names, poses, strict=True))
+        return values
+
+    def _delays_to_json(self) -> dict[str, float]:
+        """Returns the age of the samples in use, in ms, by link."""
+        conditions = self.conditions
+        names = self.scenario.names
+        receivers, senders = np.nonzero(conditions.alpha)
+        delays_ms = {}
+        for i, j in zip(receivers, senders, strict=True):
+            link = f"{names[j]}->{names[i]}"
+            delays_ms[link] = 1e3 * float(conditions.age_s[i, j])
+        return delays_ms
+
+    def to_rows(self) -> list[dict[str, Any]]:
+        """Returns a table of the characteristic roots, with a row per root.
+
+        The roots of the continuous loop come first. Then follow the roots of the sampled loop,
+        whose controllers compute once per tick, if they were computed.
+        """
+        spectra = {"continuous": self.continuous, "as computed": self.sampled}
+        rows: list[dict[str, Any]] = []
+        for loop, spectrum in spectra.items():
+            if spectrum is None:
+                continue
+            for root in _spectrum_to_json(spectrum)["roots"]:
+                row = {"loop": loop, **root}
+                row["states"] = ", ".join(root["states"])
+                rows.append(row)
+        return rows
+
+    def find_sampled_root(self, root: CharacteristicRoot) -> CharacteristicRoot | None:
+        """Finds the root of the sampled loop that corresponds to a root of the continuous loop.
+
+        It is the nearest one. It is worth showing only if both differ.
+
+        Args:
+            root: A root of the continuous loop.
+
+        Returns:
+            The sampled root. None if both differ by less than 1 %, or if there is no sampled
+            root.
+        """
+        if self.sampled is None or not self.sampled.roots:
+            return None
+        nearest = min(self.sampled.roots, key=lambda sampled: abs(sampled.s - root.s))
+        difference = abs(nearest.s - root.s)
+        if difference <= SAMPLED_ROOT_DIFFERENCE * abs(root.s):
+            return None
+        return nearest
+
+
+class _AnalysedLoop(NamedTuple):
+    """The loop that is analysed.
+
+    Attributes:
+        scenario: The scenario.
+        conditions: The numbers from which the loop is built.
+        rest: The equilibrium.
+        uses: The samples in use in every tick. None if the scenario determines them.
+        distance_rad: Distance of the end of the run from the equilibrium, in rad. None if the
+            equilibrium was not sought next to the end of a run.
+    """
+
+    scenario: Scenario
+    conditions: OperatingConditions
+    rest: Equilibrium
+    uses: SamplesInUse | None = None
+    distance_rad: float | None = None
+
+
+def _find_end_loop(scenario: Scenario, log: Log | None) -> _AnalysedLoop:
+    """Returns the loop at the end of a run, whose roots a stability certificate states.
+
+    If it does not exist, the equilibrium is that of a longer run, or a prediction.
+
+    Args:
+        scenario: The scenario of the run.
+        log: The log of the run. None to simulate the run.
+    """
+    conditions = derive_operating_conditions(scenario)
+    try:
+        if log is not None:
+            scenario = resolve_final_scenario(log)
+            end = find_log_loop(log, own_laws=True)
+        else:
+            run = FusedRun(scenario)
+            run.advance_to(scenario.duration_s)
+            end = find_run_loop(scenario, run)
+    except ScenarioError:
+        return _AnalysedLoop(scenario, conditions, find_equilibrium(scenario))
+
+    if not end.has_mean_ages:
+        conditions = end.conditions
+    else:
+        # The remarks on delays that vary stay, although the loop has only their means.
+        conditions = conditions._replace(age_s=end.conditions.age_s)
+    rest = add_limit_notes(conditions, end.rest)
+    return _AnalysedLoop(scenario, conditions, rest, end.uses, end.distance_rad)
+
+
+def analyse_linear_loop(
+    source: str | Path | Scenario | Log,
+    overrides: Mapping[str, Any] | Sequence[str] = (),
+    *,
+    pose: tuple[float, ...] | None = None,
+    roots: int = DEFAULT_ROOTS,
+    over: Sequence[str] = (),
+    ports: bool = False,
+    hands: Sequence[HandMatrices] = (),
+) -> LinearAnalysis:
+    """Predicts whether small motions of the coupled arms of a scenario die away.
+
+    The control loop is linearised about a pose in which all arms rest.
+
+    Args:
+        source: A scenario (description of an experiment), its file, the name of a shipped
+            scenario, or the log of a run.
+        overrides: Settings of the scenario that are replaced. A log then counts only as its
+            scenario.
+        pose: Pose of rest that all arms share, in rad. None for the pose at the end of a run.
+        roots: Number of characteristic roots to compute.
+        over: Ranges of settings in which to search the values where stability changes, such as
+            "control.d=0.1:3".
+        ports: True to analyse also what operators feel when they hold an arm.
+        hands: Measured impedances of operators. Any of them may hold the arm of any master.
+
+    Raises:
+        ScenarioError: The scenario is not valid, or cannot be linearised.
+        UsageError: Another argument is not valid.
+    """
+    ranges = [parse_edge_range(text) for text in over]
+    if not 1 <= roots <= MAX_ROOTS:
+        raise UsageError(f"--roots is a number of roots, 1 to {MAX_ROOTS}, not {roots}")
+
+    scenario = load_scenario(source, overrides)
+    if pose is None:
+        log = source if isinstance(source, Log) and not overrides else None
+        analysed = _find_end_loop(scenario, log)
+    else:
+        conditions = derive_operating_conditions(scenario)
+        analysed = _AnalysedLoop(scenario, conditions, find_equilibrium(scenario, pose))
+    scenario = analysed.scenario
+    conditions = analysed.conditions
+    rest = analysed.rest
+    loop = linearise_loop(conditions, rest)
+
+    analysis = LinearAnalysis(
+        scenario=scenario,
+        conditions=conditions,
+        rest=rest,
+        loop=loop,
+        continuous=compute_delay_spectrum(loop, roots),
+        sampled=compute_sampled_spectrum(conditions, rest, roots, analysed.uses),
+        margin=find_delay_margin(loop),
+        distance_rad=analysed.distance_rad,
+    )
+
+    scans = []
+    for key, low, high in ranges:
+        edges = iterate_linear_edges(scenario, key, low=low, high=high, rest=rest)
+        scans.append(EdgeScan(key, low, high, tuple(edges)))
+    port_analysis = analyse_ports(scenario, rest, hands=hands) if ports else None
+    return replace(analysis, scans=tuple(scans), ports=port_analysis)
+
+
+def _margin_to_json(margin: DelayMargin) -> dict[str, Any]:
+    """Returns a delay margin as plain values."""
+    intervals = []
+    for interval in margin.intervals:
+        ends = {"from_s": interval.low_s, "to_s": interval.high_s}
+        intervals.append(ends)
+    crossings = []
+    for crossing in margin.crossings:
+        values = {
+            "delay_s": crossing.delay_s,
+            "omega_rad_s": crossing.omega_rad_s,
+            "pairs_to_the_right": crossing.pairs,
+        }
+        crossings.append(values)
+    return {"words": margin.description, "stable": intervals, "crossings": crossings}
+
+
+def _spectrum_to_json(spectrum: Spectrum) -> dict[str, Any]:
+    """Returns the roots of a loop as plain values."""
+    roots = []
+    for root in spectrum.roots:
+        values = {
+            "re_per_s": root.s.real,
+            "im_rad_s": root.s.imag,
+            "damping": root.damping,
+            "modes": root.multiplicity,
+            "states": list(root.states),
+        }
+        roots.append(values)
+
+    return {
+        "verdict": spectrum.verdict,
+        "roots": roots,
+        "zeros_by_structure": spectrum.zeros,
+        "of_those_drifting": spectrum.drifting,
+        "dropped_candidates": spectrum.dropped,
+        "order": spectrum.order,
+        "span_s": spectrum.span_s,
+        "deviation_per_s": spectrum.deviation_per_s,
+    }

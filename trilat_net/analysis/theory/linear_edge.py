@@ -1,0 +1,473 @@
+"""Finds the values of a setting at which coupled arms become stable or unstable.
+
+A value at which this happens is called an edge. The setting is a number of the scenario (the
+description of an experiment), such as a gain or a delay, and is named by its key. The growth
+rate of small motions is the real part of the rightmost characteristic root of the linearised
+control loop. The loop is unstable if the growth rate is positive. It is evaluated for some
+values of the setting. Between two values with different signs, Brent's method finds its zero.
+
+The sampled loop, whose controllers compute once per tick (period of the control loop), is
+analysed if the tick matters. This is so for the integration scheme `digital` (zero-order hold,
+as in a plain digital controller), and for walls or operators that act once per tick. Otherwise
+the continuous loop is analysed.
+
+Invariant:
+    - The equilibrium, the pose of rest about which the arms are linearised, is determined once.
+      For every further value of the setting, the nearest equilibrium is used, so that the
+      results do not jump between different poses.
+"""
+
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import brentq
+
+from ...core.arms.exogenous import TorqueKind
+from ...core.step.site_setup import Law
+from ...core.step.vectors import Array
+from ...errors import ScenarioError, UsageError
+from ...scenario import Scenario, load_scenario
+from .characteristic_roots import CharacteristicRoot, compute_delay_spectrum
+from .equilibrium import (
+    choose_equilibrium,
+    find_equilibrium,
+    find_mean_pose,
+    follow_equilibrium,
+)
+from .floquet import compute_sampled_spectrum
+from .linear_loop import linearise_loop
+from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
+from .site_dynamics import place_arm
+
+EDGE_SCAN_POINTS = 24
+"""Default number of values of the key that a scan evaluates."""
+EDGE_TOLERANCE = 1e-6
+"""Largest error of an edge, relative to the key's value."""
+_LOGARITHMIC = 20.0
+"""Largest ratio of the ends of a range that is scanned in equal steps.
+
+A larger range is scanned in equal steps of the logarithm.
+"""
+_LEAST_PER_S = -1e3
+"""Least growth rate in Brent's method, in 1/s, which replaces -infinity if nothing moves."""
+_INTEGER_KEYS = ("rate_hz", "seed")
+
+ASSUMED_EQUILIBRIUM_REMARK = (
+    "the linear analysis of a law that learns is about the mean start pose, with true "
+    "estimates: the equilibrium of a run depends on its whole history"
+)
+
+
+def find_rightmost_root(
+    conditions: OperatingConditions,
+    rest: Equilibrium,
+    *,
+    sampled: bool,
+) -> CharacteristicRoot | None:
+    """Returns the rightmost characteristic root of the loop about an equilibrium.
+
+    Args:
+        conditions: The numbers of the loop.
+        rest: The equilibrium.
+        sampled: True to analyse the sampled loop. The continuous loop is analysed all the same
+            if a law can be linearised in continuous time only.
+
+    Returns:
+        The root. None if all roots are zero.
+    """
+    spectrum = compute_sampled_spectrum(conditions, rest, 1) if sampled else None
+    if spectrum is None:
+        spectrum = compute_delay_spectrum(linearise_loop(conditions, rest), 1)
+    return spectrum.rightmost
+
+
+def find_deepest_contact(scenario: Scenario, q: Array) -> int | None:
+    """Finds the state of a run in which an end effector has penetrated a wall most deeply.
+
+    Only sampled walls are considered, which compute their force once per tick (period of the
+    control loop).
+
+    Args:
+        scenario: Description of the experiment.
+        q: Joint angles in K states of the run, for N arms with up to n joints, shape (K, N, n),
+            in rad.
+
+    Returns:
+        Index of the state. None if no wall is touched.
+    """
+    depth_m = np.full(len(q), -np.inf)
+    for n, name in enumerate(scenario.names):
+        site = scenario.setup(name)
+        joint_angles = q[:, n, : site.layout.joints].T
+        for wall in site.actors:
+            if wall.kind is TorqueKind.WALL and wall.sampled:
+                tip = place_arm(site, joint_angles).end_effector_position()
+                from_surface = np.array(wall.a) - tip.T
+                wall_depth_m = from_surface @ np.array(wall.b)
+                depth_m = np.maximum(depth_m, wall_depth_m)
+    deepest = int(depth_m.argmax())
+    return deepest if depth_m[deepest] > 0.0 else None
+
+
+def find_contact_growth(scenario: Scenario, q: Array, theta_hat: Array) -> float:
+    """Returns the growth rate of small motions while an arm touches a wall, in 1/s.
+
+    Only sampled walls are considered, which compute their force once per tick (period of the
+    control loop). The arms are linearised at the equilibrium nearest to the state of a run that
+    is deepest in a wall. The mean of the states would not do: an arm that chatters leaves the
+    wall again and again.
+
+    Args:
+        scenario: Description of the experiment.
+        q: Joint angles in K states of the run, for N arms with up to n joints, shape (K, N, n),
+            in rad.
+        theta_hat: Estimates of the arms' P parameters in these states, shape (K, N, P).
+
+    Returns:
+        The growth rate. It is -infinity if nothing moves. It is NaN if no wall is touched, or
+        if the scenario cannot be linearised.
+    """
+    deepest = find_deepest_contact(scenario, q)
+    if deepest is None:
+        return np.nan
+
+    try:
+        # refuses imported laws, because their memory is not among the arguments
+        derive_operating_conditions(scenario, own_laws=False)
+        state = Equilibrium(q[deepest], theta_hat[deepest], "", 0.0)
+        rest = follow_equilibrium(scenario, state)
+        root = find_rightmost_root(derive_operating_conditions(scenario), rest, sampled=True)
+    except ScenarioError:
+        return np.nan
+    return -np.inf if root is None else root.s.real
+
+
+class LinearEdge(NamedTuple):
+    """A value of a scenario's key at which a loop becomes stable or unstable.
+
+    Attributes:
+        key: Key of the scenario, such as "control.d".
+        value: Value of the key at the edge, in the unit of the key.
+        omega_rad_s: Frequency of the root that crosses the imaginary axis, in rad/s.
+        stable_above: True if the loop is stable above the value and unstable below.
+    """
+
+    key: str
+    value: float
+    omega_rad_s: float
+    stable_above: bool
+
+
+class EdgeScan(NamedTuple):
+    """The values of a key, within a range, at which a loop becomes stable or unstable.
+
+    Attributes:
+        key: Key of the scenario, such as "control.d".
+        low: Lower end of the scanned range.
+        high: Upper end of the scanned range.
+        edges: The values, rising, with the roots that cross there.
+    """
+
+    key: str
+    low: float
+    high: float
+    edges: tuple[LinearEdge, ...]
+
+
+def parse_edge_range(text: str) -> tuple[str, float, float]:
+    """Parses a key and a range of values, such as "control.d=0.1:3".
+
+    Returns:
+        The key, the lower end and the upper end of the range.
+
+    Raises:
+        UsageError: The text is not a range.
+    """
+    key, _, ends = text.partition("=")
+    low, colon, high = ends.partition(":")
+    try:
+        if not key.strip() or not colon:
+            raise ValueError
+        return key.strip(), float(low), float(high)
+    except ValueError:
+        raise UsageError(
+            f"--over must have the form KEY=LOW:HIGH, as in control.d=0.1:3, not {text!r}"
+        ) from None
+
+
+def iterate_linear_edges(
+    scenario: Scenario,
+    key: str,
+    low: float,
+    high: float,
+    rest: Equilibrium | None = None,
+    *,
+    points: int = EDGE_SCAN_POINTS,
+    sampled: bool | None = None,
+) -> Iterator[LinearEdge]:
+    """Yields the values of a scenario's key at which the loop becomes stable or unstable.
+
+    The range is scanned, and each change of stability is then located. The values rise.
+
+    Args:
+        scenario: The description of the experiment.
+        key: Key of the scenario, such as "control.d".
+        low: Lower end of the range.
+        high: Upper end of the range.
+        rest: Equilibrium of the scenario, if known. It is followed along the key.
+        points: Number of values that the scan evaluates.
+        sampled: True to analyse the loop with its ticks, False to analyse the continuous loop.
+            None to choose as the module's docstring says.
+
+    Raises:
+        ScenarioError: A value is not valid for that key, or the scenario has no linear loop.
+        UsageError: The range is empty.
+    """
+    is_valid_range = np.isfinite([low, high]).all() and low < high and points >= 2
+    if not is_valid_range:
+        raise UsageError(
+            f"{key} must be scanned from a lower to a higher value, "
+            f"not from {low:g} to {high:g}"
+        )
+    growth = _GrowthRate(scenario, key, rest, sampled)
+    is_logarithmic = low > 0.0 and high / low > _LOGARITHMIC
+    choose_values = np.geomspace if is_logarithmic else np.linspace
+    values = choose_values(low, high, points)
+    if growth.takes_integers:
+        values = np.unique(np.round(values))
+
+    previous: _GrowthPoint | None = None
+    for value in values.tolist():
+        point = _GrowthPoint(value, growth.evaluate(value))
+        if previous is not None and previous.is_unstable != point.is_unstable:
+            yield growth.close_edge(previous, point)
+        previous = point
+
+
+class _GrowthPoint(NamedTuple):
+    """Growth rate of the loop at a value of a key.
+
+    Attributes:
+        value: Value of the key.
+        growth_per_s: Real part of the rightmost root, in 1/s.
+    """
+
+    value: float
+    growth_per_s: float
+
+    @property
+    def is_unstable(self) -> bool:
+        """True if the rightmost root is to the right of the imaginary axis."""
+        return self.growth_per_s > 0.0
+
+
+class _GrowthRate:
+    """Growth rate of a loop as a function of a key's value.
+
+    Each evaluation follows the equilibrium from the one of the previous evaluation.
+
+    Args:
+        scenario: The experiment.
+        key: Key of the scenario.
+        rest: Equilibrium of the scenario. None to determine it.
+        sampled: Whether to analyse the sampled loop, see `iterate_linear_edges`.
+
+    Attributes:
+        takes_integers: True if the values of the key are whole numbers.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        key: str,
+        rest: Equilibrium | None,
+        sampled: bool | None,
+    ) -> None:
+        self.takes_integers = key.rpartition(".")[2] in _INTEGER_KEYS
+        self._scenario = scenario
+        self._key = key
+        self._sampled = sampled
+        self._rest = rest or choose_equilibrium(scenario)
+        self._root: CharacteristicRoot | None = None
+
+    def evaluate(self, value: float) -> float:
+        """Computes how fast small motions grow if the examined setting has a given value.
+
+        The setting is a number of the scenario, such as a gain.
+
+        Args:
+            value: Value of the setting, in its own unit.
+
+        Returns:
+            The growth rate, in 1/s, which is negative if motions decay. It is -infinity if
+            there are no moving modes.
+        """
+        typed_value = round(value) if self.takes_integers else value
+        scenario = load_scenario(self._scenario, {self._key: typed_value})
+        conditions = derive_operating_conditions(scenario)
+        self._rest = follow_equilibrium(scenario, self._rest)
+        sampled = self._sampled
+        if sampled is None:
+            sampled = conditions.needs_sampled_loop
+        self._root = find_rightmost_root(conditions, self._rest, sampled=sampled)
+        return -np.inf if self._root is None else self._root.s.real
+
+    def close_edge(self, left: _GrowthPoint, right: _GrowthPoint) -> LinearEdge:
+        """Finds where the coupled arms change between stable and unstable, between two values.
+
+        The values belong to one setting of the scenario, such as a gain. Exactly one of them
+        gives an unstable loop. Settings with whole numbers are searched by bisection, all
+        others by Brent's method.
+
+        Args:
+            left: The smaller value, with its growth rate.
+            right: The larger value, with its growth rate.
+
+        Returns:
+            The value at which stability changes, with the frequency of the motion.
+
+        Raises:
+            ScenarioError: For a value in between, the scenario cannot be linearised.
+            ValueError: When evaluated again, both values are stable, or both are unstable.
+        """
+        low = left.value
+        high = right.value
+        if self.takes_integers:
+            while high - low > 1.0:
+                middle = float((low + high) // 2.0)
+                if (self.evaluate(middle) > 0.0) == left.is_unstable:
+                    low = middle
+                else:
+                    high = middle
+        else:
+            tolerance = 0.25 * EDGE_TOLERANCE * max(abs(low), abs(high))
+            edge = brentq(self._evaluate_finite, low, high, xtol=tolerance)
+            low = high = float(edge)
+
+        self.evaluate(high)
+        omega = 0.0 if self._root is None else self._root.s.imag
+        return LinearEdge(self._key, 0.5 * (low + high), omega, left.is_unstable)
+
+    def _evaluate_finite(self, value: float) -> float:
+        """Returns the growth rate at a value, which is at least `_LEAST_PER_S`."""
+        return max(self.evaluate(value), _LEAST_PER_S)
+
+
+class GrowthColumn(NamedTuple):
+    """Growth rate of small motions of coupled arms, for several values of one setting.
+
+    Attributes:
+        growth_per_s: Growth rate for each value, in 1/s, which is the real part of the
+            rightmost characteristic root. It is NaN if the scenario cannot be linearised, and
+            -infinity if nothing moves.
+        edges: Values at which stability changes. The key n means that the change lies between
+            the values n and n + 1.
+        remarks: Remarks for the user on the analysis, each once.
+    """
+
+    growth_per_s: list[float]
+    edges: dict[int, float]
+    remarks: list[str]
+
+
+def compute_growth_column(
+    scenarios: Sequence[Scenario],
+    key: str,
+    values: Sequence[float],
+) -> GrowthColumn:
+    """Computes how the growth of small motions depends on one setting of a scenario.
+
+    For each value of the setting, the coupled arms are linearised about a pose of rest. This
+    pose is followed from one value to the next. Between two neighbouring values of which
+    exactly one gives an unstable loop, the value at which stability changes is searched.
+
+    Args:
+        scenarios: The experiments, which differ in the setting only, by its rising value.
+        key: Name of the setting, such as "control.d".
+        values: Values of the setting, one per scenario.
+
+    Returns:
+        The growth rates, and the values at which stability changes. A value of change is
+        missing if the setting does not allow the numbers that the search needs.
+    """
+    rest: Equilibrium | None = None
+    column = GrowthColumn([], {}, [])
+    for n, scenario in enumerate(scenarios):
+        try:
+            rest, remark = _assume_equilibrium(scenario, rest)
+            conditions = derive_operating_conditions(scenario)
+            root = find_rightmost_root(conditions, rest, sampled=conditions.needs_sampled_loop)
+            column.growth_per_s.append(-np.inf if root is None else root.s.real)
+            if n > 0:
+                left = _GrowthPoint(values[n - 1], column.growth_per_s[-2])
+                right = _GrowthPoint(values[n], column.growth_per_s[-1])
+                is_finite = np.isfinite([left.growth_per_s, right.growth_per_s]).all()
+                if is_finite and left.is_unstable != right.is_unstable:
+                    # evaluated again from one equilibrium, both ends may have the same sign
+                    with suppress(ScenarioError, ValueError):
+                        edge = _GrowthRate(scenario, key, rest, None).close_edge(left, right)
+                        column.edges[n - 1] = edge.value
+        except ScenarioError as error:
+            remark = f"no linear analysis: {error.problem}"
+            column.growth_per_s.append(float("nan"))
+        if remark and remark not in column.remarks:
+            column.remarks.append(remark)
+
+    return column
+
+
+def find_root_crossings(
+    scenario: Scenario,
+    key: str,
+    low: float,
+    high: float,
+) -> tuple[tuple[float, ...], str]:
+    """Finds the values of one setting at which coupled arms become stable or unstable.
+
+    Args:
+        scenario: Description of the experiment. The pose of rest is determined with its own
+            value of the setting.
+        key: Name of the setting, such as "control.d".
+        low: Smallest value to examine.
+        high: Largest value to examine.
+
+    Returns:
+        The values at which stability changes, rising. If the scenario cannot be linearised,
+        there are none.
+        A remark for the user on the analysis. Empty if there is none.
+    """
+    try:
+        rest, remark = _assume_equilibrium(scenario, None)
+        edges = iterate_linear_edges(scenario, key, low=low, high=high, rest=rest)
+        return tuple(edge.value for edge in edges), remark
+    except ScenarioError as error:
+        return (), f"no linear analysis: {error.problem}"
+
+
+def _assume_equilibrium(
+    scenario: Scenario, previous: Equilibrium | None
+) -> tuple[Equilibrium, str]:
+    """Returns an equilibrium of a scenario, without a simulation if possible.
+
+    Adaptive sites without operators and environments have the mean start pose as their
+    equilibrium. Otherwise it is the equilibrium next to the previous one.
+
+    Args:
+        scenario: The experiment.
+        previous: Equilibrium of a similar scenario, or None.
+
+    Returns:
+        The equilibrium.
+        A remark on the assumption. Empty if none was made.
+    """
+    sites = derive_operating_conditions(scenario).sites
+    is_adaptive = any(site.gains.law is Law.ADAPTIVE for site in sites)
+    has_actors = any(site.actors for site in sites)
+    if is_adaptive and not has_actors:
+        rest = find_equilibrium(scenario, find_mean_pose(scenario))
+        return rest, ASSUMED_EQUILIBRIUM_REMARK
+    if previous is None:
+        return choose_equilibrium(scenario), ""
+    return follow_equilibrium(scenario, previous), ""

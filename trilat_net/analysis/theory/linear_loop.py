@@ -1,0 +1,773 @@
+"""Linearises the control loop of all arms about a pose of rest, with network delays.
+
+A site is a process that runs one arm. For small deviations x from the pose of rest, the result
+is a differential equation with delays:
+
+    x'(t) = A x(t) + sum_k A_k x(t - T_k) + B u(t) + sum_k B_k u(t - T_k),    y(t) = C x(t)
+
+The state x contains, for each site, its joint angles, its joint velocities, and the parameter
+estimates of its control law. The inputs u are the torques that operators add on the joints, the
+outputs y are the joint velocities, T_k are the delays of the links, and A, A_k, B, B_k and C
+are constant matrices.
+
+For an arm with n joints in a chain, the control law may estimate ten parameters theta_hat per
+link. Only one combination of them per joint acts on small motions: the estimated gravity torque
+z = Y_G theta_hat, in N m. Y_G is the regressor of the gravity torque, the matrix that
+multiplies the parameters, at rest. The torque z therefore replaces the estimates in x. Its rate
+is z' = -Y_G Gamma Y' r, with the regressor Y of the control law, its adaptation gain Gamma, and
+its filtered error r = e' + Lambda e. Here e is the error of the joint angles and Lambda a gain.
+The remaining combinations are omitted. They only add roots at zero.
+
+In task space, where end effectors instead of joints follow each other, the sites are coupled
+through the poses and velocities of their end effectors.
+"""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag, qr
+
+from ...core.arms.task_space import POSITION
+from ...core.step.site_setup import SiteSetup
+from ...core.step.vectors import Array
+from ...laws.conditions import BlockKey, LinearForm
+from . import site_dynamics
+from .numeric_law import NumericLaw
+from .operating_point import Equilibrium, OperatingConditions
+from .textbook_arm import evaluate_reference
+
+_DEPENDENT = 1e-9
+"""Largest pivot of a QR factorisation that counts as zero, relative to the largest pivot."""
+
+
+class SiteJacobian(NamedTuple):
+    """Linear model of one site (a process that runs one arm) about a pose of rest.
+
+    It contains the derivatives of the site's rates of change with respect to its states and to
+    what it receives from the other sites. States that no small motion changes or shows are left
+    out.
+
+    Attributes:
+        layout: Which column of the derivatives belongs to which quantity. There are no columns
+            for parameter estimates if the control law estimates nothing.
+        rates: The derivatives of accelerations, estimates, torques and sent values.
+        states: Names of the states, such as "q1", "qd2" and "theta4" (parameter estimate).
+            "gravity2" is the estimated gravity torque of joint 2.
+        omitted_states: Number of parameter estimates that were left out.
+    """
+
+    layout: site_dynamics.ArgumentLayout
+    rates: site_dynamics.SiteRates
+    states: tuple[str, ...]
+    omitted_states: int = 0
+
+    @property
+    def output(self) -> Array:
+        """Matrix that computes what the site sends to the other sites from its own states.
+
+        The site sends the pose that it shares, the velocity of this pose, and the external
+        torque that it reflects, with m numbers each. The matrix has the shape (3 m, states).
+        """
+        rates = self.rates
+        samples = np.vstack([rates.x, rates.xd, rates.reflected])
+        state_count = self.layout.states
+        return samples[:, :state_count]
+
+
+class DelayedTerm(NamedTuple):
+    """Effect of all states and torques on the coupled arms after one particular delay T.
+
+    It is the term A x(t - T) + B u(t - T) in the differential equation of the loop. x contains
+    the n states, and u the m torques of operators on the joints.
+
+    Attributes:
+        delay_s: The delay T, in s.
+        A: Effect of the delayed states, shape (n, n).
+        B: Effect of the delayed torques, shape (n, m). It is zero unless a control law sends
+            external torques to other arms.
+    """
+
+    delay_s: float
+    A: Array
+    B: Array
+
+
+class LinearLoop(NamedTuple):
+    """A linear loop with delays, in the notation of the module's docstring.
+
+    Attributes:
+        names: Names of the states, such as "m1.q1", "s.qd2", "m1.theta4".
+        inputs: Names of the torques on the joints, such as "m1.tau1".
+        outputs: Names of the joint velocities, such as "m1.qd1".
+        A: Matrix of the states, shape (n, n).
+        B: Matrix of the inputs, shape (n, m).
+        C: Matrix of the outputs, shape (p, n).
+        delayed: One entry per distinct delay above zero, by rising delay.
+        omitted_states: Number of states that no small motion changes or shows, each with a root
+            at zero.
+        E: Diagonal of the matrix E in E x' = A x + ..., shape (n,): 1 for a state with a rate,
+            0 for a state that an algebraic equation determines, such as a wave. None if every
+            state has a rate.
+    """
+
+    names: tuple[str, ...]
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    A: Array
+    B: Array
+    C: Array
+    delayed: tuple[DelayedTerm, ...]
+    omitted_states: int = 0
+    E: Array | None = None
+
+    @property
+    def static_matrix(self) -> Array:
+        """Sum of the matrices of present and delayed states, A + sum_k A_k, shape (n, n).
+
+        It gives the rates of change of the n states while these states are constant, because
+        delays then have no effect.
+        """
+        delayed = [term.A for term in self.delayed]
+        return sum(delayed, self.A)
+
+
+def gather_site_arguments(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
+    """Collects the states and inputs of each site when all arms are at rest.
+
+    The states are joint angles, joint velocities and parameter estimates. The inputs are what a
+    site (process that runs one arm) receives from the other sites, and the external torque.
+    `ArgumentLayout` describes their order.
+
+    Args:
+        conditions: The sites, gains and delays of the coupled arms.
+        rest: The pose of rest, with the parameter estimates.
+
+    Returns:
+        A vector for each site, with the length that its `ArgumentLayout` states.
+    """
+    layouts = [site_dynamics.lay_out_arguments(site) for site in conditions.sites]
+    arguments = [np.zeros(layout.arguments) for layout in layouts]
+    references = compute_references(conditions, rest)
+    site_arguments = list(zip(layouts, arguments, strict=True))
+    for i, (layout, x) in enumerate(site_arguments):
+        q = rest.q[i]
+        theta_hat = rest.theta_hat[i]
+        x[layout.q] = q[: layout.joints]
+        x[layout.estimate] = theta_hat[: layout.parameters]
+        x[layout.q_des] = references[i]
+
+    # the peers' torques follow from the arguments so far
+    all_rates = conditions.evaluate_rates(arguments)
+    reflected = [rates.reflected for rates in all_rates]
+    peer_torques = conditions.alpha @ reflected
+    for i, (layout, x) in enumerate(site_arguments):
+        x[layout.peer_torque] = peer_torques[i]
+        peers = [j for j in range(len(arguments)) if j != i]
+        m = layout.coordinates
+        qd = np.zeros(m)
+        for index in range(layout.peers):
+            j = peers[index]
+            q = rest.q[j]
+            torque = -reflected[j]
+            sample = layout.peer_sample(index)
+            x[sample] = np.concatenate([q[:m], qd, torque])
+    return arguments
+
+
+def compute_shared_poses(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
+    """Computes the pose that each site sends to its peers at an equilibrium.
+
+    It consists of the joint angles, or in task space of the end effector's pose.
+
+    Args:
+        conditions: The sites, gains and delays of the loop.
+        rest: The equilibrium.
+
+    Returns:
+        A pose for each site, shape (m,).
+    """
+    poses = []
+    for site, q in zip(conditions.sites, rest.q, strict=True):
+        joint_positions = q[: site.layout.joints]
+        pose = site_dynamics.compute_shared_pose(site, joint_positions)
+        poses.append(pose)
+    return poses
+
+
+def compute_references(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
+    """Computes the pose that each site tries to reach at an equilibrium.
+
+    It is the mean of its peers' poses, weighted with the dominance factors.
+
+    Args:
+        conditions: The sites, gains and delays of the loop.
+        rest: The equilibrium.
+
+    Returns:
+        A reference for each site, shape (m,).
+    """
+    poses = compute_shared_poses(conditions, rest)
+    if not conditions.sites[0].layout.task:
+        references = conditions.alpha @ np.array(poses)
+        return list(references)
+    pairs = zip(conditions.alpha, poses, strict=True)
+    return [evaluate_reference(shares, pose, poses) for shares, pose in pairs]
+
+
+def differentiate_references(
+    conditions: OperatingConditions, rest: Equilibrium
+) -> dict[tuple[int, int], Array]:
+    """Computes how the pose that a site follows depends on the poses of the other sites.
+
+    A site is a process that runs one arm. For positions, the derivative is the unit matrix
+    times the dominance factor, the weight with which site i follows site j. If end effectors
+    follow each other in orientation too, the followed pose also depends on the site's own pose.
+
+    Args:
+        conditions: The sites, gains and delays of the coupled arms.
+        rest: The pose of rest at which the derivatives are taken.
+
+    Returns:
+        For each pair (i, j), the derivative of the pose that site i follows with respect to the
+        pose of site j, shape (m, m), for poses of m numbers. Pairs without an effect are
+        missing.
+    """
+    derivatives = {}
+    poses = compute_shared_poses(conditions, rest)
+    for i, shares in enumerate(conditions.alpha):
+        followed = np.flatnonzero(shares).tolist()
+        m = len(poses[i])
+        identity = np.eye(m)
+        for j in followed:
+            derivatives[i, j] = shares[j] * identity
+        layout = conditions.sites[i].layout
+        has_orientation = m > POSITION and layout.task
+        if not has_orientation:
+            continue
+
+        for j in {i, *followed}:
+            columns = []
+            for pose in poses:
+                zeros = np.zeros(len(pose))
+                repeated_pose = pose[:, np.newaxis] + zeros
+                columns.append(repeated_pose)
+            unit_steps = np.eye(len(poses[j]))
+            imaginary_steps = 1j * site_dynamics.COMPLEX_STEP * unit_steps
+            columns[j] = columns[j] + imaginary_steps
+            reference = evaluate_reference(shares, columns[i], columns)
+            derivatives[i, j] = reference.imag / site_dynamics.COMPLEX_STEP
+    return derivatives
+
+
+def compute_couplings(
+    conditions: OperatingConditions,
+    rest: Equilibrium,
+    sites: list[SiteJacobian],
+) -> dict[tuple[int, int], Array]:
+    """Computes how what each site sends acts on the inputs of the sites that receive it.
+
+    A site (process that runs one arm) sends its pose, its velocity and its reflected torque,
+    with m numbers each. A receiver weights them with its dominance factors (weights with which
+    it follows the other arms). The control law of a user also receives them without weights.
+
+    Args:
+        conditions: The sites, gains and delays of the coupled arms.
+        rest: The pose of rest about which the arms are linearised.
+        sites: Linear model of each site, without the others.
+
+    Returns:
+        For each pair (i, j), the effect of the values that site j sends on the inputs of site
+        i, shape (inputs, 3 m).
+    """
+    references = differentiate_references(conditions, rest)
+    couplings = {}
+    for i, j in conditions.coupled_pairs:
+        layout = sites[i].layout
+        m = layout.coordinates
+        zero = np.zeros((m, m))
+        share = conditions.alpha[i, j] * np.eye(m)
+        reference = references.get((i, j), zero)
+        coupling = block_diag(reference, share, share)
+
+        if layout.peers:
+            length = len(coupling)
+            samples = np.zeros((layout.peers, length, length))
+            # tau_x in a sample is the torque of the arm, and not the torque ON the arm
+            signs = np.repeat([1.0, 1.0, -1.0], m)
+            # the site itself is not among its peers
+            peer_index = j - 1 if j > i else j
+            samples[peer_index] = np.diag(signs)
+            coupling = np.vstack([coupling, *samples])
+        couplings[i, j] = coupling
+    return couplings
+
+
+def mask_loop_states(conditions: OperatingConditions) -> list[NDArray[np.bool_]]:
+    """Finds which states of each site belong to the linear model of the coupled arms.
+
+    A site is a process that runs one arm. Its joint angles and velocities always belong to the
+    model. Its parameter estimates belong to the model if its control law changes them. The same
+    holds for the memory of a user's control law.
+
+    Args:
+        conditions: The sites and their control laws.
+
+    Returns:
+        For each site a mask of its states (angles, velocities, estimates), shape (states,). It
+        is True for states in the model.
+    """
+    masks = []
+    for site in conditions.sites:
+        layout = site_dynamics.lay_out_arguments(site)
+        mask = np.ones(layout.states, dtype=bool)
+        mask[layout.estimate] = site_dynamics.has_estimate(site)
+        masks.append(mask)
+    return masks
+
+
+def differentiate_rates(
+    conditions: OperatingConditions,
+    rest: Equilibrium,
+    *,
+    all_estimates: bool = False,
+) -> list[SiteJacobian]:
+    """Builds the linear model of each site about a pose of rest, without the other sites.
+
+    A site is a process that runs one arm. The model contains the derivatives of its rates of
+    change with respect to its own states and to its inputs.
+
+    Args:
+        conditions: The sites, gains and delays of the coupled arms.
+        rest: The pose of rest, with the parameter estimates.
+        all_estimates: True to keep every parameter estimate of a chain of joints as a state. By
+            default, only their combinations that act on small motions are states: the estimated
+            gravity torques of the joints.
+
+    Returns:
+        The models, in the order of the sites.
+    """
+    arguments = gather_site_arguments(conditions, rest)
+    references = differentiate_references(conditions, rest)
+    jacobians = []
+    for i, (site, x) in enumerate(zip(conditions.sites, arguments, strict=True)):
+        layout = site_dynamics.lay_out_arguments(site)
+        rates = site_dynamics.differentiate_site_rates(site, x)
+        if conditions.has_forms:
+            # the memory of such a law supplies the torque that holds the arm at rest
+            external = layout.external_torque
+            qdd = site_dynamics.evaluate_site_rates(site, x).qdd
+            inverse_inertia = rates.qdd[:, external]
+            holding_torque = np.linalg.solve(inverse_inertia, qdd)
+            x[external] -= holding_torque
+            rates = site_dynamics.differentiate_site_rates(site, x)
+        if (i, i) in references:
+            # chain rule: the reference depends on the site's own orientation
+            state_count = layout.states
+            pose_by_state = rates.x[:, :state_count]
+            reference_by_state = references[i, i] @ pose_by_state
+            for derivative in rates:
+                by_reference = derivative[:, layout.q_des]
+                indirect_effect = by_reference @ reference_by_state
+                derivative[:, :state_count] += indirect_effect
+
+        jacobian = _select_states(site, layout, rates, all_estimates=all_estimates)
+        jacobians.append(jacobian)
+    return jacobians
+
+
+def _select_states(
+    site: SiteSetup,
+    layout: site_dynamics.ArgumentLayout,
+    rates: site_dynamics.SiteRates,
+    *,
+    all_estimates: bool,
+) -> SiteJacobian:
+    """Returns a site's derivatives with respect to the states that the loop keeps."""
+    motion = _name_motion(layout.joints)
+    if isinstance(site.law_factory, NumericLaw):
+        memory = site.law_factory.names
+        return SiteJacobian(layout, rates, (*motion, *memory))
+    if not site_dynamics.has_estimate(site):
+        no_combination = np.zeros((0, layout.parameters))
+        return _replace_estimate(layout, rates, no_combination, ())
+    if site.chain is None or all_estimates:
+        estimates = tuple(f"theta{p + 1}" for p in range(layout.parameters))
+        return SiteJacobian(layout, rates, (*motion, *estimates))
+
+    effect = rates.tau[:, layout.estimate]
+    # pivoted QR factorisation: the leading pivots are the independent rows of the effect
+    _, R, pivots = qr(effect.T, mode="economic", pivoting=True)
+    sizes = np.abs(np.diag(R))
+    least_size = _DEPENDENT * max(1.0, sizes[0])
+    rank = int(np.sum(sizes > least_size))
+
+    joints = sorted(pivots[:rank].tolist())
+    names = tuple(f"gravity{joint + 1}" for joint in joints)
+    jacobian = _replace_estimate(layout, rates, effect[joints], names)
+    omitted_states = layout.parameters - len(joints)
+    return jacobian._replace(omitted_states=omitted_states)
+
+
+def _name_motion(joints: int) -> tuple[str, ...]:
+    """Returns the names of angles and velocities: "q1", "q2", ..., "qd1", "qd2", ..."""
+    numbers = range(1, joints + 1)
+    angles = [f"q{number}" for number in numbers]
+    velocities = [f"qd{number}" for number in numbers]
+    return (*angles, *velocities)
+
+
+def _replace_estimate(
+    layout: site_dynamics.ArgumentLayout,
+    rates: site_dynamics.SiteRates,
+    T: Array,
+    names: tuple[str, ...],
+) -> SiteJacobian:
+    """Replaces the estimates theta_hat of a site by the states z = T theta_hat.
+
+    Args:
+        layout: Layout of the columns with theta_hat.
+        rates: Derivatives with respect to theta_hat.
+        T: The matrix T, shape (states, P). The estimates must act through z only.
+        names: Names of the states z.
+    """
+    estimate_by_z = np.linalg.pinv(T)
+
+    estimate = layout.estimate
+
+    def convert(derivative: Array) -> Array:
+        """Returns a derivative by the new states."""
+        motion = derivative[:, : estimate.start]
+        by_estimate = derivative[:, estimate]
+        by_z = by_estimate @ estimate_by_z
+        inputs = derivative[:, estimate.stop :]
+        return np.hstack([motion, by_z, inputs])
+
+    converted = site_dynamics.SiteRates(*map(convert, rates))
+    z_rate = T @ converted.estimate
+    new_layout = site_dynamics.ArgumentLayout(
+        joints=layout.joints,
+        parameters=len(T),
+        shared=layout.shared,
+        peers=layout.peers,
+    )
+    return SiteJacobian(
+        layout=new_layout,
+        rates=converted._replace(estimate=z_rate),
+        states=(*_name_motion(layout.joints), *names),
+    )
+
+
+def _list_blocks(lengths: Sequence[int]) -> list[slice]:
+    """Returns consecutive slices of the given lengths."""
+    bounds = np.cumsum([0, *lengths]).tolist()
+    return [slice(start, stop) for start, stop in pairwise(bounds)]
+
+
+def linearise_loop(
+    conditions: OperatingConditions,
+    rest: Equilibrium,
+    *,
+    all_estimates: bool = False,
+) -> LinearLoop:
+    """Builds the linear model of the coupled arms for small motions about a pose of rest.
+
+    The model contains all sites (processes that each run one arm) and the links between them
+    with their delays. Its inputs are the torques of operators on the joints.
+
+    Args:
+        conditions: The sites, gains and delays of the coupled arms.
+        rest: The pose of rest, with the parameter estimates.
+        all_estimates: True to keep every parameter estimate of a chain of joints as a state. By
+            default, only their combinations that act on small motions are states: the estimated
+            gravity torques of the joints.
+
+    Returns:
+        The model, a linear differential equation with delays.
+    """
+    sites = differentiate_rates(conditions, rest, all_estimates=all_estimates)
+    states = _list_blocks([site.layout.states for site in sites])
+    ports = _list_blocks([site.layout.joints for site in sites])
+    state_count = states[-1].stop
+    port_count = ports[-1].stop
+    A = np.zeros((state_count, state_count))
+    B = np.zeros((state_count, port_count))
+    C = np.zeros((port_count, state_count))
+
+    input_effects = []
+    for i, site in enumerate(sites):
+        layout = site.layout
+        rates = site.rates
+        joints = layout.joints
+        site_states = states[i]
+        site_ports = ports[i]
+        first_velocity = layout.qd.start
+        position_rate = np.eye(joints, layout.arguments, first_velocity)
+        derivative = np.vstack([position_rate, rates.qdd, rates.estimate])
+        A[site_states, site_states] = derivative[:, : layout.states]
+        B[site_states, site_ports] = derivative[:, layout.external_torque]
+        C[site_ports, site_states] = np.eye(joints, layout.states, first_velocity)
+        input_effect = derivative[:, layout.inputs]
+        input_effects.append(input_effect)
+
+    terms: dict[float, tuple[Array, Array]] = {}
+    couplings = compute_couplings(conditions, rest, sites)
+    for (i, j), coupling in couplings.items():
+        delay_s = float(conditions.age_s[i, j])
+        if delay_s not in terms:
+            terms[delay_s] = (np.zeros_like(A), np.zeros_like(B))
+        late_A, late_B = terms[delay_s]
+        peer = sites[j]
+        peer_layout = peer.layout
+        effect = input_effects[i] @ coupling
+        effect_of_states = effect @ peer.output
+        late_A[states[i], states[j]] += effect_of_states
+        # the torque on the peer's joints is reflected without a state in between
+        first_torque = 2 * peer_layout.coordinates
+        effect_of_torque = effect[:, first_torque:]
+        reflected_by_port = peer.rates.reflected[:, peer_layout.external_torque]
+        effect_of_ports = effect_of_torque @ reflected_by_port
+        late_B[states[i], ports[j]] += effect_of_ports
+
+    loop = LinearLoop(
+        names=_name_states(conditions, sites),
+        inputs=_name_ports(conditions, sites, "tau"),
+        outputs=_name_ports(conditions, sites, "qd"),
+        A=A,
+        B=B,
+        C=C,
+        delayed=_sort_terms(terms),
+        omitted_states=sum(site.omitted_states for site in sites),
+    )
+    if all_estimates or not conditions.has_forms:
+        return loop
+    return add_law_forms(conditions, sites, loop)
+
+
+def _name_states(
+    conditions: OperatingConditions, sites: Sequence[SiteJacobian]
+) -> tuple[str, ...]:
+    """Returns the names of all states, such as "m1.q1"."""
+    names = []
+    for name, site in zip(conditions.names, sites, strict=True):
+        names += [f"{name}.{state}" for state in site.states]
+    return tuple(names)
+
+
+def _name_ports(
+    conditions: OperatingConditions,
+    sites: Sequence[SiteJacobian],
+    kind: str,
+) -> tuple[str, ...]:
+    """Returns the names of a quantity of all joints, such as "m1.tau1" for the kind "tau"."""
+    names = []
+    for name, site in zip(conditions.names, sites, strict=True):
+        numbers = range(1, site.layout.joints + 1)
+        names += [f"{name}.{kind}{number}" for number in numbers]
+    return tuple(names)
+
+
+def _sort_terms(terms: dict[float, tuple[Array, Array]]) -> tuple[DelayedTerm, ...]:
+    """Returns the delayed terms by rising delay.
+
+    Args:
+        terms: Matrices of state and torque, by the delay in s.
+    """
+    delayed = []
+    for delay_s in sorted(terms):
+        A, B = terms[delay_s]
+        term = DelayedTerm(delay_s, A, B)
+        delayed.append(term)
+    return tuple(delayed)
+
+
+def add_law_forms(
+    conditions: OperatingConditions,
+    sites: Sequence[SiteJacobian],
+    loop: LinearLoop,
+) -> LinearLoop:
+    """Adds control laws that gains do not fully describe to a linear model of the arms.
+
+    These laws may store numbers of their own, or send signals of their own, such as waves. They
+    state their linear equations as a `LinearForm`. A sent signal becomes a state without a rate
+    of change: an algebraic equation determines it, and the receiver reacts to its delayed
+    value.
+
+    Args:
+        conditions: The sites (processes that each run one arm), gains and delays.
+        sites: Linear model of each site, without the others.
+        loop: Linear model of the coupled arms without the additional equations.
+
+    Returns:
+        The model with the additional equations and states.
+    """
+    inertias = []
+    for site in sites:
+        inverse_inertia = site.rates.qdd[:, site.layout.external_torque]
+        inertia = np.linalg.inv(inverse_inertia)
+        inertias.append(inertia)
+
+    forms = conditions.find_forms(inertias)
+    blocks, names = _index_form_states(conditions, forms, loop)
+    state_count = len(names)
+    port_count = len(loop.inputs)
+
+    def make_zeros() -> tuple[Array, Array]:
+        zero_A = np.zeros((state_count, state_count))
+        zero_B = np.zeros((state_count, port_count))
+        return zero_A, zero_B
+
+    terms = {0.0: make_zeros()}
+    undelayed = DelayedTerm(0.0, loop.A, loop.B)
+    for delay_s, A, B in (undelayed, *loop.delayed):
+        late_A, late_B = terms.setdefault(delay_s, make_zeros())
+        old_count = len(A)
+        late_A[:old_count, :old_count] = A
+        late_B[:old_count] = B
+    for i, form in enumerate(forms):
+        if form is not None:
+            _add_form(conditions, sites, blocks=blocks, i=i, form=form, terms=terms)
+
+    # some laws send accelerations, which are complete only now
+    E = np.ones(state_count)
+    undelayed_A, _ = terms[0.0]
+    for i, form in enumerate(forms):
+        if form is None:
+            continue
+        acceleration = blocks[i, "qd"]
+        identity = np.eye(len(sites[i].rates.qdd))
+        for j in form.list_receivers():
+            signal = blocks[i, ("to", j)]
+            E[signal] = 0.0
+            if form.sends_acceleration:
+                for A, B in terms.values():
+                    A[signal] = A[acceleration]
+                    B[signal] = B[acceleration]
+            undelayed_A[signal, signal] -= identity
+
+    A, B = terms.pop(0.0)
+    outputs, old_states = loop.C.shape
+    added_states = state_count - old_states
+    new_columns = np.zeros((outputs, added_states))
+    return loop._replace(
+        names=tuple(names),
+        A=A,
+        B=B,
+        C=np.hstack([loop.C, new_columns]),
+        delayed=_sort_terms(terms),
+        E=E,
+    )
+
+
+_StateBlocks = dict[tuple[int, BlockKey], slice]
+"""Positions of the states of each signal of a law, by index of the site and name of the signal.
+"""
+
+
+def _index_form_states(
+    conditions: OperatingConditions,
+    forms: Sequence[LinearForm | None],
+    loop: LinearLoop,
+) -> tuple[_StateBlocks, list[str]]:
+    """Returns the positions of the states of all laws' signals, and the names of all states."""
+    blocks: _StateBlocks = {}
+    names = list(loop.names)
+    named_forms = zip(conditions.names, forms, strict=True)
+    for i, (site_name, form) in enumerate(named_forms):
+        joints = conditions.sites[i].layout.joints
+        for kind in ("q", "qd"):
+            first = names.index(f"{site_name}.{kind}1")
+            blocks[i, kind] = slice(first, first + joints)
+        if form is None:
+            continue
+        labels: dict[BlockKey, str] = {state: state for state in form.states}
+        for j in form.list_receivers():
+            labels["to", j] = f"to_{conditions.names[j]}_"
+        numbers = range(1, joints + 1)
+        for signal, label in labels.items():
+            first = len(names)
+            blocks[i, signal] = slice(first, first + joints)
+            names += [f"{site_name}.{label}{number}" for number in numbers]
+    return blocks, names
+
+
+def _add_form(
+    conditions: OperatingConditions,
+    sites: Sequence[SiteJacobian],
+    *,
+    blocks: _StateBlocks,
+    i: int,
+    form: LinearForm,
+    terms: dict[float, tuple[Array, Array]],
+) -> None:
+    """Adds the linear form of site i's law to the matrices of the loop.
+
+    Args:
+        conditions: The numbers of the loop.
+        sites: Derivatives of each site's rates.
+        blocks: Positions of the states of all signals.
+        i: Index of the site.
+        form: Linear form of its law.
+        terms: Matrices of state and torque by delay, which are changed in place.
+    """
+    site = sites[i]
+    layout = site.layout
+    ports = _list_blocks([jacobian.layout.joints for jacobian in sites])
+    A, B = terms[0.0]
+
+    def find_delayed_matrix(j: int) -> Array:
+        """Returns the matrix through which delayed states of all arms act on the loop.
+
+        The delay is the age of the samples (sent states) of site j when site i uses them. If no
+        matrix for this delay exists, one with zeros is added.
+
+        Args:
+            j: Index of the site that sends the samples.
+
+        Returns:
+            The matrix, shape (n, n), with the n states of the loop. The caller changes it in
+            place.
+        """
+        delay_s = float(conditions.age_s[i, j])
+        if delay_s not in terms:
+            terms[delay_s] = (np.zeros_like(A), np.zeros_like(B))
+        late_A, _ = terms[delay_s]
+        return late_A
+
+    external = layout.external_torque
+    for (row, column), gain in form.blocks.items():
+        if row == "tau":
+            rows = blocks[i, "qd"]
+            inverse_inertia = site.rates.qdd[:, external]
+            block = inverse_inertia @ gain
+        else:
+            rows = blocks[i, row]
+            block = gain
+        if column == "tau_h":
+            q_columns = blocks[i, "q"]
+            qd_columns = blocks[i, "qd"]
+            motion = slice(q_columns.start, qd_columns.stop)
+            torque_on_arm = site.rates.external + site.rates.held
+            torque_by_motion = torque_on_arm[:, : layout.qd.stop]
+            torque_by_input = torque_on_arm[:, external]
+            A[rows, motion] += block @ torque_by_motion
+            B[rows, ports[i]] += block @ torque_by_input
+        elif column in ("q_des", "qd_des"):
+            signal = str(column).removesuffix("_des")
+            shares = conditions.alpha[i]
+            for j in np.flatnonzero(shares).tolist():
+                late_A = find_delayed_matrix(j)
+                columns = blocks[j, signal]
+                late_A[rows, columns] += shares[j] * block
+        elif isinstance(column, tuple):
+            sender = column[1]
+            sent_signal = (sender, ("to", i))
+            if sent_signal in blocks:
+                late_A = find_delayed_matrix(sender)
+                columns = blocks[sent_signal]
+                late_A[rows, columns] += block
+        else:
+            columns = blocks[i, column]
+            A[rows, columns] += block

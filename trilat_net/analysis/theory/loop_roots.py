@@ -1,0 +1,616 @@
+"""Decides which characteristic roots a control loop has at the end of a run, for every command.
+
+The coupled arms are linearised at the pose at which a run ended. If all roots have a negative
+real part, small motions about this pose die away. The roots belong to the final loop: the
+delays, dominance factors (weights with which the arms follow each other), operators and
+environments that are in force at the end, after all planned changes and all commands.
+
+The delays of the final loop are known if they are constant, or follow sinusoids or traces that
+repeat. If a trace has ended, its last delay is constant. Random and measured delays are known
+from the records only. The roots are then those of the samples that were used in the last
+quarter of the records.
+
+Invariant:
+    - Roots are called exact only if every delay is constant or repeats after the analysed
+      period, if the loop is analysed with its ticks, the periods of its controllers, and if
+      their rightmost one has the same sign at the last pose and at the rest next to it.
+    - A command that leaves a link or a dominance factor as it was changes nothing.
+    - The code of imported control laws is executed only with permission. Without it, such a
+      loop has no roots. With it, unstable roots count as exact and stable ones do not: the law
+      may contain thresholds that its derivative at the pose does not show. The same holds for
+      sampled walls, which may hammer although the rest beside them is stable.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from itertools import chain, permutations
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+
+from ...core.links.philox import link_key
+from ...core.step.ticks import BUCKETS_PER_S, NS_PER_S
+from ...core.step.vectors import Array
+from ...errors import ScenarioError
+from ...execution.fused import FusedRun
+from ...execution.virtual import simulate_scenario
+from ...log.log_reader import Log
+from ...log.record_columns import Ints
+from ...scenario import Scenario
+from ...scenario.delay_models import LinkBase
+from ...scenario.delay_models.kernel_delays import ConstantDelay
+from ...scenario.delay_period import find_final_link, is_ending_trace
+from ...scenario.imported_code import ImportedLaw
+from ...scenario.sample_uses import draw_used_samples
+from ..run_end import SETTLED_SPEED_RAD_S, RunTrace, trace_log
+from ..stability_decision import LoopRoots
+from ..timeline import list_effective_commands, recorded_end_s
+from .characteristic_roots import Spectrum, compute_delay_spectrum
+from .equilibrium import follow_equilibrium, pad_rows, settle_memories
+from .floquet import DRAWN_SPAN_S, SamplesInUse, compute_sampled_spectrum
+from .linear_edge import find_deepest_contact
+from .linear_loop import linearise_loop
+from .operating_point import (
+    Equilibrium,
+    OperatingConditions,
+    derive_operating_conditions,
+)
+
+_SAME_POSE_RAD = 1e-6
+"""Poses that differ by less have the same roots, in rad."""
+_ZERO_SHARE = 0.1
+"""A root at the last pose counts as zero below this share of the rightmost root at the rest."""
+_ROOTS = 2
+"""Number of rightmost roots that are computed at the end of a run."""
+_BATCH_RECORDS = 4096
+"""Number of records of each site that are read from a simulated run at a time."""
+
+
+class EndLoop(NamedTuple):
+    """The control loop at the end of a run, with the rest about which it is linearised.
+
+    Attributes:
+        scenario: The scenario up to the end of the run. Delays that only the run shows are
+            replaced by their mean.
+        conditions: The numbers from which the loop is built.
+        rest: The equilibrium nearest to the end of the run.
+        uses: The samples in use in the last quarter of the run, if delays are random or
+            measured. None if the scenario determines all delays.
+        has_mean_ages: True if the age of the samples on some link is a mean over the last
+            quarter of the run.
+        distance_rad: Largest difference between the last angle of a joint and its angle at
+            the rest, in rad.
+        last_pose: The last pose of the run. None if it is the rest. Arms that nobody holds may
+            rest anywhere in between.
+    """
+
+    scenario: Scenario
+    conditions: OperatingConditions
+    rest: Equilibrium
+    uses: SamplesInUse | None
+    has_mean_ages: bool
+    distance_rad: float
+    last_pose: Equilibrium | None = None
+
+    def compute_sampled_roots(self, count: int) -> Spectrum | None:
+        """Computes the rightmost roots of the loop with its ticks.
+
+        Args:
+            count: Number of roots.
+
+        Returns:
+            The roots. None if a control law can be linearised in continuous time only.
+        """
+        return compute_sampled_spectrum(self.conditions, self.rest, count, self.uses)
+
+
+def find_log_roots(log: Log, *, own_laws: bool = False) -> LoopRoots:
+    """Computes whether small motions about the end pose of a recorded run die away.
+
+    Args:
+        log: The log of the run.
+        own_laws: True if the code of imported control laws may be executed. Otherwise a loop
+            with such a law has no roots.
+
+    Returns:
+        The roots of the final loop, or the reason why there are none.
+    """
+    try:
+        loop = find_log_loop(log, own_laws=own_laws)
+    except ScenarioError as error:
+        return _explain_no_roots(error.problem)
+    return _compute_roots(loop)
+
+
+def find_run_roots(scenario: Scenario, run: FusedRun) -> LoopRoots:
+    """Computes whether small motions about the end pose of a simulated run die away.
+
+    Args:
+        scenario: The experiment.
+        run: Its run in the fused loop.
+
+    Returns:
+        The roots of the loop at the end of the run, or the reason why there are none.
+    """
+    try:
+        loop = find_run_loop(scenario, run)
+    except ScenarioError as error:
+        return _explain_no_roots(error.problem)
+    return _compute_roots(loop)
+
+
+def find_log_loop(log: Log, *, own_laws: bool = False) -> EndLoop:
+    """Finds the control loop at the end of a recorded run, and the rest next to its end.
+
+    Args:
+        log: The log of the run.
+        own_laws: True if the code of imported control laws may be executed.
+
+    Raises:
+        ScenarioError: The loop cannot be linearised, or the run ended without a rest.
+    """
+    site_logs = [log[site] for site in log.sites]
+    if not all(map(len, site_logs)):
+        raise ScenarioError("a site has no records", source=log.source)
+    for site_log in site_logs:
+        mode = site_log.mode[-1]
+        if mode == "diverged":
+            raise ScenarioError("the run diverged", source=log.source)
+        if mode != "run":
+            problem = f"{site_log.name} ends in the mode {mode!r}"
+            raise ScenarioError(problem, source=log.source)
+
+    def read_used_samples(i: int, j: int, ticks: Ints) -> Ints:
+        """Returns the samples of site j that site i used, from its records."""
+        site_log = site_logs[i]
+        rows_after = np.searchsorted(site_log.tick, ticks, side="right")
+        rows = np.maximum(rows_after - 1, 0)
+        used: Ints = site_log.used[log.sites[j]][rows]
+        return used
+
+    last_ticks = [int(site_log.tick[-1]) for site_log in site_logs]
+    final = _fix_delays(resolve_final_scenario(log), last_ticks, read_used_samples)
+    trace = trace_log(log)
+    state = None
+    if _has_sampled_wall(final.scenario):
+        motions = [_SiteMotion(part.t_s, part.q, part.qd, part.theta_hat) for part in site_logs]
+        state = _find_state_in_wall(final.scenario, motions)
+    if state is None:
+        theta_hat = [site_log.theta_hat[-1] for site_log in site_logs]
+        state = _choose_end_state(final.scenario, trace, theta_hat)
+    return _build_end_loop(final, state, trace, own_laws=own_laws)
+
+
+def find_run_loop(scenario: Scenario, run: FusedRun) -> EndLoop:
+    """Finds the control loop at the end of a simulated run, and the rest next to its end.
+
+    The loop is that of a log of the same run. The code of imported control laws is executed.
+
+    Args:
+        scenario: The experiment.
+        run: Its run in the fused loop.
+
+    Raises:
+        ScenarioError: The loop cannot be linearised, or the run diverged.
+    """
+    if run.diverged_s is not None:
+        raise ScenarioError("the run diverged", source=scenario.name)
+    ended = msgspec.structs.replace(scenario, duration_s=run.ran_s)
+    changes_links = any(change.link for change in ended.timeline)
+    if changes_links and any(_list_unknown_delays(_end_traces(ended)).values()):
+        # Only a log shows which samples are in use while one model of delays replaces another.
+        return find_log_loop(simulate_scenario(ended), own_laws=True)
+
+    def draw_samples(i: int, j: int, ticks: Ints) -> Ints:
+        """Returns the samples of site j that site i used, as its link draws them."""
+        site = ended.names[i]
+        peer = ended.names[j]
+        name = f"{peer}->{site}"
+        drawn = draw_used_samples(
+            link=ended.links[name],
+            key=link_key(ended.seed, name),
+            receiver_hz=ended.sites[site].rate_hz,
+            sender_hz=ended.sites[peer].rate_hz,
+            duration_s=ended.duration_s,
+        )
+        return drawn[ticks]
+
+    last_ticks = [ended.ticks(name) - 1 for name in ended.names]
+    final = _fix_delays(ended, last_ticks, draw_samples)
+    trace = RunTrace(run.buckets, run.tau_x, run.diverged_s)
+    state = None
+    if _has_sampled_wall(ended):
+        state = _find_state_in_wall(ended, _record_motions(ended))
+    if state is None:
+        theta_hat = []
+        for name, record in zip(ended.names, run.records, strict=True):
+            columns = ended.layout(name).columns()
+            theta_hat.append(record[columns["theta_hat"]])
+        state = _choose_end_state(ended, trace, theta_hat)
+    return _build_end_loop(final, state, trace, own_laws=True)
+
+
+def resolve_final_scenario(log: Log) -> Scenario:
+    """Returns the scenario of a log with the commands of the run as planned changes.
+
+    Its duration is the recorded one, so that the settings in force at its end are those of the
+    final loop.
+
+    Args:
+        log: The log of the run.
+    """
+    commands = [change for change in list_effective_commands(log) if not change.order]
+    timeline = sorted([*log.scenario.timeline, *commands], key=lambda change: change.at_s)
+    return msgspec.structs.replace(
+        log.scenario, timeline=tuple(timeline), duration_s=recorded_end_s(log)
+    )
+
+
+class _FixedDelays(NamedTuple):
+    """A scenario in which every delay is known.
+
+    Attributes:
+        scenario: The scenario up to the end of the run. A link whose delays only the records
+            show has its constant mean delay.
+        uses: The samples in use in the last quarter of the run. None if the scenario determines
+            all delays, or if no sample was received over some link.
+        mean_age_s: Mean age of the samples on links with unknown delays, in s, by (index of the
+            receiver, index of the sender).
+    """
+
+    scenario: Scenario
+    uses: SamplesInUse | None
+    mean_age_s: dict[tuple[int, int], float]
+
+
+class _EndState(NamedTuple):
+    """State of all arms at the end of a run, next to which a rest is sought.
+
+    Attributes:
+        q: Joint angles, shape (N, n), in rad.
+        estimates: Estimates of the parameters of the arms, shape (N, P).
+        how: What the state is, as a phrase for the user.
+    """
+
+    q: Array
+    estimates: Array
+    how: str
+
+
+def _build_end_loop(
+    final: _FixedDelays, state: _EndState, trace: RunTrace, *, own_laws: bool
+) -> EndLoop:
+    """Returns the final loop, with the equilibrium nearest to a state.
+
+    Args:
+        final: The final loop.
+        state: The state of all arms.
+        trace: The reduced data of the run.
+        own_laws: True if the code of imported control laws may be executed.
+
+    Raises:
+        ScenarioError: The loop cannot be linearised, or has no equilibrium near the state.
+    """
+    conditions = derive_operating_conditions(final.scenario, own_laws=own_laws)
+    for pair, age_s in final.mean_age_s.items():
+        conditions.age_s[pair] = age_s
+    end = Equilibrium(state.q, state.estimates, state.how, 0.0)
+    rest = follow_equilibrium(final.scenario, settle_memories(conditions, end))
+    last_q = _find_last_angles(final.scenario, trace)
+    distance_rad = float(np.abs(last_q - rest.q).max())
+    return EndLoop(
+        scenario=final.scenario,
+        conditions=conditions,
+        rest=rest,
+        uses=final.uses,
+        has_mean_ages=bool(final.mean_age_s),
+        distance_rad=distance_rad,
+        last_pose=None if distance_rad <= _SAME_POSE_RAD else rest._replace(q=last_q),
+    )
+
+
+def _compute_roots(loop: EndLoop) -> LoopRoots:
+    """Computes the rightmost roots of a loop, as a certificate states them.
+
+    Args:
+        loop: The loop at the end of a run.
+    """
+    sampled = loop.compute_sampled_roots(_ROOTS)
+    if sampled is not None:
+        laws = loop.scenario.controls
+        has_imported_law = any(isinstance(law, ImportedLaw) for law in laws)
+        # Roots show growth, but may miss what happens beyond a threshold: in a user's law, or
+        # when an arm touches a sampled wall again.
+        has_threshold = has_imported_law or _has_sampled_wall(loop.scenario)
+        is_proof_possible = not has_threshold or sampled.verdict == "unstable"
+        exact = sampled.is_exact and is_proof_possible
+        if exact and loop.last_pose is not None:
+            # The arms still move, and it is not known where in between they will rest.
+            last_roots = loop._replace(rest=loop.last_pose).compute_sampled_roots(_ROOTS)
+            exact = _has_same_sign(sampled, last_roots)
+        roots = _describe_roots(sampled, sampled.basis, exact=exact)
+        return roots._replace(distance_rad=loop.distance_rad)
+    continuous = compute_delay_spectrum(linearise_loop(loop.conditions, loop.rest), _ROOTS)
+    basis = ", in continuous time"
+    if loop.conditions.varying or loop.has_mean_ages:
+        basis += ", of the mean ages"
+    return _describe_roots(continuous, basis, exact=False)
+
+
+def _has_same_sign(at_rest: Spectrum, at_last_pose: Spectrum | None) -> bool:
+    """Returns True if the rightmost roots at a rest and at the last pose have the same sign.
+
+    At a pose that is no rest, the roots at zero are slightly off. Therefore a root below a
+    tenth of the one at the rest counts as zero.
+
+    Args:
+        at_rest: The roots at the rest next to the end of a run.
+        at_last_pose: The roots at its last pose. None if they could not be computed.
+    """
+    if at_last_pose is None or at_rest.rightmost is None or at_last_pose.rightmost is None:
+        return at_last_pose is not None
+    rate_per_s = at_rest.rightmost.s.real
+    grows_at_last = at_last_pose.rightmost.s.real > _ZERO_SHARE * abs(rate_per_s)
+    return grows_at_last == (rate_per_s > 0.0)
+
+
+def _describe_roots(spectrum: Spectrum, basis: str, *, exact: bool) -> LoopRoots:
+    """Returns the rightmost root and the verdict, as a certificate states them.
+
+    Args:
+        spectrum: The roots at the end pose.
+        basis: A phrase that states over which ticks the roots are computed.
+        exact: True if no delay is averaged or assumed to repeat.
+    """
+    root = spectrum.rightmost
+    verdict = spectrum.verdict
+    if root is None:
+        return LoopRoots(verdict, None, exact, f"this rest: {verdict}, without roots")
+
+    omega = f" at {abs(root.s.imag):.4g} rad/s" if root.s.imag else ""
+    drift = ""
+    if spectrum.drifting:
+        drift = f"{spectrum.drifting} of its motions keep their speed, the others "
+    text = f"this rest: {verdict}, {drift}{root.s.real:+.3g} /s{omega}{basis}"
+    return LoopRoots(verdict, root.s.real, exact, text)
+
+
+def _explain_no_roots(reason: str) -> LoopRoots:
+    """Returns a result without roots, with the reason."""
+    return LoopRoots("", None, False, f"this rest: no roots: {reason}")
+
+
+def _end_traces(scenario: Scenario) -> Scenario:
+    """Returns a scenario in which traces that have ended at its end are constant delays."""
+    end_us = 1e6 * scenario.duration_s
+    links: dict[str, LinkBase] = dict(scenario.links)
+    timeline = list(scenario.timeline)
+    for name in scenario.links:
+        link = find_final_link(scenario, name)
+        points = link.points
+        if not is_ending_trace(link) or points is None or not points[-1, 0] <= end_us:
+            continue
+        links[name] = ConstantDelay(delay_ms=1e-3 * float(points[-1, 1]))
+        timeline = [change for change in timeline if change.link != name]
+    return msgspec.structs.replace(scenario, links=links, timeline=tuple(timeline))
+
+
+def _list_unknown_delays(scenario: Scenario) -> dict[str, bool]:
+    """Returns for each link, by name, whether only a run shows the delays of its samples.
+
+    Args:
+        scenario: The scenario up to the end of the run.
+    """
+    has_unknown_delay = {}
+    for name in scenario.links:
+        link = find_final_link(scenario, name)
+        has_unknown_delay[name] = link.random or link.measured or is_ending_trace(link)
+    return has_unknown_delay
+
+
+def _fix_delays(
+    scenario: Scenario,
+    last_ticks: Sequence[int],
+    find_used: Callable[[int, int, Ints], Ints],
+) -> _FixedDelays:
+    """Returns a scenario with the delays that occurred in its run.
+
+    Args:
+        scenario: The scenario up to the end of the run.
+        last_ticks: Last tick of each site.
+        find_used: Function that returns the numbers of the samples that a site used. Its
+            arguments are the index of the site, the index of the peer that sent the samples,
+            and the ticks of the site. A number is negative before the first sample. A tick
+            without a record uses the samples of the tick before.
+    """
+    scenario = _end_traces(scenario)
+    has_unknown_delay = _list_unknown_delays(scenario)
+    if not any(has_unknown_delay.values()):
+        return _FixedDelays(scenario, None, {})
+
+    links: dict[str, LinkBase] = dict(scenario.links)
+    rates_hz = [scenario.sites[name].rate_hz for name in scenario.names]
+    common_hz = math.gcd(*rates_hz)
+    # start and end of the last quarter, in ticks of the common rate
+    common_ticks = [
+        tick * common_hz // rate_hz for tick, rate_hz in zip(last_ticks, rates_hz, strict=True)
+    ]
+    end = max(1, min(common_ticks))
+    start = max(3 * end // 4, end - round(DRAWN_SPAN_S * common_hz))
+
+    used = {}
+    mean_age_s = {}
+    timeline = list(scenario.timeline)
+    for (i, site), (j, peer) in permutations(enumerate(scenario.names), 2):
+        first_tick = start * rates_hz[i] // common_hz
+        end_tick = end * rates_hz[i] // common_hz
+        ticks = np.arange(first_tick, end_tick)
+        samples = find_used(i, j, ticks)
+        if samples.min() < 0:
+            # the peer had not sent a sample yet, or never sent a sample
+            return _FixedDelays(scenario, None, {})
+
+        first_sample = start * rates_hz[j] // common_hz
+        used[i, j] = samples - first_sample
+        name = f"{peer}->{site}"
+        if has_unknown_delay[name]:
+            ages_s = ticks / rates_hz[i] - samples / rates_hz[j]
+            mean_age_s[i, j] = float(ages_s.mean())
+            links[name] = ConstantDelay(delay_ms=1e3 * mean_age_s[i, j])
+            timeline = [change for change in timeline if change.link != name]
+
+    span_s = (end - start) / common_hz
+    uses = SamplesInUse(span_s, used)
+    fixed_scenario = msgspec.structs.replace(scenario, links=links, timeline=tuple(timeline))
+    return _FixedDelays(fixed_scenario, uses, mean_age_s)
+
+
+def _choose_end_state(
+    scenario: Scenario, trace: RunTrace, theta_hat: Sequence[Array]
+) -> _EndState:
+    """Chooses the angles and the estimates of all sites at the end of a run.
+
+    The angles of a site at rest are the last ones. Those of a site that still moves are the
+    mean over the last quarter of the run, in intervals of 50 ms.
+
+    Args:
+        scenario: Scenario of the run.
+        trace: The reduced data of the run.
+        theta_hat: Last estimates of each site.
+    """
+    angles = []
+    fastest_rad_s = 0.0
+    for q, speeds in _iterate_motions(scenario, trace):
+        speed_rad_s = float(speeds[-BUCKETS_PER_S:].max())
+        fastest_rad_s = max(fastest_rad_s, speed_rad_s)
+        if speed_rad_s <= SETTLED_SPEED_RAD_S:
+            angles.append(q[-1])
+        else:
+            last_quarter = slice(3 * len(q) // 4, len(q))
+            angles.append(q[last_quarter].mean(axis=0))
+
+    end_s = min(map(len, trace.buckets)) / BUCKETS_PER_S
+    how = (
+        f"the run still moves at {end_s:.4g} s ({fastest_rad_s:.2g} rad/s): "
+        "the equilibrium nearest to the mean of its last quarter"
+    )
+    if fastest_rad_s <= SETTLED_SPEED_RAD_S:
+        how = f"the run is at rest at {end_s:.4g} s (slower than {SETTLED_SPEED_RAD_S:g} rad/s)"
+    return _EndState(pad_rows(angles), pad_rows(theta_hat), how)
+
+
+def _find_last_angles(scenario: Scenario, trace: RunTrace) -> Array:
+    """Returns the last recorded joint angles of all sites, shape (N, n), in rad."""
+    return pad_rows([q[-1] for q, _ in _iterate_motions(scenario, trace)])
+
+
+def _iterate_motions(scenario: Scenario, trace: RunTrace) -> Iterator[tuple[Array, Array]]:
+    """Yields the joint angles and the largest speeds of each site, in intervals of 50 ms.
+
+    Args:
+        scenario: Scenario of the run.
+        trace: The reduced data of the run, whose columns `RunTrace` describes.
+
+    Yields:
+        Last angles of the intervals, shape (K, n), in rad, and largest speeds, in rad/s.
+    """
+    for name, buckets in zip(scenario.names, trace.buckets, strict=True):
+        joints = scenario.layout(name).joints
+        columns = buckets.shape[1] // 3
+        q = buckets[:, 2 * columns : 2 * columns + joints]
+        speeds = buckets[:, columns : 2 * columns]
+        yield q, speeds
+
+
+class _SiteMotion(NamedTuple):
+    """Motion of a site, from its records.
+
+    Attributes:
+        t_s: Times of the K records, shape (K,), in s.
+        q: Joint angles, shape (K, n), in rad.
+        qd: Joint velocities, shape (K, n), in rad/s.
+        theta_hat: Estimates of the parameters of the arm, shape (K, P).
+    """
+
+    t_s: Array
+    q: Array
+    qd: Array
+    theta_hat: Array
+
+    @property
+    def is_at_rest(self) -> bool:
+        """True if no joint moved faster than `SETTLED_SPEED_RAD_S` in the last second."""
+        in_last_second = self.t_s > self.t_s[-1] - 1.0
+        last_speeds = np.abs(self.qd[in_last_second])
+        return float(last_speeds.max()) <= SETTLED_SPEED_RAD_S
+
+
+def _record_motions(scenario: Scenario) -> list[_SiteMotion]:
+    """Simulates a scenario, and returns the motion of each site."""
+    run = FusedRun(scenario, keep=_BATCH_RECORDS + 1)
+    fastest_hz = max(spec.rate_hz for spec in scenario.sites.values())
+    batches: list[list[_SiteMotion]] = [[] for _ in scenario.names]
+    while run.ran_s < scenario.duration_s and run.diverged_s is None:
+        run.advance_to(min(run.ran_s + _BATCH_RECORDS / fastest_hz, scenario.duration_s))
+        for n, (t_ns, rows) in enumerate(run.pop_records()):
+            columns = scenario.layout(scenario.names[n]).columns()
+            batch = _SiteMotion(
+                t_s=t_ns / NS_PER_S,
+                q=rows[:, columns["q"]],
+                qd=rows[:, columns["qd"]],
+                theta_hat=rows[:, columns["theta_hat"]],
+            )
+            batches[n].append(batch)
+    return [
+        _SiteMotion(
+            t_s=np.concatenate([part.t_s for part in parts]),
+            q=np.concatenate([part.q for part in parts]),
+            qd=np.concatenate([part.qd for part in parts]),
+            theta_hat=np.concatenate([part.theta_hat for part in parts]),
+        )
+        for parts in batches
+    ]
+
+
+def _has_sampled_wall(scenario: Scenario) -> bool:
+    """Returns True if the force of some environment is computed once per tick and held."""
+    environments = chain.from_iterable(spec.environment for spec in scenario.sites.values())
+    return any(environment.actor.sampled for environment in environments)
+
+
+def _find_state_in_wall(scenario: Scenario, motions: Sequence[_SiteMotion]) -> _EndState | None:
+    """Finds the deepest state of arms that chatter at a sampled wall, in the last quarter.
+
+    Args:
+        scenario: Scenario of the run.
+        motions: Motion of each site.
+
+    Returns:
+        The state. None if all sites are at rest, or if no arm touches a sampled wall.
+    """
+    count = min(len(motion.t_s) for motion in motions)
+    rows = slice(3 * count // 4, count)
+    first_times_s = motions[0].t_s[rows]
+    have_same_times = True
+    for motion in motions:
+        have_same_times &= np.array_equal(motion.t_s[rows], first_times_s)
+    if not have_same_times or all(motion.is_at_rest for motion in motions):
+        return None
+
+    joints = max(motion.q.shape[1] for motion in motions)
+    padded = []
+    for motion in motions:
+        missing_joints = joints - motion.q.shape[1]
+        padding = ((0, 0), (0, missing_joints))
+        padded.append(np.pad(motion.q[rows], padding))
+    q = np.stack(padded, axis=1)
+    deepest = find_deepest_contact(scenario, q)
+    if deepest is None:
+        return None
+    estimates = [motion.theta_hat[rows][deepest] for motion in motions]
+    how = (
+        f"the run chatters at a wall, deepest at {first_times_s[deepest]:.4g} s: "
+        "the equilibrium nearest to this state"
+    )
+    return _EndState(q[deepest], pad_rows(estimates), how)

@@ -1,0 +1,601 @@
+"""Determines the delays, weights and operators with which the control loop is linearised.
+
+A scenario, the description of a run, may change during the run: the delays of the links, the
+dominance factors (the weights with which an arm follows its peers), and the operators. A linear
+loop has only one set of these numbers, its operating point. It consists of the numbers at the
+end of the run.
+
+A link is the connection from one site (the process that runs one arm) to another. Its effective
+delay is the age of the peer's sample that the site uses in a tick. With a constant delay T and
+the same tick h at both sites, the effective delay is max(1, ceil(T / h)) ticks. Otherwise it is
+the mean over the same random draws that a run makes.
+
+Invariant:
+    - A note reports every number that differed earlier in the run or that is random.
+    - An operating point that cannot be known before the run is refused.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from itertools import permutations
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...core.arms.exogenous import (
+    LIVE_KINDS,
+    OWN_KINDS,
+    SCRIPTED_KINDS,
+    TorqueKind,
+    TorqueSource,
+)
+from ...core.links.delay import DelayKind
+from ...core.links.philox import link_key
+from ...core.step.site_setup import Gains, Scheme, SiteSetup, StaleAction
+from ...core.step.ticks import NS_PER_S
+from ...core.step.vectors import Array
+from ...errors import ScenarioError, count_nouns
+from ...files import find_page
+from ...laws.conditions import LinearForm, LinearSituation
+from ...scenario import Scenario
+from ...scenario.delay_models import LinkBase
+from ...scenario.delay_period import (
+    MAX_PERIOD_TICKS,
+    find_final_link,
+    find_link_period_s,
+    is_ending_trace,
+)
+from ...scenario.imported_code import ImportedLaw
+from ...scenario.sample_uses import draw_used_samples
+from ...scenario.validate import refuse_external_arms
+from .numeric_law import NumericLaw
+from .site_dynamics import SiteRates, evaluate_site_rates
+
+
+class Equilibrium(NamedTuple):
+    """The pose about which a loop is linearised, with all sites at rest.
+
+    Attributes:
+        q: Joint angles, shape (N, n), in rad. Rows of arms with fewer joints end in zeros.
+        theta_hat: Estimates of the arm parameters, shape (N, P), also padded with zeros. For a
+            law with known gravity they are the parameters that the law assumes, for an imported
+            law its memory.
+        how: A phrase that says how the equilibrium was determined.
+        residual: Largest remaining acceleration, in rad/s^2, or rate of an estimate.
+        notes: Remarks on the equilibrium.
+    """
+
+    q: Array
+    theta_hat: Array
+    how: str
+    residual: float
+    notes: tuple[str, ...] = ()
+
+
+class EffectiveDelay(NamedTuple):
+    """Age of the samples that a site uses, over its ticks.
+
+    Attributes:
+        mean_s: Mean age, in s.
+        least_s: Smallest age, in s.
+        most_s: Largest age, in s.
+    """
+
+    mean_s: float
+    least_s: float
+    most_s: float
+
+    @property
+    def varies(self) -> bool:
+        """True if the age is not constant.
+
+        Times of ticks are whole nanoseconds, so that constant ages differ a little.
+        """
+        return self.most_s > self.least_s + 1e-8
+
+
+class OperatingConditions(NamedTuple):
+    """The numbers from which the linear model of a loop is built.
+
+    They are those at the end of a run of the scenario, see `derive_operating_conditions`. N is
+    the number of sites.
+
+    Attributes:
+        sites: Setups of the sites in scenario order, with the operators and environments in
+            force.
+        alpha: Matrix of dominance factors, shape (N, N), Eq. (6). Entry (i, j) is the weight
+            with which site i follows site j.
+        age_s: Age of the sample of site j that site i uses, shape (N, N), in s. 0 if it uses
+            none.
+        notes: Remarks for the user on numbers that were left out or fixed.
+        varying: True if ages vary during the run. `age_s` then contains their means.
+        laws: Control law of each site.
+        links: The link from j to i in force, and the key of its random draws, by (i, j).
+    """
+
+    sites: tuple[SiteSetup, ...]
+    alpha: Array
+    age_s: Array
+    notes: tuple[str, ...]
+    varying: bool = False
+    laws: tuple[Any, ...] = ()
+    links: Mapping[tuple[int, int], tuple[LinkBase, int]] = MappingProxyType({})
+
+    def find_forms(self, inertia: Sequence[Array] = ()) -> list[LinearForm | None]:
+        """Returns the linear equations of control laws that their gains do not fully describe.
+
+        Examples are laws that store numbers, or send waves. `LinearForm` represents their
+        equations.
+
+        Args:
+            inertia: Inertia matrix of each arm, shape (n, n), for n joints. Empty for unit
+                matrices.
+
+        Returns:
+            The equations for each site (process that runs one arm). None for a site whose law
+            is fully described by its gains.
+        """
+        forms: list[LinearForm | None] = []
+        for n, law in enumerate(self.laws):
+            M = inertia[n] if inertia else np.eye(self.sites[n].layout.joints)
+            situation = LinearSituation(
+                site=n,
+                names=self.names,
+                laws=self.laws,
+                alpha=self.alpha,
+                inertia=M,
+            )
+            forms.append(law.linear_form(situation))
+        return forms
+
+    @property
+    def coupled_pairs(self) -> list[tuple[int, int]]:
+        """Pairs (i, j) of sites for which site i reacts to the states that site j sends.
+
+        A site is a process that runs one arm. It reacts if its dominance factor for site j, the
+        weight with which it follows site j, is not zero. The control law of a user reads the
+        states of all other sites, so that it reacts in any case.
+        """
+        pairs = []
+        for i, site in enumerate(self.sites):
+            is_imported = isinstance(site.law_factory, NumericLaw)
+            for j, share in enumerate(self.alpha[i].tolist()):
+                reads_all = is_imported and j != i
+                if share != 0.0 or reads_all:
+                    pairs.append((i, j))
+        return pairs
+
+    @property
+    def has_forms(self) -> bool:
+        """True if gains alone do not describe the control law of some site.
+
+        A site is a process that runs one arm. Examples are laws that store numbers, or send
+        waves. The coupled arms are then linearised in continuous time only.
+        """
+        return any(form is not None for form in self.find_forms())
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the sites, in scenario order."""
+        return tuple(site.name for site in self.sites)
+
+    @property
+    def needs_sampled_loop(self) -> bool:
+        """True if the controllers' ticks matter for stability and must therefore be modelled.
+
+        A tick is one period of the control loop. This is so in three cases:
+
+        - The integration scheme is `digital`: zero-order hold, as in a plain digital
+          controller.
+        - A wall or an operator acts once per tick.
+        - The delays vary in a known way, and not at random.
+        """
+        has_random_link = any(link.random for link, _ in self.links.values())
+        if self.varying and not has_random_link:
+            return True
+        if self.sites[0].scheme is Scheme.DIGITAL:
+            return True
+        actors = [actor for site in self.sites for actor in site.actors]
+        return any(actor.sampled for actor in actors)
+
+    def evaluate_rates(self, arguments: Sequence[Array]) -> list[SiteRates]:
+        """Computes how fast the states of every site change.
+
+        The states of a site (process that runs one arm) are its joint angles, its joint
+        velocities and its parameter estimates.
+
+        Args:
+            arguments: States and inputs of each site, in the order of `ArgumentLayout`.
+
+        Returns:
+            The rates of change of each site, with its torques and outputs.
+        """
+        pairs = zip(self.sites, arguments, strict=True)
+        return [evaluate_site_rates(site, x) for site, x in pairs]
+
+
+def derive_operating_conditions(
+    scenario: Scenario, *, own_laws: bool = True
+) -> OperatingConditions:
+    """Derives the numbers of a scenario's linear loop, as they are at the end of a run.
+
+    Args:
+        scenario: The description of the experiment.
+        own_laws: True if the code of imported control laws may be executed.
+
+    Raises:
+        ScenarioError: A law has no linear loop, an arm is not simulated, or the delay of a link
+            is measured during the run.
+    """
+    gains = _find_linear_gains(scenario, own_laws=own_laws)
+    notes: list[str] = []
+    sites = tuple(
+        _select_final_actors(scenario, name, notes)._replace(gains=gains[name])
+        for name in scenario.names
+    )
+
+    alpha = _find_final_dominance(scenario, sites, notes)
+    age_s = np.zeros_like(alpha)
+    laws = scenario.controls
+    sites = tuple(_build_imported_law(scenario, site, alpha) for site in sites)
+    notes += _describe_laws(scenario)
+
+    conditions = OperatingConditions(sites, alpha, age_s, (), laws=laws)
+    pairs = conditions.coupled_pairs
+    if conditions.has_forms:
+        pairs = list(permutations(range(len(alpha)), 2))
+        notes.append(
+            "a law here has states or waves of its own: "
+            "it is linearised in continuous time only"
+        )
+
+    links = {}
+    varying = []
+    for i, j in pairs:
+        peer = scenario.names[j]
+        site = scenario.names[i]
+        link = _find_final_link(scenario, f"{peer}->{site}", notes)
+        links[i, j] = link, link_key(scenario.seed, f"{peer}->{site}")
+        age = compute_effective_delay(scenario, peer, site, link)
+        age_s[i, j] = age.mean_s
+        rate_hz = max(scenario.sites[site].rate_hz, scenario.sites[peer].rate_hz)
+        if age.varies or _has_long_period(link, rate_hz):
+            varying.append(age)
+
+    if varying:
+        least_ms = 1e3 * min(age.least_s for age in varying)
+        most_ms = 1e3 * max(age.most_s for age in varying)
+        count = "one link" if len(varying) == 1 else f"{count_nouns(len(varying), 'link')}"
+        notes.append(
+            f"the age of the samples in use varies on {count}, "
+            f"{least_ms:.4g} to {most_ms:.4g} ms: the continuous loop is linearised at the "
+            "mean of each, and leaves out the effect of the variation itself"
+        )
+    if any(site.on_stale.action is not StaleAction.USE for site in sites):
+        notes.append("rules for stale peers are left out: no peer counts as stale")
+    return conditions._replace(
+        notes=tuple(dict.fromkeys(notes)), varying=bool(varying), links=links
+    )
+
+
+def _describe_laws(scenario: Scenario) -> list[str]:
+    """Returns remarks on how the control laws of a scenario are linearised."""
+    notes = []
+    laws = scenario.controls
+    codes = [law.code if isinstance(law, ImportedLaw) else "" for law in laws]
+    for code in filter(None, dict.fromkeys(codes)):
+        pairs = zip(scenario.names, codes, strict=True)
+        sites = [name for name, law_code in pairs if law_code == code]
+        notes.append(
+            f"{code} of {', '.join(sites)} is differentiated numerically, "
+            "and so is its memory: by central differences"
+        )
+    notes += [law.linear_note for law in laws if law.linear_note]
+    return notes
+
+
+def is_constant_link(link: LinkBase) -> bool:
+    """Returns True if a link delays every sample by the same time and loses none.
+
+    Args:
+        link: Delay model of the link, from the scenario.
+    """
+    has_constant_model = link.to_core_model().kind == DelayKind.CONSTANT
+    return has_constant_model and not link.loss and not link.measured
+
+
+def _build_imported_law(scenario: Scenario, site: SiteSetup, alpha: Array) -> SiteSetup:
+    """Makes the imported law of a site ready to be evaluated and differentiated.
+
+    Args:
+        scenario: The experiment.
+        site: Setup of the site.
+        alpha: Matrix of dominance factors, shape (N, N).
+
+    Returns:
+        The setup with the law. The same setup if the law of the site is not imported.
+    """
+    law = scenario.sites[site.name].control
+    if not isinstance(law, ImportedLaw):
+        return site
+    i = scenario.names.index(site.name)
+    shares = np.delete(alpha[i], i).tolist()
+    try:
+        return site._replace(law_factory=NumericLaw(site, law.code, shares))
+    except ScenarioError as error:
+        raise type(error)(error.problem, path=error.path, source=scenario.name) from None
+
+
+def _find_linear_gains(scenario: Scenario, *, own_laws: bool) -> dict[str, Gains]:
+    """Returns the gains with which each site's law acts on small motions, by site.
+
+    Raises:
+        ScenarioError: A law has no linear loop, or an arm is not simulated.
+    """
+    gains_by_site: dict[str, Gains] = {}
+    for name, spec in scenario.sites.items():
+        law = spec.control
+        theta = scenario.arms[name].theta
+        gains = law.linear_gains(theta)
+        if own_laws and isinstance(law, ImportedLaw):
+            gains = law.gains(theta)
+        if gains is None:
+            reason = _explain_missing_gains(law)
+            raise ScenarioError(
+                f"has no linear loop: {reason}",
+                path=f"sites.{name}.control.law",
+                source=scenario.name,
+            )
+        gains_by_site[name] = gains
+
+    refuse_external_arms(scenario)
+    return gains_by_site
+
+
+def _explain_missing_gains(law: Any) -> str:
+    """Returns the reason why a law has no linear loop, as part of a sentence."""
+    if isinstance(law, ImportedLaw):
+        return (
+            f"{law.code} is known by its code only, which may not run here; "
+            "trilat linear and trilat certify --law FILE run it"
+        )
+    others = (
+        "adaptive, adaptive_box, p_d, pd_d, p_f and others have one, "
+        f"see {find_page('laws.md')}"
+    )
+    reason: str = law.explain_no_linear_form() or others
+    return reason
+
+
+def _find_final_link(scenario: Scenario, name: str, notes: list[str]) -> LinkBase:
+    """Returns the delay model of a link that is in force at the end of the run.
+
+    Args:
+        scenario: The experiment.
+        name: Name of the link, "j->i".
+        notes: List to which remarks on earlier models and on outages are added.
+
+    Raises:
+        ScenarioError: The delay of the link is measured during the run, and unknown before.
+    """
+    link = find_final_link(scenario, name)
+    if link.measured:
+        raise ScenarioError(
+            "must not be 'measured', because the delay of a measured link is not known "
+            "beforehand: give a model, as in link.model = 'constant'",
+            path=f"links.{name}.model",
+            source=scenario.name,
+        )
+    if link != scenario.links[name]:
+        notes.append(
+            f"link {name} changes during the run: its state at the end is used, "
+            f"{link.describe()}"
+        )
+    if link.outages_s:
+        notes.append(f"the outages of link {name} are left out")
+    return link
+
+
+def _has_long_period(link: LinkBase, rate_hz: int) -> bool:
+    """Returns True if the delay of a link repeats only after too many ticks to compute them.
+
+    Args:
+        link: Delay model of the link.
+        rate_hz: Ticks per second.
+    """
+    period_s = find_link_period_s(link)
+    return period_s is not None and period_s * rate_hz > MAX_PERIOD_TICKS
+
+
+def compute_effective_delay(
+    scenario: Scenario,
+    peer: str,
+    site: str,
+    link: LinkBase,
+) -> EffectiveDelay:
+    """Computes the age of a peer's samples at the ticks of a site that use them.
+
+    The ages are those of the run. If the delay repeats after a longer time, they are those of a
+    whole period, because the loop goes on after the run.
+
+    Args:
+        scenario: The experiment.
+        peer: Name of the sender.
+        site: Name of the receiver.
+        link: Delay model of the link between them.
+
+    Raises:
+        ScenarioError: No sample ever arrives.
+    """
+    site_hz = scenario.sites[site].rate_hz
+    peer_hz = scenario.sites[peer].rate_hz
+    model = link.to_core_model()
+    is_constant = is_constant_link(link)
+    if is_constant and site_hz == peer_hz:
+        delay_us = max(round(model.location), model.playout_us)
+        # The negated floor division rounds up to whole ticks.
+        whole_ticks = -(-delay_us * site_hz // 1_000_000)
+        ticks = max(1, whole_ticks)
+        age_s = ticks / site_hz
+        return EffectiveDelay(age_s, age_s, age_s)
+
+    duration_s = scenario.duration_s
+    if is_constant:
+        # ages repeat, so that two seconds beyond the delay show them all
+        duration_s = min(duration_s, 2.0 + 2e-6 * model.location)
+    period_s = find_link_period_s(link)
+    if period_s is not None and not _has_long_period(link, max(site_hz, peer_hz)):
+        # ages are complete when the samples of a whole period have arrived
+        longest_s = 2e-3 * sum(link.moments())
+        duration_s = max(duration_s, period_s + longest_s)
+    used = draw_used_samples(
+        link=link,
+        key=link_key(scenario.seed, f"{peer}->{site}"),
+        receiver_hz=site_hz,
+        sender_hz=peer_hz,
+        duration_s=duration_s,
+    )
+    if used[-1] < 0:
+        raise ScenarioError(
+            "no sample sent over this link ever arrives",
+            path=f"links.{peer}->{site}",
+            source=scenario.name,
+        )
+
+    first = int(np.argmax(used >= 0))
+    tick_ns = np.arange(first, len(used)) * NS_PER_S // site_hz
+    sample_ns = used[first:] * NS_PER_S // peer_hz
+    ages_s = (tick_ns - sample_ns) * 1e-9
+    return EffectiveDelay(
+        mean_s=float(ages_s.mean()),
+        least_s=float(ages_s.min()),
+        most_s=float(ages_s.max()),
+    )
+
+
+def has_lasting_delays(scenario: Scenario) -> bool:
+    """Returns True if delays that are constant in a run stay so after its end.
+
+    They do not if a sinusoid or a trace has other delays later. The ages of samples count, so
+    that a play-out buffer may hide such delays. Random and measured delays are ignored: only
+    records show them.
+
+    Args:
+        scenario: The experiment, with the duration of the run.
+    """
+    for i, j in permutations(range(len(scenario.names)), 2):
+        if not scenario.alpha[i, j] and not scenario.timeline:
+            continue
+        site, peer = scenario.names[i], scenario.names[j]
+        link = find_final_link(scenario, f"{peer}->{site}")
+        points = link.points
+        if is_ending_trace(link) and points is not None:
+            if points[-1, 0] > 1e6 * scenario.duration_s:
+                return False
+            continue
+        if find_link_period_s(link) is None or link.random:
+            continue
+        rate_hz = max(scenario.sites[site].rate_hz, scenario.sites[peer].rate_hz)
+        age = compute_effective_delay(scenario, peer, site, link)
+        if age.varies or _has_long_period(link, rate_hz):
+            return False
+    return True
+
+
+def _find_final_dominance(
+    scenario: Scenario,
+    sites: tuple[SiteSetup, ...],
+    notes: list[str],
+) -> Array:
+    """Returns the matrix of dominance factors at the end of the run, shape (N, N).
+
+    Args:
+        scenario: The experiment.
+        sites: Setups of the sites, with the ramps of their factors.
+        notes: List to which remarks on changes are added.
+    """
+    alpha = scenario.alpha.copy()
+    end_ns = round(scenario.duration_s * 1e9)
+    for i, site in enumerate(sites):
+        peers = [scenario.names.index(link.peer) for link in site.links]
+        for ramp in site.ramps:
+            if ramp.start_ns > end_ns:
+                continue
+            progress = 1.0
+            if ramp.end_ns > end_ns:
+                elapsed_ns = end_ns - ramp.start_ns
+                progress = elapsed_ns / (ramp.end_ns - ramp.start_ns)
+            change = np.array(ramp.alpha) - alpha[i, peers]
+            alpha[i, peers] += progress * change
+            notes.append(
+                f"the dominance factors of {site.name} change during the run: "
+                "their values at the end are used"
+            )
+    return alpha
+
+
+def _select_final_actors(scenario: Scenario, name: str, notes: list[str]) -> SiteSetup:
+    """Returns a site's setup with the operators and environments in force at the end of a run.
+
+    An operator that moves an arm to a target is at the end of its motion, and a scripted torque
+    keeps its last value. Chirps and multisines are left out.
+
+    Args:
+        scenario: The experiment.
+        name: Name of the site.
+        notes: List to which a remark on each such change is added.
+    """
+    setup = scenario.setup(name)
+    end_s = scenario.duration_s
+    present = [actor for actor in setup.actors if actor.start_s <= end_s < actor.end_s]
+
+    hands = [actor for actor in present if actor.kind in _HANDS]
+    if any(hand.move_end_s > end_s for hand in hands):
+        notes.append(
+            f"an operator at {name} still moves at the end: "
+            "the end of that motion is used as the operator's target"
+        )
+    if any(actor.kind in _PERIODIC for actor in present):
+        notes.append(
+            f"an operator at {name} still swings at the end: "
+            "this torque is left out, because its mean is zero"
+        )
+
+    scripted = [
+        actor
+        for actor in present
+        if actor.kind in SCRIPTED_KINDS and actor.kind not in _PERIODIC
+    ]
+    constant = [actor._replace(a=_evaluate_script(actor, end_s)) for actor in scripted]
+    if any(any(actor.a) for actor in constant):
+        notes.append(
+            f"a scripted torque acts on {name} at the end: its value then is kept constant"
+        )
+
+    user_written = [
+        actor._replace(move_end_s=end_s) for actor in present if actor.kind in OWN_KINDS
+    ]
+    special_kinds = (*SCRIPTED_KINDS, *OWN_KINDS, *LIVE_KINDS)
+    others = [actor for actor in present if actor.kind not in special_kinds]
+    return setup._replace(actors=(*others, *user_written, *constant))
+
+
+_HANDS = (TorqueKind.HAND, TorqueKind.TASK_HAND)
+_PERIODIC = (TorqueKind.CHIRP, TorqueKind.MULTISINE)
+
+
+def _evaluate_script(actor: TorqueSource, t_s: float) -> tuple[float, ...]:
+    """Returns the torque of a scripted operator at a time.
+
+    Args:
+        actor: The operator, whose torque is a sin^2 pulse or the interpolation of a table.
+        t_s: The time, in s.
+    """
+    if actor.table is None:
+        x = (t_s - actor.start_s) / (actor.end_s - actor.start_s)
+        return tuple(peak * math.sin(math.pi * x) ** 2 for peak in actor.a)
+    times_s, *torques = actor.table.T
+    return tuple(
+        float(np.interp(t_s, times_s, torque, left=0.0, right=0.0)) for torque in torques
+    )

@@ -1,0 +1,700 @@
+"""Analyses what operators feel in coupled arms, and whether the arms stay stable.
+
+A haptic port is where an operator or an environment touches an arm. It has two variables: the
+torque that acts on a joint, and the velocity of the joint. Three properties are examined:
+
+- Passivity: the arms never return more energy at their ports than they received there.
+- Absolute stability: the arms are stable with any passive operators.
+- Transparency: what an operator feels while another arm moves freely or is clamped.
+
+If end effectors follow each other instead of joints, the ports are at the end effectors, along
+the followed axes. The joint angles q are then replaced by x = J q and z = N' q. J is the
+Jacobian of the followed axes at rest, and N a basis of the joint motions that leave these axes
+unchanged. The velocity of a port is the rate of change of x. A force F on the end effector acts
+as the joint torque J' F. Ports are numbered by their axis: 1 to 3 for the position, 4 to 6 for
+rotations. The position of port 2, for example, is called "q2", like the angle of a joint.
+
+Invariant:
+    - Operators and environments are removed from the loop. Their torque at rest stays as a
+      constant, so that a held pose can be analysed too.
+    - For an unstable loop only the instability is reported, because this loop has no steady
+      oscillations.
+    - Every result holds for the analysed band of frequencies.
+"""
+
+from collections.abc import Mapping, Sequence
+from itertools import combinations
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag, null_space
+
+from ...core.arms.exogenous import TorqueKind, TorqueSource
+from ...core.arms.task_space import POSITION
+from ...core.step.site_setup import Law, SiteSetup
+from ...core.step.vectors import Array
+from ...errors import UsageError, count_nouns
+from ...results import finite_or_none
+from ...scenario import Scenario
+from ...scenario.arms import TASK_AXES
+from ..arm_rows import build_arm_rows
+from ..dominance_history import compute_lyapunov_weights
+from . import frequency_search, port_response
+from .characteristic_roots import Complex, compute_delay_spectrum
+from .linear_loop import LinearLoop, gather_site_arguments, linearise_loop
+from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
+from .port_passivity import (
+    EIGENVALUE_ROUNDING,
+    HandMatrices,
+    Passivity,
+    check_against_hands,
+    check_passivity,
+    clamp_ports,
+    find_best_weights,
+    llewellyn_parameter,
+    llewellyn_rounding,
+)
+from .port_response import QUOTED_AT_HZ, Transparency, measure_transparency
+from .site_dynamics import compute_following, lay_out_arguments, place_arm
+
+
+def freeze_external_torques(
+    conditions: OperatingConditions, rest: Equilibrium
+) -> OperatingConditions:
+    """Replaces operators and environments by the constant torque that they apply at rest.
+
+    The response of the arms then does not contain the stiffness and damping of operators.
+
+    Args:
+        conditions: The sites, gains and delays of the loop.
+        rest: The equilibrium, at which the torques are computed.
+    """
+    arguments = gather_site_arguments(conditions, rest)
+    sites = []
+    all_rates = conditions.evaluate_rates(arguments)
+    for site, rates in zip(conditions.sites, all_rates, strict=True):
+        torque = tuple((rates.external + rates.held).tolist())
+        constant = (TorqueSource(TorqueKind.RECORDED, a=torque),) if any(torque) else ()
+        sites.append(site._replace(actors=constant))
+    return conditions._replace(sites=tuple(sites))
+
+
+def linearise_teleoperator(conditions: OperatingConditions, rest: Equilibrium) -> LinearLoop:
+    """Builds the linear model of the arms and their coupling, without operators.
+
+    Operators and environments act at its ports, the joints, and are not part of it.
+
+    Args:
+        conditions: The sites, gains and delays of the loop.
+        rest: The equilibrium.
+    """
+    frozen = freeze_external_torques(conditions, rest)
+    return move_ports_to_end_effectors(frozen, rest, linearise_loop(frozen, rest))
+
+
+def build_proof_output(
+    conditions: OperatingConditions, loop: LinearLoop
+) -> port_response.LoopOutput | None:
+    """Returns the output of a loop with respect to which the paper proves passivity.
+
+    It is the filtered error r_i = qd_i + Lambda (q_i - sum_j alpha_ij q_j(t - T_ij)) of each
+    site i, Eq. (6), (9), (10). q are the joint angles, qd the velocities, Lambda is a gain,
+    alpha_ij the dominance factor with which site i follows site j, and T_ij the delay from j to
+    i. In task space it is J r with the Jacobian J, and positions take the place of q.
+
+    Args:
+        conditions: The sites, gains and delays of the loop.
+        loop: The linear model of the loop.
+
+    Returns:
+        The output. None if there is no proof: for laws other than the paper's, for
+        orientations, and for axes that a peer does not follow.
+    """
+    sites = conditions.sites
+    if any(site.gains.law is not Law.ADAPTIVE or site.gains.absolute for site in sites):
+        return None
+    if sites[0].layout.task and sites[0].layout.shared > POSITION:
+        return None
+
+    C = loop.C.copy()
+    delays_s = conditions.age_s[conditions.alpha != 0.0]
+    delayed = {float(delay_s): np.zeros_like(loop.C) for delay_s in delays_s}
+    for i, site in enumerate(sites):
+        Lambda = np.broadcast_to(site.gains.Lambda, site.layout.shared)
+        ports = port_response.find_site_ports(loop, site.name)
+        followed = list_followed_axes(site)
+        for port, joint in zip(ports, followed, strict=True):
+            gain = Lambda[joint - 1]
+            position = loop.names.index(f"{site.name}.q{joint}")
+            C[port, position] += gain
+            for j in np.flatnonzero(conditions.alpha[i]):
+                peer = sites[j]
+                if joint not in list_followed_axes(peer):
+                    continue
+                peer_position = loop.names.index(f"{peer.name}.q{joint}")
+                factor = gain * conditions.alpha[i, j]
+                delay_s = float(conditions.age_s[i, j])
+                delayed[delay_s][port, peer_position] -= factor
+    delayed_terms = sorted(delayed.items())
+    return port_response.LoopOutput(C, tuple(delayed_terms))
+
+
+def compute_proof_weights(conditions: OperatingConditions) -> Array:
+    """Computes the weights of the sites in the energy function of the stability proof.
+
+    A site is a process that runs one arm. The weight of site i is beta_i = pi_i / c_i. pi is
+    the left eigenvector of the matrix of dominance factors, the weights with which sites follow
+    each other. c_i is the gain of site i relative to gains that are common to all sites. The
+    proof is in docs/errata-proof.md.
+
+    Args:
+        conditions: The sites, gains and dominance factors.
+
+    Returns:
+        The weights beta, shape (N,), for N sites. Their sum is N.
+    """
+    Kd = np.full((len(conditions.sites), conditions.sites[0].layout.shared), np.nan)
+    for site_Kd, site in zip(Kd, conditions.sites, strict=True):
+        followed = [n - 1 for n in list_followed_axes(site)]
+        site_Kd[followed] = np.broadcast_to(site.gains.Kd, site_Kd.shape)[followed]
+    return compute_lyapunov_weights(conditions.alpha, Kd).beta
+
+
+class TwoPort(NamedTuple):
+    """Llewellyn's criterion of absolute stability for one joint of two sites.
+
+    The criterion says whether the loop is stable with every passive operator or environment at
+    each of the two joints. No operator acts at the other joints.
+
+    Attributes:
+        sites: The two sites.
+        joint: Number of the joint, or of the coordinate in task space, from 1.
+        clamped: Name of the third site if it is clamped. Empty if it is free or does not exist.
+        minima: Llewellyn's parameter over frequency, and the bands in which it is below 1, so
+            that the criterion is violated.
+    """
+
+    sites: tuple[str, str]
+    joint: int
+    clamped: str
+    minima: frequency_search.Minima
+
+
+class PortAnalysis(NamedTuple):
+    """Results of the analysis of a teleoperator's ports, see `analyse_ports`.
+
+    Attributes:
+        scenario: The teleoperator.
+        band_hz: Lower and upper end of the analysed band, in Hz.
+        resolved_hz: Frequency up to which the grid resolves the phase of the delays, in Hz.
+        verdict: Verdict of the loop's characteristic roots: "stable", "unstable" or "at the
+            edge".
+        pole: Pole of the admittance at zero frequency.
+        velocity: Passivity at all ports with respect to the velocities.
+        joints: The same for each joint alone, without operators at the others, by number.
+        proof: Passivity with respect to r = qd + Lambda e. None if the law has no r.
+        beta: Weights of the sites in `proof`, shape (N,), with the sum N.
+        estimates_true: True if all estimates at the equilibrium are true. Otherwise the proof
+            counts the energy that they store, which a linear loop cannot show.
+        absolute: Least eigenvalue over frequency under the best weights. The loop is stable
+            with any passive operators if it is never negative.
+        two_ports: Llewellyn's criterion for every pair of sites.
+        transparency: Transparency at each site, with one other site free and clamped.
+        clamped_verdict: Verdict of the roots with that other site clamped.
+        axes: Name of each port number's axis in task space. Empty in joint space.
+        measured: Result with measured operators at the masters, see `check_against_hands`. None
+            if no operator was measured.
+    """
+
+    scenario: Scenario
+    band_hz: tuple[float, float]
+    resolved_hz: float
+    verdict: str
+    pole: port_response.PoleAtZero
+    velocity: Passivity
+    joints: dict[int, Passivity]
+    proof: Passivity | None
+    beta: Array
+    estimates_true: bool
+    absolute: frequency_search.Minima
+    two_ports: tuple[TwoPort, ...]
+    transparency: tuple[Transparency, ...]
+    clamped_verdict: str
+    axes: Mapping[int, str] = MappingProxyType({})
+    measured: frequency_search.Minima | None = None
+
+    @property
+    def sites(self) -> tuple[str, ...]:
+        """Names of the sites."""
+        return self.scenario.names
+
+    @property
+    def kind(self) -> str:
+        """The word for a port: "joint", or "axis" in task space."""
+        return "axis" if self.axes else "joint"
+
+    @property
+    def speed(self) -> str:
+        """Symbol of the velocities at which operators move the arms, for tables and figures.
+
+        It is "qd" for joints, and "xd" if end effectors follow each other.
+        """
+        return "xd" if self.axes else "qd"
+
+    def name_port(self, number: int) -> str:
+        """Returns the name of the place where an operator acts, such as "joint 2" or "axis y".
+
+        Args:
+            number: Number of the joint, or of the axis of the end effector if end effectors
+                follow each other, from 1.
+        """
+        return f"{self.kind} {self.axes.get(number, number)}"
+
+    def impedance_unit(self, number: int = 0) -> str:
+        """Returns the unit of the impedance that an operator feels, for tables and figures.
+
+        Args:
+            number: Number of a joint, or of an axis of the end effector if end effectors follow
+                each other, from 1. 0 stands for all of them together.
+        """
+        linear = "N s/m"
+        angular = "N m s/rad"
+        if not self.axes:
+            return angular
+        if number:
+            return linear if number <= POSITION else angular
+        has_rotations = max(self.axes) > POSITION
+        return f"{linear} and {angular}" if has_rotations else linear
+
+
+def analyse_ports(
+    scenario: Scenario,
+    rest: Equilibrium,
+    of: str | None = None,
+    band_hz: tuple[float, float] = (frequency_search.LOW_HZ, frequency_search.HIGH_HZ),
+    hands: Sequence[HandMatrices] = (),
+) -> PortAnalysis:
+    """Analyses what operators feel when they hold arms, and whether the arms are passive.
+
+    The coupled arms are linearised about a pose of rest. Their response to torques on the
+    joints is computed over a band of frequencies.
+
+    Args:
+        scenario: Description of the coupled arms.
+        rest: The pose of rest.
+        of: Site (process that runs one arm) whose arm is once free and once clamped, while
+            operators feel the other arms. None for the slave, or for the last site if there is
+            no slave.
+        band_hz: Lower and upper end of the band, in Hz.
+        hands: Measured impedances of operators. Any of them may hold the arm of any master.
+
+    Returns:
+        Passivity, absolute stability, and the impedances that the operators feel.
+
+    Raises:
+        ScenarioError: The scenario cannot be linearised.
+        UsageError: There is no site of that name, or the band is empty.
+    """
+    low, high = band_hz
+    if not 0.0 < low < high:
+        raise UsageError(
+            "a band must go from a frequency above 0 Hz to a higher one, "
+            f"not from {low:g} to {high:g} Hz"
+        )
+
+    conditions = derive_operating_conditions(scenario)
+    loop = linearise_teleoperator(conditions, rest)
+    other_site = of or scenario.slave
+
+    sites = port_response.list_port_sites(loop)
+    delay_s = port_response.find_longest_delay_s(loop)
+    grid = frequency_search.build_frequency_grid(low, high, delay_s)
+    Y = port_response.build_admittance(loop)
+    w_rad_s = frequency_search.refine_frequencies(Y, grid)
+    Y = frequency_search.cache_response(Y, w_rad_s)
+
+    joints = {
+        joint: check_passivity(port_response.select_ports(Y, ports), w_rad_s)
+        for joint, ports in port_response.group_ports_by_joint(loop).items()
+    }
+    transparency: list[Transparency] = []
+    for site in sites:
+        if site != other_site:
+            transparency += measure_transparency(loop, site, other_site)
+
+    clamped_loop = port_response.clamp_site(loop, other_site)
+    held_hands = _locate_hands(scenario, conditions, rest=rest, loop=loop, hands=hands)
+    return PortAnalysis(
+        scenario=scenario,
+        band_hz=band_hz,
+        resolved_hz=frequency_search.find_resolved_hz(low, high, delay_s),
+        verdict=compute_delay_spectrum(loop, 1).verdict,
+        pole=port_response.find_pole_at_zero(loop),
+        velocity=check_passivity(Y, w_rad_s),
+        joints=joints,
+        proof=_check_proof(conditions, loop, w_rad_s),
+        beta=compute_proof_weights(conditions),
+        estimates_true=_are_estimates_true(conditions, rest),
+        absolute=_check_absolute_stability(loop, Y, w_rad_s),
+        two_ports=_check_two_ports(loop, Y, w_rad_s),
+        transparency=tuple(transparency),
+        clamped_verdict=compute_delay_spectrum(clamped_loop, 1).verdict,
+        axes=name_ports(conditions),
+        measured=check_against_hands(
+            Y, w_rad_s, held=held_hands.hands, places=held_hands.places
+        ),
+    )
+
+
+def _are_estimates_true(conditions: OperatingConditions, rest: Equilibrium) -> bool:
+    """Returns True if every estimate at the equilibrium is the true parameter."""
+    for theta_hat, site in zip(rest.theta_hat, conditions.sites, strict=True):
+        if site.gains.law is Law.USER:
+            continue
+        if not np.allclose(theta_hat[: len(site.theta)], site.theta):
+            return False
+    return True
+
+
+def _check_absolute_stability(
+    loop: LinearLoop,
+    Y: port_response.PortResponse,
+    w_rad_s: Array,
+) -> frequency_search.Minima:
+    """Returns the margin of absolute stability over frequency, with the best weights.
+
+    Args:
+        loop: The loop.
+        Y: Admittance at all ports.
+        w_rad_s: Frequencies, in rad/s.
+    """
+    owners = _find_owners(loop)
+    return frequency_search.find_minima(
+        lambda w: find_best_weights(Y(w), owners).margin,
+        w_rad_s,
+        tolerance=lambda w: np.full(len(w), EIGENVALUE_ROUNDING),
+    )
+
+
+class _HeldHands(NamedTuple):
+    """The end effectors of the masters, and the measured operators that may hold them.
+
+    Attributes:
+        hands: For each master, the operators that may hold its end effector.
+        places: For each master, the matrix from the velocities at all ports to the velocity of
+            its end effector, shape (n, p).
+    """
+
+    hands: list[Sequence[HandMatrices]]
+    places: list[Array]
+
+
+def _locate_hands(
+    scenario: Scenario,
+    conditions: OperatingConditions,
+    *,
+    rest: Equilibrium,
+    loop: LinearLoop,
+    hands: Sequence[HandMatrices],
+) -> _HeldHands:
+    """Returns the end effectors of the masters, and the measured operators that may hold them.
+
+    Raises:
+        UsageError: An operator was measured along other axes than an end effector has.
+    """
+    places: list[Array] = []
+    for site, site_q in zip(conditions.sites, rest.q, strict=True):
+        if not hands or scenario.sites[site.name].role != "master":
+            continue
+
+        q = site_q[np.newaxis, : site.layout.joints]
+        ports = port_response.find_site_ports(loop, site.name)
+        arm = build_arm_rows(scenario, site.name)
+        end_effector = arm.place_end_effector(q, np.zeros_like(q))
+        J = end_effector.J[0]
+        if any(len(hand.B) != len(J) for hand in hands):
+            raise UsageError(
+                f"{site.name}: the end effector moves along {count_nouns(len(J), 'axis')}, "
+                "but a hand was measured along a different number of axes"
+            )
+
+        tip_by_ports = np.zeros((len(J), len(loop.inputs)))
+        if site.layout.task:
+            # the ports are axes already
+            for axis, port in zip(list_followed_axes(site), ports, strict=True):
+                if axis <= len(J):
+                    tip_by_ports[axis - 1, port] = 1.0
+        else:
+            tip_by_ports[:, ports] = J
+        places.append(tip_by_ports)
+    return _HeldHands([hands] * len(places), places)
+
+
+def _find_owners(loop: LinearLoop) -> NDArray[np.int64]:
+    """Returns the index of the site of each port, shape (p,)."""
+    sites = port_response.list_port_sites(loop)
+    owners = [sites.index(port_response.parse_port_site(port)) for port in loop.inputs]
+    return np.array(owners, dtype=np.int64)
+
+
+def _check_proof(
+    conditions: OperatingConditions,
+    loop: LinearLoop,
+    w_rad_s: Array,
+) -> Passivity | None:
+    """Checks passivity with respect to the output r of the paper's proof.
+
+    Returns:
+        The passivity under the weights of the proof. None if there is no proof for this loop,
+        or if some site has the weight zero.
+    """
+    output = build_proof_output(conditions, loop)
+    beta = compute_proof_weights(conditions)[_find_owners(loop)]
+    if output is None or not (beta > 0.0).all():
+        return None
+
+    def evaluate(w: Array) -> Complex:
+        s = port_response.to_imaginary_axis(w)
+        return port_response.evaluate_transfer(loop, s, output)
+
+    return check_passivity(evaluate, w_rad_s, beta)
+
+
+def _check_two_ports(
+    loop: LinearLoop,
+    Y: port_response.PortResponse,
+    w_rad_s: Array,
+) -> tuple[TwoPort, ...]:
+    """Returns Llewellyn's criterion for each joint that both sites of a pair have.
+
+    With three sites, the third one is once free and once clamped.
+    """
+    two_ports = []
+    sites = port_response.list_port_sites(loop)
+    for pair in combinations(sites, 2):
+        others = [site for site in sites if site not in pair]
+        clamped_sites = ["", *others] if len(others) == 1 else [""]
+        for clamped in clamped_sites:
+            clamped_ports = port_response.find_site_ports(loop, clamped) if clamped else []
+            for joint, ports in port_response.group_ports_by_joint(loop).items():
+                keep = [
+                    port
+                    for port in ports
+                    if port_response.parse_port_site(loop.inputs[port]) in pair
+                ]
+                if len(keep) == len(pair):
+                    minima = _check_llewellyn(Y, keep, clamped_ports, w_rad_s)
+                    two_ports.append(TwoPort(pair, joint, clamped, minima))
+    return tuple(two_ports)
+
+
+def _check_llewellyn(
+    Y: port_response.PortResponse,
+    keep: list[int],
+    clamped: list[int],
+    w_rad_s: Array,
+) -> frequency_search.Minima:
+    """Returns Llewellyn's parameter of two ports over frequency.
+
+    Args:
+        Y: Admittance at all ports.
+        keep: Indices of the two ports.
+        clamped: Indices of the ports that are clamped. All others are free.
+        w_rad_s: Frequencies, in rad/s.
+    """
+    return frequency_search.find_minima(
+        lambda w: llewellyn_parameter(clamp_ports(Y(w), keep, clamped)),
+        w_rad_s,
+        level=1.0,
+        tolerance=lambda w: llewellyn_rounding(clamp_ports(Y(w), keep, clamped)),
+    )
+
+
+def ports_to_json(ports: PortAnalysis) -> dict[str, Any]:
+    """Returns a port analysis as plain values, ready for JSON.
+
+    Infinite numbers become None, as JSON does not know them.
+
+    Args:
+        ports: The analysis.
+    """
+    measured = ports.measured
+    return {
+        "sites": list(ports.sites),
+        "band_hz": list(ports.band_hz),
+        "resolved_hz": ports.resolved_hz,
+        "roots": ports.verdict,
+        "pole_at_zero": {"order": ports.pole.order, "passive": ports.pole.passive},
+        "passive_qd": _passivity_to_json(ports.velocity),
+        "passive_qd_of_joint": {
+            ports.axes.get(joint, str(joint)): _passivity_to_json(passivity)
+            for joint, passivity in ports.joints.items()
+        },
+        "passive_r": None if ports.proof is None else _passivity_to_json(ports.proof),
+        "beta": ports.beta.tolist(),
+        "estimates_true": ports.estimates_true,
+        "absolute": _minima_to_json(ports.absolute),
+        "measured_operators": None if measured is None else _minima_to_json(measured),
+        "llewellyn": [
+            {
+                "sites": list(two_port.sites),
+                "joint": ports.axes.get(two_port.joint, two_port.joint),
+                "clamped": two_port.clamped,
+                **_minima_to_json(two_port.minima),
+            }
+            for two_port in ports.two_ports
+        ],
+        "roots_clamped": ports.clamped_verdict,
+        "felt": [
+            {
+                **_transparency_to_json(transparency),
+                "joint": ports.axes.get(transparency.joint, transparency.joint),
+            }
+            for transparency in ports.transparency
+        ],
+    }
+
+
+def _passivity_to_json(passivity: Passivity) -> dict[str, Any]:
+    """Returns a passivity as plain values."""
+    return {
+        **_minima_to_json(passivity.minima),
+        "lacking_nm_s_rad": finite_or_none(passivity.lacking_nm_s_rad),
+    }
+
+
+def _minima_to_json(minima: frequency_search.Minima) -> dict[str, Any]:
+    """Returns the least value of a curve, and the bands in which it fails, as plain values."""
+    return {
+        "holds": not minima.below,
+        "least": minima.least,
+        "least_hz": minima.least_hz,
+        "fails_hz": [list(band) for band in minima.below],
+    }
+
+
+def _transparency_to_json(transparency: Transparency) -> dict[str, Any]:
+    """Returns a transparency as plain values."""
+    free, clamped = transparency.interpolate_magnitudes(QUOTED_AT_HZ)
+    return {
+        "at": transparency.operator_site,
+        "of": transparency.other_site,
+        "joint": transparency.joint,
+        "free_at_1_hz_nm_s_rad": free,
+        "clamped_at_1_hz_nm_s_rad": clamped,
+        "band_hz": list(transparency.band_hz),
+        "softest_nm_s_rad": transparency.softest_nm_s_rad,
+        "stiffest_nm_s_rad": transparency.stiffest_nm_s_rad,
+        "width_db": transparency.ratio_db,
+        "ratio_db": transparency.ratio_db,
+        "difference_nm_s_rad": transparency.difference_nm_s_rad,
+    }
+
+
+def list_followed_axes(site: SiteSetup) -> list[int]:
+    """Lists the coordinates along which a site follows its peers.
+
+    Args:
+        site: Setup of the site.
+
+    Returns:
+        Numbers of the coordinates, from 1. In joint space they are all joints.
+    """
+    if site.chain is None or site.chain.task is None:
+        return list(range(1, site.layout.joints + 1))
+    return [n for n, is_followed in enumerate(site.chain.task.axes, 1) if is_followed]
+
+
+def name_ports(conditions: OperatingConditions) -> dict[int, str]:
+    """Returns the names of the axes along which operators move the end effectors.
+
+    Args:
+        conditions: The coupled arms.
+
+    Returns:
+        The name of each followed axis, such as "y", by its number from 1. Empty if joints
+        follow each other instead of end effectors.
+    """
+    if not conditions.sites[0].layout.task:
+        return {}
+    followed = sorted({n for site in conditions.sites for n in list_followed_axes(site)})
+    return {n: TASK_AXES[n - 1] for n in followed}
+
+
+def move_ports_to_end_effectors(
+    conditions: OperatingConditions,
+    rest: Equilibrium,
+    loop: LinearLoop,
+) -> LinearLoop:
+    """Replaces joint angles by end effector coordinates in a linear model of coupled arms.
+
+    Operators then act on the end effectors. The joint angles q of a site (process that runs one
+    arm) become x = J q and z = N' q. J is the Jacobian of the followed axes at rest, and N a
+    basis of the joint motions that leave these axes unchanged. A force F becomes the joint
+    torque J' F.
+
+    Args:
+        conditions: The sites, gains and delays of the coupled arms.
+        rest: The pose of rest about which the arms are linearised.
+        loop: Linear model with joint torques as inputs and joint velocities as outputs.
+
+    Returns:
+        The model with forces and velocities of the end effectors. If joints follow each other
+        instead of end effectors, the model is returned without a change.
+    """
+    if not conditions.sites[0].layout.task:
+        return loop
+
+    state_blocks = []
+    inverse_blocks = []
+    port_blocks = []
+    names = []
+    inputs = []
+    outputs = []
+    arguments = gather_site_arguments(conditions, rest)
+    for site, x in zip(conditions.sites, arguments, strict=True):
+        layout = lay_out_arguments(site)
+        followed = list_followed_axes(site)
+        arm = place_arm(site, x[layout.q])
+        full_J = compute_following(site, arm, x).J
+        assert full_J is not None
+        J: Array = full_J[[n - 1 for n in followed]]
+        N = null_space(J)
+        T = np.vstack([J, N.T])
+        T_inverse = np.hstack([np.linalg.pinv(J), N])
+
+        # the states of estimates, which follow those of the joints, stay as they are
+        site_states = [name for name in loop.names if name.startswith(f"{site.name}.")]
+        estimates = site_states[2 * layout.joints :]
+        unchanged = np.eye(len(estimates))
+        state_blocks.append(block_diag(T, T, unchanged))
+        inverse_blocks.append(block_diag(T_inverse, T_inverse, unchanged))
+        port_blocks.append(J)
+
+        free_names = [f"free{n + 1}" for n in range(N.shape[1])]
+        names += [f"{site.name}.q{n}" for n in followed]
+        names += [f"{site.name}.{name}" for name in free_names]
+        names += [f"{site.name}.qd{n}" for n in followed]
+        names += [f"{site.name}.{name}d" for name in free_names]
+        names += estimates
+        inputs += [f"{site.name}.tau{n}" for n in followed]
+        outputs += [f"{site.name}.qd{n}" for n in followed]
+
+    new_by_old = block_diag(*state_blocks)
+    old_by_new = block_diag(*inverse_blocks)
+    J = block_diag(*port_blocks)
+    delayed = tuple(
+        term._replace(A=new_by_old @ term.A @ old_by_new, B=new_by_old @ term.B @ J.T)
+        for term in loop.delayed
+    )
+    return loop._replace(
+        names=tuple(names),
+        inputs=tuple(inputs),
+        outputs=tuple(outputs),
+        A=new_by_old @ loop.A @ old_by_new,
+        B=new_by_old @ loop.B @ J.T,
+        C=J @ loop.C @ old_by_new,
+        delayed=delayed,
+    )

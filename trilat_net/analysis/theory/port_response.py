@@ -1,0 +1,617 @@
+"""Computes how coupled arms respond to an operator's torque at each frequency.
+
+An operator touches an arm at a haptic port, for example a joint. The admittance of the port is
+the velocity of the joint per torque of the operator, as a function of frequency. The impedance
+is its inverse. Both are computed from the linear model of all arms.
+
+Transparency is how well an operator feels what happens at another arm. It is judged by the
+impedance at one joint of the operator's arm, in N m s/rad, once while the other arm is free and
+once while it is clamped. The operator applies no torque to the other joints. A large difference
+means that the operator can distinguish free space from a rigid object. Means over a band of
+frequencies are taken on a logarithmic axis, so that each decade has the same weight.
+
+Sources:
+    - Impedance and admittance: Hogan, "Impedance control: an approach to manipulation", ASME J.
+      Dynamic Systems, Measurement, and Control 107 (1985).
+    - Teleoperators as networks of ports: Hannaford, "A design framework for teleoperators with
+      kinesthetic feedback", IEEE Trans. Robotics and Automation 5 (1989).
+    - Transmitted impedance: Lawrence, "Stability and transparency in bilateral teleoperation",
+      IEEE Trans. Robotics and Automation 9 (1993).
+    - The difference of the free and the clamped impedance (Z-width): Hashtrudi-Zaad and
+      Salcudean, "Analysis and evaluation of stability and performance robustness for
+      teleoperation control architectures", ICRA (2000). The ratio of the two impedances is our
+      own measure (docs/ports.md).
+
+Invariant:
+    - Torques act on the joint, so that torque times velocity is the power that the operator
+      supplies.
+    - A control law that reflects external torques to the other arms also reflects the torque of
+      a clamp.
+    - Frequencies are in rad/s. Frequencies that are shown to people are in Hz, and their names
+      end in _hz.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from ...core.step.vectors import Array
+from ...errors import RuntimeFault, UsageError
+from .characteristic_roots import Complex
+from .linear_loop import DelayedTerm, LinearLoop
+
+PortResponse = Callable[[Array], Complex]
+"""Matrices, shape (F, p, m), for frequencies of shape (F,), rad/s."""
+
+ZERO_ROOT_RADIUS_PER_S = 1e-3
+"""Largest absolute value of a root of the loop that counts as zero, in 1/s."""
+
+_BATCH = 512
+"""Number of frequencies that are solved together, which limits the memory."""
+_CIRCLE_POINTS = 64
+"""Number of points of the circle around zero on which the response is evaluated."""
+_HIGHEST_POWER = 6
+"""Highest order of a pole at zero that is searched."""
+_NEGLIGIBLE = 1e-3
+"""Largest part of the response that counts as zero, as a share of its size."""
+
+
+class LoopOutput(NamedTuple):
+    """An output of a loop that depends on its present and on its past state x.
+
+    It is y(t) = C x(t) + sum_k C_k x(t - T_k).
+
+    Attributes:
+        C: Matrix of the present state, shape (p, n).
+        delayed: Pairs of a delay T_k, in s, and the matrix C_k, shape (p, n).
+    """
+
+    C: Array
+    delayed: tuple[tuple[float, Array], ...] = ()
+
+    def evaluate(self, s: Complex) -> Complex:
+        """Returns the matrix from the state to the output at complex frequencies.
+
+        It is C + sum_k C_k e^{-s T_k}.
+
+        Args:
+            s: Complex frequencies, shape (F,), in 1/s.
+
+        Returns:
+            Matrices, shape (F, p, n).
+        """
+        total = _repeat_matrix(self.C, len(s))
+        for delay_s, C in self.delayed:
+            shift = _evaluate_shift(s, delay_s)
+            total += shift * C
+        return total
+
+
+def _repeat_matrix(matrix: Array, count: int) -> Complex:
+    """Returns complex copies of a matrix of shape (p, m), shape (count, p, m)."""
+    shape = (count, *matrix.shape)
+    complex_matrix = matrix.astype(np.complex128)
+    copies: Complex = np.broadcast_to(complex_matrix, shape).copy()
+    return copies
+
+
+def _evaluate_shift(s: Complex, delay_s: float) -> Complex:
+    """Returns e^{-s T} of a delay T, shape (F, 1, 1)."""
+    shift: Complex = np.exp(-s * delay_s)
+    return shift[:, np.newaxis, np.newaxis]
+
+
+class PoleAtZero(NamedTuple):
+    """Response of coupled arms to constant torques, which may make velocities grow.
+
+    The response Y(s) gives p velocities per torque, for m torques. A pole at s = 0 means that a
+    constant torque makes a velocity grow, as for a mass without friction. Near s = 0 the
+    response is then about residue / s, and higher powers of 1 / s may be added.
+
+    Attributes:
+        order: Highest power of 1 / s. If it is 0, there is no pole, and velocities under a
+            constant torque stay bounded.
+        residue: Coefficient of 1 / s, shape (p, m), in rad/s^2 per N m.
+    """
+
+    order: int
+    residue: Array
+
+    @property
+    def passive(self) -> bool:
+        """True if the response at zero frequency is compatible with a passive system.
+
+        A passive system never supplies more energy than it received. If its response has a pole
+        at zero, the pole is simple. Its residue is a symmetric matrix without negative
+        eigenvalues.
+        """
+        residue = self.residue
+        differences = np.abs(residue - residue.T)
+        asymmetry = differences.max(initial=0.0)
+        size = np.abs(residue).max(initial=0.0)
+        tolerance = _NEGLIGIBLE * size
+        if self.order > 1 or asymmetry > tolerance:
+            return False
+        eigenvalues = np.linalg.eigvalsh(residue)
+        least = eigenvalues.min(initial=0.0)
+        return bool(least >= -tolerance)
+
+
+def evaluate_transfer(
+    loop: LinearLoop,
+    s: Complex,
+    output: LoopOutput | None = None,
+) -> Complex:
+    """Computes the response of coupled arms to torques at complex frequencies s.
+
+    The arms obey E x' = A x + sum_k A_k x(t - T_k) + B u + sum_k B_k u(t - T_k), with the state
+    x, the torques u, the delays T_k, and the matrices of `LinearLoop`. The transfer function
+    from u to an output C(s) x is
+
+        C(s) (s E - A - sum_k A_k exp(-s T_k))^-1 (B + sum_k B_k exp(-s T_k)).
+
+    Args:
+        loop: Linear model of the coupled arms.
+        s: Complex frequencies, shape (F,), in 1/s.
+        output: The output matrix C(s). None for the joint velocities, so that the result is the
+            admittance, in rad/s per N m.
+
+    Returns:
+        The response, shape (F, p, m), with a row for each of p outputs and a column for each of
+        m torques.
+    """
+    output = LoopOutput(loop.C) if output is None else output
+    count = len(s)
+    outputs = len(output.C)
+    inputs = loop.B.shape[1]
+    response = np.zeros((count, outputs, inputs), np.complex128)
+    E = np.eye(len(loop.A))
+    if loop.E is not None:
+        E = np.diag(loop.E)
+
+    for first in range(0, count, _BATCH):
+        end = first + _BATCH
+        batch = s[first:end]
+        rate_term = batch[:, np.newaxis, np.newaxis] * E
+        left = rate_term - loop.A
+        right = _repeat_matrix(loop.B, len(batch))
+        for term in loop.delayed:
+            shift = _evaluate_shift(batch, term.delay_s)
+            left -= shift * term.A
+            right += shift * term.B
+        state = np.linalg.solve(left, right)
+        output_matrix = output.evaluate(batch)
+        response[first:end] = output_matrix @ state
+    return response
+
+
+def build_admittance(loop: LinearLoop) -> PortResponse:
+    """Returns the admittance Y(j w) of a loop as a function of the frequency w in rad/s.
+
+    The admittance is the velocity of each joint per torque of an operator at each joint, in
+    rad/s per N m.
+
+    Args:
+        loop: The loop. Its outputs must be the velocities of the joints of its inputs, in
+            order.
+    """
+    velocities = loop.C.shape[0]
+    torques = loop.B.shape[1]
+    if velocities != torques:
+        raise RuntimeFault(
+            "a loop with ports must have as many velocities as torques, but their numbers are "
+            f"{velocities} and {torques}"
+        )
+
+    def evaluate_admittance(w_rad_s: Array) -> Complex:
+        s = to_imaginary_axis(w_rad_s)
+        return evaluate_transfer(loop, s)
+
+    return evaluate_admittance
+
+
+def to_imaginary_axis(w_rad_s: Array) -> Complex:
+    """Returns j w for frequencies w, in rad/s."""
+    return np.asarray(1j * w_rad_s, dtype=np.complex128)
+
+
+def parse_port_site(port: str) -> str:
+    """Returns the name of the site to which a port or a state belongs.
+
+    Args:
+        port: Name of the port or state. For "m1.tau2" the site is "m1".
+    """
+    return port.partition(".")[0]
+
+
+def list_port_sites(loop: LinearLoop) -> tuple[str, ...]:
+    """Returns the names of the sites whose joints have inputs in a linear model.
+
+    A site is a process that runs one arm. The inputs are torques on joints, such as "m1.tau1"
+    for site m1. Each site is listed once, in the order of its first input.
+
+    Args:
+        loop: Linear model of the coupled arms.
+    """
+    sites = [parse_port_site(name) for name in loop.inputs]
+    # a dict keeps each site once, in order
+    return tuple(dict.fromkeys(sites))
+
+
+def find_site_ports(loop: LinearLoop, site: str) -> list[int]:
+    """Finds the ports of a site, the joints at which its operator acts.
+
+    Args:
+        loop: The loop.
+        site: Name of the site.
+
+    Returns:
+        Indices of the ports in the loop's inputs.
+
+    Raises:
+        UsageError: The loop has no such site.
+    """
+    ports = []
+    for n, name in enumerate(loop.inputs):
+        if parse_port_site(name) == site:
+            ports.append(n)
+    if not ports:
+        sites = ", ".join(list_port_sites(loop))
+        raise UsageError(f"there is no site {site!r} among the ports; the sites are {sites}")
+    return ports
+
+
+def parse_port_joint(port: str) -> int:
+    """Returns the number of the joint to which a port belongs.
+
+    Args:
+        port: Name of the port. For "m1.tau2" the number is 2.
+    """
+    _, _, number = port.rpartition("tau")
+    return int(number)
+
+
+def group_ports_by_joint(loop: LinearLoop) -> dict[int, list[int]]:
+    """Groups the ports of a loop by the number of their joint, in the order of the sites.
+
+    Args:
+        loop: The loop.
+
+    Returns:
+        Indices of the ports, by the number of the joint.
+    """
+    ports: dict[int, list[int]] = {}
+    for port, name in enumerate(loop.inputs):
+        joint = parse_port_joint(name)
+        ports.setdefault(joint, []).append(port)
+    return dict(sorted(ports.items()))
+
+
+def select_ports(response: PortResponse, ports: list[int]) -> PortResponse:
+    """Returns the response at some ports, while no operator acts at the others.
+
+    Args:
+        response: The response at all ports, as a function of frequency.
+        ports: Indices of the ports to keep.
+    """
+
+    def evaluate_selected(w_rad_s: Array) -> Complex:
+        rows = response(w_rad_s)[:, ports]
+        return rows[:, :, ports]
+
+    return evaluate_selected
+
+
+def find_longest_delay_s(loop: LinearLoop) -> float:
+    """Returns the longest delay of a loop, in s. 0 if it has no delay."""
+    delays_s = [term.delay_s for term in loop.delayed]
+    return max(delays_s, default=0.0)
+
+
+def find_pole_at_zero(loop: LinearLoop) -> PoleAtZero:
+    """Finds whether constant torques make the velocities of coupled arms grow.
+
+    This is so if the response Y(s), velocity per torque, has a pole at zero. For example, a
+    free mass m has Y(s) = 1 / (m s). A characteristic root at zero alone is not sufficient. The
+    arms have many of these roots, because they can rest in several poses, and a resting arm has
+    no velocity. The pole is found by Cauchy's integral along a small circle around zero, with
+    the radius `ZERO_ROOT_RADIUS_PER_S`.
+
+    Args:
+        loop: Linear model of the coupled arms.
+
+    Returns:
+        Order and residue of the pole. The order is 0 if there is no pole.
+    """
+    angles = 2j * math.pi * np.arange(_CIRCLE_POINTS) / _CIRCLE_POINTS
+    unit_circle = np.exp(angles)
+    small_circle = ZERO_ROOT_RADIUS_PER_S * unit_circle
+    values = evaluate_transfer(loop, small_circle)
+    circle = unit_circle[:, np.newaxis, np.newaxis]
+    # the coefficient of 1 / s^k is the mean of Y(s) s^k over the circle
+    coefficients = {}
+    for power in range(1, _HIGHEST_POWER + 1):
+        products = values * circle**power
+        mean = products.mean(axis=0)
+        coefficients[power] = mean.real
+
+    largest = np.abs(values).max(initial=0.0)
+    least = _NEGLIGIBLE * largest
+    powers = []
+    for power, coefficient in coefficients.items():
+        size = np.abs(coefficient).max(initial=0.0)
+        if size > least:
+            powers.append(power)
+
+    residue = np.zeros_like(coefficients[1])
+    if 1 in powers:
+        residue = coefficients[1] * ZERO_ROOT_RADIUS_PER_S
+    return PoleAtZero(max(powers, default=0), residue)
+
+
+def clamp_site(loop: LinearLoop, site: str) -> LinearLoop:
+    """Returns the loop with the arm of a site held still by a clamp.
+
+    The torque u_c of the clamp makes the site's accelerations zero: u_c = -B_cc^-1 (A_c x + B_c
+    u + delayed terms). Here x is the state, u the other torques, A_c and B_c are the rows of
+    the loop's matrices for these accelerations, and B_cc is the part of B_c that belongs to the
+    site's own torques. The torque acts wherever the law uses the site's torque.
+
+    Args:
+        loop: The loop.
+        site: Name of the site.
+
+    Returns:
+        The loop without the ports, velocities and angles of the site.
+
+    Raises:
+        UsageError: There is no such site, or two clamped sites reflect force onto each other.
+    """
+    ports = find_site_ports(loop, site)
+    other_ports = [n for n in range(len(loop.inputs)) if n not in ports]
+    speeds = []
+    angles = []
+    for port in ports:
+        speed_name = loop.outputs[port]
+        angle_name = loop.inputs[port].replace(".tau", ".q")
+        speeds.append(loop.names.index(speed_name))
+        angles.append(loop.names.index(angle_name))
+    removed = {*speeds, *angles}
+    kept = [n for n in range(len(loop.names)) if n not in removed]
+    undelayed_term = DelayedTerm(0.0, loop.A, loop.B)
+    terms = [undelayed_term, *loop.delayed]
+    acceleration_block = np.ix_(speeds, ports)
+    for term in loop.delayed:
+        reflected = term.B[acceleration_block]
+        if reflected.any():
+            raise UsageError(
+                "clamped sites that reflect force onto each other do not have a finite "
+                f"response: {site}"
+            )
+    inverse_inertia = loop.B[acceleration_block]
+    inertia = np.linalg.inv(inverse_inertia)
+    sums: dict[float, DelayedTerm] = {}
+
+    def add_term(delay_s: float, A: Array, B: Array) -> None:
+        """Adds matrices to the part of the model that acts after a given delay.
+
+        Delays that differ only by rounding errors count as equal.
+
+        Args:
+            delay_s: The delay, in s.
+            A: Effect of the delayed states.
+            B: Effect of the delayed torques.
+        """
+        key = round(delay_s, 12)
+        if key in sums:
+            previous = sums[key]
+            A = previous.A + A
+            B = previous.B + B
+        sums[key] = DelayedTerm(key, A, B)
+
+    clamp_torques = []
+    for term in terms:
+        by_state = term.A[speeds]
+        by_torque = term.B[speeds][:, other_ports]
+        clamp_by_state = -inertia @ by_state
+        clamp_by_torque = -inertia @ by_torque
+        clamp = DelayedTerm(term.delay_s, clamp_by_state, clamp_by_torque)
+        clamp_torques.append(clamp)
+    for term in terms:
+        other_effect = term.B[:, other_ports]
+        add_term(term.delay_s, term.A, other_effect)
+        effect = term.B[:, ports]
+        if not effect.any():
+            continue
+        for clamp in clamp_torques:
+            delay_s = term.delay_s + clamp.delay_s
+            effect_of_state = effect @ clamp.A
+            effect_of_torque = effect @ clamp.B
+            add_term(delay_s, effect_of_state, effect_of_torque)
+    kept_terms = []
+    kept_block = np.ix_(kept, kept)
+    for delay_s in sorted(sums):
+        total = sums[delay_s]
+        kept_A = total.A[kept_block]
+        kept_B = total.B[kept]
+        kept_term = DelayedTerm(delay_s, kept_A, kept_B)
+        kept_terms.append(kept_term)
+    undelayed, *delayed = kept_terms
+    active_terms = [term for term in delayed if term.A.any() or term.B.any()]
+    return LinearLoop(
+        names=tuple(loop.names[n] for n in kept),
+        inputs=tuple(loop.inputs[n] for n in other_ports),
+        outputs=tuple(loop.outputs[n] for n in other_ports),
+        A=undelayed.A,
+        B=undelayed.B,
+        C=loop.C[np.ix_(other_ports, kept)],
+        delayed=tuple(active_terms),
+        E=None if loop.E is None else loop.E[kept],
+    )
+
+
+TRANSPARENCY_BAND_HZ = (0.1, 10.0)
+"""Band of the means: operators drift below it, and do not move deliberately above it."""
+QUOTED_AT_HZ = 1.0
+"""Frequency at which impedances are quoted."""
+_SHOWN_HZ = (0.01, 100.0)
+"""Band of the figures."""
+_PER_DECADE = 100
+"""Frequencies per decade of this band."""
+
+
+class Transparency(NamedTuple):
+    """Impedance that an operator feels along a joint, with another site free and clamped.
+
+    Attributes:
+        operator_site: Site of the operator.
+        other_site: Site that is free or clamped.
+        joint: Number of the joint of the operator's site, from 1 on.
+        w_rad_s: Frequencies, shape (F,), in rad/s.
+        free: Impedance with the other site free, shape (F,), in N m s/rad.
+        clamped: Impedance with the other site clamped, shape (F,), in N m s/rad.
+        band_hz: The band over which means are taken, in Hz.
+    """
+
+    operator_site: str
+    other_site: str
+    joint: int
+    w_rad_s: Array
+    free: Complex
+    clamped: Complex
+    band_hz: tuple[float, float] = TRANSPARENCY_BAND_HZ
+
+    @property
+    def softest_nm_s_rad(self) -> float:
+        """Mean impedance that the operator feels while the other arm is free, in N m s/rad.
+
+        It is the geometric mean of the impedance's magnitude over the frequencies of `band_hz`,
+        which are weighted as on a logarithmic axis.
+        """
+        return self._average_magnitude(self.free)
+
+    @property
+    def stiffest_nm_s_rad(self) -> float:
+        """Mean impedance that the operator feels while the other arm is clamped, in N m s/rad.
+
+        It is the geometric mean of the impedance's magnitude over the frequencies of `band_hz`,
+        which are weighted as on a logarithmic axis.
+        """
+        return self._average_magnitude(self.clamped)
+
+    @property
+    def ratio_db(self) -> float:
+        """Mean ratio of the impedances with a clamped and a free other arm, in dB.
+
+        It is the mean of 20 log10(abs(Z_clamped) / abs(Z_free)) over the frequencies of
+        `band_hz`, on a logarithmic axis. Z_clamped and Z_free are the impedances that the
+        operator feels while the other arm is clamped or free.
+        """
+        ratio = self.stiffest_nm_s_rad / self.softest_nm_s_rad
+        return 20.0 * float(np.log10(ratio))
+
+    @property
+    def difference_nm_s_rad(self) -> float:
+        """Mean difference of the impedances with a clamped and a free other arm, in N m s/rad.
+
+        It is the geometric mean of abs(Z_clamped - Z_free) over the frequencies of `band_hz`,
+        which are weighted as on a logarithmic axis. Z_clamped and Z_free are the impedances
+        that the operator feels. The mean is zero if they are equal at any frequency.
+        """
+        difference = self.clamped - self.free
+        if not difference.all():
+            return 0.0
+        return self._average_magnitude(difference)
+
+    def interpolate_magnitudes(self, frequency_hz: float) -> tuple[float, float]:
+        """Returns the magnitudes of the impedances that the operator feels at one frequency.
+
+        They are interpolated between the computed frequencies on logarithmic axes.
+
+        Args:
+            frequency_hz: The frequency, in Hz.
+
+        Returns:
+            The magnitude while the other arm is free, and the magnitude while it is clamped,
+            both in N m s/rad.
+        """
+        log_w = np.log(self.w_rad_s)
+        target = np.log(2.0 * np.pi * frequency_hz)
+        log_free = np.log(np.abs(self.free))
+        log_clamped = np.log(np.abs(self.clamped))
+        log_free_at_target = np.interp(target, log_w, log_free)
+        log_clamped_at_target = np.interp(target, log_w, log_clamped)
+        free = float(np.exp(log_free_at_target))
+        clamped = float(np.exp(log_clamped_at_target))
+        return free, clamped
+
+    def _average_magnitude(self, Z: Complex) -> float:
+        """Returns the mean magnitude of an impedance over the band, on logarithmic axes."""
+        low, high = (2.0 * np.pi * edge for edge in self.band_hz)
+        # the edges of the band belong to it, up to rounding
+        w_rad_s = self.w_rad_s
+        is_above = w_rad_s >= low * (1.0 - 1e-9)
+        is_below = w_rad_s <= high * (1.0 + 1e-9)
+        inside = is_above & is_below
+        magnitudes = np.abs(Z[inside])
+        log_magnitudes = np.log(magnitudes)
+        log_w = np.log(w_rad_s[inside])
+        width = log_w[-1] - log_w[0]
+        integral = np.trapezoid(log_magnitudes, log_w)
+        mean = integral / width
+        return float(np.exp(mean))
+
+
+def measure_transparency(loop: LinearLoop, at: str, of: str) -> tuple[Transparency, ...]:
+    """Computes what an operator at one site feels of another site, free and clamped.
+
+    With ideal transparency the operator would feel no impedance while the other site is free,
+    and a rigid one while it is clamped. The impedance along each joint i is Z(j w) = 1 / Y_ii(j
+    w) with the admittance Y of the loop. All other ports are free.
+
+    Args:
+        loop: The loop.
+        at: Site of the operator.
+        of: Site that is free or clamped.
+
+    Returns:
+        The transparency along each joint of the operator's site.
+
+    Raises:
+        UsageError: There is no such site, or both are the same.
+    """
+    low, high = _SHOWN_HZ
+    decades = np.log10(high / low)
+    steps = round(_PER_DECADE * decades)
+    points = np.geomspace(low, high, 1 + steps)
+    frequencies_hz = np.union1d(points, TRANSPARENCY_BAND_HZ)
+    w_rad_s = 2.0 * np.pi * frequencies_hz
+
+    ports = find_site_ports(loop, at)
+    if at == of:
+        raise UsageError(
+            f"a load cannot be placed at {at}, because this is the operator's own site"
+        )
+    clamped_loop = clamp_site(loop, of)
+    clamped_ports = find_site_ports(clamped_loop, at)
+    free_admittance = build_admittance(loop)
+    clamped_admittance = build_admittance(clamped_loop)
+    evaluate_free = select_ports(free_admittance, ports)
+    evaluate_clamped = select_ports(clamped_admittance, clamped_ports)
+    free = evaluate_free(w_rad_s)
+    clamped = evaluate_clamped(w_rad_s)
+
+    transparencies = []
+    for n, port in enumerate(ports):
+        transparency = Transparency(
+            operator_site=at,
+            other_site=of,
+            joint=parse_port_joint(loop.inputs[port]),
+            w_rad_s=w_rad_s,
+            free=1.0 / free[:, n, n],
+            clamped=1.0 / clamped[:, n, n],
+        )
+        transparencies.append(transparency)
+    return tuple(transparencies)

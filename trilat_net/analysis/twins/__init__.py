@@ -1,0 +1,1 @@
+"""Twins: repeated runs with a small push, and whether the push grows."""

@@ -1,0 +1,268 @@
+"""Decides whether an oscillation grows, decays or stays, over the second half of a run.
+
+The envelope of a signal is its largest magnitude in each short interval of time. The second
+half of the run is divided into 16 equal windows. If these do not decide, it is divided into 8.
+The maximum of each window, at least `FLOOR_RAD`, is taken. A straight line is fitted to the
+logarithms of these maxima. Its slope has one-sided confidence bounds of 99.5 % (Student's t).
+
+The classes use the four quarters of the second half, and the three steps between the maxima of
+successive quarters:
+
+- GROWS: the lower bound of the slope is positive, and each step is a rise by 1 % or more. The
+  rise does not slow down: in logarithms, the last step is at least 3/4 of the first. If the
+  maxima rise by more than a factor of 8/5 in all, 0.45 of the first step suffices, because no
+  saturating response that starts at zero does that. Growth does not count if the first half of
+  the run falls by 1 % or more from each quarter to the next.
+- DECAYS: the upper bound of the slope is negative, and the line falls by a factor of two or
+  more. The last step is a fall of at least half the size that it has in a steady fall by a
+  factor of two. An envelope whose last quarter does not exceed `FLOOR_RAD` decays as well.
+- HARDLY: the upper bound is negative, and the line falls by 4 % or more, but the conditions of
+  DECAYS do not hold.
+- STEADY: the bounds show that the envelope neither doubles nor halves within the half.
+- UNDECIDED: no other class applies, or the last step is more than a doubling without growth.
+
+A class describes the record and predicts nothing. No finite record excludes growth that starts
+later. A beat that is longer than the run looks like growth while it rises.
+"""
+
+import math
+from enum import StrEnum
+from typing import NamedTuple
+
+import numpy as np
+
+from ...core.step.vectors import Array
+
+FLOOR_RAD = 1e-12
+"""An envelope below this is the rounding of the numbers, rad; of speeds, rad/s."""
+
+_T_QUANTILES = {16: 2.977, 8: 3.707}
+"""99.5 % quantiles of Student's t with n - 2 degrees of freedom, by the number n of windows.
+
+They have only these digits, because the classes of published runs were made with them.
+"""
+
+_LEAST_STEP = math.log(1.01)
+"""Least rise of the maxima from quarter to quarter of an envelope that grows: 1 %."""
+_DOUBLE = math.log(2.0)
+"""Logarithm of a doubling."""
+_LARGEST_CALM_RISE = math.log(1.25)
+"""Largest rise within the half that the upper bound of a calm envelope admits."""
+_LARGEST_CALM_STEP = math.log(1.5)
+"""Largest rise of a calm envelope from the last quarter but one to the last quarter."""
+_LARGEST_RISE_FROM_ZERO = math.log(8.0 / 5.0)
+"""Largest rise over the quarters of a response that starts at zero and saturates."""
+
+
+class EnvelopeTrend(StrEnum):
+    """Trend of the magnitude of an oscillation in the second half of a run.
+
+    The module's docstring defines the classes. The value of each member is a phrase for the
+    user.
+    """
+
+    DECAYS = "decays"
+    HARDLY = "hardly decays"
+    STEADY = "steady"
+    GROWS = "grows"
+    UNDECIDED = "undecided (record longer)"
+
+
+class EnvelopeFit(NamedTuple):
+    """Trend of the magnitude of an oscillation, computed by `fit_envelopes`.
+
+    The envelope is the largest magnitude of a signal in each short interval of time.
+
+    Attributes:
+        trend: Class of the trend, such as growing or decaying.
+        rate_per_s: Rate of the envelope, which is proportional to exp(rate t), in 1/s. NaN if
+            the record is too short.
+        calm: True if the envelope is not about to grow. Two conditions must hold. First, it
+            falls, or it certainly rises by less than a quarter within the second half of the
+            run. Second, its maximum in the last quarter of this half is at most 1.5 times its
+            maximum in the quarter before.
+    """
+
+    trend: EnvelopeTrend
+    rate_per_s: float
+    calm: bool = False
+
+    @property
+    def text(self) -> str:
+        """The trend of the envelope in a few words for the user, such as "grows"."""
+        if self.trend is EnvelopeTrend.UNDECIDED:
+            return "shows no trend"
+        return self.trend.value
+
+    @property
+    def rate_text(self) -> str:
+        """The trend of the envelope in a few words for the user.
+
+        If the envelope grows or decays, it is the rate, such as "+0.12/s". Otherwise it is
+        `text`, such as "steady".
+        """
+        if self.trend in (EnvelopeTrend.STEADY, EnvelopeTrend.UNDECIDED):
+            return self.text
+        return f"{self.rate_per_s:+.3g}/s"
+
+
+def fit_envelopes(
+    t_s: Array,
+    values: Array,
+    floor: float = FLOOR_RAD,
+    *,
+    falls_first: bool = False,
+) -> list[EnvelopeFit]:
+    """Determines whether oscillations grow, decay or stay, over the second half of a run.
+
+    The module's docstring defines the classes of the trend.
+
+    Args:
+        t_s: Ascending times, shape (K,), in s.
+        values: The C envelopes, shape (K, C). Each is the largest magnitude of a signal in the
+            interval that ends at a time.
+        floor: Value below which an envelope counts as zero. It has the unit of `values`.
+        falls_first: True if an envelope that falls and then rises counts as growing too. By
+            default its trend is undecided.
+
+    Returns:
+        The trend of each of the C envelopes.
+    """
+    envelopes = values.shape[1]
+    no_fit = EnvelopeFit(EnvelopeTrend.UNDECIDED, math.nan)
+    fits = [no_fit] * envelopes
+    undecided = list(range(envelopes))
+    for windows in _T_QUANTILES:
+        maxima = _find_window_maxima(t_s, values[:, undecided], windows, floor)
+        if maxima is None:
+            continue
+        half_s = 0.5 * (t_s[-1] - t_s[0])
+        window_fits = _fit_maxima(maxima, half_s / windows, math.log(floor))
+        for n, fit in zip(undecided, window_fits, strict=True):
+            fits[n] = fit
+        undecided = [n for n in undecided if fits[n].trend is EnvelopeTrend.UNDECIDED]
+    growing = [n for n, fit in enumerate(fits) if fit.trend is EnvelopeTrend.GROWS]
+    if falls_first or not growing:
+        return fits
+
+    # growth after a fall in the first half is a V; in reversed time the fall is a rise
+    reversed_t_s = -t_s[::-1]
+    reversed_values = values[::-1, growing]
+    first_half = _find_window_maxima(reversed_t_s, reversed_values, 4, floor)
+    if first_half is None:
+        return fits
+    steps = np.diff(np.log(first_half), axis=0)
+    least_steps = steps.min(axis=0)
+    for n, least_step in zip(growing, least_steps, strict=True):
+        if least_step >= _LEAST_STEP:
+            fits[n] = fits[n]._replace(trend=EnvelopeTrend.UNDECIDED)
+    return fits
+
+
+def _find_window_maxima(
+    t_s: Array,
+    values: Array,
+    windows: int,
+    floor: float,
+) -> Array | None:
+    """Returns the maxima of equal windows of the second half, shape (windows, C).
+
+    Args:
+        t_s: Ascending times, shape (K,), in s.
+        values: The envelopes, shape (K, C).
+        windows: Number of windows.
+        floor: Least maximum.
+
+    Returns:
+        The maxima. None if some window has fewer than two points.
+    """
+    if not len(t_s):
+        return None
+    end_s = t_s[-1]
+    middle_s = 0.5 * (t_s[0] + end_s)
+    edges = np.linspace(middle_s, end_s, windows + 1)
+    starts = np.searchsorted(t_s, edges[:-1])
+    counts = np.diff(np.append(starts, len(t_s)))
+    if np.any(counts < 2):
+        return None
+    maxima = np.maximum.reduceat(values, starts, axis=0)
+    return np.maximum(maxima, floor)
+
+
+def _fit_maxima(maxima: Array, window_s: float, log_floor: float) -> list[EnvelopeFit]:
+    """Determines the trends of envelopes by least-squares lines through their log maxima.
+
+    Args:
+        maxima: Maxima of n equal windows, shape (n, C).
+        window_s: Length of a window, in s.
+        log_floor: Logarithm of the floor. An envelope below it is at rest.
+    """
+    n = len(maxima)
+    log_maxima = np.log(maxima)
+    x = np.arange(n) - 0.5 * (n - 1)
+    x_squares = float(x @ x)
+    column_x = x[:, np.newaxis]
+    # a sum, because the last bits of a matrix product may vary between machines
+    products = (column_x * log_maxima).sum(axis=0)
+    slopes = products / x_squares
+    residual = log_maxima - log_maxima.mean(axis=0) - column_x * slopes
+    residual_squares = (residual**2).sum(axis=0)
+    slope_variance = residual_squares / (n - 2) / x_squares
+    bounds = _T_QUANTILES[n] * np.sqrt(slope_variance)
+    windows_by_quarter = maxima.reshape(4, n // 4, -1)
+    log_quarters = np.log(windows_by_quarter.max(axis=1))
+
+    fits = []
+    lines = zip(slopes.tolist(), bounds.tolist(), log_quarters.T, strict=True)
+    for slope, bound, log_quarter in lines:
+        steps = np.diff(log_quarter)
+        is_dead = float(log_quarter[-1]) <= log_floor
+        trend = _classify_trend(slope * n, bound * n, steps, dead=is_dead)
+        falls = trend in (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY)
+        largest_rise = (slope + bound) * n
+        may_stay = falls or largest_rise <= _LARGEST_CALM_RISE
+        last_step = float(steps[-1])
+        calm = may_stay and last_step <= _LARGEST_CALM_STEP
+        rate_per_s = float(slope / window_s)
+        fits.append(EnvelopeFit(trend, rate_per_s, bool(calm)))
+    return fits
+
+
+def _classify_trend(
+    change: float,
+    bound: float,
+    steps: Array,
+    *,
+    dead: bool,
+) -> EnvelopeTrend:
+    """Returns the class of the trend of an envelope, as the module's docstring defines it.
+
+    Args:
+        change: Change of the envelope's logarithm over the half, according to the line.
+        bound: Bound of the error of this change.
+        steps: Steps of the log maxima from quarter to quarter of the half, shape (3,).
+        dead: True if the last quarter is at the floor.
+    """
+    if dead:
+        return EnvelopeTrend.DECAYS
+    first_step = steps[0]
+    last_step = steps[-1]
+    rises_far = steps.sum() > _LARGEST_RISE_FROM_ZERO
+    is_not_saturating = rises_far and last_step >= 0.45 * first_step
+    keeps_rising = last_step >= 0.75 * first_step or is_not_saturating
+    if change > bound and steps.min() >= _LEAST_STEP and keeps_rising:
+        return EnvelopeTrend.GROWS
+
+    if last_step > _DOUBLE:
+        return EnvelopeTrend.UNDECIDED
+
+    if change + bound < 0.0 and change <= -4.0 * _LEAST_STEP:
+        halves = change <= -_DOUBLE
+        # in a steady fall to one half, each step is a quarter of the fall
+        still_falls = last_step <= -_DOUBLE / 8.0
+        is_clear = halves and still_falls
+        return EnvelopeTrend.DECAYS if is_clear else EnvelopeTrend.HARDLY
+
+    if abs(change) + bound <= _DOUBLE:
+        return EnvelopeTrend.STEADY
+    return EnvelopeTrend.UNDECIDED

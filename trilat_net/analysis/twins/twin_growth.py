@@ -1,0 +1,1030 @@
+"""Measures whether small disturbances of a run grow or die away, by repeating the run.
+
+A twin is a repetition of a run that receives a small push, for example of one joint. Without
+the push, it would be identical to the run. The effect of the push is measured by the
+differences d of the joint velocities between the twin and the run, 20 times per second. Their
+amplitude A is
+
+    A^2 = sum over joints of d^2 + (a / w)^2
+
+Here a is the time derivative of d. The frequency w, in rad/s, is chosen so that both parts are
+equal on average. If d is an oscillation that grows or decays with a certain rate, A does not
+oscillate, but is proportional to exp(rate t) over the time t. The rate is the slope of log A
+over the part of the run that is judged. `envelope_trend` defines the bounds of the slope, and
+the classes such as "grows" and "decays".
+
+Invariant:
+    - Velocities are compared. If a push merely shifts all arms to another position of rest, the
+      difference becomes zero.
+    - A scenario may contain several groups of arms that do not follow each other. Each group is
+      judged separately, so that growth in one group is not hidden by another group.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...core.arms.exogenous import TorqueKind
+from ...core.links.delay import DelayKind
+from ...core.step.ticks import BUCKETS_PER_S
+from ...core.step.vectors import Array
+from ...errors import NotRepeatable, UsageError, count_nouns
+from ...execution.twins import (
+    LEAST_PUSH,
+    MOST_PUSH,
+    PUSH_RAD,
+    SMALLEST,
+    Push,
+    TwinPath,
+    Twins,
+    choose_pushes,
+    parse_push,
+    run_twins,
+    run_virtual_twins,
+)
+from ...log.log_reader import Log, open_log
+from ...results import Result, finite_or_none
+from ...scenario import Scenario
+from ...scenario.delay_period import (
+    find_burst_interval_s,
+    find_final_delay_period,
+    find_final_link,
+)
+from ..run_end import RunEnd, classify_log_end, find_coupled_sites
+from .envelope_trend import EnvelopeFit, EnvelopeTrend, fit_envelopes
+
+LEAST_LEFT_S = 5.0
+"""Shortest departure from a rest position that counts, in s."""
+DOUBLES = 2.0
+"""Least growth of the speed during a departure from a rest, as a factor.
+
+Pushes of runs with random delays must grow by the same factor, to exclude chance.
+"""
+CLEAR_GROWTH = 100.0
+"""Growth of an unstable mode, as a factor, that shows in a push of any direction.
+
+A push excites all modes. Growth of one of them by this factor outweighs the decay of the rest.
+"""
+_TRENDS_FROM_BEST = (
+    EnvelopeTrend.DECAYS,
+    EnvelopeTrend.HARDLY,
+    EnvelopeTrend.UNDECIDED,
+    EnvelopeTrend.STEADY,
+    EnvelopeTrend.GROWS,
+)
+_FALLING = (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY)
+_AMPLITUDE_FLOOR = 1e-300
+"""Smallest amplitude in a fit. The amplitudes are scaled and have no unit."""
+SAME_SCALED = math.log(1.1)
+"""Largest difference of the logarithms of two scaled twins that count as equal: 10 %."""
+MOST_LOG = 700.0
+"""Largest argument of the exponential function that certainly does not overflow."""
+
+
+class PushGrowth(NamedTuple):
+    """How the effect of one push developed over the judged part of a run.
+
+    A push is a small disturbance in a repetition of the run, called a twin. Its effect is the
+    difference between the twin and the run. If a run has several groups of sites that do not
+    follow each other, a push has one such object for each group.
+
+    Attributes:
+        push: The push: what was changed, when and by how much.
+        trend: Class of the trend of the difference, such as growing.
+        rate_per_s: Rate of the difference, which is proportional to exp(rate t), in 1/s. NaN if
+            the judged part is too short.
+        factor: Factor by which the difference changed over the judged part. 0 if it died down
+            to the rounding errors.
+        joint: Name of the joint with the worst trend: the joint at which the difference is
+            largest at the end, or a joint that grows, or stays, although the largest difference
+            dies away.
+        group: Index of the group of sites.
+        becomes_rad_s: Largest difference in the last second, in rad/s, with all scalings of
+            the difference undone.
+        ended_s: Time at which the twin ended before the run, in s, because the difference died
+            down to the rounding errors or the twin diverged. None if the twin did not end
+            early.
+        leads: True if the difference is largest at this joint at the end.
+    """
+
+    push: Push
+    trend: EnvelopeTrend
+    rate_per_s: float
+    factor: float
+    joint: str
+    group: int
+    becomes_rad_s: float
+    ended_s: float | None = None
+    leads: bool = True
+
+
+def estimate_miss_probability(directions: int) -> float:
+    """Estimates how likely pushes in random directions miss a mode that grows clearly.
+
+    A mode that grows by `CLEAR_GROWTH` is missed if less than 1 / `CLEAR_GROWTH` of the usual
+    share of every push excites it. The share of a mode in a push with many random components is
+    nearly normally distributed, with the density 1 / sqrt(2 pi) at zero.
+
+    Args:
+        directions: Number of independent random directions.
+    """
+    share = 1.0 / CLEAR_GROWTH
+    single = 2.0 * share / math.sqrt(2.0 * math.pi)
+    return math.pow(single, directions)
+
+
+class RestDeparture(NamedTuple):
+    """A time in which a run and its twins moved away from rest by themselves.
+
+    Twins are repeated runs with a small push. Nobody acts on the arms during this time, which
+    shows that the rest position is unstable.
+
+    Attributes:
+        from_s: Start, in s.
+        to_s: End, in s.
+        rate_per_s: Rate at which the speed of the run grew, in 1/s.
+        joint: Name of the fastest joint.
+    """
+
+    from_s: float
+    to_s: float
+    rate_per_s: float
+    joint: str
+
+
+class TwinGrowth(NamedTuple):
+    """Whether small pushes of a run grow or die away, computed by `judge_twins`.
+
+    Each push is made in a repeated run, called a twin. Its difference from the run is then
+    observed.
+
+    Attributes:
+        why: The reason why there are no twins. Empty if there are.
+        from_s: Start of the part of the run that is judged, in s.
+        to_s: End of this part, in s.
+        pushes: Growth of every push, in every group of sites that follow each other.
+        departure: Fastest departure of the run from a rest. None if there was none.
+        same_platform: False if the run was recorded on another platform. The last bits of the
+            repeated run may then differ from the log.
+        links_random: True if some link draws its delays at random. Slow trends may then be
+            chance.
+        delay_period_s: Time after which delays that vary, and the ticks of all sites, repeat,
+            in s. None if delays are constant, random, or never repeat.
+        burst_interval_s: Mean time from one burst of lost samples to the next one, in s. None
+            if no link loses samples in bursts.
+        twins: The twins themselves, for figures. None if there are none.
+    """
+
+    why: str
+    from_s: float = 0.0
+    to_s: float = 0.0
+    pushes: tuple[PushGrowth, ...] = ()
+    departure: RestDeparture | None = None
+    same_platform: bool = True
+    links_random: bool = False
+    delay_period_s: float | None = None
+    burst_interval_s: float | None = None
+    twins: Twins | None = None
+
+    @property
+    def worst(self) -> PushGrowth | None:
+        """The push whose effect grew most, or died away most slowly.
+
+        A push is a small disturbance in a repetition of the run. None if there are no pushes.
+        """
+        return max(self.pushes, key=_rank_badness, default=None)
+
+    @property
+    def trend(self) -> EnvelopeTrend:
+        """Whether the worst push of the run grows or dies away, as a class.
+
+        The worst push is the push whose effect grows most or dies away most slowly. Undecided
+        if there are no pushes.
+        """
+        return EnvelopeTrend.UNDECIDED if self.worst is None else self.worst.trend
+
+    @property
+    def grows(self) -> bool:
+        """True if small disturbances of the run grow, that is, if the run is unstable.
+
+        A push is a small disturbance in a repetition of the run. Arms that follow each other
+        form a group. The disturbances of a group grow if the effects of at least half of its
+        pushes grow throughout, from `from_s` to `to_s`. They also grow if the motion of the
+        same joint grows throughout after at least two pushes, and is the fastest motion after
+        one of them: a joint that does not act on the others moves only after the pushes that
+        reach it. If network delays are random, the effects must grow by a factor of two, to
+        exclude chance.
+        """
+        least_factor = DOUBLES if self.links_random else 1.0
+        grown = []
+        for push in self.pushes:
+            grows_throughout = push.trend is EnvelopeTrend.GROWS
+            if grows_throughout and push.factor >= least_factor:
+                grown.append(push)
+
+        for group in {push.group for push in self.pushes}:
+            pushes = [push for push in self.pushes if push.group == group]
+            grown_in_group = [push for push in grown if push.group == group and push.leads]
+            if 2 * len(grown_in_group) >= len(pushes):
+                return True
+        for joint in {push.joint for push in grown}:
+            with_joint = [push for push in grown if push.joint == joint]
+            if len(with_joint) >= 2 and any(push.leads for push in with_joint):
+                return True
+        return False
+
+    @property
+    def _miss_text(self) -> str:
+        """A clause on the probability of missing a growth, if joints were not pushed singly."""
+        directions = {push.push.direction for push in self.pushes if push.push.direction}
+        if not directions:
+            return ""
+        probability = estimate_miss_probability(len(directions))
+        return (
+            f"; {count_nouns(len(directions), 'random direction')} of all joints miss a mode "
+            f"that grows {CLEAR_GROWTH:g} times with a probability of {probability:.0e}"
+        )
+
+    @property
+    def hides_period(self) -> bool:
+        """True if the delays repeat only after more time than the judged part of the run.
+
+        A trend over a part of the period of the delays says nothing about the whole period.
+        """
+        judged_s = self.to_s - self.from_s
+        return self.delay_period_s is not None and self.delay_period_s > judged_s
+
+    @property
+    def judged_bursts(self) -> float:
+        """Mean number of bursts of lost samples in the judged part of the run.
+
+        That of the link with the fewest bursts counts. Infinite if no link loses samples in
+        bursts.
+        """
+        if self.burst_interval_s is None:
+            return math.inf
+        return (self.to_s - self.from_s) / self.burst_interval_s
+
+    @property
+    def period_text(self) -> str:
+        """A sentence for a judged part that is shorter than the period of the delays."""
+        judged_s = self.to_s - self.from_s
+        return (
+            f"the delays repeat after {self.delay_period_s:.6g} s, but the twins were judged "
+            f"over {judged_s:.4g} s"
+        )
+
+    @property
+    def needs_s(self) -> float | None:
+        """Length that the run should have to show clearly that small pushes die away, in s.
+
+        This length gives the push that dies away most slowly the time to halve four more times
+        at its present rate. None if the pushes do not die away, or if the run is long enough
+        already.
+        """
+        worst = self.worst
+        if worst is None or not worst.rate_per_s < 0.0 or self.trend is EnvelopeTrend.DECAYS:
+            return None
+        return self.to_s + 4.0 * math.log(2.0) / -worst.rate_per_s
+
+    @property
+    def excluded_rate_per_s(self) -> float:
+        """Rate in 1/s above which no disturbance of the run can grow.
+
+        A disturbance with a larger rate would have grown by the factor `CLEAR_GROWTH` from
+        `from_s` to `to_s`, and would have been seen in the repeated runs. If not every push
+        dies away, no rate is excluded, and the value is infinite.
+        """
+        judged_s = self.to_s - self.from_s
+        dies = self.trend is EnvelopeTrend.DECAYS and judged_s > 0.0
+        return math.log(CLEAR_GROWTH) / judged_s if dies else math.inf
+
+    def to_json(self) -> dict[str, Any]:
+        """Returns how each small push of the run grows or dies away, as plain values.
+
+        They are ready for JSON.
+        """
+        pushes = [
+            {
+                "push": growth.push.name,
+                "trend": growth.trend.name.lower(),
+                "rate_per_s": finite_or_none(growth.rate_per_s),
+                "factor": finite_or_none(growth.factor),
+                "joint": growth.joint,
+                "becomes_rad_s": finite_or_none(growth.becomes_rad_s),
+                "ended_s": growth.ended_s,
+            }
+            for growth in self.pushes
+        ]
+
+        return {
+            "trend": None if self.worst is None else self.trend.name.lower(),
+            "from_s": self.from_s,
+            "to_s": self.to_s,
+            "pushes": pushes,
+            "left": None if self.departure is None else self.departure._asdict(),
+            "needs_s": self.needs_s,
+            "same_bits": self.same_platform,
+            "text": self.text,
+        }
+
+    @property
+    def text(self) -> str:
+        """A sentence for the user that says whether small pushes of the run grow or die away.
+
+        It describes the push that grows most or dies away most slowly. If the arms left a
+        position of rest by themselves, the sentence describes that motion instead. If the run
+        was not repeated with pushes, the sentence gives the reason.
+        """
+        worst = self.worst
+        departure = self.departure
+        if worst is None:
+            return f"twins: {self.why}"
+        if departure is not None:
+            span = f"from {departure.from_s:.4g} to {departure.to_s:.4g} s"
+            rate = f"{departure.rate_per_s:+.3g} /s at {departure.joint}"
+            return f"twins: {span} the run and its twins left a rest by themselves, {rate}"
+        if worst.factor == 0.0:
+            return "twins: every push died down to the rounding of the numbers"
+        if math.isnan(worst.rate_per_s):
+            return "twins: the run is too short to tell"
+
+        name = worst.push.name
+        span = f"in {self.to_s - self.from_s:.4g} s ({worst.rate_per_s:+.3g} /s)"
+        if self.trend in _FALLING:
+            slowest = f"{name}, to {worst.factor:.3g} of its size {span}"
+            return f"twins: every push dies away; the slowest, {slowest}{self._miss_text}"
+
+        change = f"x {worst.factor:.3g} {span}, most at {worst.joint}"
+        if self.trend is EnvelopeTrend.GROWS:
+            return f"twins: a push of {name} grows {change}"
+        text = f"twins: a push of {name} shows no clear trend: it changes {change}"
+        if self.needs_s is not None:
+            text += f"; a run of {self.needs_s:.3g} s would tell"
+        return text
+
+
+def measure_twins(
+    log: Log,
+    end: RunEnd,
+    count: int | None = None,
+    *,
+    own_laws: bool = False,
+) -> TwinGrowth:
+    """Repeats a recorded run with small pushes, and judges whether the pushes grow.
+
+    Each repetition with a push is called a twin.
+
+    Args:
+        log: The log of the run.
+        end: The end of the run, which states from when on the run is judged.
+        count: Number of twins. None for one push of every joint.
+        own_laws: True to run the code of control laws that are not part of this program.
+
+    Returns:
+        The growth of the pushes. If the run cannot be repeated, the result contains no pushes,
+        and the reason.
+
+    Raises:
+        LogError: A record cannot be read.
+    """
+    try:
+        twins = run_twins(log, choose_pushes(log.scenario, count), own_laws=own_laws)
+    except NotRepeatable as error:
+        return TwinGrowth(str(error).removeprefix("twins cannot be run: "))
+    return judge_twins(log.scenario, twins, end.counts_from_s, end.quiet_from_s)
+
+
+def measure_virtual_twins(
+    scenario: Scenario,
+    end: RunEnd,
+    duration_s: float,
+    count: int | None = None,
+) -> TwinGrowth:
+    """Simulates a scenario with small pushes, and judges whether the pushes grow.
+
+    This needs no log: the run and its repetitions with a push, the twins, are executed in
+    virtual time.
+
+    Args:
+        scenario: The description of the experiment.
+        end: The end of the run, which states from when on the run is judged.
+        duration_s: Length of the run, in s.
+        count: Number of twins. None for one push of every joint.
+
+    Raises:
+        ScenarioError: The scenario cannot run in virtual time.
+    """
+    twins = run_virtual_twins(scenario, choose_pushes(scenario, count), duration_s)
+    return judge_twins(scenario, twins, end.counts_from_s, end.quiet_from_s)
+
+
+def judge_twins(
+    scenario: Scenario,
+    twins: Twins,
+    counts_from_s: float,
+    quiet_from_s: float,
+) -> TwinGrowth:
+    """Judges whether the pushes in the twins of a run grow or die away.
+
+    A twin is a repetition of the run with a small push. Its difference from the run is
+    evaluated over the judged part of the run.
+
+    Args:
+        scenario: The description of the experiment.
+        twins: The twins.
+        counts_from_s: Time from which the run counts, in s. The second half of the time after
+            it is judged.
+        quiet_from_s: Time from which nobody acts on the run, and its control loop does not
+            change, in s. Departures from a rest are searched from there on.
+    """
+    t_s = twins.paths[0].t_s
+    has_motion = twins.speed.any(axis=1) | np.isfinite(twins.paths[0].largest).any(axis=1)
+    rows = np.flatnonzero(has_motion)
+    end = int(rows[-1]) if len(rows) else 0  # without the last interval, which may be one tick
+    period_s = find_varying_period_s(scenario)
+    counts_from_s = _fit_to_period(counts_from_s, float(t_s[end]), period_s)
+    first = min(int(np.searchsorted(t_s, counts_from_s)), end)
+    quiet = slice(int(np.searchsorted(t_s, quiet_from_s)), end)
+
+    joint_counts = [scenario.layout(site).joints for site in scenario.names]
+    first_joints = np.cumsum([0, *joint_counts]).tolist()
+    pushes = []
+    departures = []
+    for group, sites in enumerate(find_coupled_sites(scenario)):
+        joints: list[int] = []
+        for site in sites:
+            joints += range(first_joints[site], first_joints[site + 1])
+        amplitudes = [measure_amplitude(path, joints) for path in twins.paths]
+        for path, amplitude in zip(twins.paths, amplitudes, strict=True):
+            is_affected = np.isfinite(amplitude[first:end]).any()
+            if is_affected:
+                growth = _judge_worst_joint(
+                    path=path,
+                    amplitude=amplitude,
+                    joints=joints,
+                    part=slice(first, end),
+                    joint_names=twins.joints,
+                )
+                pushes.append(growth._replace(group=group))
+        departures += list(_find_departures(twins, amplitudes, joints, quiet))
+
+    return TwinGrowth(
+        "" if pushes else "no push moved anything",
+        from_s=0.5 * float(t_s[first] + t_s[end]),
+        to_s=float(t_s[end]),
+        pushes=tuple(pushes),
+        departure=max(departures, key=lambda departure: departure.rate_per_s, default=None),
+        same_platform=twins.same,
+        links_random=scenario.links_random,
+        delay_period_s=period_s,
+        burst_interval_s=find_burst_interval_s(scenario),
+        twins=twins,
+    )
+
+
+def find_varying_period_s(scenario: Scenario) -> float | None:
+    """Returns the period of delays that vary, in s, as it is at the end of a scenario.
+
+    Args:
+        scenario: The description of the experiment.
+
+    Returns:
+        The period, of all links and of the ticks of all sites. None if all delays are constant,
+        and if some delay never repeats.
+    """
+    links = [find_final_link(scenario, name) for name in scenario.links]
+    if all(link.to_core_model().kind == DelayKind.CONSTANT for link in links):
+        return None
+    return find_final_delay_period(scenario).true_s
+
+
+def _fit_to_period(counts_from_s: float, end_s: float, period_s: float | None) -> float:
+    """Returns a later start of the part that counts, whose second half has whole periods.
+
+    Args:
+        counts_from_s: Start of the part that counts, in s.
+        end_s: End of the part, in s.
+        period_s: Period of the delays, in s. None if they are constant or never repeat.
+    """
+    half_s = 0.5 * (end_s - counts_from_s)
+    if period_s is None or period_s > half_s:
+        return counts_from_s
+    whole_periods = math.floor(half_s / period_s)
+    return end_s - 2.0 * whole_periods * period_s
+
+
+def measure_amplitude(path: TwinPath, group: Sequence[int]) -> Array:
+    """Computes the effect of a small push on a run over time, as a logarithm.
+
+    A twin is a repetition of the run with a small push. The effect is the amplitude A of the
+    difference between twin and run, which the module's docstring defines. A push whose effect
+    died down to the rounding errors is repeated. The times between two pushes are evaluated
+    separately.
+
+    Args:
+        path: The twin's difference from its run at K times.
+        group: Indices of the joints that count.
+
+    Returns:
+        log A, shape (K,), with A in rad/s. It is -inf where the difference is zero. It is never
+        less than the logarithm of the largest velocity difference of a joint.
+    """
+    amplitude: Array = path.largest[:, group].max(axis=1)
+    leg_ends = [*path.pushed[1:], len(amplitude)]
+    for leg in map(slice, path.pushed, leg_ends):
+        if leg.stop - leg.start > 2:  # too short for a derivative otherwise
+            largest = amplitude[leg]
+            whole = _measure_leg(path.last[leg][:, group], path.scale[leg], largest)
+            larger = np.maximum(whole, largest)
+            amplitude[leg] = np.where(np.isfinite(whole), larger, largest)
+    return amplitude
+
+
+def _measure_leg(last: Array, scale: Array, largest: Array) -> Array:
+    """Returns log A of the differences between two pushes, as the module's docstring defines A.
+
+    Twins store their differences scaled, because these may become too small or too large for
+    floating-point numbers. Therefore the differences are first scaled by their largest value.
+
+    Args:
+        last: Scaled differences of the joints, shape (K, n).
+        scale: Logarithm of the scale of each row, shape (K,).
+        largest: Logarithm of the largest difference of a joint, shape (K,).
+
+    Returns:
+        log A, shape (K,). Not finite where the difference is zero or unknown.
+    """
+    with np.errstate(
+        divide="ignore",
+        invalid="ignore",
+        over="ignore",
+        under="ignore",
+    ):
+        is_finite = np.isfinite(largest)
+        peak = np.max(largest, where=is_finite, initial=-np.inf)
+        d = last * np.exp(scale - peak)[:, np.newaxis]
+        d_rate = np.gradient(d, 1.0 / BUCKETS_PER_S, axis=0)
+
+        # w is the ratio of d' to d over the whole leg. Each row is divided by the local size
+        # of the difference, so that the rows where the difference is large do not dominate.
+        size = np.exp(2.0 * (_running_maximum(largest) - peak))
+        is_weighted = np.isfinite(largest) & (size > 0.0)
+        weights = np.where(is_weighted, 1.0 / size, 0.0)[:, np.newaxis]
+        w_squared = float((weights * d_rate**2).sum() / (weights * d**2).sum())
+
+        squares = (d**2 + d_rate**2 / w_squared).sum(axis=1)
+        log_amplitude: Array = np.log(squares) / 2.0 + peak
+    return log_amplitude
+
+
+def _running_maximum(values: Array) -> Array:
+    """Returns the maximum over half a second before and after each value, shape (K,)."""
+    padded = np.pad(values, BUCKETS_PER_S // 2, constant_values=-np.inf)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, BUCKETS_PER_S + 1)
+    maximum: Array = windows.max(axis=1)
+    return maximum
+
+
+def _fit_trend(t_s: Array, amplitude: Array) -> EnvelopeFit:
+    """Returns the trend of an amplitude.
+
+    Args:
+        t_s: Times, shape (K,), in s.
+        amplitude: Logarithm of the amplitude, shape (K,). Values that are not finite are
+            treated as an amplitude of zero.
+
+    Returns:
+        The trend. Undecided with fewer than two finite values.
+    """
+    known = np.isfinite(amplitude)
+    if known.sum() < 2:
+        return EnvelopeFit(EnvelopeTrend.UNDECIDED, float("nan"))
+    scaled = np.exp(np.where(known, amplitude, -np.inf) - amplitude[known].max())
+    return fit_envelopes(t_s, scaled[:, np.newaxis], _AMPLITUDE_FLOOR, falls_first=True)[0]
+
+
+def _judge_push(
+    path: TwinPath,
+    amplitude: Array,
+    joints: Sequence[int],
+    part: slice,
+    joint_names: Sequence[str],
+) -> PushGrowth:
+    """Returns how a push developed. The group is set by the caller.
+
+    A push that died down to the rounding errors was repeated. It is judged from its last
+    repetition on, if that is long enough ago.
+
+    Args:
+        path: The twin's difference from its run.
+        amplitude: Logarithm of the amplitude of the difference, shape (K,).
+        joints: Indices of the joints that count.
+        part: Rows of the judged part, and of the part before it.
+        joint_names: Names of all joints.
+    """
+    t_s = path.t_s
+    first = part.start
+    end = part.stop
+    if not path.push.again:  # a push that is not repeated may have died, or left its limits
+        end = min(end, int(np.flatnonzero(np.isfinite(amplitude))[-1]) + 1)
+    leg_edges = [row for row in path.pushed if row < end]
+    last_push = leg_edges[-1]
+    last_second = slice(max(first, end - BUCKETS_PER_S), end)
+    largest = path.largest[last_second, joints].max(axis=0)
+    start = max(first, last_push)
+    fit = _fit_trend(t_s[start:end], amplitude[start:end])
+    growth = PushGrowth(
+        push=path.push,
+        trend=fit.trend,
+        rate_per_s=fit.rate_per_s,
+        factor=0.0,
+        joint=joint_names[joints[int(largest.argmax())]],
+        group=0,
+        becomes_rad_s=_exp(float(largest.max())),
+    )
+
+    ended_early = path.died is not None or end < part.stop - BUCKETS_PER_S
+    if ended_early:
+        trend = EnvelopeTrend.GROWS if path.died is None else EnvelopeTrend.DECAYS
+        return growth._replace(trend=trend, ended_s=float(t_s[end - 1]))
+
+    died_in_judged_part = len(leg_edges) > 1 and last_push > (first + end) // 2
+    is_too_recent = end - last_push < (end - first) // 4
+    if died_in_judged_part and (fit.trend is not EnvelopeTrend.GROWS or is_too_recent):
+        # The leg since the last repetition is too short to show the rate. Therefore the rate is
+        # that of the leg before, at the end of which the push had died.
+        before = slice(leg_edges[-2], last_push)
+        rate_per_s = _fit_trend(t_s[before], amplitude[before]).rate_per_s
+        return growth._replace(trend=EnvelopeTrend.DECAYS, rate_per_s=rate_per_s)
+
+    half_s = 0.5 * float(t_s[end - 1] - t_s[start])
+    return growth._replace(factor=_exp(fit.rate_per_s * half_s))
+
+
+def _judge_worst_joint(
+    path: TwinPath,
+    amplitude: Array,
+    joints: Sequence[int],
+    part: slice,
+    joint_names: Sequence[str],
+) -> PushGrowth:
+    """Returns how a push developed, at all joints of a group or at the worst of them.
+
+    A slow growth at one joint does not show in the amplitude of the group while a faster joint
+    still decays from a larger amplitude. Therefore each joint is judged by itself, too.
+
+    Args:
+        path: The twin's difference from its run.
+        amplitude: Logarithm of the amplitude of the difference of all joints, shape (K,).
+        joints: Indices of the joints that count.
+        part: Rows of the judged part, and of the part before it.
+        joint_names: Names of all joints.
+    """
+    worst = _judge_push(path, amplitude, joints, part, joint_names)
+    leading_joint = worst.joint
+    if len(joints) == 1 or worst.ended_s is not None:
+        return worst
+    for joint in joints:
+        joint_amplitude = measure_amplitude(path, [joint])
+        actual = joint_amplitude - path.scale
+        joint_amplitude[actual < math.log(SMALLEST)] = -np.inf
+        last_second = joint_amplitude[max(part.start, part.stop - BUCKETS_PER_S) : part.stop]
+        has_died = not np.isfinite(last_second).any()
+        if has_died:
+            continue
+        growth = _judge_push(path, joint_amplitude, [joint], part, joint_names)
+        stays = growth.trend in (EnvelopeTrend.STEADY, EnvelopeTrend.GROWS)
+        if stays and _rank_badness(growth) > _rank_badness(worst):
+            leads = growth.joint == leading_joint
+            worst = growth._replace(leads=leads)
+    return worst
+
+
+def _rank_badness(growth: PushGrowth) -> tuple[int, float]:
+    """Returns a key that orders pushes from the fastest decay to the fastest growth."""
+    return _TRENDS_FROM_BEST.index(growth.trend), growth.rate_per_s
+
+
+def _exp(logarithm: float) -> float:
+    """Returns the exponential of a number, or infinity if it would overflow."""
+    return math.exp(logarithm) if not logarithm > MOST_LOG else math.inf
+
+
+def _find_departures(
+    twins: Twins,
+    amplitudes: Sequence[Array],
+    joints: Sequence[int],
+    quiet: slice,
+) -> Iterator[RestDeparture]:
+    """Yields the stretches of time in which a run departs from a rest by itself.
+
+    The speed of the run and the differences from at least half of its twins must grow. Windows
+    of several lengths are tried, from the whole quiet part to a quarter of it. The second half
+    of each window is judged.
+
+    Args:
+        twins: The run and its twins.
+        amplitudes: Logarithm of the amplitude of each twin's difference, shape (K,) each.
+        joints: Indices of the joints that count.
+        quiet: Rows in which nobody acts on the run.
+    """
+    t_s = twins.paths[0].t_s
+    with np.errstate(divide="ignore"):
+        log_speed = np.log(twins.speed[:, joints].max(axis=1))
+    length = quiet.stop - quiet.start
+    for divisor in (2, 4, 8):
+        half = length // divisor
+        if half < LEAST_LEFT_S * BUCKETS_PER_S:
+            return
+        # Consecutive windows overlap by three quarters.
+        for start in range(quiet.start, quiet.stop - 2 * half + 1, max(1, half // 2)):
+            rows = slice(start, start + 2 * half)
+            run_fit = _fit_trend(t_s[rows], log_speed[rows])
+            if run_fit.trend is not EnvelopeTrend.GROWS:
+                continue
+            if run_fit.rate_per_s * half < math.log(DOUBLES) * BUCKETS_PER_S:
+                continue  # the speed does not double within the half
+            twin_fits = [_fit_trend(t_s[rows], amplitude[rows]) for amplitude in amplitudes]
+            growing = sum(fit.trend is EnvelopeTrend.GROWS for fit in twin_fits)
+            if 2 * growing >= len(twin_fits):
+                last_second = slice(rows.stop - BUCKETS_PER_S, rows.stop)
+                speed = twins.speed[last_second, joints].max(axis=0)
+                yield RestDeparture(
+                    from_s=float(t_s[start + half]),
+                    to_s=float(t_s[rows.stop - 1]),
+                    rate_per_s=run_fit.rate_per_s,
+                    joint=twins.joints[joints[int(speed.argmax())]],
+                )
+
+
+class LinearSizes(NamedTuple):
+    """The range of sizes for which the effect of a push is proportional to its size.
+
+    A push is a small disturbance in a repetition of the run. Its size is in rad, in rad/s or in
+    the unit of a parameter estimate, depending on what is pushed.
+
+    Attributes:
+        smallest: The smallest size of the push in this range.
+        largest: The largest size of the push in this range.
+        text: A sentence on this range, and on the effect of a larger push.
+    """
+
+    smallest: float
+    largest: float
+    text: str
+
+
+@dataclass(frozen=True, repr=False)
+class PushedTwins(Result):
+    """Result of `trilat twin`: how pushes at a given time of a recorded run develop.
+
+    A push is a small disturbance in a repetition of the run, called a twin.
+
+    Attributes:
+        log: The log of the run.
+        at_s: Time of the pushes, in s.
+        growth: Growth of the pushes.
+        linear: Range of sizes for which the effect of a push is proportional to its size. None
+            if the user did not ask for several sizes.
+    """
+
+    log: Log
+    at_s: float
+    growth: TwinGrowth
+    linear: LinearSizes | None = None
+
+    def describe(self, pushed: PushGrowth) -> str:
+        """Returns a sentence for the user on whether the effect of a push grows or dies away.
+
+        Args:
+            pushed: The push and its effect.
+        """
+        rate = "" if math.isnan(pushed.rate_per_s) else f" ({pushed.rate_per_s:+.3g} /s)"
+        push = f"a push of {pushed.push.name} at {self.at_s:.4g} s"
+        to_s = self.growth.to_s
+        if pushed.ended_s is not None:
+            outcome = "makes the run diverge"
+            if pushed.trend is EnvelopeTrend.DECAYS:
+                outcome = "dies down to the rounding of the numbers"
+            return f"{push} {outcome} in {pushed.ended_s - self.at_s:.3g} s{rate}"
+        if pushed.trend is EnvelopeTrend.GROWS:
+            growth = f"grows x {pushed.factor:.3g} in {to_s - self.growth.from_s:.4g} s"
+            return f"{push} {growth}{rate}, most at {pushed.joint}"
+        outcome = f"becomes {pushed.becomes_rad_s:.3g} rad/s in {to_s - self.at_s:.4g} s{rate}"
+        text = f"{push} {outcome}, most at {pushed.joint}"
+        return text if pushed.trend in _FALLING else f"{text}; it shows no clear trend"
+
+    def headline(self) -> str:
+        """Returns a sentence for the user on how the pushes develop.
+
+        It describes the worst push, which grows most or dies away most slowly. If the user
+        asked for pushes of several sizes, it says instead for which sizes the effect is
+        proportional to the size.
+        """
+        if self.linear:
+            return self.linear.text
+        worst = self.growth.worst
+        return self.describe(worst) if worst else self.growth.text
+
+    def to_rows(self) -> list[dict[str, Any]]:
+        """Returns a row for each push: what was pushed, and how its effect develops.
+
+        A push is a small disturbance in a repetition of the run. The keys are those of an entry
+        of `pushes` in `trilat twin --json`.
+        """
+        rows = self.growth.to_json()["pushes"]
+        return [
+            {**row, "text": self.describe(push)}
+            for row, push in zip(rows, self.growth.pushes, strict=True)
+        ]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns the pushes and how they develop as plain values, ready for JSON.
+
+        The keys are those of `trilat twin --json`.
+        """
+        growth = self.growth.to_json()
+        return {
+            "log": self.log.source,
+            "at_s": self.at_s,
+            "from_s": growth["from_s"],
+            "to_s": growth["to_s"],
+            "same_bits": growth["same_bits"],
+            "pushes": self.to_rows(),
+            "linear": self.linear and self.linear._asdict(),
+            "text": self.headline(),
+        }
+
+
+def twin(
+    log: str | Path | Log,
+    at_s: float = 0.0,
+    push: Mapping[str, float] | Sequence[str] = (),
+    delta: str = "",
+) -> PushedTwins:
+    """Repeats a recorded run with small pushes at a given time, as `trilat twin` does.
+
+    A twin is a repeated run in which one quantity was changed by a small amount, the push. The
+    result shows how the difference between each twin and the run develops.
+
+    >>> found = tn.twin(tn.simulate("two_sites", duration_s=4), at_s=1, push={"m.q1": 1e-6})
+    >>> found.growth.pushes[0].rate_per_s < 0.0
+    True
+
+    Args:
+        log: The log, or its path.
+        at_s: Time of the pushes, in s.
+        push: Sizes by target, with one twin per push. A target is a joint's angle,
+            `{"m1.q1": 1e-6}`, its speed, `m1.qd1`, an estimate, `m1.theta1`, or many of them
+            in a random direction, `m1.q` or `q`. By default the pushes are those of `certify`,
+            and at 0 s their growth is judged as it judges them.
+        delta: Sizes of a single push, as in "1e-9:1e-3", with one twin per decade.
+
+    Raises:
+        UsageError: There is no such target, time or range.
+        LogError: The log cannot be read, or cannot be executed again.
+        CodeWithheld: The code of a law of the log may not be executed.
+    """
+    log = log if isinstance(log, Log) else open_log(log)
+    scenario = log.scenario
+    targets = list(push.items()) if isinstance(push, Mapping) else [*map(_parse_push, push)]
+    end_s = max(len(log[site]) / log[site].rate_hz for site in log.sites)
+    if not 0.0 <= at_s < end_s and end_s > 0.0:
+        raise UsageError(
+            f"--at {at_s:g}: a push is within the run, from 0 s until before {end_s:g} s"
+        )
+    if delta and len(targets) > 1:
+        names = ", ".join(target for target, _ in targets)
+        raise UsageError(f"--delta sweeps the size of one push, not of {names}")
+
+    # Without options the twins are those of a certificate, and so is the part that is judged.
+    is_of_certificate = not targets and not delta and at_s == 0.0
+    counts_from_s = at_s
+    quiet_from_s = math.inf
+    sizes = []
+    if delta:
+        target, _ = next(iter(targets), ("q", 0.0))
+        sizes = _parse_sizes(delta)
+        pushes = [
+            parse_push(scenario, target, size, at_s)._replace(largest=math.inf)
+            for size in sizes
+        ]
+    elif targets:
+        pushes = [parse_push(scenario, target, size, at_s) for target, size in targets]
+    elif is_of_certificate:
+        pushes = choose_pushes(scenario)
+        end = classify_log_end(log)
+        counts_from_s = end.counts_from_s
+        quiet_from_s = end.quiet_from_s
+    else:
+        pushes = [
+            default._replace(at_s=at_s, again=False) for default in choose_pushes(scenario)
+        ]
+    twins = run_twins(log, pushes, own_laws=True)
+    growth = judge_twins(scenario, twins, counts_from_s, quiet_from_s)
+    linear = _find_linear_sizes(scenario, growth, sizes) if delta else None
+    return PushedTwins(log, at_s, growth, linear)
+
+
+def _parse_push(text: str) -> tuple[str, float]:
+    """Parses a push such as "m1.q1=1e-6".
+
+    Returns:
+        The target and the size. The size may be missing and then has a default value.
+
+    Raises:
+        UsageError: The size is not a number.
+    """
+    target, has_size, size = text.partition("=")
+    try:
+        return target.strip(), float(size) if has_size else PUSH_RAD
+    except ValueError:
+        raise UsageError(
+            f"--push {text}: its size is a number, as in m1.q1=1e-6, not {size!r}"
+        ) from None
+
+
+def _parse_sizes(text: str) -> list[float]:
+    """Parses a range of push sizes such as "1e-9:1e-3".
+
+    Returns:
+        The sizes from the lower to the upper end of the range, each ten times the one before.
+
+    Raises:
+        UsageError: The text is no range, or the range is too short or too large.
+    """
+    try:
+        low, high = map(float, text.split(":"))
+    except ValueError:
+        low = high = math.nan
+    if not LEAST_PUSH <= low < high / 9.99 <= MOST_PUSH / 9.99:
+        allowed = f"from {LEAST_PUSH:g} to {MOST_PUSH:g}, a decade apart or more"
+        raise UsageError(f"--delta is two sizes {allowed}, as in 1e-9:1e-3, not {text!r}")
+    decades = math.floor(math.log10(high / low) + 1e-3)
+    return [float(f"{low * 10.0**n:.6g}") for n in range(decades + 1)]
+
+
+def _find_linear_sizes(
+    scenario: Scenario,
+    growth: TwinGrowth,
+    sizes: Sequence[float],
+) -> LinearSizes:
+    """Finds the sizes of a push up to which its effect is proportional to its size.
+
+    Two pushes of neighbouring sizes are compared at all times. Their effect is proportional if
+    the ratio of their amplitudes differs from the ratio of their sizes by at most 10 %.
+
+    Args:
+        scenario: Scenario of the run.
+        growth: Growth of the pushes, whose twins are in the order of the sizes.
+        sizes: Increasing sizes of the push.
+    """
+    assert growth.twins is not None
+    paths = growth.twins.paths
+    all_joints = range(len(growth.twins.joints))
+    envelopes = [_running_maximum(measure_amplitude(path, all_joints)) for path in paths]
+    unit = paths[0].push.name.partition(" ")[2]
+    largest_linear = sizes[-1]
+    beyond = ""
+    for n, (smaller, larger) in enumerate(pairwise(envelopes)):
+        log_scale = np.full(len(larger), math.log(sizes[n + 1] / sizes[n]))
+        # Rounding errors decide on amplitudes below this limit: they count as proportional.
+        known = (smaller > math.log(10.0 * SMALLEST)) & np.isfinite(larger)
+        log_ratio = np.subtract(larger, smaller, out=log_scale.copy(), where=known)
+        deviation = log_ratio - log_scale
+        row = int(np.abs(deviation).argmax())
+        if abs(deviation[row]) > SAME_SCALED:
+            largest_linear = sizes[n]
+            grows = any(
+                push.trend is EnvelopeTrend.GROWS and push.push is paths[n].push
+                for push in growth.pushes
+            )
+            outcome = "goes another way"
+            if grows and deviation[row] < 0.0:
+                outcome = "saturates"
+            if _has_wall(scenario):
+                outcome += " (there is a wall)"
+            ratio = _exp(float(deviation[row]))
+            times = f"x {ratio:.3g} of that at {paths[0].t_s[row]:.4g} s"
+            beyond = f"; a push of {sizes[n + 1]:g} {outcome}: {times}"
+            break
+
+    text = f"not linear, from {largest_linear:g} {unit} on"
+    if largest_linear > sizes[0]:
+        text = f"linear from {sizes[0]:g} to {largest_linear:g} {unit}"
+    return LinearSizes(sizes[0], largest_linear, text + beyond)
+
+
+def _has_wall(scenario: Scenario) -> bool:
+    """Returns True if a wall stands at some site, whose contact makes the run nonlinear."""
+    for site in scenario.sites.values():
+        for environment in site.environment:
+            if environment.actor.kind == TorqueKind.WALL:
+                return True
+    return False

@@ -1,0 +1,1 @@
+"""What people start: the command line, the Python interface, demo, doctor and player."""

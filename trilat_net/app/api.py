@@ -1,0 +1,602 @@
+"""The Python interface: one function for each command that needs no network.
+
+A scenario describes an experiment. It may be the name of a shipped scenario, the path of a TOML
+file, a TOML text, its tables, or a `Scenario`. A log is the record of a run. It may be the path
+of an MCAP file, or a `Log`. Functions that need a network are in the package `sites`.
+
+Invariant:
+    - These functions only convert their arguments, and call the packages that do the work.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..analysis.certificate.stability_certificate import Certificate
+from ..analysis.metrics.log_metrics import LogMetrics, compute_log_metrics
+from ..errors import UsageError
+from ..execution.log_checks import LogCheckReport, run_log_checks
+from ..execution.virtual import SimulatedLog, simulate_scenario
+from ..files import make_results_folder
+from ..log.accounting import MIN_COVERAGE
+from ..log.log_reader import Log, open_log, open_logs
+from ..scenario import Scenario, load_scenario
+
+if TYPE_CHECKING:
+    from ..analysis.theory.linear_analysis import LinearAnalysis
+    from ..presentation.conclude import Conclusion
+    from ..studies.bench import BenchResults
+    from ..studies.sweep.margin_search import SweepMargins
+    from ..studies.sweep.sweep_results import SweepResults
+    from ..studies.tuning.tuning_plan import TuningResult
+    from ..work.executor import Workers
+
+AnyScenario = str | Path | Mapping[str, Any] | Scenario
+AnyLog = str | Path | Log
+Overrides = Mapping[str, Any] | Sequence[str]
+Axes = str | Sequence[str] | Mapping[str, Any]
+
+
+def _open(log: AnyLog) -> Log:
+    """Opens a log unless it is open already, and returns it."""
+    return log if isinstance(log, Log) else open_log(log)
+
+
+def _list_override_texts(overrides: Overrides, duration_s: float | None) -> list[str]:
+    """Returns overrides as texts KEY=VALUE, as the command line has them.
+
+    Args:
+        overrides: Overrides by key, or a text or texts KEY=VALUE.
+        duration_s: Duration of the run in s, which becomes the last override. None adds none.
+    """
+    from ..studies.trials import list_assignments
+
+    texts: list[Any]
+    if isinstance(overrides, Mapping):
+        texts = list(list_assignments(overrides))
+    elif isinstance(overrides, list | tuple):
+        texts = list(overrides)
+    else:
+        texts = [overrides]
+    if duration_s is not None:
+        texts.append(f"duration_s={duration_s}")
+    return texts
+
+
+def simulate(
+    scenario: AnyScenario,
+    set: Overrides = (),  # noqa: A002 - the command's --set, by its name
+    *,
+    duration_s: float | None = None,
+    seed: int | None = None,
+) -> SimulatedLog:
+    """Runs a scenario in virtual time and returns its log; the command is `trilat sim`.
+
+    In virtual time, one process computes all arms and the network, as fast as possible. The
+    function warns if the run diverged. The time of divergence is then in `log.diverged_s`.
+
+    >>> log = tn.simulate("two_sites", duration_s=0.1)
+    >>> log["m"].q.shape
+    (100, 2)
+
+    Args:
+        scenario: The scenario, which describes the experiment: the name of a shipped scenario,
+            a path, a TOML text, its tables, or a `Scenario`.
+        set: Settings that replace those of the scenario ("overrides"), as in
+            `{"control.Kd": 5}` or `["control.Kd=5"]`.
+        duration_s: Duration of the run, in s. By default that of the scenario.
+        seed: Seed of the random delays and losses of messages. By default that of the scenario.
+
+    Returns:
+        The log, which contains one record per control period and site.
+
+    Raises:
+        ScenarioError: The scenario or an override is not valid.
+    """
+    log = simulate_scenario(load_scenario(scenario, set, duration_s=duration_s, seed=seed))
+    log.warn_if_diverged()
+    return log
+
+
+def export(
+    log: AnyLog | Sequence[AnyLog],
+    to: str,
+    out: str | Path,
+    *,
+    force: bool = False,
+    **settings: Any,
+) -> Path:
+    """Exports a log to files that other tools can read, and returns their path.
+
+    The command is `trilat log export`.
+
+    >>> tn.export(tn.simulate("two_sites", duration_s=0.1), "npz", "run.npz").name
+    'run.npz'
+
+    Args:
+        log: The log, or its path. For lerobot also several logs, or a folder of logs.
+        to: Format: ros2, parquet, csv, npz, mat or lerobot.
+        out: Path of the file, or of the folder for parquet, csv and lerobot.
+        force: True to replace an existing file or folder.
+        settings: Settings of the format, as `fps=30`, `program="m2"` and `actions="tip"` of
+            lerobot.
+
+    Raises:
+        UsageError: There is no such format or setting, a package is missing, or the path
+            exists.
+    """
+    from ..presentation.export import Exporter
+
+    exporter = Exporter(to, Path(out), force=force, settings=settings)
+    all_logs = [log] if isinstance(log, str | Path | Log) else log
+    opened = [entry for entry in all_logs if isinstance(entry, Log)]
+    paths = [entry for entry in all_logs if not isinstance(entry, Log)]
+    exporter.export(*opened, *open_logs(*paths))
+    return Path(out)
+
+
+def verify(
+    log: AnyLog,
+    *,
+    virtual: bool = False,
+    min_coverage: float = MIN_COVERAGE,
+    resume_every: int = 0,
+) -> LogCheckReport:
+    """Executes a run again from its log, and compares all computed numbers bit for bit.
+
+    The command is `trilat verify`.
+
+    >>> tn.verify(tn.simulate("two_sites", duration_s=0.1)).passed
+    True
+
+    Args:
+        log: The log, or its path.
+        virtual: True to compare the log also with a run in virtual time, in which one process
+            computes all arms and the network.
+        min_coverage: Smallest fraction of the ticks (control periods) of each site that must be
+            compared for the check to pass.
+        resume_every: Number of ticks after which the state of each site is restored from the
+            log, again and again. This reveals state of a user's control law that the log lacks.
+            0 never restores.
+
+    Returns:
+        The result of the comparison. Its property `passed` is True if all numbers are equal, if
+        enough ticks were compared, and if the log is unchanged since it was written.
+
+    Raises:
+        LogError: The log cannot be read.
+    """
+    return run_log_checks(
+        _open(log), virtual=virtual, min_coverage=min_coverage, resume_every=resume_every
+    )
+
+
+def certify(
+    log: AnyLog,
+    *,
+    min_coverage: float = MIN_COVERAGE,
+    own_laws: bool = False,
+    twins: int | None = None,
+) -> Certificate:
+    """Judges if a recorded run is stable; the command is `trilat certify`.
+
+    The judgement is "stable", "not stable", or "open" if neither can be shown.
+
+    >>> print(tn.certify(tn.simulate("free")).stability)
+    stable
+
+    Args:
+        log: The log, or its path.
+        min_coverage: Smallest fraction of the ticks (control periods) of each site that must be
+            judged, so that the run can be called stable.
+        own_laws: True if the code of a user's control laws may be executed. It is needed to
+            check the energies that a law reports, and to repeat the run.
+        twins: Number of repetitions of the run with a small disturbance ("twins"). They show
+            whether disturbances grow.
+
+    Returns:
+        The judgement with its reasons.
+
+    Raises:
+        LogError: The log cannot be read.
+    """
+    from ..analysis.judge import certify_run
+
+    return certify_run(_open(log), min_coverage=min_coverage, own_laws=own_laws, twins=twins)
+
+
+def metrics(log: AnyLog) -> LogMetrics:
+    """Measures the tracking, effort, energies, force sharing and network of a run.
+
+    The command is `trilat metrics`. docs/metrics.md has the formula of every metric.
+
+    >>> found = tn.metrics(tn.simulate("two_sites", duration_s=0.1))
+    >>> found.sites["m"]["rms_error_rad"].value > 0.0
+    True
+
+    Args:
+        log: The log, or its path.
+
+    Returns:
+        The metrics of the run, of each site and of each link, with their units.
+
+    Raises:
+        LogError: The log cannot be read.
+    """
+    return compute_log_metrics(_open(log))
+
+
+def report(
+    log: AnyLog, out: str | Path | None = None, *, force: bool = False, png: bool = False
+) -> "Conclusion":
+    """Writes a report of a log, with figures and a summary; the command is `trilat report`.
+
+    >>> path = tn.simulate("two_sites", duration_s=0.1).save("run.mcap")
+    >>> tn.report(path, "report").passed
+    True
+
+    Args:
+        log: Path of the log, or a log that was opened from a file.
+        out: Folder of the report. By default the name of the file without .mcap.
+        force: True to use a folder that is not empty.
+        png: True to write every figure as a PNG file too.
+
+    Returns:
+        The conclusion of the report: the checks of the log, the judgement whether the run was
+        stable, and the paths of the files.
+
+    Raises:
+        UsageError: The folder is not empty, or the log is not in a file.
+    """
+    from ..presentation.conclude import conclude
+
+    opened = _open(log)
+    first = Path(opened.sources[0])
+    if not first.is_file():
+        raise UsageError(
+            "a report needs a log in a file: save the log first, as in log.save('run.mcap')"
+        )
+    folder = first.with_suffix("") if out is None else Path(out)
+    return conclude(opened, make_results_folder(folder, "", force=force), png=png)
+
+
+def linear(
+    scenario: AnyScenario | Log,
+    set: Overrides = (),  # noqa: A002 - the command's --set, by its name
+    *,
+    pose: Sequence[float] | None = None,
+    roots: int = 6,
+    over: Sequence[str] = (),
+    ports: bool = True,
+    operators: Sequence[str | Path] = (),
+) -> "LinearAnalysis":
+    """Linearises the closed loop of all arms about its equilibrium, and analyses it.
+
+    The analysis has the characteristic roots, the margins to instability, and the passivity and
+    impedances that operators feel. The command is `trilat linear`.
+
+    >>> tn.linear("p_d_margin", {"control.d": 0.9}, ports=False).verdict
+    'unstable'
+
+    Args:
+        scenario: The scenario, which describes the experiment: the name of a shipped scenario,
+            a path, a TOML text, its tables, or a `Scenario`. Or a log, whose loop is analysed
+            as it was at the end of its run, after all commands.
+        set: Settings that replace those of the scenario, as in `{"control.d": 0.9}`.
+        pose: Joint angles of all sites, in rad. By default those at the end of a run.
+        roots: Number of characteristic roots, the exponents of the loop's motions, that are
+            computed.
+        over: Ranges of settings in which edges of stability (values at which the stability
+            changes) are searched, as in `["control.d=0.1:3"]`.
+        ports: True to analyse passivity and the impedances that operators feel.
+        operators: Files of measured operators, from `trilat identify hand --json`.
+
+    Returns:
+        The analysis, with its verdict.
+
+    Raises:
+        ScenarioError: The scenario is not valid, or has no linear loop.
+        UsageError: Another argument is not valid.
+    """
+    from ..analysis.theory.linear_analysis import analyse_linear_loop
+    from ..studies.hand_impedance import read_hands
+
+    try:
+        angles = None if pose is None else tuple(map(float, pose))
+    except (TypeError, ValueError):
+        raise UsageError(
+            f"a pose must consist of angles in rad, as in (0.1, 0.3), but is {pose!r}"
+        ) from None
+    source: Scenario | Log = load_scenario(scenario, set)
+    if isinstance(scenario, Log) and not set:
+        source = scenario
+    return analyse_linear_loop(
+        source,
+        pose=angles,
+        roots=roots,
+        over=over,
+        ports=ports,
+        hands=read_hands(operators),
+    )
+
+
+def sweep(
+    scenario: AnyScenario,
+    over: Axes = (),
+    set: Overrides = (),  # noqa: A002 - the command's --set, by its name
+    *,
+    seeds: int | Sequence[int] = 1,
+    laws: Sequence[str | type] = (),
+    duration_s: float | None = None,
+    longest_s: float | None = None,
+    judge: str = "verdict",
+    metrics: Sequence[str] = (),
+    out: str | Path | None = None,
+    jobs: int | None = None,
+    on: "Workers" = None,
+) -> "SweepResults":
+    """Runs a scenario over a grid of values of its keys, and judges the stability of each.
+
+    The command is `trilat sweep`.
+
+    >>> axes = {"control.d": [0.3, 3.0]}
+    >>> found = tn.sweep("p_d_margin", axes, duration_s=2, out="grid", jobs=1)
+    >>> len(found.rows)
+    2
+
+    Args:
+        scenario: The scenario, which describes the experiment: the name of a shipped scenario,
+            a path, a TOML text, its tables, or a `Scenario`.
+        over: Axes of the grid: lists or arrays of values by key, as in
+            `{"link.delay_ms": range(0, 1601, 50)}`, or texts, as in
+            `["link.delay_ms=0:1600:50"]`.
+        set: Settings that replace those of the scenario in all cells of the grid, as in
+            `{"control.Kd": 5}`.
+        seeds: Number of seeds of random delays and losses, or the seeds. Each cell, a point of
+            the grid, has one run per seed.
+        laws: Names or classes of control laws, which are a further axis of the grid.
+        duration_s: First duration of the runs of a cell, in s.
+        longest_s: Longest duration of the runs of a cell whose stability is still open, in s.
+            By default eight times `duration_s`, or `duration_s` if `judge` is "twins".
+        judge: "verdict" or "twins". Twins are two runs that differ by a small disturbance. With
+            "twins", the exponent with which the disturbance grows is measured in each cell, in
+            addition to its verdict.
+        metrics: Keys of docs/metrics.md that are measured in each run. They become columns of
+            the rows.
+        out: Folder of the results. A sweep in it is continued. By default the next free
+            runs/sweep-NAME-N.
+        jobs: Number of processes. None uses one per core.
+        on: Address of a Dask scheduler, or an executor, that executes the runs instead.
+
+    Returns:
+        The verdict and the metrics of each cell.
+
+    Raises:
+        ScenarioError: The scenario, an axis or one of its values is not valid.
+        UsageError: The folder contains something else.
+    """
+    from ..studies.sweep import plan_sweep, prepare_sweep_folder, run_sweep
+
+    plan = plan_sweep(
+        scenario,
+        _list_override_texts(set, duration_s),
+        over=over,
+        seeds=seeds,
+        laws=laws,
+        longest_s=longest_s,
+        judge=judge,
+        metrics=metrics,
+    )
+    folder = prepare_sweep_folder(plan, None if out is None else Path(out))
+    return run_sweep(folder, jobs, on=on).results
+
+
+def margin(
+    scenario: AnyScenario,
+    along: str,
+    over: Axes = (),
+    set: Overrides = (),  # noqa: A002 - the command's --set, by its name
+    *,
+    tolerance: float = 0.005,
+    seeds: int | Sequence[int] = 1,
+    laws: Sequence[str | type] = (),
+    duration_s: float | None = None,
+    jobs: int | None = None,
+    on: "Workers" = None,
+) -> "SweepMargins":
+    """Searches the edge of stability along a key; the command is `trilat sweep --margin`.
+
+    The edge is the value of the key at which runs change from stable to not stable.
+
+    >>> found = tn.margin("p_d_margin", "control.d=0.2:3", tolerance=0.2, duration_s=4, jobs=1)
+    >>> [search.margin.spans[0].stable_below for search in found.found]
+    [False]
+
+    Args:
+        scenario: The scenario, which describes the experiment: the name of a shipped scenario,
+            a path, a TOML text, its tables, or a `Scenario`.
+        along: The key and its range, as in "control.d=0.2:3".
+        over: Axes of a grid at whose points the edge is searched, as in `sweep`:
+            `{"link.delay_ms": [100, 200]}`.
+        set: Settings that replace those of the scenario in all runs.
+        tolerance: Largest width of the interval that contains an edge, relative to its value.
+        seeds: Number of seeds of random delays and losses, or the seeds.
+        laws: Names or classes of control laws, which are a further axis of the grid.
+        duration_s: First duration of a run, in s.
+        jobs: Number of processes. None uses one per core.
+        on: Address of a Dask scheduler, or an executor, that executes the runs instead.
+
+    Returns:
+        For each point of the grid, the intervals of the key that contain an edge.
+
+    Raises:
+        ScenarioError: The scenario or one of the values is not valid.
+        UsageError: The range is not of the form KEY=LOW:HIGH.
+    """
+    from ..studies.sweep import plan_sweep
+    from ..studies.sweep.margin_search import (
+        SweepMargins,
+        format_range_axis,
+        parse_search_range,
+        search_margins,
+    )
+    from ..studies.sweep.sweep_plan import list_axes
+
+    search_range = parse_search_range(along, tolerance)
+    axes = [*list_axes(over), format_range_axis(search_range)]
+    overrides = _list_override_texts(set, duration_s)
+    plan = plan_sweep(scenario, overrides, over=axes, seeds=seeds, laws=laws)
+    edges = search_margins(plan, search_range, jobs, on=on)
+    return SweepMargins(plan, search_range, edges)
+
+
+def tune(
+    scenario: AnyScenario,
+    laws: Sequence[str | type] = (),
+    set: Overrides = (),  # noqa: A002 - the command's --set, by its name
+    *,
+    budget: int = 64,
+    seed: int = 1,
+    seeds: int = 1,
+    objective: str = "error",
+    gravity_percent: float = 100.0,
+    duration_s: float | None = None,
+    jobs: int | None = None,
+    on: "Workers" = None,
+) -> "TuningResult":
+    """Compares control laws that one procedure tunes; the command is `trilat compare --tune`.
+
+    The procedure tries the same number of candidates for the gains of each law.
+
+    >>> found = tn.tune("free", ["p_d"], budget=2, duration_s=2, jobs=1)
+    >>> [law.space.law for law in found.found]
+    ['p_d']
+
+    Args:
+        scenario: The scenario, which describes the experiment: the name of a shipped scenario,
+            a path, a TOML text, its tables, or a `Scenario`.
+        laws: Names or classes of the laws. Empty selects all laws for any number of sites.
+        set: Settings that replace those of the scenario, as in `{"link.delay_ms": 100}`.
+        budget: Number of candidates per law.
+        seed: Seed of the search, which draws the candidates.
+        seeds: Number of seeds of the scenario over which each candidate is averaged.
+        objective: What the search minimises besides the effort of the arms: "error", the
+            tracking error, or "settling", the settling time.
+        gravity_percent: Gravity that all laws assume, in % of the true gravity.
+        duration_s: Duration of a run, in s. By default that of the scenario.
+        jobs: Number of processes. None uses one per core.
+        on: Address of a Dask scheduler, or an executor, that executes the runs instead.
+
+    Returns:
+        The candidates of each law, with their gains and results.
+
+    Raises:
+        ScenarioError: The scenario is not valid, or laws cannot be compared in it.
+        UsageError: Another argument is not valid.
+    """
+    from ..studies.tuning import plan_tuning
+
+    plan = plan_tuning(
+        scenario,
+        _list_override_texts(set, duration_s),
+        laws=laws,
+        budget=budget,
+        seed=seed,
+        objective=objective,
+        gravity_percent=gravity_percent,
+        seeds=seeds,
+    )
+    return plan.run(jobs, on=on)
+
+
+def bench(
+    study: str = "small",
+    *,
+    tasks: Sequence[str] = (),
+    laws: Sequence[str] = (),
+    links: Sequence[str] = (),
+    seeds: int | None = None,
+    confirm: bool = False,
+    out: str | Path | None = None,
+    jobs: int | None = None,
+    on: "Workers" = None,
+) -> "BenchResults":
+    """Runs the benchmark suite, which compares control laws in the same tasks and links.
+
+    The command is `trilat bench`, which also writes tables and figures.
+
+    >>> cell = {"tasks": ["free"], "laws": ["p_d"], "links": ["rtt68"]}
+    >>> found = tn.bench(**cell, seeds=1, out="suite", jobs=1)
+    >>> len(found.runs)
+    1
+
+    Args:
+        study: Part of the suite: full, small or round-trips.
+        tasks: Names of the selected tasks. Empty selects all tasks of the study.
+        laws: Names of the selected laws. Empty selects all laws of the study.
+        links: Names of the selected links (network conditions), as in "rtt68-loss10" or "4g".
+            Empty selects all links of the study.
+        seeds: Number of seeds of random delays and losses. By default that of the study.
+        confirm: Has no effect any more: every run that is not stable is repeated over twice
+            its length, which confirms or refutes the verdict.
+        out: Folder of the results. A suite in it is continued. By default runs/bench-STUDY.
+        jobs: Number of processes. None uses one per core.
+        on: Address of a Dask scheduler, or an executor, that executes the runs instead.
+
+    Returns:
+        The runs of all combinations of tasks, laws and links, with their results.
+
+    Raises:
+        UsageError: There is no such study, task, law or link, or the folder contains something
+            else.
+    """
+    from ..studies.bench import plan_bench, prepare_bench_folder, run_bench
+
+    plan = plan_bench(study, tasks=tasks, laws=laws, links=links, seeds=seeds)
+    folder = prepare_bench_folder(plan, None if out is None else Path(out))
+    return run_bench(folder, jobs, on, confirm=confirm)
+
+
+def view(
+    *files: str | Path,
+    full: bool = False,
+    save: str | Path | None = None,
+    foxglove: bool = False,
+    rviz: bool = False,
+) -> None:
+    """Opens a log in the viewer Rerun; the command is `trilat log view`.
+
+    The function returns when the viewer is closed.
+
+    >>> tn.view("run.mcap")  # doctest: +SKIP
+
+    Args:
+        files: Path of the log, or paths of its parts.
+        full: True to show the record of every control period. False shows fewer, evenly spaced
+            ones.
+        save: Path of a Rerun file to write instead of opening the viewer.
+        foxglove: True to write a layout for the viewers Foxglove and Lichtblick beside the log,
+            as run.foxglove.json, instead of opening Rerun.
+        rviz: True to write a configuration of RViz for the ROS 2 topics of the session beside
+            the log, as run.rviz, instead of opening Rerun.
+
+    Raises:
+        UsageError: Rerun is not installed, there is no display, or a file exists.
+        LogError: The log cannot be read.
+    """
+    from ..presentation.rerun_viewer import ViewerOptions, open_rerun
+    from ..presentation.viewer_files import write_foxglove_layout, write_rviz_config
+
+    paths = [Path(file) for file in files]
+    if foxglove or rviz:
+        if full or save is not None:
+            raise UsageError("foxglove and rviz cannot be combined with full or save")
+        if foxglove:
+            print(write_foxglove_layout(paths[0]))
+        if rviz:
+            print(write_rviz_config(paths[0]))
+        return
+    viewer_options = ViewerOptions(
+        full=full, web=False, save=None if save is None else Path(save)
+    )
+    open_rerun(paths, lambda: open_log(*paths), viewer_options, print)

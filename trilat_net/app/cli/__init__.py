@@ -1,0 +1,354 @@
+"""The `trilat` command: registers all commands, and maps errors to exit codes.
+
+The commands are functions in the files of this folder. The function `log_info_command` is the
+command `trilat log info`. Its docstring is the help of the command.
+
+Invariant:
+    - A command parses its options, calls one function of the library, and prints the result.
+    - The exit code is 0 on success, 1 for a failed run or comparison, 2 for bad input, 4 if a
+      user's law that a log names may not run, 5 if a disk is full, and 128 + n if signal n
+      ended the command.
+    - An error is printed as one sentence.
+"""
+
+import errno
+import gc
+import inspect
+import os
+import pkgutil
+import sys
+from importlib import import_module
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from ...errors import LogRefused, TrilatError, UsageError, find_nearest
+from ...files import (
+    DISK_ERRNOS,
+    EXTRAS,
+    STUDY_LIBRARIES,
+    describe_missing_library,
+    find_version,
+    require_libraries,
+)
+from ...presentation.terminal_output import err, print_error, print_line
+from ...process import Interrupt
+from . import options, sessions
+from .options import flag
+
+_SYNONYMS = {
+    "trilat": {
+        "simulate": "sim", "run": "sim or trilat demo", "start": "demo or trilat site",
+        "play": "live play", "plot": "figure", "draw": "figure", "export": "log export",
+        "show": "report or trilat log info", "info": "log info", "open": "report",
+        "view": "log view", "check": "log check", "validate": "scenario check",
+        "recover": "log recover", "repair": "log recover", "sign": "log sign",
+        "analyse": "certify or trilat metrics", "analyze": "certify or trilat metrics",
+        "stable": "certify", "stability": "certify", "judge": "certify", "diff": "compare",
+        "evaluate": "metrics", "stats": "metrics", "summary": "report",
+        "optimise": "tune", "optimize": "tune", "benchmark": "bench", "roots": "linear",
+        "margin": "linear", "list": "scenario list", "ls": "scenario list", "init": "new law",
+        "create": "new law", "law": "new law", "certificate": "certify", "monitor": "watch",
+        "status": "watch", "halt": "stop", "kill": "stop", "end": "stop", "quit": "stop",
+        "resume": "enable", "restart": "reset", "latency": "ping", "recorder": "record",
+        "config": "scenario show", "version": "--version", "help": "--help",
+    },
+    "keys": {"join": "add","make": "new", "create": "new", "generate": "new", "show": "info",
+             "extend": "renew", "sign": "pair"},
+    "log": {"show": "info", "repair": "recover", "convert": "export", "open": "view",
+            "verify": "check", "plot": "view"},
+    "scenario": {"ls": "list", "print": "show", "cat": "show", "validate": "check",
+                 "verify": "check", "create": "new", "make": "new", "template": "new"},
+    "new": {"control": "law", "controller": "law", "operator": "hand", "policy": "hand",
+            "arm": "plant", "robot": "plant"},
+    "set": {"delay": "link", "alpha": "dominance", "authority": "dominance"},
+    "experiment": {"create": "new", "start": "run", "validate": "check", "analyze": "analyse"},
+}  # fmt: skip
+"""For each group of commands: words that a user may enter, and the command for what they mean.
+
+Words that are only misspelt need no entry.
+"""
+
+
+class _Group(TyperGroup):
+    """A group of commands that suggests a command in place of an unknown one."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Finds the command that the arguments name.
+
+        Raises:
+            UsageError: There is no such command. The error suggests one.
+        """
+        name = args[0] if args else ""
+        is_known = name.startswith("-") or self.get_command(ctx, name) is not None
+        if not name or is_known or ctx.resilient_parsing:
+            return super().resolve_command(ctx, args)
+        word = "trilat" if ctx.parent is None else str(ctx.info_name)
+        group = word if ctx.parent is None else f"trilat {word}"
+        commands = self.list_commands(ctx)
+        suggested = _SYNONYMS.get(word, {}).get(name.casefold())
+        suggested = suggested or find_nearest(name, commands)
+        hint = f"did you mean {group} {suggested}?"
+        if not suggested:
+            hint = f"{group} has the commands {', '.join(commands)}"
+        return ctx.fail(f"There is no command {name!r}; {hint}")
+
+
+class _Commands(_Group):
+    """The group of all commands. Ctrl-C ends any of them with exit code 130.
+
+    The framework (Typer) alone would exit with code 1. If Ctrl-C arrives while Python runs a
+    `__del__`, the KeyboardInterrupt is lost. The class `Interrupt` therefore records the
+    signal.
+    """
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Returns the names of all commands in the order of the help."""
+        positions = {name: n for n, name in enumerate(_PANEL_OF)}
+        end = len(positions)
+        return sorted(super().list_commands(ctx), key=lambda name: positions.get(name, end))
+
+    def invoke(self, ctx: Any) -> Any:
+        """Runs a command; Ctrl-C ends it with the exit code of the signal."""
+        with Interrupt() as interrupt:
+            try:
+                with interrupt.raising():
+                    return super().invoke(ctx)
+            except KeyboardInterrupt:
+                err.print("interrupted")
+                exit_code = interrupt.exit_code if interrupt.is_requested() else 130
+                raise typer.Exit(exit_code) from None
+
+
+app = typer.Typer(
+    cls=_Commands,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="Two people, one remote arm, and a network with delays: live, simulated, or again "
+    "from the log.",
+    epilog="Start with: trilat live play\n\nDocs: docs/first-hour.md, docs/commands.md",
+)
+
+
+def _print_version(is_requested: bool) -> None:
+    """Prints the version and exits, if the option --version is used."""
+    if is_requested:
+        print_line(f"trilat-net {find_version()}")
+        raise typer.Exit
+
+
+@app.callback()
+def _main(
+    _: Annotated[
+        bool,
+        flag(
+            "--version", "Print the version and exit.", is_eager=True, callback=_print_version
+        ),
+    ] = False,
+) -> None:
+    """Declares the options of `trilat` itself, which have their own functions."""
+
+
+_OWN_PANEL = "Make your own"
+_PANELS = {
+    "Start here": ("demo", "live", "sim"),
+    "Analyse a log": (
+        "report", "verify", "certify", "metrics", "figure", "compare", "log", "twin", "rerun",
+        "replay",
+    ),
+    "Study": ("sweep", "tune", "linear", "bench", "experiment", "test"),
+    "Control a running session": ("watch", "stop", "enable", "reset", "set", "ping"),
+    "Machines and bridges": (
+        "site", "record", "hand", "router", "keys", "ros2", "doctor",
+    ),
+    _OWN_PANEL: ("new", "scenario", "trace", "identify"),
+}  # fmt: skip
+"""The commands and groups of each panel of the help, in the order of the help.
+
+A command that no panel names is in the last panel.
+"""
+_PANEL_OF = {name: panel for panel, names in _PANELS.items() for name in names}
+_GROUPS: dict[str, dict[str, Any]] = {
+    "log": {
+        "help": "Inspects, checks, signs, recovers, exports or views a log.",
+        "epilog": "Example: trilat log info run.mcap\n\nDocs: docs/log-tools.md",
+    },
+    "scenario": {
+        "help": "Lists, shows, checks and creates scenarios.",
+        "epilog": "Example: trilat scenario show paper\n\nDocs: docs/commands.md",
+    },
+    "new": {
+        "help": "Creates your own control law, hand or plant, with a test.",
+        "epilog": "Example: trilat new law mylaw.py\n\nDocs: docs/own-controller.md",
+    },
+    "identify": {
+        "help": "Identifies the dynamics of the hand that holds an arm.",
+        "epilog": (
+            "Example: trilat identify hand run.mcap --site m1\n\nDocs: docs/measured-hands.md"
+        ),
+    },
+    "trace": {
+        "help": "Imports delays that another program measured.",
+        "epilog": "Example: trilat trace import irtt run.json.gz\n\nDocs: docs/delay-traces.md",
+    },
+    "experiment": {
+        "help": "Runs studies with people, from the protocol to the tables.",
+        "epilog": "Example: trilat experiment new reaching.toml\n\nDocs: docs/experiments.md",
+    },
+    "set": {
+        "callback": options.expand_option_tuples(sessions.set_command),
+        "epilog": "Example: trilat set --session paper link 'm1->s' --delay 350ms\n\n"
+        "Docs: docs/links.md",
+    },
+    "keys": {
+        "help": "Creates keys that encrypt a session or sign logs.",
+        "epilog": "Example: trilat keys pair lab\n\nDocs: docs/keys.md",
+    },
+}
+_GROUP_OPTIONS = {"set": "--session paper "}
+"""Options of a group that its examples need before the name of the command."""
+
+
+def _add_command(group: typer.Typer, command_line: str, run: Any) -> None:
+    """Adds a command to a group of commands.
+
+    Args:
+        group: The group.
+        command_line: Name of the command with that of its group, as in "log info".
+        run: Function of the command, which `options.command` has declared.
+    """
+    examples = [
+        f"Example: trilat {command_line} {example}".rstrip() for example in run.examples
+    ]
+    text = run.__doc__ or "(Its help is left out by python -OO: start it as python -O.)"
+    # One line per paragraph, because the help keeps line breaks.
+    paragraphs = inspect.cleandoc(text).split("\n\n")
+    text = "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
+    name = command_line.split()[-1]
+    epilog = "\n\n".join([*examples, f"Docs: {run.page}"])
+    panel = _find_panel(command_line) if group is app else None
+    declare = group.command(name, help=text, epilog=epilog, rich_help_panel=panel)
+    declare(options.expand_option_tuples(run))
+
+
+def _find_panel(name: str) -> str:
+    """Returns the panel of the help that lists a command or a group of commands."""
+    return _PANEL_OF.get(name, _OWN_PANEL)
+
+
+def _add_commands() -> None:
+    """Adds the commands of all files in this folder to their groups.
+
+    A function is a command if `options.command` has declared it. If the first word of its name
+    is that of a group, the command belongs to that group: `log_info_command` is `trilat log
+    info`.
+    """
+    groups = {
+        name: typer.Typer(cls=_Group, no_args_is_help=True, **settings)
+        for name, settings in _GROUPS.items()
+    }
+    for file in pkgutil.iter_modules(__path__):
+        module = import_module(f"{__name__}.{file.name}")
+        for function_name, run in vars(module).items():
+            if not hasattr(run, "examples"):
+                continue
+            command = function_name.removesuffix("_command").replace("_", "-")
+            first, _, rest = command.partition("-")
+            if first in groups:
+                group_options = _GROUP_OPTIONS.get(first, "")
+                _add_command(groups[first], f"{first} {group_options}{rest}", run)
+            else:
+                _add_command(app, command, run)
+    for name, group in groups.items():
+        app.add_typer(group, name=name, rich_help_panel=_find_panel(name))
+
+
+_add_commands()
+
+_TOO_LITTLE_MEMORY = (
+    "there is too little memory: 3 GiB of addresses suffice (ulimit -v), "
+    "and 1 GiB of memory itself"
+)
+_MEMORY_ERRORS = (
+    "failed to map segment",
+    "libllvmlite",
+    "start new thread",
+    "allocate memory",
+)
+"""Parts of the messages of Python, Numba and threads that could not allocate memory."""
+
+
+def _run() -> None:
+    """Runs `trilat`.
+
+    If a library is missing that an installation may lack, the error names the remedy.
+    """
+    try:
+        app()
+    except ModuleNotFoundError as error:
+        library = (error.name or "").partition(".")[0]
+        if library in STUDY_LIBRARIES:
+            require_libraries(library)  # raises the error that names the remedy
+        if library in EXTRAS:
+            problem = describe_missing_library("this command", error)
+            raise UsageError(problem) from None
+        raise
+
+
+def main() -> None:
+    """Runs `trilat`. An error becomes one sentence and an exit code."""
+    TrilatError.in_command = True
+    try:
+        _run()
+    except TrilatError as error:
+        print_error(error)
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except (MemoryError, ImportError, RuntimeError, OSError) as error:
+        sys.exit(_report_system_error(error))
+    finally:
+        TrilatError.in_command = False
+        gc.freeze()  # keeps Python from traversing all objects at exit
+
+
+def _report_system_error(error: Exception) -> int:
+    """Prints an error of the operating system.
+
+    Args:
+        error: The error that ended the command.
+
+    Returns:
+        The exit code. It is 0 if the program that reads the output has ended, as in
+        `trilat ... | head`.
+
+    Raises:
+        Exception: The error itself, if it is a bug of this program.
+    """
+    lacks_memory = any(text in str(error) for text in _MEMORY_ERRORS)
+    if isinstance(error, MemoryError) or lacks_memory:
+        # Written directly, because the layout of the text by `print_error` needs memory, too.
+        sys.stderr.write(f"error: {_TOO_LITTLE_MEMORY}\n")
+        return 1
+    if not isinstance(error, OSError):
+        # A bug. An OSError is, for example, a full disk or a folder that was deleted.
+        raise error
+
+    # Windows reports an invalid file name and a closed pipe by the same error number. Only the
+    # former comes with a file name.
+    is_invalid = os.name == "nt" and error.errno == errno.EINVAL
+    is_closed_pipe = isinstance(error, BrokenPipeError) or (is_invalid and not error.filename)
+    if is_closed_pipe:
+        # Python flushes its output at exit, which must not fail again.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+    prefix = f"{error.filename}: " if error.filename else ""
+    print_error(f"{prefix}{error.strerror or error}")
+    if error.errno in DISK_ERRNOS:
+        return LogRefused.exit_code
+    is_bad_name = is_invalid or error.errno == errno.ENAMETOOLONG
+    return 2 if is_bad_name else 1

@@ -1,0 +1,349 @@
+"""Commands for the inputs of a run: scenarios, user-written code, measured delays, and keys.
+
+A scenario is a TOML file that describes an experiment. The code of a user may be a control law,
+an operator (a program that moves an arm) or a plant (a model of an arm). Delays that were
+measured on a network can be repeated in a simulation. Keys prove to the other processes of a
+session which process is connected.
+"""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ...errors import count_nouns
+from ...files import refuse_existing, write_whole
+from ...presentation import terminal_output as terminal
+from ...presentation.result_text import TextTable
+from . import options
+from .options import value
+
+
+@options.command("")
+def scenario_list_command(as_json: options.JsonOption = False) -> None:
+    """Lists the shipped scenarios."""
+    from ...scenario import list_shipped, load_scenario
+
+    scenarios = {name: load_scenario(name) for name in list_shipped()}
+    if as_json:
+        entries = [
+            {
+                "name": name,
+                "sites": scenario.names,
+                "duration_s": scenario.duration_s,
+                "title": scenario.title,
+            }
+            for name, scenario in scenarios.items()
+        ]
+        return terminal.print_json(entries)
+
+    rows = [
+        (name, str(len(scenario.names)), f"{scenario.duration_s:g} s", scenario.title)
+        for name, scenario in scenarios.items()
+    ]
+    columns = ("name", "sites", "time", "what it is")
+    return terminal.print_table(TextTable(columns, rows, align="lrrl"))
+
+
+@options.command("paper --set control.Kd=5", page="docs/laws.md")
+def scenario_show_command(
+    name: options.ScenarioArgument,
+    duration: options.DurationOption = None,
+    seed: options.SeedOption = None,
+    overrides: options.SetOption = None,
+) -> None:
+    """Prints a scenario in full: every value of every site and link."""
+    from ...scenario.describe import list_arm_notes
+
+    scenario = options.load_chosen_scenario(name, overrides, duration, seed)
+    sys.stdout.write(scenario.text)
+    for note in list_arm_notes(scenario):
+        terminal.print_note(note)
+
+
+@options.command("mine.toml", page="docs/arms.md")
+def scenario_check_command(
+    file: options.ScenarioArgument,
+    overrides: options.SetOption = None,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Checks a scenario, and prints what its values imply."""
+    from ...scenario.describe import describe_scenario
+    from ...scenario.validate import check_outside_arms
+
+    scenario = options.load_chosen_scenario(file, overrides, None, None)
+    check_outside_arms(scenario)
+    lines = describe_scenario(scenario)
+    if as_json:
+        facts = {"name": scenario.name, "sha256": scenario.sha256, "consequences": lines}
+        return terminal.print_json(facts)
+    terminal.print_texts(lines)
+    return None
+
+
+@options.command("mine.toml", page="docs/links.md")
+def scenario_new_command(
+    file: Annotated[Path, typer.Argument(help="File to write.")],
+    force: options.ForceOption = False,
+) -> None:
+    """Writes a scenario template with comments and the unit of every key."""
+    from ...scenario import read_template
+
+    write_whole(file, read_template(), force=force)
+    terminal.print_text(f"{file}: a template; check it with: trilat scenario check {file}")
+
+
+def _print_skeleton(kind: str, written: list[Path], key: str, check: str) -> None:
+    """Prints which files were written for a new law, hand or plant, and how to run it.
+
+    Args:
+        kind: "law", "hand" or "plant".
+        written: Path of the file, and path of its test.
+        key: Override that makes a scenario use the class, with {} in place of the class.
+        check: The command that examines the log of the run, as in "certify {log}", with {log}
+            and {file} in place of the names of the log and of the file.
+    """
+    from ...scenario.skeletons import name_skeleton_class
+
+    file, test = written
+    code = f"{file.stem}:{name_skeleton_class(file.stem, kind)}"
+    change_folder = "" if file.parent == Path() else f"cd {file.parent}, and "
+    terminal.print_text(
+        f"{file}: a {kind} that works; {test.name}: its test. "
+        f"Change the {kind}, {change_folder}run"
+    )
+    terminal.print_text(f"  trilat sim paper --set {key.format(code)} -o {file.stem}.mcap")
+    terminal.print_text(f"  trilat {check.format(log=f'{file.stem}.mcap', file=file.name)}")
+    terminal.print_text(f"  pytest {test.name}   (pip install pytest)")
+
+
+@options.command("mylaw.py", page="docs/own-controller.md")
+def new_law_command(
+    file: Annotated[Path, typer.Argument(help="File to write, for example mylaw.py.")],
+    force: options.ForceOption = False,
+) -> None:
+    """Creates a working, commented control law to start from, and its test."""
+    from ...scenario.skeletons import new_law
+
+    check = "certify {log} --law {file}"
+    _print_skeleton("law", new_law(file, force=force), "control.law={}", check)
+
+
+@options.command("myhand.py", page="docs/policies.md")
+def new_hand_command(
+    file: Annotated[Path, typer.Argument(help="File to write, for example myhand.py.")],
+    force: options.ForceOption = False,
+) -> None:
+    """Creates a working hand (a program that acts as a user) to start from, and its test."""
+    from ...scenario.skeletons import new_hand
+
+    key = """'sites.m2.hands=[{{kind="own", class="{}"}}]'"""
+    _print_skeleton("hand", new_hand(file, force=force), key, "report {log}")
+
+
+@options.command("myplant.py", page="docs/own-plant.md")
+def new_plant_command(
+    file: Annotated[Path, typer.Argument(help="File to write, for example myplant.py.")],
+    force: options.ForceOption = False,
+) -> None:
+    """Creates a working plant (a model of an arm) to start from, and its test."""
+    from ...scenario.skeletons import new_plant
+
+    _print_skeleton("plant", new_plant(file, force=force), "sites.s.plant={}", "verify {log}")
+
+
+@options.command(
+    "irtt run.json.gz", "csv drive.txt --way half -o drive.csv", page="docs/delay-traces.md"
+)
+def trace_import_command(
+    form: Annotated[
+        str, typer.Argument(help="Format of FILE: irtt, ping or csv.", metavar="FORM")
+    ],
+    file: Annotated[Path, typer.Argument(metavar="FILE")],
+    out: Annotated[Path | None, value("--out -o", "CSV")] = None,
+    way: Annotated[str, value("--way", "half|send|receive|whole")] = "",
+    column: Annotated[str, value("--column", "NAME")] = "",
+    every_s: Annotated[
+        float,
+        value("--every", "S", "Interval between pings, s, if the output of ping has no times."),
+    ] = 1.0,
+    as_json: options.JsonOption = False,
+    force: options.ForceOption = False,
+) -> None:
+    """Converts delays that another program measured into a trace for links.
+
+    The command also prints statistics of the network.
+
+    Options:
+        file: File with the JSON output of irtt, the text output of ping or fping, or a table
+            with a header.
+        out: File for the trace; default: the name of FILE with -trace.csv in place of its
+            ending, in the current folder.
+        way: Delay to use: half of a round trip (half), one direction that irtt measured (send
+            or receive), or the delay unchanged (whole). Default: half of a round trip; one-way
+            delays stay unchanged.
+        column: Column of the table that contains the delays; default: the first one with
+            a name such as delay, rtt or latency.
+    """
+    from ...scenario.delay_traces import import_trace
+
+    name = file.name.split(".")[0]
+    path = out if out is not None else Path(f"{name}-trace.csv")
+    refuse_existing(path, force=force)
+    trace = import_trace(file, form, way=way, column=column, every_s=every_s)
+    write_whole(path, trace.write_rows())
+    if as_json:
+        terminal.print_json({**trace.to_dict(), "file": str(path)})
+        return
+    terminal.print_line(trace.summary())
+    terminal.print_line(f"{path}: use it with --set link.model=trace --set link.file={path}")
+
+
+@options.command("keys m1 m2 s recorder operator --host 192.0.2.1", page="docs/keys.md")
+def keys_new_command(
+    folder: Annotated[
+        Path, typer.Argument(help="Folder to create for the keys.", metavar="DIR")
+    ],
+    members: Annotated[list[str], typer.Argument(metavar="MEMBER...")],
+    hosts: Annotated[list[str] | None, value("--host", "NAME")] = None,
+    days: Annotated[
+        int,
+        typer.Option("--days", min=1, max=3650, help="Validity of the certificates, in days."),
+    ] = 30,
+) -> None:
+    """Creates keys: a certificate authority, and a folder of keys for each member.
+
+    Copy each folder to its member's machine over a channel that you trust, and name the folder
+    with --keys. Members without keys, or with keys from another authority, cannot connect; a
+    member can send only under its own name. Keep the folder `authority` on a machine where no
+    member runs: `trilat keys renew` needs this folder before the keys expire, and `trilat keys
+    add` for further members.
+
+    Options:
+        members: Members of the session: all sites, and the recorder, operator, router and
+            bridge if the session has them.
+        hosts: Host name or address on which a member listens; repeatable. This machine is
+            always included.
+    """
+    from ...net.member_keys import create_keys
+
+    folders = create_keys(folder, members, hosts or (), days)
+    for member_folder in folders:
+        terminal.print_line(f"{member_folder}: for {member_folder.name}")
+    first = folders[0]
+    terminal.print_line(
+        f"they are valid for {count_nouns(days, 'day')}; use them as in: "
+        f"trilat site {first.name} --keys {first} ..."
+    )
+
+
+@options.command("keys s2 bridge --host 192.0.2.9", page="docs/network.md")
+def keys_add_command(
+    folder: Annotated[
+        Path, typer.Argument(help="Folder that `trilat keys new` created.", metavar="DIR")
+    ],
+    members: Annotated[
+        list[str], typer.Argument(help="Names of the new members.", metavar="MEMBER...")
+    ],
+    hosts: Annotated[
+        list[str] | None,
+        value(
+            "--host",
+            "NAME",
+            "Host name or address on which a new member listens; repeatable. This machine is "
+            "always included.",
+        ),
+    ] = None,
+    days: Annotated[
+        int,
+        typer.Option(
+            "--days", min=1, max=3650, help="Validity of the new certificates, in days."
+        ),
+    ] = 30,
+) -> None:
+    """Creates keys for further members; the keys of the others stay valid.
+
+    The authority in the folder signs the new certificates. Copy each new folder to its member's
+    machine. Every other member needs its new file members.json, which lists all members, and a
+    restart before the next session: until then it refuses what the new members send.
+    """
+    from ...net.member_keys import MEMBERS, add_keys
+
+    added = add_keys(folder, members, hosts or (), days)
+    for member_folder in added:
+        terminal.print_line(f"{member_folder}: for {member_folder.name}; copy the folder")
+    for path in sorted(folder.glob(f"*/{MEMBERS}")):
+        if path.parent not in added:
+            terminal.print_line(f"{path}: for {path.parent.name}; copy this file")
+    terminal.print_line(f"the new keys are valid for {count_nouns(days, 'day')}")
+
+
+@options.command("keys", "keys m1 recorder --days 90", page="docs/network.md")
+def keys_renew_command(
+    folder: Annotated[
+        Path, typer.Argument(help="Folder that `trilat keys new` created.", metavar="DIR")
+    ],
+    members: Annotated[list[str] | None, typer.Argument(metavar="[MEMBER]...")] = None,
+    days: Annotated[
+        int,
+        typer.Option("--days", min=1, max=3650, help="Validity of the certificates, in days."),
+    ] = 30,
+) -> None:
+    """Renews the certificates of members; their private keys stay the same.
+
+    The authority in the folder signs the new certificates. Copy the files authority.pem,
+    certificate.pem and members.json from each folder to the member's machine again, and restart
+    the member before its next session: a running member keeps its old certificate.
+
+    Options:
+        members: Members whose certificates are renewed; default: all members with a folder.
+    """
+    from ...net.member_keys import renew_keys
+
+    for member_folder in renew_keys(folder, members or (), days):
+        terminal.print_line(f"{member_folder}: valid for {count_nouns(days, 'day')} from now")
+
+
+@options.command("lab", page="docs/signatures.md")
+def keys_pair_command(
+    name: Annotated[
+        Path,
+        typer.Argument(
+            help="Name of the pair; its files are NAME.key and NAME.pub.", metavar="NAME"
+        ),
+    ],
+) -> None:
+    """Creates a pair of Ed25519 keys, to sign logs and to check signatures.
+
+    Keep NAME.key private. Give NAME.pub to everybody who checks your logs, over a channel that
+    they trust.
+    """
+    from ...log.log_signature import create_signing_keys
+
+    private, public = create_signing_keys(name)
+    terminal.print_text(f"{private}: signs, as in: trilat log sign run.mcap --key {private}")
+    terminal.print_text(f"{public}: checks, as in: trilat log check run.mcap --key {public}")
+
+
+@options.command("keys/m1", page="docs/keys.md")
+def keys_info_command(
+    folder: Annotated[Path, typer.Argument(help="Folder of one member's keys.", metavar="DIR")],
+    as_json: options.JsonOption = False,
+) -> None:
+    """Shows whose keys they are, when they expire, and the Zenoh settings that they imply."""
+    from ...net.member_keys import read_member_keys
+
+    keys = read_member_keys(folder)
+    if as_json:
+        description = {
+            "member": keys.member,
+            "members": list(keys.members),
+            "until": keys.ends.isoformat(),
+            "zenoh": keys.settings,
+        }
+        return terminal.print_json(description)
+    terminal.print_line(
+        f"{keys.member} of {', '.join(keys.members)}; until {keys.ends:%Y-%m-%d %H:%M} UTC"
+    )
+    return terminal.print_json(keys.settings)

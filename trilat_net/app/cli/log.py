@@ -1,0 +1,290 @@
+"""The commands `trilat log info`, `check`, `sign`, `recover`, `export` and `view`.
+
+A log is the MCAP file that contains the scenario of a run and all records, the results of each
+period of the arms' control loops.
+
+Invariant:
+    - No command of this file repeats the run of a log, or executes code that the log names. The
+      commands are therefore safe for logs of unknown origin.
+"""
+
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ...errors import UsageError, count_nouns
+from ...presentation import terminal_output as terminal
+from ...presentation.exports import list_export_formats
+from . import options
+
+_LOSSY_EXIT_CODE = 3
+"""Exit code of `trilat log recover` if a part of the log was lost."""
+
+
+@options.command("run.mcap", page="docs/log-tools.md")
+def log_info_command(files: options.LogsArgument, as_json: options.JsonOption = False) -> None:
+    """Prints the contents of a log: session, sites, links and channels, and missing records."""
+    from ...analysis.file_overview import info
+
+    with terminal.progress_bar(f"reading {files[0]}") as progress:
+        overview = info(*files, progress=progress)
+    terminal.print_result(overview, as_json=as_json)
+    if not as_json:
+        for path in files:
+            terminal.warn_if_unfinished(path)
+
+
+@options.command("run.mcap", "run.mcap --key lab.pub", page="docs/log-checks.md")
+def log_check_command(
+    files: options.LogsArgument,
+    key: Annotated[
+        Path | None, options.value("--key", "PUB", "Also check FILE.sig with this public key.")
+    ] = None,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Checks that a log is well-formed, complete and consistent, without executing anything.
+
+    Exit code 0: the log is sound. 1: the log is not sound. 2: the file does not exist. For
+    files from other programs, only the structure is checked.
+    """
+    from ...log.session_check import check_file
+
+    with terminal.progress_bar(f"checking {files[0]}") as progress:
+        check = check_file(*files, progress=progress)
+    if key is not None:
+        from ...log.log_signature import check_signatures
+
+        with terminal.progress_bar(f"checking the signature of {files[0]}") as progress:
+            check.findings.append(check_signatures(files, key, progress))
+    terminal.print_result(check, as_json=as_json)
+    if not as_json:
+        if not check.ours:
+            terminal.print_note(
+                "this is not a trilat-net log: only the structure of the file was checked"
+            )
+        for path in files:
+            terminal.warn_if_unfinished(path)
+    raise typer.Exit(check.exit_code)
+
+
+@options.command("run.mcap --key lab.key", page="docs/signatures.md")
+def log_sign_command(
+    file: options.LogArgument,
+    key: Annotated[
+        Path, options.value("--key", "KEY", "Private key, created by `trilat keys pair`.")
+    ],
+    force: options.ForceOption = False,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Signs a finished log with Ed25519: writes FILE.sig, and does not change FILE.
+
+    The signature covers the digest chain: all messages and everything that describes them.
+    Check it with the public key: trilat log check FILE --key PUB
+    """
+    from ...log.log_signature import sign_log
+
+    with terminal.progress_bar(f"reading {file}") as progress:
+        signature = sign_log(file, key, force=force, progress=progress)
+    if as_json:
+        terminal.print_json({"file": file.as_posix(), "signature": signature.as_posix()})
+    else:
+        terminal.print_text(f"{signature}: signs {file}")
+
+
+@options.command("run.mcap.active", page="docs/log-damage.md")
+def log_recover_command(
+    file: options.LogArgument,
+    output: Annotated[
+        Path | None,
+        options.value(
+            "-o --out --output",
+            "OUT",
+            "File for the recovered log; default: the name of FILE without .active, or with "
+            ".recovered.mcap in place of .mcap.",
+        ),
+    ] = None,
+    force: options.ForceOption = False,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Recovers an unfinished or damaged log into a new, complete file.
+
+    The original file is not changed. The command works with every MCAP file. Exit code 0:
+    nothing was lost. 3: something was lost, and is listed. 1: nothing could be recovered.
+    """
+    from ...log.recover import recover
+
+    with terminal.progress_bar(f"reading {file}") as progress:
+        result = recover(file, output, force=force, progress=progress)
+    terminal.print_result(result, as_json=as_json)
+    if not result.lossless:
+        raise typer.Exit(_LOSSY_EXIT_CODE)
+
+
+@options.command("run.mcap --to parquet", page="docs/log-tools.md")
+def log_export_command(
+    files: options.LogsOrFoldersArgument,
+    form: Annotated[str, options.value("--to", "|".join(list_export_formats()))],
+    settings: Annotated[list[str] | None, options.value("--set", "KEY=VALUE")] = None,
+    actions: Annotated[str, options.value("--actions", "tip|joints")] = "",
+    output: Annotated[Path | None, options.value("-o --out", "OUT")] = None,
+    force: options.ForceOption = False,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Exports a log to files for other tools, with exact numbers and units in the column names.
+
+    Options:
+        form: Format. ros2: an MCAP file of standard messages at full rate; parquet or csv: a
+            folder with a file for each site and kind of record; npz or mat: one file with an
+            array for each column; lerobot: a LeRobot dataset with an episode for each log in
+            FILE.
+        settings: Setting of the format; repeatable. For lerobot: fps=30, or program=m2 if the
+            user m2 is a program. For ros2: names=crtk, or a file of names.
+        actions: For lerobot: store the actions as the LeRobot plugin accepts them, as positions
+            of the end effectors (tip) or angles of the joints (joints). Default: the values
+            that the sites exchange.
+        output: File or folder to write; default: next to FILE, with a name derived from it.
+    """
+    from ...log.log_reader import open_logs
+    from ...presentation.export import Exporter
+
+    pairs = [text.partition("=") for text in settings or []]
+    format_settings = {key: value for key, _, value in pairs}
+    if actions:
+        format_settings["actions"] = actions
+    # Refuses wrong settings and an existing output before the log is read.
+    exporter = Exporter(form, output, force=force, log=files[0], settings=format_settings)
+
+    with terminal.progress_bar(f"reading {files[0]}") as progress:
+        logs = open_logs(*files, progress=progress)
+    for log in logs:
+        terminal.warn_of_damage(log)
+    with terminal.progress_bar(f"writing {exporter.path}") as progress:
+        summary = exporter.export(*logs, progress=progress)
+
+    records = {site: sum(len(log[site]) for log in logs) for site in logs[0].sites}
+    if not summary:
+        summary = f"{count_nouns(sum(records.values()), 'record')} of {', '.join(records)}"
+    if as_json:
+        terminal.print_json(
+            {"file": exporter.path.as_posix(), "format": form, "records": records}
+        )
+    else:
+        terminal.print_text(f"{exporter.path}: {summary}")
+
+
+@options.command("run.mcap", "run.mcap --foxglove", page="docs/log-tools.md")
+def log_view_command(
+    files: options.LogsArgument,
+    full: Annotated[
+        bool, typer.Option("--full", help="Show every record, not the decimated channels.")
+    ] = False,
+    web: Annotated[
+        bool, typer.Option("--web", help="Serve the viewer to a browser on this machine.")
+    ] = False,
+    save: Annotated[
+        Path | None,
+        options.value("--save", "OUT.rrd", "Write a Rerun file instead of opening Rerun."),
+    ] = None,
+    foxglove: Annotated[
+        bool,
+        typer.Option(
+            "--foxglove",
+            help="Write a layout for Foxglove and Lichtblick next to FILE instead.",
+        ),
+    ] = False,
+    rviz: Annotated[
+        bool,
+        typer.Option(
+            "--rviz",
+            help="Write a configuration of RViz next to FILE instead, for its ROS 2 topics.",
+        ),
+    ] = False,
+    force: options.ForceOption = False,
+) -> None:
+    """Opens a log in Rerun, with a column for each site and a label for every curve.
+
+    If a log lacks the standard channels (--views off), was not finished or is split into parts,
+    a temporary file with these channels is written first. If Rerun is not installed, the page
+    of the log opens in a browser instead.
+    """
+    from importlib.util import find_spec
+
+    from ...files import stage_output
+    from ...presentation.rerun_viewer import ViewerOptions, open_rerun
+
+    if foxglove or rviz:
+        if full or web or save:
+            raise UsageError(
+                "--foxglove and --rviz cannot be combined with --full, --web or --save"
+            )
+        return _write_viewer_files(files[0], foxglove=foxglove, rviz=rviz, force=force)
+
+    needs_rerun = full or web or save
+    if not needs_rerun and find_spec("rerun") is None:
+        return _open_page(files)
+    with stage_output(save, force=force) if save is not None else nullcontext() as staged:
+        open_rerun(
+            files,
+            lambda: terminal.open_with_progress(*files),
+            ViewerOptions(full=full, web=web, save=staged),
+            terminal.print_text,
+        )
+    if save is not None:
+        terminal.print_text(f"{save}: open it with: rerun {save}")
+    return None
+
+
+def _write_viewer_files(file: Path, *, foxglove: bool, rviz: bool, force: bool) -> None:
+    """Writes the files with which other viewers show a log, and prints how to use them.
+
+    Args:
+        file: The log, its first part, or an exported bag.
+        foxglove: True to write a layout for Foxglove and Lichtblick.
+        rviz: True to write a configuration of RViz.
+        force: True to replace existing files.
+    """
+    from ...presentation.viewer_files import write_foxglove_layout, write_rviz_config
+
+    if foxglove:
+        layout = write_foxglove_layout(file, force=force)
+        terminal.print_text(
+            f"{layout}: open {file} in Foxglove or Lichtblick, and import this file as a layout"
+        )
+    if rviz:
+        config = write_rviz_config(file, force=force)
+        terminal.print_text(
+            f"{config}: during a session with `trilat ros2`, run: rviz2 -d {config}\n"
+            "  for a bag: ros2 bag play --clock BAG, and add: --ros-args -p use_sim_time:=true"
+        )
+
+
+def _open_page(files: list[Path]) -> None:
+    """Opens the page of a log in a browser, in place of the viewer Rerun.
+
+    If the page is missing, it is written first, as by `trilat report`.
+
+    Args:
+        files: The log, or its parts.
+    """
+    import webbrowser
+    from contextlib import suppress
+
+    from ...files import format_extra_install, make_results_folder, refuse_link
+    from ...presentation.conclude import conclude
+
+    terminal.print_note(
+        f"Rerun is not installed ({format_extra_install('view')}); this is the log's page"
+    )
+    folder = files[0].with_suffix("")
+    refuse_link(folder)
+    page = folder / "report.html"
+    if not page.is_file():
+        log = terminal.open_with_progress(*files)
+        results = make_results_folder(folder, "", force=None)
+        with terminal.progress_bar("drawing") as progress:
+            page = conclude(log, results, progress).page
+    terminal.print_text(f"{page}: open it in a browser")
+    with suppress(OSError, webbrowser.Error):
+        webbrowser.open(page.resolve().as_uri())

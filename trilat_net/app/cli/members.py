@@ -1,0 +1,863 @@
+"""Commands for the processes of a session, each of which can run on a machine of its own.
+
+A session is a live run. Its processes are the sites (one per arm, with the control loop), the
+programs that act as operators, the recorder, and optionally a router or a bridge to ROS 2. A
+replay publishes a log as if it were a running session.
+"""
+
+import math
+import os
+from collections.abc import Callable
+from contextlib import closing, suppress
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ...errors import CodeWithheld, RunFailed, UsageError, count_nouns
+from ...net.clock import Clock, SystemClock, make_system_clock
+from ...presentation import terminal_output as terminal
+from ...presentation.result_text import TextTable
+from ...process import Interrupt
+from . import options
+from .options import flag, seconds, value
+
+if TYPE_CHECKING:
+    from trilat_net.app.play.play_process import PlaybackSummary
+    from trilat_net.app.play.player import PlayProgress
+    from trilat_net.app.play.session_reader import SessionHeader
+
+    from ...scenario import Scenario
+
+
+@options.command("m1 --scenario paper", page="docs/network.md")
+def site_command(
+    name: Annotated[str, typer.Argument(autocompletion=options.complete_sites)],
+    scenario: Annotated[
+        str, typer.Option("--scenario", "-s", autocompletion=options.complete_scenarios)
+    ],
+    session: Annotated[
+        str | None,
+        value("--session", "ID", "Name of the session; default: the name of the scenario."),
+    ] = None,
+    *,
+    ways: options.MemberOptions,
+    join_timeout: Annotated[
+        float, seconds("--join-timeout", "Longest wait for the other sites, s.")
+    ] = 60.0,
+    needs_recorder: options.NeedsRecorderOption = False,
+    cpu: Annotated[
+        int | None, typer.Option("--cpu", help="Pin the process to this processor.")
+    ] = None,
+    stay: Annotated[float, seconds("--stay")] = 0.0,
+    without: Annotated[list[str] | None, value("--without", "SITE")] = None,
+    leave_timeout: Annotated[float | None, seconds("--leave-timeout")] = None,
+    clock_offset: options.ClockOffsetOption = 0.0,
+    clock_drift: options.ClockDriftOption = 0.0,
+    duration: options.DurationOption = None,
+    seed: options.SeedOption = None,
+    overrides: options.SetOption = None,
+) -> None:
+    """Runs one site of a session as a process of its own.
+
+    Use it in separate terminals or on separate machines. Without endpoints, the sites of a
+    session find each other on this machine: each site listens on a loopback port derived from
+    the names of the session and the site, and connects to the sites that precede it in the
+    scenario.
+
+    Options:
+        name: Name of the site in the scenario.
+        scenario: Name of a shipped scenario, or path of a TOML file.
+        stay: Longest wait at the end for the recorder to leave the session, s.
+        without: Begin without SITE, which may join later; repeatable. Only the first site
+            accepts this option.
+        leave_timeout: Longest time to continue after another site has left, if the arms then
+            glide (on_stale.action = "glide"), s; default: until the end of the run.
+    """
+    from sites.site_parts import SiteOptions
+    from sites.site_process import run_site
+
+    from ...net.connection import default_endpoints
+    from ...scenario import find_site
+
+    chosen = options.load_chosen_scenario(scenario, overrides, duration, seed)
+    find_site(chosen, name)
+    session_name = options.check_session_name(session or chosen.name)
+
+    # By default each site connects to those before it, so that each pair has one connection.
+    endpoints = default_endpoints(session_name, chosen.names, encrypted=ways.keys is not None)
+    earlier_sites = chosen.names[: chosen.names.index(name)]
+    earlier_endpoints = [endpoints[site] for site in earlier_sites]
+    connection = ways.resolve([endpoints[name]], earlier_endpoints).require(name)
+
+    site_options = SiteOptions(
+        session=session_name,
+        connection=connection,
+        join_timeout_s=join_timeout,
+        needs_recorder=needs_recorder,
+        cpu=cpu,
+        stay_s=stay,
+        clock_offset_s=clock_offset,
+        clock_drift_ppm=clock_drift,
+        without=_check_without(chosen, name, without or []),
+        leave_timeout_s=leave_timeout,
+    )
+    raise typer.Exit(run_site(chosen, name, site_options, terminal.print_line))
+
+
+@options.command(
+    "m2 --scenario my_run.toml",
+    "m1 --session play --device haply_inverse3",
+    page="docs/devices.md",
+)
+def hand_command(
+    context: typer.Context,
+    name: Annotated[str, typer.Argument(autocompletion=options.complete_sites)],
+    scenario: Annotated[
+        str, typer.Option("--scenario", "-s", autocompletion=options.complete_scenarios)
+    ] = "",
+    session: Annotated[str | None, value("--session", "ID")] = None,
+    join_timeout: Annotated[
+        float, seconds("--join-timeout", "Longest wait for the site, s.")
+    ] = 60.0,
+    duration: options.DurationOption = None,
+    seed: options.SeedOption = None,
+    overrides: options.SetOption = None,
+    device: Annotated[str | None, value("--device", "NAME[=ADDRESS]")] = None,
+    *,
+    reach: options.Reach,
+) -> None:
+    """Runs your program, or a device that you hold, as a user.
+
+    A hand acts as the user of a site. A class of your own (kind = "own", process = true) runs
+    in this process: it reads the state of the site and decides how to move the arm, and the
+    site applies each decision after the hand's delay_ms. A device (kind = "live") leads an arm
+    of a session that is already running.
+
+    Options:
+        name: Name of the site in the scenario.
+        scenario: For a class: scenario that the site runs, as the name of a shipped scenario or
+            the path of a TOML file.
+        session: Name of the session; required with --device, otherwise the default is the name
+            of the scenario.
+        device: Device in your hand: haply_inverse3 or spacemouse. The scenario of the session
+            defines how the device leads the arm.
+    """
+    if device is not None:
+        scenario_options = {"--scenario", "--duration", "--seed", "--set"}
+        extra = scenario_options & set(options.list_used_options(context))
+        if extra:
+            raise UsageError(
+                f"--device leads an arm of a running session: leave out {min(extra)}"
+            )
+        return _lead_by_device(
+            device=device, name=name, session=session, reach=reach, timeout_s=join_timeout
+        )
+    if not scenario:
+        raise UsageError(
+            "a class of your own needs --scenario; a device that you hold needs --device"
+        )
+    from sites.hand_process import run_hand
+
+    from ...net.connection import default_endpoints
+    from ...net.zenoh_config import OPERATOR
+    from ...scenario import find_site
+
+    chosen = options.load_chosen_scenario(scenario, overrides, duration, seed)
+    session_name = options.check_session_name(session or chosen.name)
+    endpoints = default_endpoints(session_name, chosen.names, encrypted=reach.keys is not None)
+    find_site(chosen, name)
+    member = options.MemberOptions(None, *reach)
+    connection = member.resolve((), [endpoints[name]]).require(OPERATOR)
+    with Interrupt() as interrupt:
+        run_hand(
+            scenario=chosen,
+            name=name,
+            session=session_name,
+            connection=connection,
+            interrupt=interrupt,
+            say=terminal.print_line,
+            timeout_s=join_timeout,
+        )
+    if interrupt.is_requested():
+        raise typer.Exit(interrupt.exit_code)
+    return None
+
+
+def _lead_by_device(
+    device: str, name: str, session: str | None, reach: options.Reach, timeout_s: float
+) -> None:
+    """Lets the user lead an arm of a running session with an input device.
+
+    The function returns when the session ends, or at Ctrl-C.
+
+    Args:
+        device: Name of the device, and its address if needed, as in NAME=ADDRESS.
+        name: Name of the site whose arm is led.
+        session: Name of the session.
+        reach: The options by which the command reaches the session.
+        timeout_s: Longest wait for the site, in s.
+    """
+    from sites.devices import open_device
+    from trilat_net.app.running_session import RunningSession
+
+    running = RunningSession(options.check_session_name(session or ""), reach.resolve())
+    opened_device = open_device(device)
+    with Interrupt() as interrupt:
+        running.lead(
+            name,
+            opened_device,
+            stopped=interrupt.is_requested,
+            say=terminal.print_line,
+            timeout_s=timeout_s,
+        )
+    if interrupt.is_requested():
+        raise typer.Exit(interrupt.exit_code)
+
+
+def _check_without(scenario: "Scenario", name: str, without: list[str]) -> tuple[str, ...]:
+    """Checks the sites without which a session may begin.
+
+    Args:
+        scenario: The scenario of the session.
+        name: Name of this site.
+        without: Names of the sites that may join later, from --without.
+
+    Returns:
+        The names in `without`.
+
+    Raises:
+        UsageError: This site is not the first one, or the scenario does not let sites join
+            later.
+    """
+    from ...scenario import find_site
+
+    first_site = scenario.names[0]
+    for late_site in without:
+        find_site(scenario, late_site)
+        if name != first_site or late_site == name:
+            raise UsageError(
+                f"--without can be given only at {first_site}, the first site, and must name "
+                "other sites"
+            )
+        if not scenario.sites_may_return:
+            raise UsageError('--without needs on_stale.action = "glide" at every site')
+    return tuple(without)
+
+
+@options.command("--session paper -o run.mcap --split-duration 600", page="docs/recording.md")
+def record_command(
+    session: Annotated[str, value("--session", "ID", "Session to record.")],
+    *,
+    ways: options.MemberOptions,
+    output: Annotated[Path | None, value("-o --out --output", "FILE")] = None,
+    join_timeout: Annotated[float | None, seconds("--join-timeout")] = None,
+    clock_offset: options.ClockOffsetOption = 0.0,
+    clock_drift: options.ClockDriftOption = 0.0,
+    concluded: Annotated[bool, flag("--conclude")] = False,
+    include: Annotated[list[str] | None, value("--include", "KEYS")] = None,
+    exclude: Annotated[list[str] | None, value("--exclude", "KEYS")] = None,
+    split_size: Annotated[float | None, value("--split-size", "MIB")] = None,
+    split_duration: Annotated[float | None, value("--split-duration", "S")] = None,
+    carry_on: Annotated[
+        bool, flag("--continue", "If the log exists, continue it in a new part.")
+    ] = False,
+    durable: Annotated[bool, flag("--durable")] = False,
+    views: options.ViewsOption = "100",
+    force: options.ForceOption = False,
+    png: options.PngOption = False,
+) -> None:
+    """Records a session into an MCAP log.
+
+    The recording lasts from the start of the session until its end or Ctrl-C. Without
+    endpoints, the recorder connects to the loopback port of the first site and asks for the
+    other sites. If the log is split, its parts are named FILE-001.mcap and so on. The name of a
+    file ends in .active until the file is finished.
+
+    Options:
+        output: File of the log; default: SESSION.mcap, or runs/SESSION-N/run.mcap if --conclude
+            is used.
+        join_timeout: Longest wait for the session to begin, s; default: no limit.
+        concluded: Verify the log at the end, and write a report into its folder.
+        include: Record only these channels, for example '**/m1/**'; repeatable.
+        exclude: Leave out these channels, for example '**/link'; repeatable.
+        split_size: Split the log into parts of at most this size, MiB.
+        split_duration: Split the log into parts of this duration, s.
+        durable: Sync to the disk at every flush instead of every second.
+    """
+    from recorder.record_process import record_session
+    from sites.machine_load import describe_load, measure_busy_share
+
+    from ...files import refuse_existing
+    from ...log.log_layout import find_parts, parse_channel_filter
+    from ...log.log_writer import LogStorage, parse_split
+    from ...log.ros2.viz_channels import parse_viz_rate
+    from ...net.topics import RECORDER
+
+    options.check_session_name(session)
+    connection = ways.resolve().require(RECORDER)
+    path = _choose_path(output, session, concluded=concluded)
+    storage = LogStorage(
+        path,
+        force=force,
+        durable=durable,
+        split_bytes=parse_split("--split-size", "MiB", split_size, 1 << 20),
+        split_ns=parse_split("--split-duration", "seconds", split_duration, 10**9),
+        carry_on=carry_on,
+        choice=parse_channel_filter(include or [], exclude or []),
+        views_hz=parse_viz_rate(views),
+    )
+
+    # Problems of the output are reported now, before the recorder waits for the session.
+    storage.find_first_part()
+    if not os.access(path.parent, os.W_OK):
+        raise UsageError(f"{path}: cannot be written: {path.parent} is not a writable folder")
+    page = path.parent / "report.html"
+    if concluded:
+        refuse_existing(page, force=force)
+    clock = make_system_clock(clock_offset, clock_drift)
+
+    def warn_of_load() -> None:
+        """Warns if other programs keep the processors of this machine busy."""
+        warning = describe_load(measure_busy_share(clock))
+        if warning:
+            terminal.print_note(warning)
+
+    def conclude() -> None:
+        """Checks the finished log and writes its report, if the option --conclude was given."""
+        if concluded:
+            _conclude(list(find_parts(path).values()), png=png)
+
+    try:
+        code = record_session(
+            session=session,
+            storage=storage,
+            connection=connection,
+            join_timeout_s=join_timeout,
+            clock=clock,
+            say=terminal.print_line,
+            afterwards=conclude,
+            warn=warn_of_load,
+        )
+    finally:
+        if concluded and output is None:
+            # Removes the new folder if nothing was written into it; otherwise this fails.
+            with suppress(OSError):
+                path.parent.rmdir()
+    raise typer.Exit(code)
+
+
+def _choose_path(output: Path | None, session: str, *, concluded: bool) -> Path:
+    """Chooses the path of the log of a session, and makes the folder of its report.
+
+    Args:
+        output: Path from --out. None uses SESSION.mcap, or run.mcap in a new folder if there
+            will be a report.
+        session: Name of the session.
+        concluded: True if a report is written into the folder of the log.
+    """
+    from ...files import make_folder, make_results_folder, require_libraries
+
+    if not concluded:
+        return output if output is not None else Path(f"{session}.mcap")
+    require_libraries()
+    if output is None:
+        return make_results_folder(None, session, force=False) / "run.mcap"
+    make_folder(output.parent)
+    return output
+
+
+def _conclude(parts: list[Path], *, png: bool) -> None:
+    """Verifies a finished log, and writes its report into the folder of the log.
+
+    Args:
+        parts: Paths of all parts of the log.
+        png: True to write every figure as a PNG file too.
+
+    Raises:
+        CodeWithheld: The log names a user's code, which was not executed. Therefore the log
+            could not be verified completely.
+        RunFailed: The log failed a check, or the session ended with a failure.
+    """
+    log, conclusion = terminal.conclude_files(parts, parts[0].parent, png=png)
+    if conclusion.exit_code == CodeWithheld.exit_code:
+        raise CodeWithheld(
+            f"{parts[0]}: parts of this log were not checked, because code that the log names "
+            "may not run; check them with: trilat verify --law FILE"
+        )
+
+    if not conclusion.passed:
+        raise RunFailed(f"{parts[0]}: failed a check")
+    for event in log.events:
+        if event.kind in ("diverged", "failed"):
+            raise RunFailed(f"{parts[0]}: {event.text}")
+
+
+@options.command("run.mcap --rate 2 --start 5", page="docs/replay.md")
+def replay_command(
+    files: Annotated[list[Path], typer.Argument(metavar="FILE...")],
+    rate: Annotated[str, value("--rate", "X")] = "1",
+    loop: Annotated[bool, flag("--loop", "Start over at the end, until Ctrl-C.")] = False,
+    start: Annotated[float | None, value("--start", "S")] = None,
+    stop: Annotated[
+        float | None, value("--stop", "S", "End of the part to play, s since tick 0.")
+    ] = None,
+    duration: Annotated[float | None, value("--duration", "S")] = None,
+    include: Annotated[list[str] | None, value("--include", "KEYEXPR")] = None,
+    exclude: Annotated[list[str] | None, value("--exclude", "KEYEXPR")] = None,
+    prefix: Annotated[str, value("--prefix", "WORD")] = "replay",
+    session: Annotated[
+        str | None,
+        value("--session", "ID", "Name of the replayed session, to which no prefix is added."),
+    ] = None,
+    time: Annotated[str, value("--time", "publish|log")] = "publish",
+    low_cpu: Annotated[bool, flag("--low-cpu")] = False,
+    needs_recorder: options.NeedsRecorderOption = False,
+    preload: Annotated[int, value("--preload", "MIB")] = 256,
+    listen: options.ListenOption = None,
+    connect: options.ConnectOption = None,
+    router: options.RouterOption = None,
+    zenoh_config: options.ZenohConfigOption = None,
+    insecure: options.InsecureOption = False,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Publishes a log on the network with its original timing.
+
+    The log appears as a separate session. To recorders, viewers and `trilat ping`, the replay
+    looks like a running session. It answers for the recorded sites, and publishes their
+    messages byte for byte. Without endpoints, the replay listens on the loopback port of the
+    first site of the replayed session.
+
+    Options:
+        files: File of an MCAP log, or the files of all its parts in order.
+        rate: Speed relative to the recording, or max for as fast as possible.
+        start: Start of the part to play, s since tick 0.
+        duration: Duration of the part to play, s, instead of --stop.
+        include: Play only these channels, for example '**/m1/*'; repeatable. Default: all
+            channels of the sites.
+        exclude: Leave out these channels, for example '**/link'; repeatable.
+        prefix: Name the replayed session WORD-NAME, where NAME is the recorded name; '' keeps
+            the recorded name.
+        time: Times at which messages are played: the times at which they were sent (publish),
+            or at which they arrived (log).
+        low_cpu: Sleep until each deadline to save processor time; the timing is then about
+            0.1 ms less exact.
+        preload: Largest log that is held in memory, MiB; a separate process reads larger logs
+            during the replay.
+    """
+    from trilat_net.app.play.play_process import PlayOptions, play_log
+    from trilat_net.app.play.player import parse_rate
+    from trilat_net.app.play.session_reader import parse_selection, preload_messages
+
+    from ...net.connection import default_endpoint
+
+    if preload < 0:
+        raise UsageError(f"--preload must be a number of MiB, at least 0, not {preload}")
+    selection = parse_selection(
+        include=include or (),
+        exclude=exclude or (),
+        start_s=start,
+        stop_s=stop,
+        duration_s=duration,
+        time=time,
+    )
+    speed = parse_rate(rate)
+    preload_bytes = preload << 20
+    with terminal.progress_bar(f"reading {files[0]}") as progress:
+        header, block = preload_messages(files, selection, preload_bytes, progress)
+
+    prefixed_name = f"{prefix}-{header.session}" if prefix else header.session
+    name = options.check_session_name(session or prefixed_name)
+    ways = options.MemberOptions(
+        listen=listen,
+        connect=connect,
+        router=router,
+        zenoh_config=zenoh_config,
+        keys=None,
+        insecure=insecure,
+    )
+    connection = ways.resolve([default_endpoint(name, 0)], [])
+
+    play_options = PlayOptions(
+        session=name, rate=speed, loop=loop, low_cpu=low_cpu, needs_recorder=needs_recorder
+    )
+    # With --json, the standard output contains nothing but the JSON.
+    console = terminal.err if as_json else terminal.out
+    print_line = partial(console.print, markup=False, soft_wrap=True)
+    _announce_playback(header, name, speed, print_line)
+    reported = set(header.torn)  # a copy, because the replay may find more torn files
+    _warn_torn(header.torn)
+
+    clock = SystemClock()
+    with Interrupt() as interrupt:
+        outcome = play_log(
+            loaded=(header, block),
+            paths=files,
+            selection=selection,
+            options=play_options,
+            connection=connection,
+            clock=clock,
+            stopped=interrupt.is_requested,
+            say=print_line,
+            show=_make_progress_line(clock),
+        )
+
+    if outcome is None:
+        raise typer.Exit(interrupt.exit_code)
+    if as_json:
+        terminal.print_json({"session": name, **_describe_playback(outcome, speed)})
+    else:
+        _show_playback(outcome)
+    _warn_about_playback(outcome, reported)
+    if interrupt.is_requested():
+        terminal.err.print("interrupted")
+        raise typer.Exit(interrupt.exit_code)
+    if outcome.cut or outcome.strays:
+        raise typer.Exit(1)
+
+
+def _announce_playback(
+    header: "SessionHeader", name: str, rate: float, print_line: Callable[[str], None]
+) -> None:
+    """Prints which session a replay opens, how fast it plays, and if its messages are of today.
+
+    Args:
+        header: Description of the recorded session.
+        name: Name of the session that the replay opens.
+        rate: Speed relative to the recording. Infinity for as fast as possible.
+        print_line: Function that prints a line.
+    """
+    from ...net.messages import VERSION
+
+    speed = "as fast as possible" if math.isinf(rate) else f"at {rate:g} times its speed"
+    sites = ", ".join(header.boots)
+    print_line(f"playing {sites} as session {name}, {speed}; Ctrl-C ends it")
+    if header.version != VERSION:
+        print_line(
+            f"note: these messages are of schema version {header.version}: recorders and sites "
+            f"of today accept {VERSION} and count others as dropped; any other Zenoh "
+            "subscriber receives them"
+        )
+
+
+def _make_progress_line(clock: Clock) -> Callable[["PlayProgress"], None]:
+    """Returns a function that shows the progress of a replay in one line of the terminal.
+
+    The line has the position in the recording, the present speed relative to the recording, the
+    number of messages and the largest delay. If the output is not a terminal, the function does
+    nothing.
+
+    Args:
+        clock: Clock of this process, from which the speed is computed.
+    """
+    if not terminal.err.is_interactive:
+        return lambda _: None
+    last_now_ns: int | None = None
+    last_position_ns = 0
+
+    def show(progress: "PlayProgress") -> None:
+        """Overwrites the line of the terminal with the present progress."""
+        nonlocal last_now_ns, last_position_ns
+        now_ns = clock.monotonic_ns()
+        position_ns = progress.position_ns
+        rate = 0.0
+        if last_now_ns is not None and now_ns > last_now_ns:
+            rate = (position_ns - last_position_ns) / (now_ns - last_now_ns)
+        last_now_ns = now_ns
+        last_position_ns = position_ns
+        text = (
+            f"{position_ns / 1e9:8.1f} s   x{rate:.2f}   "
+            f"{count_nouns(progress.published, 'message')}   "
+            f"latest {progress.late_max_us / 1e3:.2f} ms late"
+        )
+        terminal.err.file.write(f"\r{text:<72}")
+        terminal.err.file.flush()
+
+    return show
+
+
+def _describe_playback(outcome: "PlaybackSummary", rate: float) -> dict[str, Any]:
+    """Returns the outcome of a replay as plain values, with the keys of `trilat replay --json`.
+
+    A replay publishes the messages of a log again, at the times of the recording. Receivers may
+    be slow, and recorders may store the messages.
+
+    Args:
+        outcome: The outcome.
+        rate: Speed relative to the recording. Infinity, which becomes None, for as fast as
+            possible.
+
+    Returns:
+        The values by key. Comments in the function explain the keys.
+    """
+    lateness = outcome.lateness
+    late_us = None
+    if lateness is not None:
+        late_us = {"p50": lateness.p50_us, "p99": lateness.p99_us, "max": lateness.max_us}
+    has_recorders = bool(outcome.recorders)
+    damaged_files = {path.as_posix(): reason for path, reason in outcome.torn.items()}
+    return {
+        # Number of published messages by topic, and of all of them.
+        "messages": outcome.counts,
+        "published": sum(outcome.counts.values()),
+        # Number of passes through the log that were started.
+        "rounds": outcome.rounds,
+        "rate": None if math.isinf(rate) else rate,
+        "took_s": round(outcome.took_s, 6),
+        # How late messages were published. None if they had no deadlines.
+        "late_us": late_us,
+        # Time for which the replay waited for slow receivers, in s.
+        "held_s": round(outcome.held_s, 3),
+        # How often a receiver was disconnected, because it accepted no message for 5 s.
+        "cut": outcome.cut,
+        # Number of messages whose place in the file was too far from their turn.
+        "strays": outcome.strays,
+        # Number of recorders after the last message, and whether they stored all messages.
+        "recorders": outcome.recorders,
+        "stored": outcome.stored if has_recorders else None,
+        # Number of messages that were sent again to recorders that missed them.
+        "told": outcome.refilled,
+        # Damaged files of the log, with the reason.
+        "torn": damaged_files,
+    }
+
+
+def _show_playback(outcome: "PlaybackSummary") -> None:
+    """Prints the outcome of a replay.
+
+    It has the number of messages of each channel, the duration, the delay of the messages
+    behind their schedule, and whether a recorder received all of them.
+    """
+    if terminal.err.is_interactive:
+        terminal.err.file.write("\r" + " " * 72 + "\r")  # erases the line of the progress
+    rows = [(topic, str(count)) for topic, count in sorted(outcome.counts.items())]
+    terminal.print_table(TextTable(("channel", "messages"), rows, align="lr"))
+
+    messages = count_nouns(sum(outcome.counts.values()), "message")
+    text = f"{messages} in {outcome.took_s:.2f} s"
+    if outcome.rounds > 1:
+        text += f", {count_nouns(outcome.rounds, 'round')}"
+    late = outcome.lateness
+    if late:
+        text += f"; late by p50 {late.p50_us} us, p99 {late.p99_us} us, max {late.max_us} us"
+    if outcome.held_s > 0.1:
+        text += f"; waited {outcome.held_s:.2f} s for slow subscribers"
+    if not outcome.cut:
+        text += "; none dropped"
+    terminal.print_text(text)
+
+    if outcome.recorders:
+        stored = "has not confirmed that it has everything"
+        if outcome.stored:
+            stored = "has everything"
+        resent = ""
+        if outcome.refilled:
+            missed = count_nouns(outcome.refilled, "message")
+            resent = f"; {missed} that it had missed were sent again"
+        terminal.print_text(f"the recorder {stored}{resent}")
+
+
+def _warn_torn(torn: dict[Path, str]) -> None:
+    """Warns of files of a log that were not finished, for example because of a power failure.
+
+    Args:
+        torn: For each file the problem.
+    """
+    for path, text in torn.items():
+        terminal.print_note(
+            f"{path}: {text}; the intact part is played; "
+            f"repair the file with: trilat log recover {path}"
+        )
+
+
+def _warn_about_playback(outcome: "PlaybackSummary", reported: set[Path]) -> None:
+    """Warns of everything in a replay that was not as recorded.
+
+    This may be torn files, subscribers that were cut off, or messages that were played late.
+
+    Args:
+        outcome: Outcome of the replay.
+        reported: Torn files of which the user has been warned already.
+    """
+    _warn_torn({path: text for path, text in outcome.torn.items() if path not in reported})
+    if outcome.cut:
+        terminal.print_error(
+            "a subscriber received nothing for 5 s and was cut off, "
+            f"{count_nouns(outcome.cut, 'time')}: the subscriber lacks the messages "
+            "that were played then"
+        )
+    if outcome.strays:
+        terminal.print_error(
+            f"{count_nouns(outcome.strays, 'message lies', 'messages lie')} more than a "
+            "minute from their position in the file, and were "
+            "played late; with a larger --preload they are played in order"
+        )
+
+
+LOOPBACK = "tcp/127.0.0.1:7447"
+"""Default endpoint of a router without keys, which other machines cannot reach."""
+ANY_ADDRESS = "tls/0.0.0.0:7447"
+"""Default endpoint of a router with keys, whose connections are encrypted."""
+
+
+@options.command("--keys keys/router", page="docs/network.md")
+def router_command(
+    listen: Annotated[
+        list[str] | None,
+        value(
+            "--listen",
+            "EP",
+            "Endpoint to listen on; repeatable. "
+            f"Default: {ANY_ADDRESS} with --keys, otherwise {LOOPBACK}.",
+        ),
+    ] = None,
+    connect: options.ConnectOption = None,
+    zenoh_config: options.ZenohConfigOption = None,
+    keys: options.KeysOption = None,
+    insecure: options.InsecureOption = False,
+    until_idle: Annotated[
+        float | None,
+        seconds(
+            "--until-idle",
+            "End after all members have been absent for this long, s; default: never.",
+        ),
+    ] = None,
+) -> None:
+    """Connects sites that cannot reach each other directly.
+
+    Use a router for sites behind NAT, for example. Start the sites and the recorder with
+    --router, in any order. The router runs until Ctrl-C, and a session continues after its
+    router is restarted. Routers that are connected to each other with --connect act as one
+    router.
+    """
+    from ...net.connection import (
+        open_bus,
+        resolve_member_connection,
+        run_router,
+        secure_connection,
+    )
+    from ...net.zenoh_bus import read_zenoh_file
+    from ...net.zenoh_config import ROUTER
+
+    file = None if zenoh_config is None else read_zenoh_file(zenoh_config)
+    default_listen = [LOOPBACK if keys is None else ANY_ADDRESS]
+    open_connection = resolve_member_connection(
+        listen=listen,
+        connect=connect,
+        routers=None,
+        file=file,
+        listen_else=default_listen,
+        connect_else=(),
+        routes=True,
+    )
+    secured = secure_connection(open_connection, keys, insecure=insecure)
+    connection = secured.require(ROUTER)
+    expiry = connection.describe_end()
+    if expiry:
+        terminal.print_note(expiry)
+
+    clock = SystemClock()
+    with Interrupt() as interrupt:
+        bus = open_bus(
+            connection=connection,
+            clock=clock,
+            stopped=interrupt.is_requested,
+            timeout_s=None,
+            say=terminal.print_line,
+        )
+        if bus is None:
+            raise typer.Exit(interrupt.exit_code)
+        with closing(bus):
+            endpoints = ", ".join(map(str, connection.listen))
+            _print_router_line(f"listening at {endpoints}; Ctrl-C ends it")
+            run_router(
+                bus=bus,
+                clock=clock,
+                stopped=interrupt.is_requested,
+                say=_print_router_line,
+                until_idle_s=until_idle,
+            )
+        raise typer.Exit(interrupt.exit_code if interrupt.is_requested() else 0)
+
+
+def _print_router_line(text: str) -> None:
+    """Prints a line that starts with "router:"."""
+    terminal.print_line(f"router: {text}")
+
+
+@options.command(
+    "--session paper",
+    "--session paper --ros tcp/192.0.2.7:7447 --domain 3",
+    page="docs/ros2.md",
+)
+def ros2_command(
+    session: Annotated[str, value("--session", "ID", "Session to bridge.")],
+    ros: options.RosRouterOption = None,
+    domain: options.RosDomainOption = 0,
+    distro: Annotated[str, value("--ros-distro", "humble|jazzy|kilted|lyrical")] = "jazzy",
+    rate: Annotated[
+        float, value("--rate", "HZ", callback=options.check_range(1.0, 20000.0, "a rate in Hz"))
+    ] = 100.0,
+    names: Annotated[str, value("--names", "crisp|crtk|FILE")] = "crisp",
+    rviz: Annotated[Path | None, value("--rviz", "OUT.rviz")] = None,
+    timeout: options.AnswerOption = 10.0,
+    *,
+    reach: options.Reach,
+) -> None:
+    """Connects a session to ROS 2.
+
+    ROS programs can hold arms, and ROS robots can serve as arms. ROS must use
+    RMW_IMPLEMENTATION=rmw_zenoh_cpp, and its Zenoh router must run. This machine needs no ROS
+    installation. The bridge waits for the router, and ends with the session. docs/ros2.md lists
+    all topics and services.
+
+    Options:
+        distro: ROS 2 distribution whose message format the bridge writes.
+        rate: Rate of each topic, Hz.
+        names: Naming scheme of the topics: crisp, crtk, or a TOML file that lists topics and
+            robots.
+        rviz: Write a configuration of RViz that shows the arms of the session.
+    """
+    from trilat_net.app.ros2_bridge import serve_ros2
+    from trilat_net.app.running_session import RunningSession
+
+    from ...log.ros2.topic_names import read_topic_table
+    from ...net.host_names import check_hosts
+    from ...net.ros2_graph import DISTROS, Refusals, Ros2Graph
+    from ...net.ros2_names import check_ros_name
+    from ...net.zenoh_config import BRIDGE
+
+    if distro not in DISTROS:
+        raise UsageError(f"--ros-distro must be one of {', '.join(DISTROS)}, not {distro!r}")
+    name = check_ros_name(options.check_session_name(session), "session")
+    table = read_topic_table(names)
+    # Checked now, because the bridge would wait for a router at a wrong address forever.
+    check_hosts(ros or ())
+    running = RunningSession(name, reach.resolve(operates=False).require(BRIDGE))
+
+    def open_graph(refusals: Refusals) -> Ros2Graph:
+        """Joins the network of ROS as a node with the name of the session."""
+        return Ros2Graph(
+            refusals=refusals,
+            routers=ros or [options.ROS_ROUTER],
+            namespace=name,
+            name="trilat",
+            clock=SystemClock(),
+            domain=domain,
+            distro=distro,
+        )
+
+    with Interrupt() as interrupt:
+        serve_ros2(
+            running=running,
+            open_graph=open_graph,
+            rate_hz=rate,
+            table=table,
+            stopped=interrupt.is_requested,
+            say=terminal.print_line,
+            timeout_s=timeout,
+            rviz=rviz,
+        )
+    if interrupt.is_requested():
+        raise typer.Exit(interrupt.exit_code)

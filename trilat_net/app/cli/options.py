@@ -1,0 +1,729 @@
+"""Defines the command-line options that several commands share.
+
+The options select a scenario, a network connection or a log. Options that belong together are
+fields of a named tuple, for instance `Reach`, which describes how a command reaches a session.
+A command that has a parameter of such a type accepts all options of the type
+(`expand_option_tuples`). The methods of the tuple then open the connection or read the file.
+"""
+
+import inspect
+import re
+from collections.abc import Callable, Sequence
+from functools import wraps
+from importlib import import_module, resources
+from pathlib import Path
+from pkgutil import iter_modules
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
+
+import typer
+
+from ...errors import TrilatError, UsageError
+from ...presentation import terminal_output as terminal
+
+if TYPE_CHECKING:
+    from ...log.log_reader import Log
+    from ...net.connection import Connection
+    from ...results import Result
+    from ...scenario import Scenario
+
+Runs = TypeVar("Runs", bound=Callable[..., None])
+
+
+def check_range(
+    low: float, high: float, noun: str
+) -> Callable[[typer.CallbackParam, float | None], Any]:
+    """Returns a function that refuses the number of an option if it is out of a range.
+
+    Args:
+        low: The smallest number.
+        high: The largest number.
+        noun: Name of the number in the error message, as in "a share".
+
+    Returns:
+        A callback for `typer.Option`, which returns the number.
+    """
+
+    def check(param: typer.CallbackParam, value: float | None) -> float | None:
+        """Returns the number that the user gave for an option, after checking its range.
+
+        Args:
+            param: Declaration of the option, which contains its name.
+            value: The number. None if the option was not given.
+
+        Raises:
+            UsageError: The number is less than `low` or greater than `high`.
+        """
+        if value is not None and not low <= value <= high:
+            raise UsageError(
+                f"{param.opts[0]} must be {noun} from {low:.7g} to {high:.7g}, not {value:g}"
+            )
+        return value
+
+    return check
+
+
+def value(names: str, metavar: str, text: str = "", **settings: Any) -> Any:
+    """Declares an option that takes a value.
+
+    Args:
+        names: Names of the option, separated by spaces, as in "-o --out".
+        metavar: Placeholder of the value in the help.
+        text: Help of the option.
+        settings: Further arguments of `typer.Option`.
+    """
+    return typer.Option(*names.split(), metavar=metavar, help=text, **settings)
+
+
+def flag(names: str, text: str = "", **settings: Any) -> Any:
+    """Declares an option without a value.
+
+    Args:
+        names: Names of the option, as in "--json" or "--ports/--no-ports".
+        text: Help of the option.
+        settings: Further arguments of `typer.Option`.
+    """
+    return typer.Option(names, help=text, **settings)
+
+
+def seconds(name: str, text: str = "") -> Any:
+    """Declares a command line option with a time to wait, from 0 s to one day.
+
+    Args:
+        name: Name of the option, such as "--timeout".
+        text: Help of the option.
+    """
+    return value(name, "S", text, callback=check_range(0.0, 86_400.0, "a number of seconds"))
+
+
+_OPTION_ENTRY = re.compile(r"^    (\w+): (.+(?:\n {8}.+)*)", re.MULTILINE)
+"""An entry in the section `Options` of a docstring after `inspect.cleandoc`."""
+
+
+def command(*examples: str, page: str = "docs/commands.md") -> Callable[[Runs], Runs]:
+    """Returns a decorator that declares a function as a command of the program.
+
+    The docstring of the function is the help of the command. The help of options that is too
+    long for their declaration is in the section `Options` of the docstring, with an entry for
+    each parameter.
+
+    Args:
+        examples: Arguments of the examples that the help shows.
+        page: Page of the documentation that the help names, as in "docs/links.md".
+    """
+
+    def declare(run: Runs) -> Runs:
+        """Stores the help of a command where Typer, the command line library, expects it.
+
+        The entries in the section `Options` of the docstring become the help texts of the
+        options. The rest of the docstring is the help of the command.
+
+        Args:
+            run: Function that executes the command.
+
+        Returns:
+            The same function, with the examples and the page in its attributes `examples`
+            and `page`.
+        """
+        run.examples = examples  # type: ignore[attr-defined]
+        run.page = page  # type: ignore[attr-defined]
+        docstring = inspect.getdoc(run) or ""
+        command_help, _, option_entries = docstring.partition("\n\nOptions:\n")
+        run.__doc__ = command_help or None
+        for parameter, text in _OPTION_ENTRY.findall(option_entries):
+            option = run.__annotations__[parameter].__metadata__[0]
+            option.help = " ".join(text.split())
+        return run
+
+    return declare
+
+
+_NO_LAWS = ("conditions", "interface", "sent_vectors")
+"""Modules in the folder of the laws that define no law."""
+
+
+def list_laws() -> list[str]:
+    """Lists the names of the built-in control laws, without importing their modules."""
+    folder = str(Path(__file__).parents[1] / "laws")
+    return [module.name for module in iter_modules([folder]) if module.name not in _NO_LAWS]
+
+
+def complete_scenarios(incomplete: str) -> list[str]:
+    """Lists the scenarios with which a shell may complete a word.
+
+    They are the shipped scenarios, and the TOML files of a folder.
+
+    Args:
+        incomplete: The word so far. If it has a slash, files of its folder are listed,
+            otherwise files of the current folder.
+    """
+    shipped = (entry.name.removesuffix(".toml") for entry in _SCENARIOS.iterdir())
+    names = [name for name in shipped if "." not in name and not name.startswith("_")]
+    folder = Path(incomplete).parent if "/" in incomplete else Path()
+    files = [str(path) for path in folder.glob("*.toml")] if folder.is_dir() else []
+    return sorted(name for name in [*names, *files] if name.startswith(incomplete))
+
+
+def complete_figures(incomplete: str) -> list[str]:
+    """Lists the names of plots that begin with the letters that the user has typed in a shell.
+
+    Args:
+        incomplete: The letters before the completion.
+    """
+    from ...presentation.figures.registry import FIGURES
+
+    return [name for name in FIGURES if name.startswith(incomplete)]
+
+
+def complete_sites(context: typer.Context, incomplete: str) -> list[str]:
+    """Lists the sites with which a shell may complete a word.
+
+    Args:
+        context: The command line, whose scenario or log has the sites.
+        incomplete: The word so far.
+
+    Returns:
+        The names. Empty if the command line has no valid scenario or log yet.
+    """
+    from ...log.log_reader import open_log
+    from ...scenario import load_scenario
+
+    files = context.params.get("files") or []
+    # Arguments in front of an option without a value are not parsed yet.
+    if "files" in context.params and not files:
+        files = [Path(argument) for argument in context.args]
+    try:
+        if files:
+            names = open_log(*files).sites
+        else:
+            names = load_scenario(context.params["scenario"]).names
+    except (TrilatError, KeyError, TypeError):
+        return []
+    return [name for name in names if name.startswith(incomplete)]
+
+
+_SCENARIOS = resources.files("trilat_net") / "scenarios"
+
+ScenarioArgument = Annotated[
+    str,
+    typer.Argument(
+        help="Name of a shipped scenario, or path of a TOML file.",
+        autocompletion=complete_scenarios,
+    ),
+]
+SetOption = Annotated[
+    list[str] | None,
+    value(
+        "--set",
+        "KEY=VALUE",
+        "Override a scenario key, for example control.Kd=5; repeatable.",
+    ),
+]
+SeedOption = Annotated[
+    int | None, typer.Option("--seed", help="Override the seed of the scenario.")
+]
+DurationOption = Annotated[
+    float | None, value("--duration", "S", "Override the duration of the run, s.")
+]
+ForceOption = Annotated[bool, flag("--force", "Replace existing files.")]
+ListenOption = Annotated[
+    list[str] | None,
+    value(
+        "--listen", "EP", "Endpoint to listen on, for example tcp/192.0.2.1:7447; repeatable."
+    ),
+]
+ConnectOption = Annotated[
+    list[str] | None, value("--connect", "EP", "Endpoint to connect to; repeatable.")
+]
+
+RouterOption = Annotated[
+    list[str] | None,
+    value(
+        "--router",
+        "EP",
+        "Endpoint of a router to use instead of direct connections, for example "
+        "tcp/192.0.2.1:7447. If repeated, the first router that answers is used.",
+    ),
+]
+ZenohConfigOption = Annotated[
+    Path | None,
+    value(
+        "--zenoh-config",
+        "FILE",
+        "Your own Zenoh configuration file, for example for TLS, QUIC or access control.",
+    ),
+]
+KeysOption = Annotated[
+    Path | None,
+    value("--keys", "DIR", "Folder with this member's keys, created by `trilat keys new`."),
+]
+InsecureOption = Annotated[
+    bool,
+    flag(
+        "--insecure",
+        "Allow other machines to connect without encryption, on a network whose users you "
+        "trust.",
+    ),
+]
+
+
+MOST_LETTERS = 80
+"""Largest length of a session's name. The name of a scenario has at most 64 letters."""
+
+
+def check_session_name(name: str) -> str:
+    """Checks that the name of a session can be part of a Zenoh key, and returns the name.
+
+    Zenoh is the network protocol, and its keys are the names of the channels.
+
+    Raises:
+        UsageError: The name is too long or has other characters.
+    """
+    if len(name) > MOST_LETTERS or not re.fullmatch("[A-Za-z0-9_.-]+", name):
+        # Letters of other alphabets may look like those of ASCII.
+        letters = "" if name.isascii() else "; only the letters a to z and A to Z are allowed"
+        raise UsageError(
+            f"a session's name must have 1 to {MOST_LETTERS} characters (letters, digits, _, - "
+            f"and .), not {ascii(name)[:80]}{letters}"
+        )
+    return name
+
+
+AnswerOption = Annotated[float, seconds("--timeout", "Longest wait for the first answer, s.")]
+ClockOffsetOption = Annotated[
+    float,
+    value(
+        "--clock-offset-s",
+        "S",
+        "For tests: offset added to the clock of this machine, s.",
+        callback=check_range(-1e6, 1e6, "a number of seconds"),
+    ),
+]
+ClockDriftOption = Annotated[
+    float,
+    value(
+        "--clock-drift-ppm",
+        "PPM",
+        "For tests: drift added to the clock of this machine, ppm; positive is faster.",
+        callback=check_range(-200.0, 200.0, "a number"),
+    ),
+]
+
+ViewsOption = Annotated[
+    str,
+    value(
+        "--views",
+        "off|full|HZ",
+        "Rate of the channels with standard messages for ROS 2 and viewers, Hz; the "
+        "decimation keeps minima and maxima. full: every record; off: no such channels.",
+    ),
+]
+
+JobsOption = Annotated[
+    int | None,
+    value("--jobs", "N", "Number of parallel processes; default: one per core.", min=1),
+]
+
+
+LogArgument = Annotated[Path, typer.Argument(help="File of an MCAP log.", metavar="FILE")]
+LogsArgument = Annotated[
+    list[Path],
+    typer.Argument(
+        help="File of an MCAP log, or the files of all its parts.", metavar="FILE..."
+    ),
+]
+LogsOrFoldersArgument = Annotated[
+    list[Path],
+    typer.Argument(
+        help="MCAP logs, or folders with MCAP logs. Files of the same session are one log.",
+        metavar="FILE...",
+    ),
+]
+ROS_ROUTER = "tcp/127.0.0.1:7447"
+RosRouterOption = Annotated[
+    list[str] | None,
+    value(
+        "--ros",
+        "EP",
+        f"Endpoint of the Zenoh router of ROS (rmw_zenohd); default: {ROS_ROUTER}.",
+    ),
+]
+RosDomainOption = Annotated[
+    int, value("--domain", "N", "ROS 2 domain (ROS_DOMAIN_ID).", min=0, max=232)
+]
+NeedsRecorderOption = Annotated[
+    bool, flag("--needs-recorder", "Do not start until a recorder has joined the session.")
+]
+
+
+MinCoverageOption = Annotated[
+    float,
+    value(
+        "--min-coverage",
+        "SHARE",
+        "Smallest share of each site's ticks (control periods) that must be checked to pass.",
+        callback=check_range(0.0, 1.0, "a share"),
+    ),
+]
+MIN_COVERAGE = 0.999
+"""The same number as in `log.accounting`, whose import takes long."""
+OnOption = Annotated[
+    str | None,
+    value(
+        "--on",
+        "tcp://HOST:PORT",
+        "Run on the workers of this Dask scheduler instead of on this machine.",
+    ),
+]
+FIGURE_HELP = "File for a figure of the result (.png, .svg or .pdf)."
+PngOption = Annotated[bool, flag("--png", "Write every figure as a PNG file too.")]
+JsonOption = Annotated[bool, flag("--json", "Print everything as JSON.")]
+AllOption = Annotated[
+    bool, flag("--all", "Print everything, not only the ten most important lines.")
+]
+
+
+def check_picture(path: Path | None, *, force: bool) -> None:
+    """Refuses the path of a figure that cannot be written.
+
+    Args:
+        path: Path of the figure. None if no figure was requested.
+        force: True to replace an existing file.
+
+    Raises:
+        UsageError: The format is unknown, the file exists, or its folder does not.
+    """
+    if path is None:
+        return
+    from ...files import refuse_existing
+    from ...presentation.style import FIGURE_FORMATS
+
+    if path.suffix.lstrip(".").lower() not in FIGURE_FORMATS:
+        raise UsageError(
+            f"{path}: the name of a figure must end in one of .{', .'.join(FIGURE_FORMATS)}"
+        )
+    refuse_existing(path, force=force)
+    if not path.parent.is_dir():
+        raise UsageError(f"{path}: the folder {path.parent} does not exist")
+
+
+def print_and_draw(
+    result: "Result", picture: Path | None, figure: str, drawn: Any, *, as_json: bool
+) -> None:
+    """Prints a result, and writes a figure of it if a path is given.
+
+    Args:
+        result: The result.
+        picture: Path of the figure. None for no figure.
+        figure: Module and function that draw the figure, as in "twin_differences:draw_twins".
+        drawn: Argument of that function.
+        as_json: True to print the result as JSON.
+    """
+    if picture is not None:
+        from ...presentation.style import REPORT_DPI, write_figure
+
+        module_name, _, function_name = figure.partition(":")
+        module = import_module(f"trilat_net.presentation.figures.{module_name}")
+        draw = getattr(module, function_name)
+        write_figure(draw(drawn), picture, REPORT_DPI)
+    terminal.print_result(result, as_json=as_json)
+    if picture is not None and not as_json:
+        terminal.print_paths([picture])
+
+
+def load_chosen_scenario(
+    source: str, overrides: list[str] | None, duration: float | None, seed: int | None
+) -> "Scenario":
+    """Returns the scenario that the options of a command describe.
+
+    Args:
+        source: Name of a shipped scenario, or path of a TOML file.
+        overrides: Overrides from --set.
+        duration: Duration in s from --duration. None keeps that of the scenario.
+        seed: Seed from --seed. None keeps that of the scenario.
+    """
+    from ...scenario import load_scenario
+
+    return load_scenario(source, overrides or [], duration_s=duration, seed=seed)
+
+
+def list_overrides(overrides: list[str] | None, duration: float | None) -> list[str]:
+    """Returns the overrides of --set and --duration, in this order."""
+    texts = list(overrides or [])
+    if duration is not None:
+        texts.append(f"duration_s={duration!r}")
+    return texts
+
+
+def split_names(text: str | None) -> list[str]:
+    """Splits a text of names such as "adaptive,p_d". None gives an empty list."""
+    return [] if text is None else [name.strip() for name in text.split(",")]
+
+
+def list_used_options(context: typer.Context) -> list[str]:
+    """Lists the options and arguments that the user wrote on the command line.
+
+    Returns:
+        The first name of each, in the order of declaration.
+    """
+    used = []
+    for param in context.command.params:
+        source = context.get_parameter_source(param.name or "")
+        if source and source.name == "COMMANDLINE":
+            used.append(param.opts[0])
+    return used
+
+
+class MemberOptions(NamedTuple):
+    """The options by which a process takes part in a session as one of its members.
+
+    The members of a session are its sites and recorders. A connection listens at some endpoints
+    and connects to others.
+    """
+
+    listen: ListenOption = None
+    connect: ConnectOption = None
+    router: RouterOption = None
+    zenoh_config: ZenohConfigOption = None
+    keys: KeysOption = None
+    insecure: InsecureOption = False
+
+    def find_endpoints(
+        self, listen_else: Sequence[str] = (), connect_else: Sequence[str] | None = None
+    ) -> "Connection":
+        """Returns the network addresses that the options state, without encryption keys.
+
+        Args:
+            listen_else: Addresses at which to listen if the options state none.
+            connect_else: Addresses to which to connect if the options state none.
+        """
+        from ...net.connection import resolve_member_connection
+        from ...net.zenoh_bus import read_zenoh_file
+
+        file = None if self.zenoh_config is None else read_zenoh_file(self.zenoh_config)
+        return resolve_member_connection(
+            listen=self.listen,
+            connect=self.connect,
+            routers=self.router,
+            file=file,
+            listen_else=listen_else,
+            connect_else=connect_else,
+        )
+
+    def resolve(
+        self,
+        listen_else: Sequence[str] = (),
+        connect_else: Sequence[str] | None = None,
+        *,
+        stops: bool = False,
+    ) -> "Connection":
+        """Returns the connection that the options describe, secured by the keys of the process.
+
+        Prints a note if the keys expire soon.
+
+        Args:
+            listen_else: Endpoints at which to listen if the options name none.
+            connect_else: Endpoints to which to connect if the options name none.
+            stops: True if the connection only serves to stop arms. Expired keys are then
+                accepted, and no note is printed.
+        """
+        from ...net.connection import secure_connection
+
+        connection = self.find_endpoints(listen_else, connect_else)
+        keys: Any = self.keys
+        if stops and keys is not None:
+            from ...net.member_keys import read_member_keys
+
+            keys = read_member_keys(keys, stops=True)
+        secured = secure_connection(connection, keys, insecure=self.insecure)
+        expiry = secured.describe_end()
+        # A user who stops an arm in a hurry does not read notes.
+        if expiry and not stops:
+            terminal.print_note(expiry)
+        return secured
+
+
+class Reach(NamedTuple):
+    """Command line options with which a command connects to a running session from outside.
+
+    The command only observes or changes the session. It is not one of its sites or recorders.
+    """
+
+    connect: ConnectOption = None
+    router: RouterOption = None
+    zenoh_config: ZenohConfigOption = None
+    keys: KeysOption = None
+
+    def resolve(self, *, operates: bool = True, stops: bool = False) -> "Connection":
+        """Returns the connection to the session that the command line options describe.
+
+        If the session is encrypted, the option --keys names the keys of the command.
+
+        Args:
+            operates: True if only the keys of the operator permit what the command does. Then
+                other keys are refused.
+            stops: True if the command only stops arms. Then expired keys are accepted too.
+        """
+        from ...net.zenoh_config import OPERATOR
+
+        connection = MemberOptions(None, *self).resolve(stops=stops)
+        return connection.require(OPERATOR) if operates else connection
+
+
+class LawFiles(NamedTuple):
+    """The options that allow files to run as the user-written control laws that a log names.
+
+    A log may come from somebody else. Code that it names runs only with the permission of the
+    user.
+    """
+
+    law: Annotated[
+        list[Path] | None,
+        value(
+            "--law",
+            "FILE",
+            "Allow this file to run as a control law that the log names; repeatable.",
+        ),
+    ] = None
+    other_version: Annotated[
+        bool,
+        flag(
+            "--other-version",
+            "Accept a --law FILE that differs from the file used in the recorded session.",
+        ),
+    ] = False
+    remember: Annotated[
+        bool,
+        flag(
+            "--remember",
+            "Remember the permission of --law, for later logs that name a file of the same "
+            "hash with the same settings.",
+        ),
+    ] = False
+
+    def open(self, *files: Path, runs_them: bool = True) -> "Log":
+        """Opens a log, and warns the user if code from another person will be executed.
+
+        A log may name files with control laws. They are executed if the run is repeated.
+
+        Args:
+            *files: The log, or the files into which it is divided.
+            runs_them: True if the command executes the control laws that the log names. Only
+                then the user is warned.
+        """
+        allowed: dict[str, Any] = {**self._asdict(), "law": self.law or ()}
+        log = terminal.open_with_progress(*files, **allowed)
+        if runs_them:
+            terminal.warn_user_laws(log)
+        return log
+
+
+class RunOptions(NamedTuple):
+    """The options of a command that runs a session on this machine and reports on it."""
+
+    duration: DurationOption = None
+    folder: Annotated[
+        Path | None, value("--out -o", "DIR", "Folder for the results; default: runs/NAME-N.")
+    ] = None
+    seed: SeedOption = None
+    overrides: SetOption = None
+    force: ForceOption = False
+    png: PngOption = False
+    as_json: JsonOption = False
+
+    def load(self, source: str, longest_s: float | None = None) -> "Scenario":
+        """Returns the scenario of the run.
+
+        Args:
+            source: Name of a shipped scenario, or path of a TOML file.
+            longest_s: Duration of the run without --duration, in s. None uses that of the
+                scenario.
+        """
+        duration_s = longest_s if self.duration is None else self.duration
+        return load_chosen_scenario(source, self.overrides, duration_s, self.seed)
+
+
+class PageServing(NamedTuple):
+    """The options of a command that serves a page to browsers."""
+
+    host: Annotated[
+        str,
+        value(
+            "--host",
+            "ADDRESS",
+            "Address on which the page is served; any address other than loopback requires "
+            "--tls or --insecure.",
+        ),
+    ] = "127.0.0.1"
+    port: Annotated[
+        int,
+        typer.Option(
+            "--port",
+            min=0,
+            max=65535,
+            help="Port on which the page is served; 0 selects any free port.",
+        ),
+    ] = 0
+    insecure: Annotated[
+        bool, flag("--insecure", "Allow a --host other than loopback without encryption.")
+    ] = False
+    browser: Annotated[
+        bool,
+        flag(
+            "--browser/--no-browser",
+            "Open the page in a browser, if this machine has a browser.",
+        ),
+    ] = True
+    tls: Annotated[
+        Path | None,
+        value("--tls", "DIR", "Encrypt the page with the member's keys in this folder."),
+    ] = None
+
+
+_OPTION_TUPLES = (MemberOptions, Reach, LawFiles, RunOptions, PageServing)
+
+
+def expand_option_tuples(run: Callable[..., Any]) -> Callable[..., Any]:
+    """Makes a command for Typer from a function whose parameters are groups of options.
+
+    Typer, the command line library, makes one option of each parameter. A group is a named
+    tuple such as `Reach`, with one field per option. The returned function has one parameter
+    per field instead. When it is called, it puts the fields together again.
+
+    Args:
+        run: Function that executes the command, with groups of options as parameters.
+
+    Returns:
+        The function with one parameter per option.
+    """
+    declared = inspect.signature(run).parameters
+    tuples = {
+        name: parameter.annotation
+        for name, parameter in declared.items()
+        if parameter.annotation in _OPTION_TUPLES
+    }
+
+    parameters = []
+    for name, parameter in declared.items():
+        fields = [parameter]
+        if name in tuples:
+            fields = list(inspect.signature(tuples[name]).parameters.values())
+        parameters += [field.replace(kind=inspect.Parameter.KEYWORD_ONLY) for field in fields]
+
+    @wraps(run)
+    def run_with_tuples(**arguments: Any) -> Any:
+        """Executes the command, after it has put the options into their groups again.
+
+        Args:
+            **arguments: Value of each option, by the name of its parameter.
+        """
+        for name, option_tuple in tuples.items():
+            values = [arguments.pop(field) for field in option_tuple._fields]
+            arguments[name] = option_tuple(*values)
+        return run(**arguments)
+
+    # Typer reads the parameters from these two attributes.
+    vars(run_with_tuples)["__signature__"] = inspect.Signature(parameters)
+    run_with_tuples.__annotations__ = {
+        parameter.name: parameter.annotation for parameter in parameters
+    }
+    return run_with_tuples

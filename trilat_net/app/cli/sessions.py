@@ -1,0 +1,769 @@
+"""Commands that start, show, measure, change or stop a session, or check this machine.
+
+A session is a live run. Several processes ("sites"), possibly on different machines, each
+control one robot arm and exchange the states of the arms over a network. The commands reach the
+sites over the same network.
+"""
+
+import re
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ...errors import UsageError
+from ...net.clock import SystemClock, make_system_clock
+from ...presentation import terminal_output as terminal
+from ...presentation.result_text import MARKS
+from ...process import Interrupt
+from . import options
+from .options import flag, value
+
+if TYPE_CHECKING:
+    from live.page_server import PageAttendant
+    from trilat_net.app.running_session import RunningSession
+
+    from ...scenario import Scenario
+
+
+@options.command("paper --duration 10 --set control.Kd=5")
+def demo_command(
+    scenario: options.ScenarioArgument = "paper", *, run: options.RunOptions
+) -> None:
+    """Runs a scenario live, verifies its log and writes a report.
+
+    Each site runs in its own process, and so does the recorder; they communicate over Zenoh.
+    """
+    run_and_report(run.load(scenario), run)
+
+
+def _describe_log(path: Path) -> str:
+    """Returns what the log of an interrupted session contains, as the end of a sentence.
+
+    Args:
+        path: The log.
+
+    Returns:
+        A text that starts with a colon. Empty if the log cannot be read.
+    """
+    from ...errors import LogError
+    from ...log.log_reader import open_log
+
+    with suppress(LogError):
+        # The headline names the session first, which the user knows.
+        _, _, contents = open_log(path).headline().partition("; ")
+        return f": {contents}"
+    return ""
+
+
+def run_and_report(
+    chosen: "Scenario", run: options.RunOptions, page: "PageAttendant | None" = None
+) -> None:
+    """Runs a scenario live, then verifies its log and writes a report.
+
+    Args:
+        chosen: The scenario.
+        run: The options of the run.
+        page: Page in a browser that shows the session, has a button that ends it, and links to
+            the report. None for no page.
+
+    Raises:
+        typer.Exit: The session was interrupted or had problems, or the log failed a check.
+    """
+    from trilat_net.app.demo_session import run_demo
+
+    from ...files import make_results_folder, require_libraries
+
+    require_libraries()
+    results = make_results_folder(run.folder, chosen.name, force=run.force)
+    with terminal.lines_aside(run.as_json):
+        terminal.print_text(chosen.title or chosen.name)
+        members = f"{', '.join(chosen.names)} and a recorder, session {chosen.name}"
+        terminal.print_text(f"{chosen.duration_s:g} s live: {members}; Ctrl-C ends it")
+        outcome = run_demo(chosen, results, terminal.out, page.attend if page else None)
+    for problem in outcome.problems:
+        terminal.print_error(problem)
+
+    has_log = outcome.log.exists()
+    # With a page, an interruption is the normal end of a session, and its log is verified.
+    ends_without_report = outcome.interrupted and not (page and has_log)
+    if ends_without_report:
+        contents = ""
+        if has_log:
+            contents = f"; {outcome.log} holds the records so far{_describe_log(outcome.log)}"
+        terminal.err.print(f"interrupted{contents}", markup=False, soft_wrap=True)
+        raise typer.Exit(128 + outcome.interrupted)
+    if not has_log:
+        raise typer.Exit(outcome.exit_code)
+
+    _, conclusion = terminal.conclude_files(
+        [outcome.log], results, as_json=run.as_json, png=run.png
+    )
+    if page is not None:
+        page.offer_results((conclusion.page, outcome.log))
+    if outcome.problems or not conclusion.passed:
+        raise typer.Exit(outcome.exit_code)
+
+
+@options.command("play", "--session paper", page="docs/live-page.md")
+def live_command(
+    context: typer.Context,
+    scenario: options.ScenarioArgument = "play",
+    session: Annotated[str | None, value("--session", "ID")] = None,
+    *,
+    reach: options.Reach,
+    serving: options.PageServing,
+    run: options.RunOptions,
+) -> None:
+    """Runs a scenario live on a web page, where you lead the arms.
+
+    A button on the page or Ctrl-C ends the session; then its log is verified and a report is
+    written. With --session, the page shows a session that is already running, and leaves it
+    running.
+
+    Options:
+        session: Show this running session instead of starting one.
+    """
+    from live.page_server import MAX_DURATION_S, PageAttendant, PageOptions, show_on_page
+    from live.terminal_watch import watch_session
+
+    clock = SystemClock()
+    say = terminal.print_line
+    page = PageOptions(*serving)
+    page.check()
+
+    if session is not None:
+        extra = _START_OPTIONS & set(options.list_used_options(context))
+        if extra:
+            raise UsageError(
+                "--session shows a session that is already running: "
+                f"leave out {', '.join(sorted(extra))}"
+            )
+        connection = reach.resolve()
+        name = options.check_session_name(session)
+        show = partial(show_on_page, page, clock, name, say)
+        raise typer.Exit(
+            watch_session(
+                session=name,
+                connection=connection,
+                clock=clock,
+                show=show,
+                say=say,
+                timeout_s=10.0,
+            )
+        )
+
+    if any(reach):
+        raise UsageError(
+            "--connect, --router, --zenoh-config and --keys can be used only with --session"
+        )
+    with PageAttendant(page, clock) as attendant:
+        run_and_report(run.load(scenario, MAX_DURATION_S), run, attendant)
+
+
+_START_OPTIONS = {
+    "--duration",
+    "--out",
+    "--seed",
+    "--set",
+    "--force",
+    "--png",
+    "--json",
+    "scenario",
+}
+"""Options of `trilat live` that only concern a session that it starts."""
+
+_check_count = options.check_range(5, 10_000, "a number")
+
+
+@options.command("--session paper", page="docs/network-check.md")
+def ping_command(
+    context: typer.Context,
+    session: Annotated[str, value("--session", "ID", "Session to measure.")] = "paper",
+    *,
+    reach: options.Reach,
+    count: Annotated[
+        int,
+        value("--count", "N", "Number of round trips to each member.", callback=_check_count),
+    ] = 50,
+    timeout: options.AnswerOption = 3.0,
+    benchmark: Annotated[
+        str | None, value("--benchmark", "SCENARIO", autocompletion=options.complete_scenarios)
+    ] = None,
+    ros2: Annotated[str | None, value("--ros2", "TOPIC")] = None,
+    ros: options.RosRouterOption = None,
+    domain: options.RosDomainOption = 0,
+    overrides: options.SetOption = None,
+    seconds: Annotated[
+        float | None,
+        value(
+            "--seconds", "S", callback=options.check_range(1.0, 86400.0, "a number of seconds")
+        ),
+    ] = None,
+    picture: Annotated[Path | None, value("--figure", "FILE")] = None,
+    force: options.ForceOption = False,
+    answer: Annotated[list[str] | None, value("--answer", "EP")] = None,
+    insecure: options.InsecureOption = False,
+    as_json: options.JsonOption = False,
+    clock_offset: options.ClockOffsetOption = 0.0,
+    clock_drift: options.ClockDriftOption = 0.0,
+) -> None:
+    """Measures delay and clock offset to each member of a session.
+
+    The command shows the round-trip time, the clock offset and the jitter between this machine
+    and every member. The session may still be waiting for members. If it is running, the delays
+    that its sites measure on their links are shown too. Without endpoints, the command connects
+    to the loopback port of the first site and asks for the other sites.
+
+    With --benchmark no session is needed: the command measures whether the network is good
+    enough for a scenario, using the delay margin that `trilat linear` computes. To measure the
+    network to another machine, run `trilat ping --answer EP` there, and use --connect EP here.
+    Without --connect, both ends run on this machine, over TCP, TLS and QUIC, and no network is
+    measured. The benchmark takes half a minute. The exit code is 1 if the network is not good
+    enough.
+
+    With --ros2 no session is needed either: the command listens over Zenoh to a ROS 2 topic of
+    any message type (docs/ros2.md).
+
+    Options:
+        benchmark: Measure the network to --connect EP for this scenario instead, for several
+            message sizes, rates and transports. Without --connect, measure this machine alone.
+        ros2: Measure the delay of messages of this ROS 2 topic instead.
+        seconds: Total duration of the benchmark, s; default: 24. With --ros2: duration of the
+            measurement, s; default: 5. With --answer: time after which the command ends, s;
+            default: no limit.
+        picture: File for a figure of the benchmark (.png, .svg or .pdf).
+        answer: Answer benchmarks from other machines on this endpoint; repeatable.
+    """
+    mode = ""
+    if benchmark is not None:
+        mode = "--benchmark"
+    elif ros2 is not None:
+        mode = "--ros2"
+    elif answer:
+        mode = "--answer"
+    _refuse_options_of_other_modes(context, mode)
+    if benchmark is not None:
+        return _benchmark(
+            scenario=benchmark,
+            overrides=overrides,
+            seconds=seconds,
+            reach=reach,
+            picture=picture,
+            force=force,
+            as_json=as_json,
+        )
+    if ros2 is not None:
+        return _ping_topic(ros2, ros, domain, seconds or 5.0, as_json=as_json)
+    if answer:
+        return _run_far_end(answer, reach.keys, seconds, insecure=insecure)
+
+    from trilat_net.app.session_ping import ping_session
+
+    connection = reach.resolve(operates=False)
+    clock = make_system_clock(clock_offset, clock_drift)
+    with Interrupt() as interrupt:
+        measurement = ping_session(
+            connection=connection,
+            clock=clock,
+            session=options.check_session_name(session),
+            count=count,
+            timeout_s=timeout,
+            stopped=interrupt.is_requested,
+        )
+        if measurement is None:
+            raise typer.Exit(interrupt.exit_code)
+
+    terminal.print_result(measurement, as_json=as_json)
+    has_reply = any(member["answers"] for member in measurement.members)
+    if not has_reply:
+        raise typer.Exit(1)
+    return None
+
+
+_MODE_OPTIONS = {
+    "--benchmark": {
+        "--benchmark",
+        "--set",
+        "--seconds",
+        "--figure",
+        "--force",
+        "--connect",
+        "--keys",
+        "--json",
+    },
+    "--answer": {"--answer", "--seconds", "--keys", "--insecure"},
+    "--ros2": {"--ros2", "--ros", "--domain", "--seconds", "--json"},
+}
+"""For each mode of `trilat ping`, all options that it accepts."""
+_OPTIONS_WITH_MODE = {
+    "--set",
+    "--seconds",
+    "--figure",
+    "--force",
+    "--insecure",
+    "--ros",
+    "--domain",
+}
+"""Options of `trilat ping` that are only valid together with an option that selects a mode."""
+
+
+def _refuse_options_of_other_modes(context: typer.Context, mode: str) -> None:
+    """Refuses options that do not belong to the selected mode of `trilat ping`.
+
+    Args:
+        context: The command line.
+        mode: The option that selects the mode, as in "--benchmark". Empty for the normal mode,
+            which measures a session.
+
+    Raises:
+        UsageError: An option belongs to another mode.
+    """
+    used = set(options.list_used_options(context))
+    if mode:
+        refused = sorted(used - _MODE_OPTIONS[mode])
+        reason = f"cannot be used with {mode}"
+    else:
+        refused = sorted(used & _OPTIONS_WITH_MODE)
+        reason = "can be used only with --benchmark, --answer or --ros2"
+    if refused:
+        raise UsageError(f"{refused[0]}: {reason}")
+
+
+def _benchmark(
+    scenario: str,
+    overrides: list[str] | None,
+    seconds: float | None,
+    reach: options.Reach,
+    picture: Path | None,
+    *,
+    force: bool,
+    as_json: bool,
+) -> None:
+    """Measures whether the network is good enough for a scenario, and prints the result.
+
+    Args:
+        scenario: Name of a shipped scenario, or path of a TOML file.
+        overrides: Overrides of the scenario.
+        seconds: Duration of all measurements together, in s. None uses the default.
+        reach: The options that name the machine at the far end.
+        picture: Path of a figure to draw. None for no figure.
+        force: True to replace an existing figure.
+        as_json: True to print the result as JSON.
+
+    Raises:
+        typer.Exit: The network is not good enough.
+    """
+    options.check_picture(picture, force=force)
+    from trilat_net.app.network_benchmark import DEFAULT_S, ping_benchmark
+
+    measured = "the network" if reach.connect else "this machine alone, without --connect"
+    with terminal.progress_lines(f"measuring {measured}, for {seconds or DEFAULT_S:g} s"):
+        result = ping_benchmark(
+            scenario,
+            overrides or [],
+            duration_s=seconds or DEFAULT_S,
+            connect=reach.connect,
+            keys=reach.keys,
+        )
+    figure = "linear_figures:draw_network_delays"
+    options.print_and_draw(result, picture, figure, result.to_dict(), as_json=as_json)
+    if not result.good:
+        raise typer.Exit(1)
+
+
+def _ping_topic(
+    topic: str, routers: list[str] | None, domain: int, lasts_s: float, *, as_json: bool
+) -> None:
+    """Measures the delay of the messages of a ROS 2 topic, and prints the result.
+
+    Args:
+        topic: Name of the topic.
+        routers: Endpoints of the Zenoh router of ROS. None uses the one on this machine.
+        domain: Number of the ROS domain.
+        lasts_s: Duration of the measurement, in s.
+        as_json: True to print the result as JSON.
+    """
+    from trilat_net.app.session_ping import ping_topic
+
+    from ...net.ros2_graph import Refusals, Ros2Graph
+    from ...net.ros2_names import check_ros_name
+
+    name = check_ros_name(topic, "topic")
+    clock = SystemClock()
+    graph = Ros2Graph(
+        refusals=Refusals(terminal.print_note),
+        routers=routers or [options.ROS_ROUTER],
+        namespace="",
+        name="trilat_ping",
+        clock=clock,
+        domain=domain,
+    )
+    with graph, Interrupt() as interrupt:
+        measurement = ping_topic(
+            graph=graph,
+            clock=clock,
+            topic=name,
+            lasts_s=lasts_s,
+            stopped=interrupt.is_requested,
+        )
+    terminal.print_result(measurement, as_json=as_json)
+
+
+def _run_far_end(
+    endpoints: list[str], keys: Path | None, seconds: float | None, *, insecure: bool
+) -> None:
+    """Replies to benchmarks from other machines, for a time or until Ctrl-C.
+
+    Args:
+        endpoints: Endpoints at which to listen.
+        keys: Folder of keys. None for unencrypted connections.
+        seconds: Duration, in s. None for no limit.
+        insecure: True to allow unencrypted connections from other machines.
+    """
+    from math import inf
+
+    from trilat_net.app.network_benchmark import run_far_end
+
+    with Interrupt() as interrupt:
+        run_far_end(
+            endpoints,
+            keys,
+            interrupt.is_requested,
+            seconds or inf,
+            insecure=insecure,
+            say=terminal.print_line,
+        )
+    if interrupt.is_requested():
+        raise typer.Exit(interrupt.exit_code)
+
+
+@options.command("--session paper", page="docs/live-page.md")
+def watch_command(
+    session: Annotated[str, value("--session", "ID", "Session to watch.")],
+    *,
+    as_site: Annotated[
+        str, value("--as", "SITE", "Show only the view of this site's user.")
+    ] = "",
+    reach: options.Reach,
+    timeout: options.AnswerOption = 10.0,
+) -> None:
+    """Shows a running session in the terminal.
+
+    The command ends with the session or with Ctrl-C. Each site has a line with its joint
+    angles, the size |e| of its synchronisation error, its torque and mode, the age of the
+    newest sample of each peer, and the holder of the arm. The line above the sites shows V, the
+    energy function of the stability proof. Without endpoints, the command connects to the
+    loopback port of the first site and asks for the other sites.
+    """
+    from live.terminal_watch import show_in_terminal, watch_session
+
+    name = options.check_session_name(session)
+    clock = SystemClock()
+    show = partial(show_in_terminal, clock, name, as_site, terminal.out)
+    raise typer.Exit(
+        watch_session(
+            session=name,
+            connection=reach.resolve(),
+            clock=clock,
+            show=show,
+            say=terminal.print_line,
+            timeout_s=timeout,
+        )
+    )
+
+
+SessionOption = Annotated[str, value("--session", "ID", "Name of the session.")]
+SitesArgument = Annotated[
+    list[str] | None,
+    typer.Argument(metavar="SITE...", help="Names of the sites; default: all sites."),
+]
+
+
+def _connect(session: str, reach: options.Reach, *, stops: bool = False) -> "RunningSession":
+    """Prepares the connection to a running session.
+
+    Args:
+        session: Name of the session.
+        reach: The options by which the command reaches the session.
+        stops: True if the command only stops arms. Expired keys are then accepted.
+    """
+    from trilat_net.app.running_session import RunningSession
+
+    connection = reach.resolve(operates=False, stops=stops)
+    return RunningSession(options.check_session_name(session), connection)
+
+
+@options.command("--session paper s", "--session paper --end", page="docs/live-page.md")
+def stop_command(
+    session: SessionOption,
+    sites: SitesArgument = None,
+    end: Annotated[
+        bool, flag("--end", "End the whole session instead; recorders get every record.")
+    ] = False,
+    *,
+    reach: options.Reach,
+) -> None:
+    """Stops arms at once; the session goes on.
+
+    The arms come to rest where they are, and stay there until you run `trilat enable`.
+    With --end, all sites end their run at the same time instead. Without endpoints, the command
+    reaches the sites on this machine at the addresses that they have stored in files. If there
+    are none, it connects to the loopback port of the first site and asks for the other sites.
+    """
+    if end and sites:
+        raise UsageError("--end ends the whole session: do not name a site")
+    running = _connect(session, reach, stops=not end)
+    replies = running.end() if end else running.stop(*(sites or ()))
+    terminal.print_texts(replies)
+
+
+@options.command("--session paper s", page="docs/live-page.md")
+def enable_command(
+    session: SessionOption, sites: SitesArgument = None, *, reach: options.Reach
+) -> None:
+    """Lets stopped arms follow the other arms again.
+
+    Each arm first waits for the other arms and aligns with them.
+    """
+    terminal.print_texts(_connect(session, reach).enable(*(sites or ())))
+
+
+@options.command("--session paper s", page="docs/external-arm.md")
+def reset_command(
+    session: SessionOption,
+    sites: Annotated[
+        list[str], typer.Argument(metavar="SITE...", help="Sites whose fault is cleared.")
+    ],
+    *,
+    reach: options.Reach,
+) -> None:
+    """Clears the faults of sites whose cause is gone.
+
+    The sites then wait for the other sites. Each arm aligns with the other arms before it
+    follows them.
+    """
+    terminal.print_texts(_connect(session, reach).reset(*sites))
+
+
+_UNITS = {"us": 1e-3, "ms": 1.0, "s": 1e3}
+"""Units of time in ms."""
+
+
+def parse_milliseconds(text: str) -> float:
+    """Parses a time with its unit, such as 350ms or 0.35s.
+
+    Returns:
+        The time in ms.
+
+    Raises:
+        UsageError: The text is not a number with a unit.
+    """
+    match = re.fullmatch(r"([-+.\deE]+?)\s*(us|ms|s)", text.strip())
+    try:
+        if match:
+            return float(match[1]) * _UNITS[match[2]]
+    except ValueError:
+        pass
+    raise UsageError(f"a time must be a number with a unit, as in 350ms or 0.35s, not {text!r}")
+
+
+def parse_share(text: str) -> float:
+    """Parses a number or a percentage, such as 0.05 or 5%.
+
+    Returns:
+        The number, which is 0.05 for both examples.
+
+    Raises:
+        UsageError: The text is not a number or a percentage.
+    """
+    number = text.strip().removesuffix("%")
+    is_percentage = number != text.strip()
+    try:
+        return float(number) / (100.0 if is_percentage else 1.0)
+    except ValueError:
+        raise UsageError(
+            f"a share must be a number or a percentage, as in 0.05 or 5%, not {text!r}"
+        ) from None
+
+
+def parse_pairs(texts: list[str], example: str) -> dict[str, Any]:
+    """Parses texts KEY=VALUE, in which a value is TOML or a bare word.
+
+    Args:
+        texts: The texts.
+        example: A correct text, for the error message.
+
+    Returns:
+        The values by key.
+
+    Raises:
+        UsageError: A text is not of that form.
+    """
+    from ...scenario.override import split_assignment
+
+    pairs = []
+    for text in texts:
+        pair = split_assignment(text)
+        if pair is None:
+            raise UsageError(
+                f"a change must have the form KEY=VALUE, as in {example}, not {text!r}"
+            )
+        pairs.append(pair)
+    return dict(pairs)
+
+
+def set_command(
+    context: typer.Context,
+    session: Annotated[
+        str | None, value("--session", "ID", "Session to change; required.")
+    ] = None,
+    *,
+    reach: options.Reach,
+) -> None:
+    """Changes a link, or who leads, while a session runs.
+
+    Without endpoints, it asks the first site, on its loopback port, for the other sites.
+    """
+    name = None if session is None else options.check_session_name(session)
+    # Typer runs this function first, and then the command of the group, which needs both.
+    context.obj = name, reach.resolve()
+
+
+@options.command("'m1->s' --delay 350ms --loss 5%", page="docs/links.md")
+def set_link_command(
+    context: typer.Context,
+    name: Annotated[
+        str, typer.Argument(help="Link that is changed, for example m1->s.", metavar="FROM->TO")
+    ],
+    delay: Annotated[
+        str | None, typer.Option("--delay", help="New delay, for example 350ms.")
+    ] = None,
+    loss: Annotated[
+        str | None, typer.Option("--loss", help="New packet loss, for example 5%.")
+    ] = None,
+    preset: Annotated[
+        str | None, typer.Option("--preset", help="Preset of link settings, for example 4g.")
+    ] = None,
+    to: Annotated[
+        list[str] | None,
+        value(
+            "--to",
+            "KEY=VALUE",
+            "New value of any link key, for example model=gamma; repeatable.",
+        ),
+    ] = None,
+) -> None:
+    """Changes keys of a directed link; a model or a preset replaces all keys."""
+    table = parse_pairs(to or [], "deviation_ms=20")
+    if preset is not None:
+        table["preset"] = preset
+    if delay is not None:
+        table["delay_ms"] = parse_milliseconds(delay)
+    if loss is not None:
+        table["loss"] = parse_share(loss)
+    if not table:
+        raise UsageError("nothing to change: give --delay, --loss, --preset or --to KEY=VALUE")
+    _, arrow, receiver = name.partition("->")
+    if not arrow:
+        raise UsageError(
+            f"a link must be written as FROM->TO in quotes, as in 'm1->s', not {name!r}"
+        )
+    _send_change(context, receiver, {"link": name, "to": table})
+
+
+@options.command("s m1=0.9 m2=0.1", page="docs/first-hour.md")
+def set_dominance_command(
+    context: typer.Context,
+    site: Annotated[str, typer.Argument(help="Site whose dominance row changes.")],
+    shares: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="PEER=SHARE...",
+            help="New dominance shares of the site's peers, which sum to 1.",
+        ),
+    ],
+    ramp: Annotated[
+        str, typer.Option("--ramp", help="Duration of the ramp, for example 2s.")
+    ] = "1s",
+) -> None:
+    """Changes one row of the dominance matrix along a linear ramp; the row always sums to 1."""
+    pairs = parse_pairs(shares, "m1=0.9")
+    table = {peer: parse_share(str(share)) for peer, share in pairs.items()}
+    ramp_s = parse_milliseconds(ramp) / 1e3
+    _send_change(context, site, {"dominance": site, "to": table, "ramp_s": ramp_s})
+
+
+def _send_change(context: typer.Context, site: str, change: dict[str, Any]) -> None:
+    """Requests a change from a site of the running session, and prints its reply.
+
+    Args:
+        context: The command line. `set_command` has stored the session and the connection in
+            it.
+        site: Name of the site.
+        change: Fields of a `ChangeRequest`.
+
+    Raises:
+        UsageError: The session is not named, or the site refuses the change.
+    """
+    from trilat_net.app.running_session import RunningSession
+
+    from ...fields import check_finite
+    from ...net.requests import ChangeRequest
+
+    session, connection = context.obj
+    check_finite(change, "")  # messages cannot hold infinite numbers
+    if session is None:
+        raise UsageError("the session is not named: use trilat set --session ID ...")
+    reply = RunningSession(session, connection).change(site, ChangeRequest(**change))
+    if not reply.accepted:
+        raise UsageError(f"refused: {reply.text}")
+    terminal.print_text(reply.text)
+
+
+@options.command(
+    "--keys keys/m1 --listen tls/0.0.0.0:7447", "--session paper", page="docs/network-check.md"
+)
+def doctor_command(
+    *,
+    ways: options.MemberOptions,
+    session: Annotated[
+        str | None,
+        value("--session", "ID", "Also check the clocks of this session's members."),
+    ] = None,
+    folder: Annotated[
+        Path, value("--out -o", "DIR", "Folder planned for results, whose disk is checked.")
+    ] = Path("runs"),
+    as_json: options.JsonOption = False,
+) -> None:
+    """Checks whether this machine is ready for a live session.
+
+    It checks keys, endpoints, clocks, real-time privileges, disk and processors. Use the
+    options of the site, recorder or router that will run on this machine. The exit code is 1 if
+    a check fails.
+    """
+    from trilat_net.app.doctor import examine_machine
+
+    connection = ways.find_endpoints()
+    name = None if session is None else options.check_session_name(session)
+    examined = examine_machine(
+        connection=connection,
+        keys=ways.keys,
+        folder=folder,
+        session=name,
+        clock=SystemClock(),
+        insecure=ways.insecure,
+    )
+
+    # Each check is printed as soon as it is done, because some take seconds.
+    findings = []
+    for finding in examined:
+        findings.append(finding)
+        if not as_json:
+            terminal.print_marked(MARKS[finding.state], f"{finding.check:<10}  {finding.text}")
+    if as_json:
+        terminal.print_json([finding._asdict() for finding in findings])
+    if any(finding.state == "fail" for finding in findings):
+        raise typer.Exit(1)

@@ -1,0 +1,867 @@
+"""Commands that study several runs: tests, comparisons, tuning, benchmarks, experiments.
+
+A run is one execution of a scenario, which describes the arms, their control laws and the
+network. Such a command executes or reads many runs that differ in a law, a gain, a delay or the
+people who take part, and prints their results side by side.
+
+Invariant:
+    - The commands print measured numbers. They do not rank control laws, because which number
+      matters depends on the task.
+    - An interrupted benchmark or experiment continues if the same command is entered again.
+"""
+
+import os
+import platform
+import re
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ...errors import UsageError, count_nouns
+from ...net.clock import SystemClock
+from ...presentation import terminal_output as terminal
+from . import options
+from .options import flag, value
+
+if TYPE_CHECKING:
+    from trilat_net.app.demo_session import SessionResult
+
+    from ...scenario import Scenario
+    from ...studies.bench import BenchResults
+    from ...studies.bench.bench_run import BenchFolder
+    from ...studies.trials import Trial, TrialReport, TrialResult
+    from ...studies.tuning import TuningPlan
+
+
+MAX_SEEDS = 100_000
+"""Largest number of seeds that --seeds may name."""
+
+
+@options.command("jitter --seeds 1..20 --junit out.xml", page="docs/lab.md")
+def test_command(
+    scenarios: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[SCENARIO]...",
+            help="Names or paths of scenarios; default: all shipped scenarios with a section "
+            "\\[expect].",
+            autocompletion=options.complete_scenarios,
+        ),
+    ] = None,
+    live: Annotated[
+        bool,
+        flag(
+            "--live/--virtual",
+            "Run the scenarios live over a network, one after another, instead of in virtual "
+            "time.",
+        ),
+    ] = False,
+    seeds: Annotated[
+        str | None,
+        value(
+            "--seeds",
+            "LIST",
+            "Seeds, for example 1..20 or 1,5,9; default: the seed of the scenario.",
+        ),
+    ] = None,
+    junit: Annotated[
+        Path | None, value("--junit", "FILE", "Write the results as JUnit XML as well.")
+    ] = None,
+    jobs: options.JobsOption = None,
+    on: options.OnOption = None,
+    overrides: options.SetOption = None,
+    as_json: options.JsonOption = False,
+) -> None:
+    r"""Checks scenarios against their own expectations.
+
+    Each scenario is run, the expectations in its section \[expect] are checked, and margins are
+    printed. A margin is the distance of a measured value from its expected bound. For each
+    failure, the command that repeats the run is printed.
+    """
+    from ...files import write_whole
+    from ...studies.trials import encode_junit_xml
+    from ...work.executor import check_workers
+
+    if live and on is not None:
+        raise UsageError(
+            "--on distributes runs in virtual time and cannot be combined with --live: leave "
+            "out one of the two"
+        )
+    check_workers(jobs, on)
+    if junit is not None and (junit.is_dir() or not os.access(junit.parent, os.W_OK)):
+        raise UsageError(f"{junit}: cannot be written")
+    trials = _list_trials(scenarios or [], parse_seeds(seeds), overrides or [], live=live)
+    began_unix_ns = SystemClock().unix_ns()
+    with terminal.lines_aside(as_json):
+        report = _run_live(trials) if live else _run_virtual(trials, jobs, on)
+    terminal.print_result(report, as_json=as_json)
+    if junit is not None:
+        write_whole(junit, encode_junit_xml(report, began_unix_ns, platform.node()))
+    if not report.held:
+        raise typer.Exit(1)
+
+
+def parse_seeds(text: str | None) -> list[int]:
+    """Parses seeds such as 1..20 or 1,5,9 or 1..3,8.
+
+    Args:
+        text: The text. None if the user gave no seeds.
+
+    Returns:
+        The seeds. Empty if there is no text.
+
+    Raises:
+        UsageError: The text is not of that form, or names more than `MAX_SEEDS` seeds.
+    """
+    if text is None:
+        return []
+    wrong_form = f"--seeds must be a range or a list, as in 1..20 or 1,5,9, not {text!r}"
+    seeds: list[int] = []
+    for part in text.split(","):
+        match = re.fullmatch(r"\s*([0-9]{1,18})(?:\.\.([0-9]{1,18}))?\s*", part)
+        if match is None:
+            raise UsageError(wrong_form)
+        first = int(match[1])
+        last = int(match[2] or match[1])
+        if last < first:
+            raise UsageError(wrong_form)
+        if len(seeds) + last - first >= MAX_SEEDS:
+            raise UsageError(
+                f"--seeds {text} names more than {MAX_SEEDS} seeds; at most {MAX_SEEDS} are "
+                "allowed"
+            )
+        seeds += range(first, last + 1)
+    return seeds
+
+
+def _list_trials(
+    sources: list[str], seeds: list[int], overrides: list[str], *, live: bool
+) -> "list[Trial]":
+    """Lists the trials of a test: each scenario with each seed.
+
+    Args:
+        sources: Names or paths of the scenarios. Empty selects all shipped scenarios that have
+            expectations.
+        seeds: The seeds. Empty uses those of each scenario.
+        overrides: Overrides of all scenarios.
+        live: True if the trials run live over a network.
+    """
+    from ...scenario import list_shipped, load_scenario
+    from ...studies.trials import trials
+
+    if not sources:
+        sources = [
+            name for name in list_shipped() if load_scenario(name).expect.has_expectations
+        ]
+    all_trials = []
+    for source in dict.fromkeys(sources):  # without repetitions
+        all_trials += trials(source, seeds, overrides, live=live)
+    return all_trials
+
+
+def _run_virtual(trials: "list[Trial]", jobs: int | None, on: str | None) -> "TrialReport":
+    """Runs trials in virtual time, and shows their progress.
+
+    In a terminal it is a bar, otherwise a line for each scenario whose trials have all ended.
+
+    Args:
+        trials: The trials.
+        jobs: Number of processes. None uses one per core.
+        on: Address of a Dask scheduler that executes the trials instead.
+    """
+    from ...studies.trials import run_trials
+
+    remaining = Counter(trial.source for trial in trials)
+    with terminal.progress_bar("running the trials") as show:
+
+        def report_done(result: "TrialResult") -> None:
+            """Updates the progress that the user sees after one run of a scenario has finished.
+
+            Without a terminal, a line is printed when all runs of the same scenario have
+            finished.
+
+            Args:
+                result: Result of the finished run.
+            """
+            source = result.trial.source
+            remaining[source] -= 1
+            done = len(trials) - remaining.total()
+            show(done, len(trials))
+            is_last_of_source = not remaining[source]
+            if is_last_of_source and not terminal.out.is_terminal:
+                terminal.print_text(f"{source}: ran")
+
+        return run_trials(trials, jobs, report_done, on)
+
+
+def _run_live(trials: "list[Trial]") -> "TrialReport":
+    """Runs trials live, one after the other, and evaluates their logs."""
+    from ...studies.trials import TrialReport, evaluate_live_log
+
+    clock = SystemClock()
+    start_ns = clock.monotonic_ns()
+    results = []
+    for trial in trials:
+        began_ns = clock.monotonic_ns()
+        outcome = run_in_own_folder(trial.scenario, str(trial), f"test-{trial}")
+        wall_s = (clock.monotonic_ns() - began_ns) * 1e-9
+        results.append(evaluate_live_log(trial, outcome.log, outcome.problems, wall_s))
+    return TrialReport(results, (clock.monotonic_ns() - start_ns) * 1e-9)
+
+
+def run_in_own_folder(scenario: "Scenario", label: str, folder_name: str) -> "SessionResult":
+    """Runs a scenario live, with its results in a new folder.
+
+    Args:
+        scenario: The scenario.
+        label: Name of the run in the printed line.
+        folder_name: Name of the folder, to which a number is added.
+
+    Raises:
+        typer.Exit: The session was interrupted.
+    """
+    from trilat_net.app.demo_session import run_demo
+
+    from ...files import make_results_folder
+
+    folder = make_results_folder(None, folder_name, force=False)
+    terminal.print_text(f"{label}: {scenario.duration_s:g} s live, into {folder}")
+    outcome = run_demo(scenario, folder, terminal.out)
+    if outcome.interrupted:
+        terminal.err.print("interrupted")
+        raise typer.Exit(128 + outcome.interrupted)
+    return outcome
+
+
+_PROGRESS_LINES = 10
+"""Number of lines that show progress if the output is not a terminal."""
+
+
+@contextmanager
+def show_progress(
+    label: str, print_line: Callable[[str], None], items: str = "runs"
+) -> Iterator[Callable[[int, int], None]]:
+    """Shows progress as a bar in a terminal, and elsewhere as a few printed lines.
+
+    Args:
+        label: Label of the bar.
+        print_line: Function that prints a line.
+        items: Noun of the counted items, in the plural.
+
+    Yields:
+        A function to call with the number of finished items and of all items.
+    """
+    if terminal.err.is_interactive:
+        with terminal.progress_bar(label) as show:
+            yield show
+        return
+    from ...studies.sweep.sweep_run import format_wall_time
+
+    clock = SystemClock()
+    first_call_ns = -1  # time of the first call of `show_line`, -1 before it
+    done_at_first_call = 0
+    printed_tenths = 0  # tenths of the items that were finished at the last printed line
+
+    def show_line(done: int, total: int) -> None:
+        """Prints a line with the remaining time, about once per tenth of the items.
+
+        The remaining time follows from the mean duration of the items since the first call. No
+        line is printed at the first call, where this duration is unknown, nor after the last
+        item.
+
+        Args:
+            done: Number of finished items.
+            total: Number of all items.
+        """
+        nonlocal first_call_ns, done_at_first_call, printed_tenths
+        if first_call_ns < 0:
+            # The time before the first item is the start of the processes, which does not
+            # count towards the duration of an item.
+            first_call_ns = clock.monotonic_ns()
+            done_at_first_call = done
+        finished_tenths = done * _PROGRESS_LINES // total
+        has_no_remaining_time = done in (total, done_at_first_call)
+        if has_no_remaining_time or finished_tenths <= printed_tenths:
+            return
+        printed_tenths = finished_tenths
+        elapsed_s = (clock.monotonic_ns() - first_call_ns) * 1e-9
+        remaining_s = elapsed_s / (done - done_at_first_call) * (total - done)
+        print_line(f"  {done} of {total} {items}, about {format_wall_time(remaining_s)} left")
+
+    yield show_line
+
+
+def _run_tuning(
+    plan: "TuningPlan",
+    folder: Path | None,
+    jobs: int | None,
+    on: str | None,
+    *,
+    force: bool,
+    as_json: bool,
+) -> None:
+    """Tunes control laws, prints the comparison, and writes its files.
+
+    Args:
+        plan: The laws and the procedure.
+        folder: Folder of the results. None uses the next free one.
+        jobs: Number of processes. None uses one per core.
+        on: Address of a Dask scheduler that executes the runs instead.
+        force: True to replace existing files.
+        as_json: True to print the result as JSON.
+    """
+    from ...files import make_results_folder
+    from ...studies.sweep.sweep_run import format_wall_time
+    from ...studies.tuning.tuning_report import describe_procedure, write_tuning
+    from ...work.executor import count_workers
+
+    workers = count_workers(jobs, on)
+    name = plan.base.scenario.name
+    results_folder = make_results_folder(folder, f"tune-{name}", force=force)
+    if not as_json:
+        laws = ", ".join(space.law for space in plan.spaces)
+        terminal.print_text(f"{name}, laws {laws}; the same for all:")
+        terminal.print_texts(f"  {line}" for line in describe_procedure(plan))
+        cores = count_nouns(workers, "core")
+        duration = format_wall_time(plan.estimate_s(workers))
+        terminal.print_text(
+            f"{count_nouns(plan.runs, 'run')} on {cores}: about {duration} at the present "
+            "speed of this machine"
+        )
+
+    with terminal.progress_bar("searching") as progress:
+        comparison = plan.run(jobs, progress, on)
+    paths = write_tuning(comparison, results_folder)
+    if not as_json:
+        terminal.out.print()
+    terminal.print_result(comparison, as_json=as_json)
+    terminal.print_paths([] if as_json else paths)
+
+
+_option = partial(value, rich_help_panel="Tune laws")
+
+
+@options.command(
+    "a.mcap b.mcap", "--tune free --law adaptive,p_d", page="docs/fair-comparison.md"
+)
+def compare_command(
+    context: typer.Context,
+    files: Annotated[list[Path] | None, typer.Argument(metavar="FILE FILE...")] = None,
+    tune: Annotated[str | None, _option("--tune", "SCENARIO")] = None,
+    law: Annotated[
+        str | None,
+        _option(
+            "--law",
+            "LAW,LAW...",
+            "Control laws; default: adaptive,adaptive_box,p_d,pd_d. All laws: "
+            f"{', '.join(options.list_laws())}, known (adaptive with a known arm), and your "
+            "own, for example mylaws:Law.",
+        ),
+    ] = None,
+    budget: Annotated[int, _option("--budget", "N")] = 64,
+    seed: Annotated[int, _option("--seed", "S", "Seed of the search.")] = 1,
+    seeds: Annotated[int, _option("--seeds", "N")] = 1,
+    objective: Annotated[str, _option("--objective", "error|settling")] = "error",
+    gravity: Annotated[float, _option("--gravity", "PERCENT")] = 100.0,
+    duration: options.DurationOption = None,
+    overrides: options.SetOption = None,
+    jobs: options.JobsOption = None,
+    on: options.OnOption = None,
+    output: Annotated[Path | None, _option("--out -o", "DIR")] = None,
+    force: options.ForceOption = False,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Compares logs, or tuned control laws, side by side.
+
+    For logs, the command also shows how their experiments differ. All control laws are tuned by
+    the same procedure. Whether a tuned law is stable is judged from the motion in the second
+    half of its runs alone; `trilat certify` also uses twins and roots. The results are not
+    ranked, because small errors can also mean that an arm hangs freely, or that no operator
+    moves it.
+
+    Options:
+        files: Files of two or more MCAP logs.
+        tune: Tune control laws in this scenario and compare them, instead of logs.
+        budget: Number of settings (candidates) that are tried for each control law.
+        seeds: Number of seeds of the scenario over which each candidate is averaged.
+        objective: Objective that is minimised together with effort.
+        gravity: Gravity that all laws assume, in % of the true gravity.
+        output: Folder for the results; default: the next free runs/tune-NAME-N.
+    """
+    if tune is None:
+        for name in options.list_used_options(context):
+            if name not in ("files", "--json"):
+                raise UsageError(
+                    f"{name} can be used only with --tune SCENARIO; logs are compared as they "
+                    "were recorded"
+                )
+        from ...studies.log_comparison import compare
+
+        logs = [terminal.open_with_progress(file) for file in files or []]
+        with terminal.progress_lines(f"comparing {count_nouns(len(logs), 'log')}"):
+            comparison = compare(*logs)
+        terminal.print_result(comparison, as_json=as_json)
+        return
+    if files:
+        raise UsageError("--tune makes its own runs: leave out either the logs or --tune")
+    from ...studies.tuning import plan_tuning
+
+    plan = plan_tuning(
+        tune,
+        options.list_overrides(overrides, duration),
+        laws=options.split_names(law),
+        budget=budget,
+        seed=seed,
+        objective=objective,
+        gravity_percent=gravity,
+        seeds=seeds,
+    )
+    _run_tuning(plan, output, jobs, on, force=force, as_json=as_json)
+
+
+@options.command(
+    "--arm arm6.urdf --delay 40ms --figure gains.png",
+    "--arm my.urdf --delay measured:run.mcap",
+    page="docs/arm-gains.md",
+)
+def tune_command(
+    arm: Annotated[
+        Path, value("--arm", "URDF", "URDF file of the arm, or name of a shipped one.")
+    ],
+    delay: Annotated[str, value("--delay", "40ms|measured:SESSION|CSV")],
+    law: Annotated[
+        str, value("--law", "LAW", "Control law: p_d, pd_d or saturated_pd.")
+    ] = "p_d",
+    tip: Annotated[
+        str,
+        value(
+            "--tip", "LINK", "End link of the arm; default: the only link that has no child."
+        ),
+    ] = "",
+    sites: Annotated[
+        int, value("--sites", "2|3", "Number of arms that follow one another.")
+    ] = 2,
+    rate: Annotated[
+        int, value("--rate", "HZ", "Rate of the control loops (tick rate), Hz.")
+    ] = 1000,
+    margin: Annotated[
+        float,
+        value(
+            "--margin", "FACTOR", "Factor by which the gain K stays below the stability limit."
+        ),
+    ] = 2.0,
+    damping: Annotated[float, value("--damping", "RATIO", "Damping ratio of an arm.")] = 0.7,
+    quantile: Annotated[float, value("--quantile", "SHARE")] = 1.0,
+    overrides: options.SetOption = None,
+    *,
+    reach: options.Reach,
+    picture: Annotated[Path | None, value("--figure", "FILE", options.FIGURE_HELP)] = None,
+    force: options.ForceOption = False,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Finds the largest gains for an arm on links with a delay.
+
+    The gains keep a margin to the stability limit, and are tested in simulation. Two or three
+    such arms follow one another over links with that delay in both directions
+    (docs/arm-gains.md). Paste the last line of the output into a scenario. Exit code 0: all
+    simulated runs behave as the linear loop predicts. 1: at least one run does not.
+
+    Options:
+        delay: One-way delay of the links, for example 40ms. The delays can also come from a
+            running session (measured:SESSION), a log (measured:FILE), or a table with the
+            columns t_s,delay_ms.
+        quantile: Quantile of varying delays that is used as the constant delay; 1 is the
+            largest delay.
+    """
+    options.check_picture(picture, force=force)
+    from ...studies.arm_gains import tune_arm
+
+    delay_text = _measure_delay(delay, reach)
+    with terminal.progress_bar("computing the edge of stability and running") as show:
+        gains = tune_arm(
+            arm,
+            delay_text,
+            law,
+            set=overrides or (),
+            tip=tip,
+            sites=sites,
+            rate_hz=rate,
+            margin=margin,
+            damping=damping,
+            quantile=quantile,
+            curve=picture is not None,
+            progress=show,
+        )
+    figure = "linear_figures:draw_arm_gains"
+    options.print_and_draw(gains, picture, figure, gains.to_dict(), as_json=as_json)
+    if not gains.agree:
+        raise typer.Exit(1)
+
+
+def _measure_delay(text: str, reach: options.Reach) -> str:
+    """Returns a delay as `tune_arm` accepts it, and measures it if it names a running session.
+
+    The delay of a session is that of its slowest link. If the session measures no link, it is
+    half of the longest round trip from this machine, at the 99th percentile.
+
+    Args:
+        text: A delay such as "40ms", a file, or "measured:SESSION".
+        reach: The options by which the command reaches the session.
+    """
+    name = text.removeprefix("measured:")
+    names_session = name != text and not name.endswith(".mcap")
+    if not names_session:
+        return text
+
+    from trilat_net.app.session_ping import ping_session
+
+    measurement = ping_session(
+        connection=reach.resolve(operates=False),
+        clock=SystemClock(),
+        session=options.check_session_name(name),
+        count=50,
+        timeout_s=3.0,
+        stopped=lambda: False,
+    )
+    assert measurement is not None  # nothing stops the measurement
+    half_trips_us = [
+        0.5 * member["rtt_us"]["p99"] for member in measurement.members if member["answers"]
+    ]
+    delays_us = [max(link["delay_us"], link["delay_max_us"]) for link in measurement.links]
+    if delays_us:
+        return f"{max(delays_us):.0f}us"
+    longest_us = max(half_trips_us, default=0.0)
+    return f"{longest_us:.0f}us"
+
+
+def _tune_bench(laws: list[str], study: str, jobs: int | None, on: str | None) -> None:
+    """Tunes the control laws of a study of the benchmark, and stores their gains.
+
+    The file of the gains is part of the program. The gains of each law are stored as soon as
+    they are tuned. Gains that are up to date are kept, so that the same command continues an
+    interrupted tuning.
+
+    Args:
+        laws: Names of the laws. Empty selects all laws of the study.
+        study: Name of the study.
+        jobs: Number of processes. None uses one per core.
+        on: Address of a Dask scheduler that executes the runs instead.
+
+    Raises:
+        UsageError: A law is not part of the study.
+    """
+    from ...studies.bench.bench_plan import (
+        GAINS_FILE,
+        STUDIES,
+        read_gains,
+        tune_laws,
+        write_gains,
+    )
+
+    laws_by_form = STUDIES[study].laws
+    all_laws = {law for form_laws in laws_by_form.values() for law in form_laws}
+    unknown = [law for law in laws if law not in all_laws]
+    if unknown:
+        raise UsageError(f"--law: {unknown[0]} is not a law of the study {study}")
+
+    selected_by_form = {}
+    for form, form_laws in laws_by_form.items():
+        selected_laws = [law for law in form_laws if law in laws or not laws]
+        if selected_laws:
+            selected_by_form[form] = selected_laws
+
+    with show_progress("tuning", terminal.print_note) as progress:
+        tune_laws(
+            selected_by_form,
+            jobs,
+            on,
+            progress,
+            known=read_gains().values(),
+            store=lambda gains: write_gains([gains]),
+        )
+    terminal.print_paths([GAINS_FILE])
+
+
+def _run_bench(
+    folder: "BenchFolder", jobs: int | None, on: str | None, *, confirm: bool
+) -> "BenchResults":
+    """Runs the benchmark in its folder. On Ctrl-C it prints how to continue.
+
+    Args:
+        folder: Folder of the benchmark.
+        jobs: Number of processes. None uses one per core.
+        on: Address of a Dask scheduler that executes the runs instead.
+        confirm: Accepted for older commands, see `run_bench`.
+    """
+    from ...studies.bench import run_bench
+
+    try:
+        with show_progress("running", terminal.print_note) as progress:
+            return run_bench(folder, jobs, on, progress, confirm=confirm)
+    except KeyboardInterrupt:
+        terminal.print_note(
+            f"finished runs are kept in {folder.path}; the same command continues"
+        )
+        raise
+
+
+@options.command("--small", "--study round-trips --law wave,smith", page="docs/bench.md")
+def bench_command(
+    study: Annotated[
+        str, value("--study", "full|small|round-trips", "Part of the suite to run.")
+    ] = "full",
+    small: Annotated[
+        bool, typer.Option("--small", help="Same as --study small, which takes a few minutes.")
+    ] = False,
+    task: Annotated[
+        str | None, value("--task", "TASK,TASK...", "Run only these tasks; default: all.")
+    ] = None,
+    law: Annotated[
+        str | None, value("--law", "LAW,LAW...", "Run only these control laws; default: all.")
+    ] = None,
+    link: Annotated[str | None, value("--link", "LINK,LINK...")] = None,
+    seeds: Annotated[
+        int | None,
+        value("--seeds", "N", "Number of seeds; default: the number of the study."),
+    ] = None,
+    cell: Annotated[str | None, value("--cell", "TASK/LAW/LINK")] = None,
+    tune: Annotated[bool, typer.Option("--tune", rich_help_panel="Gains")] = False,
+    confirm: Annotated[bool, typer.Option("--confirm")] = False,
+    output: Annotated[Path | None, value("--out -o", "DIR")] = None,
+    jobs: options.JobsOption = None,
+    on: options.OnOption = None,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Compares control laws on the same tasks and links.
+
+    The tables show stability, energy, errors, effort and stiffness. The gains of all laws were
+    tuned by the same procedure. Finished runs are kept; use the same command again to continue
+    an interrupted suite.
+
+    Options:
+        link: Use these links instead of the links of the study, for example rtt68-loss10,4g.
+        cell: Only print the commands that write the logs of this cell of the tables.
+        tune: Tune the laws whose gains are out of date, and store their gains with the suite;
+            the same command continues an interrupted tuning.
+        confirm: Has no effect any more: every run that is not stable is repeated over twice
+            its length, to confirm or refute the verdict.
+        output: Folder for the results; a suite that the folder already contains is continued.
+            Default: runs/bench-STUDY.
+    """
+    from ...studies.bench import plan_bench, prepare_bench_folder
+    from ...studies.bench.bench_figures import write_bench
+    from ...studies.bench.bench_plan import find_stale
+    from ...work.executor import check_workers
+    from ...work.study_folder import format_command
+
+    check_workers(jobs, on)
+    chosen_study = "small" if small else study
+    laws = options.split_names(law)
+    if tune:
+        _tune_bench(laws, chosen_study, jobs, on)
+        return
+    plan = plan_bench(
+        chosen_study,
+        tasks=options.split_names(task),
+        laws=laws,
+        links=options.split_names(link),
+        seeds=seeds,
+    )
+
+    if cell is not None:
+        bench_cell = plan.cell(cell)
+        for seed in bench_cell.seeds:
+            log = f"{cell.replace('/', '-')}-{seed}.mcap"
+            terminal.print_line(f"{bench_cell.build(seed).command} -o {log}")
+        return
+
+    tuned_gains = {str(planned.tuned): planned.tuned for planned in plan.cells}
+    stale = find_stale(tuned_gains.values())
+    if stale:
+        terminal.print_note(
+            f"tuned for another text of law or task, see --tune: {', '.join(stale)}"
+        )
+
+    folder = prepare_bench_folder(plan, output)
+    cells = count_nouns(len(plan.cells), "cell")
+    runs = count_nouns(plan.runs, "run")
+    terminal.print_note(f"{cells}, {runs}, into {folder.path}")
+    results = _run_bench(folder, jobs, on, confirm=confirm)
+
+    # The command that repeats this benchmark, for its page.
+    arguments = ["--study", chosen_study]
+    filters = {"--task": task, "--law": law, "--link": link, "--seeds": seeds}
+    for name, filter_value in filters.items():
+        if filter_value is not None:
+            arguments += [name, str(filter_value)]
+    if confirm:
+        arguments.append("--confirm")
+    paths = write_bench(results, folder.path, format_command("bench", *arguments))
+    terminal.print_result(results, as_json=as_json)
+    terminal.print_paths([] if as_json else paths)
+
+
+ProtocolArgument = Annotated[
+    Path, typer.Argument(help="Protocol of an experiment (a TOML file).", metavar="FILE")
+]
+FolderArgument = Annotated[Path, typer.Argument(help="Folder of an experiment.", metavar="DIR")]
+
+
+@options.command("reaching.toml", "two-people.toml --pair", page="docs/experiment-protocol.md")
+def experiment_new_command(
+    file: Annotated[
+        Path, typer.Argument(help="Protocol to write (a TOML file).", metavar="FILE")
+    ],
+    pair: Annotated[
+        bool,
+        flag("--pair", "Write a protocol for two people, each of whom holds a master arm."),
+    ] = False,
+    force: options.ForceOption = False,
+) -> None:
+    """Writes a commented protocol that runs without changes."""
+    from ...studies.experiment.experiment_run import new_experiment
+
+    new_experiment(file, pair=pair, force=force)
+    people = f"trilat experiment run {file} --live"
+    models = f"trilat experiment run {file}"
+    terminal.print_text(
+        f"{file}: a protocol; with people: {people}; with models of people: {models}"
+    )
+
+
+@options.command("reaching.toml", page="docs/experiment-protocol.md")
+def experiment_check_command(
+    file: ProtocolArgument, as_json: options.JsonOption = False
+) -> None:
+    """Prints the plan of a protocol, or everything that is wrong with the protocol."""
+    from ...studies.experiment.experiment_run import check_experiment
+
+    terminal.print_result(check_experiment(file), as_json=as_json)
+
+
+@options.command(
+    "reaching.toml",
+    "two-people.toml --live",
+    "runs/experiment-reaching-001",
+    page="docs/experiments.md",
+)
+def experiment_run_command(
+    file: Annotated[
+        Path, typer.Argument(help="A protocol, or the folder of an experiment to continue.")
+    ],
+    out: Annotated[
+        Path | None,
+        value("--out -o", "DIR", "Folder for the results; default: runs/experiment-NAME-N."),
+    ] = None,
+    live: Annotated[
+        bool, flag("--live", "Run with people, who take part on pages in their browsers.")
+    ] = False,
+    *,
+    serving: options.PageServing,
+    jobs: options.JobsOption = None,
+    on: options.OnOption = None,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Runs an experiment with synthetic participants in virtual time, or with people.
+
+    Each trial produces a verified log. With --live, the command prints a link for the
+    experimenter and one for each user; trials begin once all users are ready on their pages.
+    The button on the experimenter's page or Ctrl-C pauses the experiment.
+    """
+    from live.page_server import PageOptions
+
+    from ...studies.experiment.experiment_run import begin_experiment, open_experiment
+
+    page = PageOptions(*serving)
+    if live:
+        page.check()
+    experiment = open_experiment(file) if file.is_dir() else begin_experiment(file, out)
+    exit_code = 0
+    with terminal.lines_aside(as_json):
+        trials = count_nouns(len(experiment.plan.trials), "trial")
+        terminal.print_text(f"{trials}, into {experiment.folder}; after Ctrl-C, continue with")
+        live_option = " --live" if live else ""
+        terminal.print_text(f"  trilat experiment run {experiment.folder}{live_option}")
+        if live:
+            from live.experiment_sessions import run_with_people
+
+            exit_code = run_with_people(experiment, page, terminal.print_line)
+        else:
+            with show_progress("trials", terminal.print_text) as show:
+                experiment.run(jobs, show, on)
+    terminal.print_result(experiment, as_json=as_json)
+    if exit_code:
+        raise typer.Exit(exit_code)
+
+
+@options.command("runs/experiment-reaching-001", page="docs/experiment-analysis.md")
+def experiment_analyse_command(
+    folder: FolderArgument,
+    out: Annotated[Path | None, value("--out -o", "DIR")] = None,
+    exclude: Annotated[list[str] | None, value("--exclude", "WHO=REASON")] = None,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Compares the conditions of an experiment, in tables, figures and a paragraph for a paper.
+
+    Options:
+        out: Folder for the results; default: analysis, in the folder of the experiment.
+        exclude: Participant or pair to leave out, with the reason; repeatable.
+    """
+    from ...studies.experiment.experiment_analysis import analyse_experiment
+
+    excluded = {}
+    for text in exclude or []:
+        participant, _, reason = text.partition("=")
+        excluded[participant] = reason
+    analysis = analyse_experiment(folder, out, exclude=excluded)
+    terminal.print_result(analysis, as_json=as_json)
+    terminal.print_paths([] if as_json else analysis.paths)
+
+
+@options.command("0.8 --participants 16", page="docs/experiment-analysis.md")
+def experiment_power_command(
+    effect: Annotated[
+        float, typer.Argument(help="Cohen's d_z of a paired comparison.", min=0.01, max=10.0)
+    ],
+    participants: Annotated[
+        int | None,
+        value(
+            "--participants",
+            "N",
+            "Planned number of participants, whose power is computed.",
+            min=2,
+        ),
+    ] = None,
+    seed: Annotated[int, value("--seed", "S", "Seed of the simulated experiments.")] = 1,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Computes how many participants are needed to detect an effect.
+
+    The power is computed from theory. With --participants, it is also computed from simulated
+    experiments, whose data are random.
+    """
+    from ...studies.experiment.experiment_analysis import compute_experiment_power
+
+    power = compute_experiment_power(effect, participants, seed=seed)
+    terminal.print_result(power, as_json=as_json)
+
+
+@options.command("runs/experiment-reaching-001", page="docs/experiments.md")
+def experiment_status_command(
+    folder: FolderArgument, as_json: options.JsonOption = False
+) -> None:
+    """Prints the progress of an experiment, and checks that its logs were not changed."""
+    from ...studies.experiment.experiment_run import list_log_problems, open_experiment
+
+    experiment = open_experiment(folder)
+    problems = list(list_log_problems(experiment))
+    terminal.print_result(experiment, as_json=as_json)
+    for problem in problems:
+        terminal.err.print(problem, markup=False, highlight=False)
+    if problems:
+        raise typer.Exit(1)

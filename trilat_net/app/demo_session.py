@@ -1,0 +1,733 @@
+"""Runs a whole session on one machine, with a process per site and a recorder.
+
+A session is a run in which several robot arms are coupled over a network. A site is a process
+that runs one arm and its control loop. The recorder is a process that writes the log of the
+session. `run_demo` runs such a session for the command `trilat demo`, and `run` does so for
+Python programs.
+
+All processes are copies (forks) of one process, the starter, which has imported all modules and
+compiled the control code. A copy starts in a tenth of the time that a Python interpreter takes.
+The starter has no network connection, no threads of its own, and none of the user's code,
+because these cannot be copied safely.
+
+Invariant:
+    - The recorder always ends last, so that it receives the last messages of the sites.
+    - No child process is left when a function returns, even if this process is killed. If the
+      starter is killed, all processes receive a signal to end.
+    - Each child has a process session of its own. Ctrl-C in the terminal therefore reaches only
+      this process, which then ends the children in the right order.
+"""
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, closing, nullcontext, suppress
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import chain
+from multiprocessing.connection import Connection, Pipe
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from setproctitle import setproctitle
+
+from sites.machine_load import describe_load, measure_busy_share
+from sites.site_parts import warm_up
+from trilat_net.core.step.jit import compiling_notice, is_core_cached
+from trilat_net.core.step.ticks import NS_PER_S
+from trilat_net.errors import LogRefused, RunFailed
+from trilat_net.files import (
+    create_file,
+    find_page,
+    make_results_folder,
+    make_subfolder,
+    write_whole,
+)
+from trilat_net.log.log_reader import Log, open_log
+from trilat_net.net import topics
+from trilat_net.net.clock import Clock, SystemClock
+from trilat_net.net.connection import reserve_session_endpoints
+from trilat_net.net.zenoh_bus import ZenohBus
+from trilat_net.process import Interrupt, freeze_gc
+from trilat_net.scenario import Scenario, load_scenario
+from trilat_net.scenario.code_consent import list_imported_code
+from trilat_net.scenario.operators.program_hand import find_own_hand
+from trilat_net.scenario.validate import check_outside_arms
+
+from .monitor import SessionDisplay, SessionMonitor
+
+POLL_NS = 100_000_000
+"""Time between two updates of the display, in ns."""
+START_S = 10
+"""Time that a site may need to start if many sites share a few processors, in s."""
+JOIN_S = 60
+"""Longest wait of the sites for each other and for the recorder, in s."""
+WAIT_S = 600
+"""Longest wait of the sites if people decide when the session begins, in s."""
+END_TIMEOUT_NS = 45 * NS_PER_S
+"""Time after which a child is killed that has not ended after its signal, in ns.
+
+A site waits 10 s for the recorder, and as long again after each query of a recorder that lacks
+messages.
+"""
+RECORDER_NS = 2 * NS_PER_S
+"""Time that the recorder may need to write the last messages after all sites have ended, in ns.
+"""
+
+
+@dataclass(slots=True)
+class SessionResult:
+    """Outcome of a session that `run_demo` has run.
+
+    Attributes:
+        log: Path of the log. The file exists only if the session has begun.
+        problems: Sentences that say what failed, in the order of the failures.
+        interrupted: Number of the signal that ended the session. 0 if no signal did.
+        exit_code: Exit code for the command: that of a failed run, or of a disk that refused
+            the log.
+    """
+
+    log: Path
+    problems: list[str] = field(default_factory=list)
+    interrupted: int = 0
+    exit_code: int = RunFailed.exit_code
+
+
+class SessionProcess:
+    """State of one process of a session: a site, a recorder or an operator program.
+
+    `ProcessStarter` creates this object, and updates it with the reports of the starter
+    process.
+
+    Attributes:
+        name: Name of the process, which is that of its site or "recorder".
+        output: File with everything that the process prints.
+        pid: Process number. None before the process has started.
+        code: Exit code. None before the process has ended.
+    """
+
+    def __init__(self, starter: "ProcessStarter", name: str, output: Path) -> None:
+        self.name = name
+        self.output = output
+        self.pid: int | None = None
+        self.code: int | None = None
+        self._starter = starter
+        self._signalled = False
+
+    def end(self, number: int) -> None:
+        """Ends the process with a signal. Nothing happens if the process has ended already.
+
+        Args:
+            number: Number of the signal in the operating system.
+        """
+        if self.code is None:
+            self._signalled = True
+            self._starter.signal(self, number)
+
+    def problem(self) -> str | None:
+        """Describes how the process failed.
+
+        Returns:
+            A sentence with the exit code or signal, and the last line that the process printed.
+            None if the process has not failed: it is running, it ended with code 0, or it was
+            ended by a signal of this process.
+        """
+        code = self.code
+        if self._signalled and self.pid is None:
+            # The signal has interrupted the start of the process, which may then end with any
+            # exit code.
+            return None
+
+        if code in (0, None):
+            return None
+        if self._signalled and code in (128 + signal.SIGINT, -signal.SIGINT):
+            # The process was already ending, and had removed its signal handler.
+            return None
+        if code is not None and code < 0:
+            return f"{self.name} was killed by {signal.Signals(-code).name}"
+
+        lines = self.output.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        last_line = lines[-1].removeprefix("error: ") if lines else "it printed nothing"
+        return f"{self.name} ended with code {code}: {last_line}"
+
+
+class ProcessStarter:
+    """Starts the child processes of a session, and collects their output in a folder.
+
+    This object runs the starter as a child process (`run_starter`), and sends it requests
+    through a pipe. The starter reports through the same pipe when a process has started or
+    ended.
+
+    Args:
+        scenario_file: Scenario of the session.
+        folder: Folder for the output of each process.
+    """
+
+    def __init__(self, scenario_file: Path, folder: Path) -> None:
+        self._folder = folder
+        self._output = folder / "starter.txt"
+        self._processes: dict[str, SessionProcess] = {}
+        self._pipe, child_end = Pipe()
+        with child_end, create_file(self._output) as sink:
+            # The arguments of `run_starter`.
+            arguments = ["start-processes", str(child_end.fileno()), str(scenario_file)]
+            self._starter = subprocess.Popen(
+                [sys.executable, "-m", "trilat_net", *arguments],
+                stdin=subprocess.DEVNULL,
+                stdout=sink,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+                pass_fds=[child_end.fileno()],
+            )
+
+    def start(self, name: str, arguments: Sequence[str]) -> SessionProcess:
+        """Requests the start of a command as a child process.
+
+        Args:
+            name: Name of the process, which no other process of the session has.
+            arguments: The command and its arguments, without `trilat`.
+
+        Returns:
+            The process, which may not have started yet.
+        """
+        process = SessionProcess(self, name, self._folder / f"{name}.txt")
+        # Created in this process, so that a full disk is reported to the user.
+        create_file(process.output).close()
+        self._processes[name] = process
+        self._send_order(name, [*arguments], 0, process.output)
+        return process
+
+    def signal(self, process: SessionProcess, number: int) -> None:
+        """Sends a signal to a process.
+
+        If the process has not been started yet, it will not be started at all.
+
+        Args:
+            process: The process, as `start` returned it.
+            number: Number of the signal in the operating system.
+        """
+        self._send_order(process.name, [], number, process.output)
+        # This signal interrupts a starter that is still importing modules. A starter that is
+        # ready has blocked it.
+        self._starter.send_signal(signal.SIGINT)
+
+    def _send_order(
+        self,
+        name: str,
+        arguments: list[str],
+        number: int,
+        output: Path,
+    ) -> None:
+        """Sends a request to the starter: a start if `number` is 0, otherwise a signal.
+
+        Args:
+            name: Name of the process.
+            arguments: The command and its arguments. Empty for a signal.
+            number: Number of the signal. 0 requests a start.
+            output: File for the output of the process.
+        """
+        with suppress(OSError):  # the starter has failed, which `poll` reports
+            self._pipe.send((name, arguments, number, output))
+
+    def poll(self) -> None:
+        """Receives news from the starter, the process that starts the processes of the session.
+
+        Each process object is updated with its process number or its exit code. If the starter
+        itself has failed, its processes are told to end. They then count as ended with the exit
+        code of the starter.
+        """
+        try:
+            while self._pipe.poll():
+                name, pid, code = self._pipe.recv()
+                self._processes[name].pid = pid
+                self._processes[name].code = code
+        except (EOFError, OSError):
+            code = self._starter.wait()
+            for process in self._processes.values():
+                if process.code is not None:
+                    continue
+                process.code = code
+                process.output = self._output
+                if process.pid is not None:
+                    with suppress(ProcessLookupError):
+                        os.kill(process.pid, signal.SIGINT)
+
+    def close(self) -> None:
+        """Ends the starter, the process that starts all other processes of the session.
+
+        The method must be called after all other processes have ended, because nobody could
+        start or signal processes any more.
+        """
+        self._pipe.close()
+        self._starter.send_signal(signal.SIGINT)
+        self._starter.wait()
+
+
+SessionAttendant = Callable[
+    [str, Sequence[str], Callable[[str], None]], AbstractContextManager[Callable[[], bool]]
+]
+"""Function that watches a session, for example to serve a web page, and may end the session.
+
+It receives the name of the session, its endpoints, and a function that prints a line for the
+user. It returns a context manager that lasts as long as the session. The value of the `with`
+statement is a function that returns True once the session should end.
+"""
+
+
+def run_demo(
+    scenario: Scenario,
+    folder: Path,
+    console: Console,
+    attend: SessionAttendant | None = None,
+    begins: Callable[[], bool] | None = None,
+) -> SessionResult:
+    """Runs a session on this machine, with a process for each site and for the recorder.
+
+    The session has the name of the scenario.
+
+    A site is a process that runs one arm and its control loop. The recorder writes the log.
+
+    Args:
+        scenario: The scenario, which describes the arms, their links and the run.
+        folder: Folder for the log and for the output of the processes.
+        console: Terminal of the user.
+        attend: Function that watches the session, for example to serve a web page, and may end
+            it. None if there is no such function.
+        begins: Function that returns True once the session may begin. Until then, for at most
+            `WAIT_S`, the sites wait for the recorder. The session begins a second or two later.
+            None lets it begin at once.
+
+    Returns:
+        The outcome of the session. If the session has begun, the log is valid.
+
+    Raises:
+        ScenarioError: The scenario lacks the limits of an external arm.
+    """
+    check_outside_arms(scenario)
+    result = SessionResult(folder / "run.mcap")
+    session = scenario.name
+    clock = SystemClock()
+    with (
+        SessionDisplay(console, clock) as display,
+        Interrupt() as interrupt,
+        ExitStack() as reserved,
+    ):
+        compile_core(scenario, display.say, interrupt)
+        load_warning = describe_load(measure_busy_share(clock))
+        if load_warning:
+            display.say(f"warning: {load_warning}")
+        endpoints = reserved.enter_context(reserve_session_endpoints(session, scenario.names))
+        patience_s = JOIN_S if begins is None else WAIT_S
+        starter, sites, start_recorder = _start(
+            scenario=scenario,
+            folder=folder,
+            reserved=reserved,
+            endpoints=endpoints,
+            wait_s=patience_s,
+        )
+        recorder: list[SessionProcess] = []  # empty until the session may begin
+        display.say(f"others connect to {', '.join(endpoints)}")
+        for name in scenario.outside:
+            key = topics.key(session, name, topics.MEASURED)
+            endpoint = endpoints[scenario.names.index(name)]
+            page = find_page("external-arm.md")
+            display.say(f"{name} waits for its arm on {key} at {endpoint}; see {page}")
+
+        attending: AbstractContextManager[Callable[[], bool]] = nullcontext(lambda: False)
+        if attend is not None:
+            attending = attend(session, endpoints, display.say)
+        try:
+            with closing(ZenohBus([], endpoints)) as bus, attending as should_end:
+                monitor = SessionMonitor(bus, session, scenario, display)
+                while not interrupt.is_requested() and not should_end():
+                    if _is_over([*sites, *recorder], result):
+                        break
+                    if not recorder and (begins is None or begins()):
+                        recorder.append(start_recorder())
+                    monitor.poll()
+                    clock.sleep_until(clock.monotonic_ns() + POLL_NS)
+                    starter.poll()
+        finally:
+            _end_all(
+                starter=starter,
+                sites=sites,
+                recorder=recorder,
+                clock=clock,
+                interrupt=interrupt,
+                say=display.say,
+            )
+        result.interrupted = interrupt.number
+
+    for child in [*sites, *recorder]:
+        problem = child.problem()
+        if child.code == LogRefused.exit_code:
+            result.exit_code = LogRefused.exit_code
+        if problem and not result.interrupted and problem not in result.problems:
+            result.problems.append(problem)
+    return result
+
+
+def compile_core(scenario: Scenario, say: Callable[[str], None], interrupt: Interrupt) -> None:
+    """Compiles the code of the control loop for a scenario, unless it is cached on disk.
+
+    The code depends on the number of joints of the arms. The compilation may take minutes, and
+    a signal such as Ctrl-C interrupts it.
+
+    Args:
+        scenario: The scenario, which describes the arms, their links and the run.
+        say: Function that tells the user that the code is being compiled.
+        interrupt: Handler of the signals.
+    """
+    # One site of each kind of arm suffices.
+    sites_by_counts = {arm.counts: name for name, arm in scenario.arms.items()}
+    has_chains = any(arm.chain is not None for arm in scenario.arms.values())
+    # The cached code may be for chains with another number of joints.
+    if has_chains or not is_core_cached():
+        compiling_notice.report = say
+        with interrupt.raising():
+            for name in sites_by_counts.values():
+                warm_up(scenario, name)
+
+
+def _start(
+    scenario: Scenario,
+    folder: Path,
+    reserved: ExitStack,
+    endpoints: list[str],
+    wait_s: int,
+) -> tuple[ProcessStarter, list[SessionProcess], Callable[[], SessionProcess]]:
+    """Starts the processes of all sites, and those of the user's own operator programs.
+
+    Args:
+        scenario: The scenario.
+        folder: Folder for the scenario, the log and the output of the processes.
+        reserved: Closes the starter at the end of the session.
+        endpoints: Endpoint at which each site listens, in the order of the scenario.
+        wait_s: Longest wait of a process for the others, in s.
+
+    Returns:
+        The starter, the processes, and a function that starts the recorder.
+    """
+    scenario_file = folder / "scenario.toml"
+    log = folder / "run.mcap"
+    output = folder / "processes"
+    write_whole(scenario_file, scenario.text)
+    make_subfolder(output)
+    log.unlink(missing_ok=True)  # of an earlier run, in a folder that may be replaced
+    starter = reserved.enter_context(closing(ProcessStarter(scenario_file, output)))
+
+    session = scenario.name
+    common = ["--scenario", str(scenario_file), "--session", session]
+    connect = [["--connect", endpoint] for endpoint in endpoints]
+    patience = ["--join-timeout", str(max(wait_s, START_S * len(endpoints)))]
+    processes = []
+    # Each site connects to the sites before it, so that every two sites are connected once.
+    for index, name in enumerate(scenario.names):
+        arguments = ["site", name, *common, "--listen", endpoints[index]]
+        arguments += [*chain(*connect[:index]), "--needs-recorder", *patience]
+        processes.append(starter.start(name, arguments))
+    for index, name in enumerate(scenario.names):
+        own_hand = find_own_hand(scenario, name)
+        if own_hand is not None and own_hand.has_separate_process:
+            arguments = ["hand", name, *common, *connect[index], *patience]
+            processes.append(starter.start(f"hand-{name}", arguments))
+
+    record = ["record", "--session", session, *chain(*connect), "-o", str(log)]
+    record += [*patience, "--force"]
+    start_recorder = partial(starter.start, topics.RECORDER, record)
+    return starter, processes, start_recorder
+
+
+def _is_over(children: list[SessionProcess], result: SessionResult) -> bool:
+    """Returns True if the session is over: a process has failed, or all processes have ended.
+
+    Args:
+        children: The processes.
+        result: Outcome of the session. The problems of failed processes are added to it.
+    """
+    problems = [child.problem() for child in children]
+    result.problems += [problem for problem in problems if problem]
+    return bool(result.problems) or all(child.code == 0 for child in children)
+
+
+def _end_all(
+    starter: ProcessStarter,
+    sites: list[SessionProcess],
+    recorder: list[SessionProcess],
+    clock: Clock,
+    interrupt: Interrupt,
+    say: Callable[[str], None],
+) -> None:
+    """Ends the processes of a session: first the sites, and then the recorder.
+
+    In this order, the recorder stores the last messages of the sites. If the user presses
+    Ctrl-C a second time, all processes receive another signal, which ends them at once.
+
+    Args:
+        starter: Starter of the processes.
+        sites: Processes of the sites and of operator programs.
+        recorder: Process of the recorder. Empty if it has not been started.
+        clock: Clock of this process.
+        interrupt: Handler of the signals of this process.
+        say: Function that prints a line for the user.
+    """
+    announce = partial(
+        say,
+        "the sites keep their last records until the recorder has them; "
+        "Ctrl-C a second time ends it at once",
+    )
+    _end_group(
+        starter=starter,
+        group=sites,
+        clock=clock,
+        ends_now=interrupt.is_repeated,
+        announce=announce,
+    )
+    sites_ended_ns = clock.monotonic_ns()
+
+    def must_end_now() -> bool:
+        """Returns True if the recorder must end at once, by a second signal.
+
+        This is the case if the user has pressed Ctrl-C a second time, or if the recorder has
+        not ended within `RECORDER_NS` after the sites.
+        """
+        return interrupt.is_repeated() or clock.monotonic_ns() - sites_ended_ns > RECORDER_NS
+
+    _end_group(
+        starter=starter,
+        group=recorder,
+        clock=clock,
+        ends_now=must_end_now,
+        announce=lambda: None,
+    )
+
+
+def _end_group(
+    starter: ProcessStarter,
+    group: list[SessionProcess],
+    clock: Clock,
+    ends_now: Callable[[], bool],
+    announce: Callable[[], None],
+) -> None:
+    """Sends processes a signal to end, and waits until all have ended.
+
+    A process that does not end within `END_TIMEOUT_NS` is killed.
+
+    Args:
+        starter: Starter of the processes.
+        group: The processes.
+        clock: Clock of this process.
+        ends_now: Function that returns True to end the processes at once, by a second signal.
+        announce: Function that tells the user why the wait takes long. It is called once, after
+            a second.
+    """
+    for process in group:
+        process.end(signal.SIGINT)
+
+    begun_ns = clock.monotonic_ns()
+    is_announced = False
+    is_repeated = False
+    while any(process.code is None for process in group):
+        waited_ns = clock.monotonic_ns() - begun_ns
+        if ends_now() and not is_repeated:
+            is_repeated = True
+            for process in group:
+                process.end(signal.SIGINT)
+
+        if waited_ns > NS_PER_S and not is_announced:
+            is_announced = True
+            announce()
+        if waited_ns > END_TIMEOUT_NS:
+            for process in group:
+                process.end(signal.SIGKILL)
+        clock.sleep_until(clock.monotonic_ns() + POLL_NS // 10)
+        starter.poll()
+
+
+def run_starter(number: int, scenario_file: str) -> list[str] | None:
+    """Runs the starter process, which creates the processes of a session as copies of itself.
+
+    It does so on request, until the requesting process is gone. As with `os.fork`, the function
+    returns in every process: in each copy, which then runs its command, and finally in the
+    starter.
+
+    Args:
+        number: File descriptor of the pipe to the requesting process.
+        scenario_file: Scenario of the session.
+
+    Returns:
+        In a copy, the command and arguments that the copy has to run. In the starter, None.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    scenario = load_scenario(scenario_file)
+    # A user's own code is imported only in the process that runs it.
+    if not list_imported_code([scenario]):
+        # One site of each kind of arm suffices.
+        sites_by_counts = {arm.counts: name for name, arm in scenario.arms.items()}
+        for name in sites_by_counts.values():
+            warm_up(scenario, name)
+    freeze_gc()
+    # The signal is blocked and not ignored. If it arrives while a copy has no handler yet, it
+    # is delivered as soon as the copy has one.
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    return _StarterProcess(Connection(number)).serve()
+
+
+class _StarterProcess:
+    """Executes the requests to the starter process, and keeps track of its copies.
+
+    Args:
+        pipe: Connection to the requesting process.
+    """
+
+    def __init__(self, pipe: Connection) -> None:
+        self._pipe = pipe
+        self._running: dict[str, int] = {}
+
+    def serve(self) -> list[str] | None:
+        """Executes requests to start processes or to signal them, and reports when they end.
+
+        Each new process is a copy of this starter process, made by `os.fork`. Therefore the
+        method returns in every copy and, at the end, in the starter.
+
+        A request is a tuple of four values: the name of the process; the command and its
+        arguments; the number of the signal to send, or 0 to start the process; and the file for
+        the output of the process.
+
+        Returns:
+            The command and its arguments, if the method returns in a copy, which must now
+            execute the command. None, if it returns in the starter, after the requesting
+            process has disappeared and all copies have ended.
+        """
+        arguments: list[str]
+        longest_wait_s = POLL_NS / 10 / NS_PER_S  # then the ends of processes are reported
+        while True:
+            self._report_ends()
+            try:
+                has_request = self._pipe.poll(longest_wait_s)
+                if not has_request:
+                    continue
+                name, arguments, signal_number, output = self._pipe.recv()
+            except (EOFError, OSError):
+                # The requesting process has disappeared.
+                self._end_all()
+                return None
+
+            is_start_request = signal_number == 0
+            if is_start_request:
+                is_copy = self._fork(name)
+                if is_copy:
+                    _become_process(arguments, output)
+                    return arguments
+            elif name in self._running:
+                os.kill(self._running[name], signal_number)
+
+    def _fork(self, name: str) -> bool:
+        """Copies this process.
+
+        Args:
+            name: Name of the copy.
+
+        Returns:
+            True in the copy, False in the starter.
+        """
+        pid = os.fork()
+        if pid:
+            self._running[name] = pid
+            self._report(name, pid, None)
+            return False
+        self._pipe.close()
+        return True
+
+    def _report_ends(self) -> None:
+        """Reports the exit codes of the processes that have ended."""
+        for name, pid in list(self._running.items()):
+            ended, status = os.waitpid(pid, os.WNOHANG)
+            if ended:
+                del self._running[name]
+                self._report(name, pid, os.waitstatus_to_exitcode(status))
+
+    def _report(self, name: str, pid: int, code: int | None) -> None:
+        """Reports that a process has started, or has ended with an exit code."""
+        with suppress(OSError):  # the requesting process is gone, which `serve` notices next
+            self._pipe.send((name, pid, code))
+
+    def _end_all(self) -> None:
+        """Ends all processes and waits for them, the recorder last."""
+        recorder = []
+        if topics.RECORDER in self._running:
+            recorder.append(self._running.pop(topics.RECORDER))
+        others = list(self._running.values())
+        for pids in (others, recorder):
+            for pid in pids:
+                os.kill(pid, signal.SIGINT)
+            for pid in pids:
+                os.waitpid(pid, 0)
+
+
+def _become_process(arguments: list[str], output: Path) -> None:
+    """Turns a copy of the starter into a process like one that a shell has started.
+
+    The copy receives its own process session, output file, signal handling and process title.
+
+    Args:
+        arguments: The command and its arguments.
+        output: File for everything that the process prints.
+    """
+    os.setsid()
+    sink = os.open(output, os.O_WRONLY | os.O_NOFOLLOW)
+    for stream in (sys.stdout, sys.stderr):
+        os.dup2(sink, stream.fileno())
+    os.close(sink)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    setproctitle(" ".join(["trilat", *arguments]))
+
+
+def run(
+    scenario: str | Path | Mapping[str, Any] | Scenario,
+    set: Mapping[str, Any] | Sequence[str] = (),  # noqa: A002 - the command's --set, by its name
+    *,
+    duration_s: float | None = None,
+    seed: int | None = None,
+    out: str | Path | None = None,
+    force: bool = False,
+    quiet: bool = True,
+) -> Log:
+    """Runs a scenario live, with one process per site and a recorder, and returns the log.
+
+    The command `trilat demo` does the same, and also reports on the log, as `tn.report(log)`
+    does.
+
+    >>> log = tn.run("two_sites", duration_s=2)
+    >>> tn.verify(log).passed
+    True
+
+    Args:
+        scenario: The name of a shipped scenario, a path, a TOML text, the tables of a scenario,
+            or a scenario.
+        set: Settings that replace those of the scenario, as in `{"control.Kd": 5}`.
+        duration_s: Duration of the run in s. None keeps that of the scenario.
+        seed: Seed of the random numbers. None keeps that of the scenario.
+        out: Folder of the log. None uses the next free folder runs/NAME-N.
+        force: True if the folder may contain files already.
+        quiet: True if nothing is printed during the run.
+
+    Raises:
+        ScenarioError: The scenario or a replaced setting is not valid.
+        RunFailed: A process failed, or the run was interrupted. The message says whether there
+            is a log.
+    """
+    loaded = load_scenario(scenario, set, duration_s=duration_s, seed=seed)
+    folder = make_results_folder(None if out is None else Path(out), loaded.name, force=force)
+    result = run_demo(loaded, folder, Console(quiet=quiet))
+    problems = ["interrupted"] if result.interrupted else result.problems
+    if problems:
+        kept = f"; {result.log} holds what there was" if result.log.exists() else ""
+        raise RunFailed("; ".join(problems) + kept)
+    log = open_log(result.log)
+    log.warn_if_diverged()
+    return log

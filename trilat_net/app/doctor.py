@@ -1,0 +1,784 @@
+"""Checks whether this machine is ready for a session, and states how to solve each problem.
+
+A session consists of processes ("sites") that run arms at 1000 ticks per second and exchange
+their states over the network. The checks concern the keys, the network endpoints, the clocks,
+the operating system's real-time rights, the tick rate that this machine achieves, the disk and
+the processors. The command is `trilat doctor`.
+
+Each check yields a finding: its result and, if there is a problem, a remedy. The checks change
+nothing on this machine. The real-time rights and the tick rate are measured in another process,
+because the settings of the measuring process have to be changed for that.
+"""
+
+import json
+import os
+import platform
+import re
+import shutil
+import socket
+import ssl
+import subprocess
+import sys
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+from sites.machine_load import describe_load, measure_busy_share
+from sites.site_loop import PeerInbox, StateBlock, run_loop
+from sites.site_parts import warm_up
+from trilat_net import process
+from trilat_net.core.step.jit import is_core_cached
+from trilat_net.core.step.site_step import Site
+from trilat_net.core.step.ticks import NS_PER_S, Arrival, TickInput, TickRecord
+from trilat_net.errors import RunFailed, SessionError, UsageError, count_nouns
+from trilat_net.files import read_foreign_permissions
+from trilat_net.net.clock import Clock, SystemClock
+from trilat_net.net.connection import (
+    ENCRYPTED,
+    ENDS_SOON,
+    Connection,
+    find_endpoint_addresses,
+    is_loopback,
+    resolve_member_connection,
+    secure_connection,
+)
+from trilat_net.net.member_keys import (
+    AUTHORITY,
+    CERTIFICATE,
+    PRIVATE_KEY,
+    MemberKeys,
+    read_member_keys,
+)
+from trilat_net.net.timing import LoopStats, SiteTiming
+from trilat_net.net.zenoh_bus import RouterSilent, ZenohBus
+from trilat_net.results import Result
+from trilat_net.scenario import Scenario, load_scenario
+
+from .session_ping import ping_session
+
+FindingState = Literal["ok", "warn", "fail"]
+CONNECT_S = 2.0
+"""Longest wait for a connection or for replies to pings, in s."""
+MIN_FREE_BYTES = 100 << 20
+"""Free space below which a recording is likely to end early."""
+LOW_FREE_BYTES = 2 << 30
+"""Free space below which there is a warning. It is enough for 90 minutes of three sites."""
+CLOCK_TEST_NS = 100_000_000
+"""Time for which the monotonic clock and the time of day are compared, in ns."""
+MAX_CLOCK_STEP_NS = 1_000_000
+"""Largest change of the difference between the clocks in that time, in ns."""
+MAX_BOUND_US = 1_000
+"""Largest error bound of a clock offset without a warning, in us."""
+PINGS = 20
+"""Number of pings to each member of a session."""
+RATES_HZ = (1000, 500, 200, 100)
+"""Tick rates that are tried, in Hz, until one of them is achieved."""
+REHEARSAL_S = 1.0
+"""Duration of the trial of each rate, in s."""
+MAX_LATE_PERIODS = 0.5
+"""Largest lateness of a punctual tick, in periods of the tick rate."""
+MIN_PUNCTUAL_SHARE = 0.99
+"""A rate counts as achieved if at least this share of its ticks is punctual."""
+
+
+class DoctorFinding(NamedTuple):
+    """Result of one check of this machine, which `trilat doctor` prints as one line.
+
+    Attributes:
+        check: Subject of the check, such as "keys" or "disk".
+        state: "ok", "warn" for a possible problem, or "fail" for a certain one.
+        text: Sentence about the result and, if there is a problem, its remedy.
+    """
+
+    check: str
+    state: FindingState
+    text: str
+
+
+def examine_machine(
+    connection: Connection,
+    keys: Path | None,
+    folder: Path,
+    session: str | None,
+    clock: Clock,
+    *,
+    insecure: bool,
+) -> Iterator[DoctorFinding]:
+    """Performs all checks, and yields each finding as soon as it is known.
+
+    Args:
+        connection: Endpoints at which this machine would listen, or to which it would connect.
+        keys: Folder of a member's keys. None if there is none.
+        folder: Folder where results would be stored.
+        session: Name of a running session with whose members the clocks are compared. None if
+            the comparison is not made.
+        clock: Clock of this process.
+        insecure: True to permit connections without keys, because everybody on the network is
+            trusted.
+
+    Yields:
+        The findings, in the order of the checks.
+    """
+    member_keys = yield from examine_keys(keys)
+    yield from examine_links(connection, keys, member_keys, insecure=insecure)
+    yield from examine_clock(clock)
+    if session is not None:
+        safe = secure_connection(connection, member_keys, insecure=insecure)
+        yield from examine_offsets(safe, clock, session)
+    yield examine_system()
+    yield from examine_rights()
+    yield examine_rate()
+    yield from examine_room(folder)
+
+
+def examine_keys(folder: Path | None) -> Generator[DoctorFinding, None, MemberKeys | None]:
+    """Checks if a member's keys are valid, for how long, and if other users can read them.
+
+    Args:
+        folder: Folder of a member's keys. None if there is none.
+
+    Returns:
+        The keys. None if there are no keys, or if they cannot be used.
+
+    Yields:
+        The findings about the keys.
+    """
+    if folder is None:
+        yield DoctorFinding(
+            "keys", "ok", "none given: without --keys a member listens on this machine alone"
+        )
+        return None
+    try:
+        member_keys = read_member_keys(folder)
+    except UsageError as error:
+        yield DoctorFinding("keys", "fail", str(error))
+        return None
+
+    names = ", ".join(member_keys.members)
+    text = f"{member_keys.member} of {names}, until {member_keys.ends:%Y-%m-%d %H:%M} UTC"
+    if member_keys.ends - datetime.now(UTC) < ENDS_SOON:
+        yield DoctorFinding("keys", "warn", f"{text}: soon; renew them with trilat keys renew")
+    else:
+        yield DoctorFinding("keys", "ok", text)
+
+    if read_foreign_permissions(folder):
+        yield DoctorFinding(
+            "keys", "warn", f"others can look into {folder}: chmod 700 {folder}"
+        )
+
+    authority = folder.resolve().parent / "authority" / PRIVATE_KEY
+    if authority.exists():
+        text = f"{authority} lies here too: with it anybody makes keys; keep it elsewhere"
+        yield DoctorFinding("keys", "warn", text)
+    return member_keys
+
+
+def examine_links(
+    connection: Connection,
+    folder: Path | None,
+    member_keys: MemberKeys | None,
+    *,
+    insecure: bool,
+) -> Iterator[DoctorFinding]:
+    """Checks if each endpoint can be listened at or reached, and if it is encrypted.
+
+    Args:
+        connection: Endpoints to listen at and to connect to.
+        folder: Folder of a member's keys. None if there is none.
+        member_keys: The keys. None if there are no keys, or if they cannot be used.
+        insecure: True to permit connections without keys, because everybody on the network is
+            trusted.
+
+    Yields:
+        The findings about the endpoints. There is a single one if no endpoint can be used at
+        all.
+    """
+    try:
+        safe = secure_connection(connection, member_keys, insecure=insecure)
+    except UsageError as error:
+        yield DoctorFinding("links", "fail", str(error))
+        return
+
+    for endpoint in find_endpoint_addresses(safe.reach(safe.listen)):
+        address = _split_address(endpoint)
+        if address is None:
+            yield _describe_untried(endpoint)
+        else:
+            yield _examine_listening(endpoint, address)
+
+    for endpoint in find_endpoint_addresses(safe.reach(safe.connect or ())):
+        address = _split_address(endpoint)
+        if endpoint.startswith("quic/"):
+            yield _examine_quic(endpoint, member_keys)
+        elif address is None:
+            yield _describe_untried(endpoint)
+        else:
+            yield _examine_reaching(endpoint, address, folder if member_keys else None)
+
+    if not safe.listen and not safe.connect:
+        yield DoctorFinding(
+            "links", "ok", "no endpoints given: --listen and --connect are tried if given"
+        )
+
+
+def _describe_untried(endpoint: str) -> DoctorFinding:
+    """Returns the finding about an endpoint of a kind that this module cannot check."""
+    text = f"{endpoint} was not tried: not an address of TCP or QUIC"
+    return DoctorFinding("links", "warn", text)
+
+
+def _examine_listening(endpoint: str, address: tuple[str, int]) -> DoctorFinding:
+    """Checks if this machine can listen at an endpoint, by listening there for a moment.
+
+    Args:
+        endpoint: The endpoint, such as "tls/0.0.0.0:7447".
+        address: Its host and port.
+    """
+    is_quic = endpoint.startswith("quic/")
+    family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
+    kind = socket.SOCK_DGRAM if is_quic else socket.SOCK_STREAM
+
+    try:
+        with socket.socket(family, kind) as probe:
+            if not is_quic:  # with this option, two UDP sockets could share the port
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(address)
+            if not is_quic:
+                probe.listen(1)
+    except OSError as error:
+        text = f"cannot listen at {endpoint}: {error.strerror or error}"
+        return DoctorFinding("links", "fail", text)
+
+    if endpoint.startswith(ENCRYPTED) or is_loopback(endpoint):
+        return DoctorFinding("links", "ok", f"can listen at {endpoint}")
+    text = f"{endpoint} would listen unencrypted, to anybody who reaches it"
+    return DoctorFinding("links", "warn", text)
+
+
+def _examine_reaching(
+    endpoint: str, address: tuple[str, int], folder: Path | None
+) -> DoctorFinding:
+    """Checks if another member answers at an endpoint of TCP or TLS.
+
+    Args:
+        endpoint: The endpoint.
+        address: Its host and port.
+        folder: Folder of this member's keys. None if they cannot be used: then only the
+            connection is tried, and not the certificate.
+    """
+    try:
+        with socket.create_connection(address, CONNECT_S) as link:
+            if not endpoint.startswith("tls/"):
+                state: FindingState = "ok" if is_loopback(endpoint) else "warn"
+                return DoctorFinding("links", state, f"{endpoint} answers, unencrypted")
+            context = _tls_context(folder)
+            with context.wrap_socket(link, server_hostname=address[0]) as safe:
+                authority = "whose authority is unknown"
+                if folder:
+                    authority = "with a certificate of the same authority"
+                text = f"{endpoint} answers over {safe.version()}, {authority}"
+                return DoctorFinding("links", "ok", text)
+    except ssl.SSLError as error:
+        reason = getattr(error, "verify_message", "") or error.reason or str(error)
+        text = f"{endpoint} answers, but not as a member with these keys: {reason}"
+        return DoctorFinding("links", "fail", text)
+    except OSError as error:
+        text = f"{endpoint} cannot be reached: {error.strerror or error}"
+        return DoctorFinding("links", "fail", text)
+
+
+def _examine_quic(endpoint: str, member_keys: MemberKeys | None) -> DoctorFinding:
+    """Checks if another member answers over QUIC, by connecting as a member.
+
+    Python has no QUIC client in its standard library. Therefore the connection uses Zenoh.
+
+    Args:
+        endpoint: The endpoint.
+        member_keys: Keys of this member. None if there are no keys, or if they cannot be used.
+    """
+    if member_keys is None:
+        return DoctorFinding(
+            "links", "warn", f"{endpoint} was not tried: QUIC asks for the keys of a member"
+        )
+    try:
+        with closing(ZenohBus([], [endpoint], "client", member_keys.settings)):
+            text = f"{endpoint} answers over QUIC, with a certificate of the same authority"
+            return DoctorFinding("links", "ok", text)
+    except (RouterSilent, UsageError) as error:
+        return DoctorFinding(
+            "links", "fail", f"{endpoint} does not answer a member with these keys: {error}"
+        )
+
+
+def _tls_context(folder: Path | None) -> ssl.SSLContext:
+    """Returns the TLS settings with which a member connects.
+
+    Args:
+        folder: Folder of this member's keys. None accepts any certificate.
+    """
+    if folder is None:
+        context = ssl.create_default_context()
+        context.check_hostname = False
+        context.verify_mode = ssl.CERT_NONE
+        return context
+    context = ssl.create_default_context(cafile=str(folder / AUTHORITY))
+    context.load_cert_chain(folder / CERTIFICATE, folder / PRIVATE_KEY)
+    return context
+
+
+def _split_address(endpoint: str) -> tuple[str, int] | None:
+    """Splits an endpoint of TCP, TLS or QUIC into its host and its port.
+
+    Args:
+        endpoint: The endpoint, such as "tls/[::1]:7447".
+
+    Returns:
+        The host and the port. None for other endpoints, such as socket files.
+    """
+    # protocol / host or [IPv6 address] : port, with optional Zenoh settings after ? or #
+    pattern = r"(?:tcp|tls|quic)/(\[[^\]]+\]|[^:/]+):(\d{1,5})(?:[?#].*)?"
+    match = re.fullmatch(pattern, endpoint)
+    if match is None or int(match[2]) >= 1 << 16:
+        return None
+    return match[1].strip("[]"), int(match[2])
+
+
+def examine_clock(clock: Clock) -> Iterator[DoctorFinding]:
+    """Checks for `CLOCK_TEST_NS` if the clocks of this machine run steadily.
+
+    The monotonic clock must not go back. The time of day must not step relative to the
+    monotonic clock. The finding also states the longest time between two readings, which shows
+    how long the operating system interrupts a process.
+
+    Args:
+        clock: Clock of this process.
+
+    Yields:
+        One finding about the clocks.
+    """
+    begun_ns = clock.monotonic_ns()
+    wall_ns = clock.unix_ns()
+    previous_ns = begun_ns
+    backward_steps = 0
+    longest_gap_ns = 0
+    while previous_ns - begun_ns < CLOCK_TEST_NS:
+        now_ns = clock.monotonic_ns()
+        backward_steps += now_ns < previous_ns
+        longest_gap_ns = max(longest_gap_ns, now_ns - previous_ns)
+        previous_ns = now_ns
+
+    # If both clocks run steadily, they have advanced by the same time.
+    step_ns = abs(clock.unix_ns() - wall_ns - (clock.monotonic_ns() - begun_ns))
+
+    if backward_steps:
+        times = count_nouns(backward_steps, "time")
+        text = f"the monotonic clock went back {times} in 0.1 s"
+        yield DoctorFinding("clock", "fail", text)
+    elif step_ns > MAX_CLOCK_STEP_NS:
+        step = f"the wall clock stepped by {step_ns / 1e6:.1f} ms in 0.1 s"
+        yield DoctorFinding("clock", "warn", f"{step}; that distorts no record")
+    else:
+        longest_ms = longest_gap_ns / 1e6
+        text = f"steady; largest pause of a loop that never sleeps {longest_ms:.1f} ms"
+        yield DoctorFinding("clock", "ok", text)
+
+
+def examine_offsets(
+    connection: Connection, clock: Clock, session: str
+) -> Iterator[DoctorFinding]:
+    """Compares the clock of this machine with those of a session's members.
+
+    Args:
+        connection: Endpoints of the session, and keys.
+        clock: Clock of this process.
+        session: Name of the session.
+
+    Yields:
+        For each member, the offset of its clock and the error bound of the offset.
+    """
+    try:
+        ping = ping_session(
+            connection=connection,
+            clock=clock,
+            session=session,
+            count=PINGS,
+            timeout_s=CONNECT_S,
+            stopped=lambda: False,
+        )
+    except (RunFailed, SessionError, UsageError) as error:
+        yield DoctorFinding("clock", "fail", str(error))
+        return
+    for row in ping.members if ping else ():
+        member = row["member"]
+        if row["same_clock"]:
+            yield DoctorFinding("clock", "ok", f"{member} has the same clock")
+        elif "offset_ns" not in row:
+            yield DoctorFinding("clock", "warn", f"{member} answered too few pings")
+        else:
+            offset_s = row["offset_ns"] / 1e9
+            bound_us = row["bound_us"]
+            text = f"{member} is {offset_s:+.6f} s, known to {bound_us:.0f} us"
+            yield DoctorFinding("clock", "ok" if bound_us <= MAX_BOUND_US else "warn", text)
+
+
+def _run_in_process(code: str) -> Any:
+    """Runs Python code in a new process, and returns the value that it prints.
+
+    Args:
+        code: The code.
+
+    Returns:
+        The JSON value in the last line that the process prints. None if the process fails.
+    """
+    completed = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, encoding="utf-8", check=False
+    )
+    if completed.returncode:
+        return None
+    return json.loads(completed.stdout.splitlines()[-1])
+
+
+_RIGHTS_CODE = (
+    "import json; from sites.realtime import prepare; print(json.dumps(prepare(None)))"
+)
+"""Program that requests the real-time settings of a site, and prints the obtained ones."""
+
+
+def examine_rights() -> Iterator[DoctorFinding]:
+    """Checks which real-time settings the operating system grants to a site.
+
+    A site needs for example a high priority, so that its control loop is not interrupted by
+    other programs.
+
+    Yields:
+        One finding per setting. A single warning if the settings could not be tried.
+    """
+    obtained: dict[str, str] | None = _run_in_process(_RIGHTS_CODE)
+    if obtained is None:
+        yield DoctorFinding("rights", "warn", "could not be tried")
+        return
+    wanted = {"scheduling": "SCHED_FIFO", "memory": "locked", "timer_slack": "1 ns"}
+    remedy = "ticks will be late by milliseconds under load: see compose.realtime.yaml"
+    for name, prefix in wanted.items():
+        text = f"{name.replace('_', ' ')}: {obtained[name]}"
+        if obtained[name].startswith(prefix):
+            yield DoctorFinding("rights", "ok", text)
+        else:
+            yield DoctorFinding("rights", "warn", f"{text}; {remedy}")
+
+
+def examine_system() -> DoctorFinding:
+    """Reports which parts of the program are supported on this operating system.
+
+    Returns:
+        A single finding. It is "ok" on Linux. On other systems, it names what is missing.
+    """
+    name = {"Darwin": "macOS"}.get(platform.system(), platform.system())
+    if name == "Linux":
+        return DoctorFinding(
+            "system", "ok", "Linux: live sessions and studies are both promised"
+        )
+    text = (
+        f"live sessions are promised on Linux alone; on {name} simulation, logs and studies are"
+    )
+    return DoctorFinding("system", "warn", text)
+
+
+class Rehearsal(LoopStats):
+    """Runs the control loop of a single site without a network, to measure how late ticks are.
+
+    The loop does the same work as in a session, except that no messages are exchanged. This
+    object takes the place of two objects of the loop: of its statistics, so that the lateness
+    of each tick can be stored, and of the `RunningSite`, whose methods do nothing here.
+
+    A tick is one period of the control loop. It is late if it begins after the time at which it
+    was due.
+
+    Args:
+        scenario: The scenario, which describes the arms, their links and the run.
+        name: Name of the site.
+    """
+
+    def __init__(self, scenario: Scenario, name: str) -> None:
+        self._site = Site(scenario.setup(name))
+        self._ticks = scenario.ticks(name)
+        super().__init__(self._site, 1)
+        self._late_us: list[int] = []
+
+    def run(self, clock: Clock) -> list[int]:
+        """Executes all ticks (periods of the control loop) of the scenario in real time.
+
+        The loop runs without other sites: there are no links to receive samples from, and the
+        records are not sent anywhere.
+
+        Args:
+            clock: Clock of this process.
+
+        Returns:
+            The lateness of each tick, the time from its due time to its beginning, in us.
+        """
+        boot = 1  # identifies the start of the process, which matters only in a network
+        inbox_without_peers = PeerInbox(
+            links=(), rings=(), boots=(), monitors=(), dropped=self.dropped
+        )
+        # The first tick is due a tenth of a second from now.
+        first_tick_ns = clock.monotonic_ns() + NS_PER_S // 10
+        timing = SiteTiming(first_tick_ns, self._site.rate_hz, peers=(), leader="")
+        discarded_records = StateBlock(self._site, boot, send=lambda _: None)
+
+        # This object has the methods of a `RunningSite` that the loop calls, without its type.
+        replacement_of_running_site: Any = self
+        run_loop(
+            site=self._site,
+            boot=boot,
+            ticks=self._ticks,
+            clock=clock,
+            inbox=inbox_without_peers,
+            timing=timing,
+            stats=self,
+            states=discarded_records,
+            io=replacement_of_running_site,
+        )
+        return self._late_us
+
+    def count_tick(self, late_us: int, busy_us: int, skipped: int = 0) -> None:
+        """Adds one tick to the statistics, and stores its lateness.
+
+        The loop calls the method in place of `LoopStats.count_tick`.
+
+        Args:
+            late_us: Time by which the tick began late, in us.
+            busy_us: Computing time of the previous tick, in us.
+            skipped: Number of ticks (periods of the control loop) that were skipped before this
+                tick.
+        """
+        super().count_tick(late_us, busy_us, skipped)
+        self._late_us.append(late_us)
+
+    def step(self, k: int, arrivals: Sequence[Arrival]) -> TickRecord:
+        """Computes one tick of the site without samples from other sites, to test its timing.
+
+        A tick is one period of the control loop. The loop calls this method in place of
+        `RunningSite.step`.
+
+        Args:
+            k: Number of the tick.
+            arrivals: Samples (states of other sites) that have arrived. Always empty in this
+                test.
+
+        Returns:
+            The record of the tick: what the site measured and computed.
+        """
+        return self._site.step(TickInput(k, arrivals))
+
+    def run_housekeeping(self, *_: object) -> bool:
+        """Does nothing, because this test of the control loop has no network.
+
+        The loop calls this method after a tick, in the place where a site of a session sends
+        and receives messages.
+
+        Returns:
+            False, so that the loop continues.
+        """
+        return False
+
+    # The other methods of `RunningSite` that the loop calls.
+    publish_sample = run_housekeeping
+    publish_link = run_housekeeping
+    report_tick = run_housekeeping
+    should_stop = run_housekeeping
+    use_slack = run_housekeeping
+
+
+def rehearse_rates(clock: Clock) -> list[tuple[int, int, int]]:
+    """Runs a site at decreasing tick rates until its ticks are punctual.
+
+    Args:
+        clock: Clock of this process.
+
+    Returns:
+        For each rate that was tried: the rate in Hz, the lateness in us that
+        `MIN_PUNCTUAL_SHARE` of its ticks did not exceed, and the largest lateness in us.
+    """
+    results: list[tuple[int, int, int]] = []
+    for rate_hz in RATES_HZ:
+        if results:
+            last_rate_hz, last_quantile_us, _ = results[-1]
+            if is_held(last_rate_hz, last_quantile_us):
+                break
+        scenario = load_scenario("free", {"rate_hz": rate_hz, "duration_s": REHEARSAL_S})
+        warm_up(scenario, "s", clock)
+        late_us = sorted(Rehearsal(scenario, "s").run(clock))
+        quantile_us = late_us[int(MIN_PUNCTUAL_SHARE * len(late_us))]
+        results.append((rate_hz, quantile_us, late_us[-1]))
+    return results
+
+
+def is_held(rate_hz: int, late_us: int) -> bool:
+    """Returns True if a site holds a tick rate although its ticks are late by some time.
+
+    It does so if the lateness is at most `MAX_LATE_PERIODS` periods of the rate.
+
+    Args:
+        rate_hz: The tick rate, in ticks (periods of the control loop) per second.
+        late_us: The lateness, in us.
+    """
+    return late_us <= MAX_LATE_PERIODS * 1e6 / rate_hz
+
+
+_RATES_CODE = (
+    "import json; from sites import doctor, realtime; realtime.prepare(None); "
+    "print(json.dumps(doctor.rehearse_rates(doctor.SystemClock())))"
+)
+"""Program that requests the real-time settings of a site, and prints the result of the trials.
+"""
+
+
+def examine_rate() -> DoctorFinding:
+    """Finds the highest tick rate that a single site achieves on this machine at present.
+
+    Each rate of `RATES_HZ` is tried for `REHEARSAL_S`, until one is achieved.
+
+    A tick is one period of the control loop.
+    """
+    if not is_core_cached():
+        return DoctorFinding(
+            "rate", "warn", "not measured: the core is not yet compiled, see below"
+        )
+
+    results: list[tuple[int, int, int]] | None = _run_in_process(_RATES_CODE)
+    if results is None:
+        return DoctorFinding("rate", "warn", "could not be measured")
+
+    # All rates before the last one were not achieved.
+    rate_hz, late_us, largest_us = results[-1]
+    missed = results[:-1]
+    share = f"{MIN_PUNCTUAL_SHARE:.0%}"
+    text = (
+        f"{share} of the ticks began within {late_us / 1e3:.2f} ms of their time, "
+        f"all within {largest_us / 1e3:.1f} ms"
+    )
+
+    if not is_held(rate_hz, late_us):
+        text = f"a site alone holds not even {rate_hz} Hz: {text}; end other programs"
+        return DoctorFinding("rate", "fail", text)
+    text = f"a site alone holds {rate_hz} Hz: {text} ({share} must within half a period)"
+    if missed:
+        missed_hz, missed_us, _ = missed[-1]
+        text += f"; at {missed_hz} Hz within {missed_us / 1e3:.2f} ms: lower rate_hz"
+    return DoctorFinding("rate", "warn" if missed else "ok", text)
+
+
+def examine_room(folder: Path) -> Iterator[DoctorFinding]:
+    """Checks the free disk space, the load of the processors, and the compiled code.
+
+    If the control code has not been compiled and cached yet, the first run takes longer to
+    start.
+
+    Args:
+        folder: Folder where results would be stored. It need not exist.
+    """
+    candidates = (folder.absolute(), *folder.absolute().parents)
+    existing = next(path for path in candidates if path.is_dir())
+    free = shutil.disk_usage(existing).free
+
+    state: FindingState = "ok"
+    if free < MIN_FREE_BYTES:
+        state = "fail"
+    elif free < LOW_FREE_BYTES:
+        state = "warn"
+    if not os.access(existing, os.W_OK):
+        yield DoctorFinding("disk", "fail", f"{existing} cannot be written to")
+    yield DoctorFinding("disk", state, f"{free / 1e9:.1f} GB are free in {existing}")
+
+    cores = process.count_cores()
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
+    text = f"{count_nouns(cores, 'processor')}, of which {load:.1f} are busy"
+    warning = describe_load(measure_busy_share(SystemClock()))
+    if warning:
+        text = f"{text}; {warning}"
+    is_short = cores < 2 or load >= cores or bool(warning)
+    yield DoctorFinding("processors", "warn" if is_short else "ok", text)
+
+    if is_core_cached():
+        yield DoctorFinding("core", "ok", "compiled")
+    else:
+        text = "not yet compiled: the first session here begins half a minute later"
+        yield DoctorFinding("core", "warn", text)
+
+
+@dataclass(frozen=True, repr=False)
+class DoctorReport(Result):
+    """Results of the checks whether this machine is ready for a session.
+
+    Attributes:
+        findings: Result of each check, in the order of the checks.
+    """
+
+    findings: list[DoctorFinding]
+
+    def headline(self) -> str:
+        """Returns a summary of the checks in one line.
+
+        The line contains the numbers of failed checks, of warnings and of passed checks.
+        """
+        states = [finding.state for finding in self.findings]
+        return (
+            f"{states.count('fail')} fail, {states.count('warn')} warn, {states.count('ok')} ok"
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns all findings as plain values, which can be written as JSON.
+
+        The keys are those that `trilat doctor --json` prints.
+        """
+        return {"findings": self.to_rows()}
+
+    def to_rows(self) -> list[dict[str, Any]]:
+        """Returns the findings as table rows, with the fields of `DoctorFinding` as columns."""
+        return [finding._asdict() for finding in self.findings]
+
+
+def doctor(
+    *,
+    listen: Sequence[str] | None = None,
+    connect: Sequence[str] | None = None,
+    router: Sequence[str] | None = None,
+    keys: str | Path | None = None,
+    session: str | None = None,
+    folder: str | Path = "runs",
+    insecure: bool = False,
+) -> DoctorReport:
+    """Checks whether this machine is ready for a session, as `trilat doctor` does.
+
+    >>> "clock" in {finding.check for finding in tn.doctor().findings}
+    True
+
+    Args:
+        listen: Endpoints at which this machine would listen.
+        connect: Endpoints to which this machine would connect.
+        router: Endpoints of routers that this machine would connect to.
+        keys: Folder of a member's keys. None if there is none.
+        session: Name of a running session with whose members the clocks are compared.
+        folder: Folder where results would be stored.
+        insecure: True to permit connections without keys, because everybody on the network is
+            trusted.
+
+    Returns:
+        The findings.
+
+    Raises:
+        UsageError: An endpoint or the keys cannot be used.
+    """
+    findings = examine_machine(
+        connection=resolve_member_connection(listen, connect, router),
+        keys=None if keys is None else Path(keys),
+        folder=Path(folder),
+        session=session,
+        clock=SystemClock(),
+        insecure=insecure,
+    )
+    return DoctorReport(list(findings))

@@ -1,0 +1,339 @@
+"""Shows a running session in a terminal, with one row per site.
+
+A site is a process that controls one robot arm, and exchanges its state with the other sites.
+
+The commands `trilat demo` and `trilat watch` use this module. In a terminal, the rows form a
+table that is refreshed four times a second. If the output is a file or a pipe, the same rows
+are printed as lines every two seconds.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from rich.box import HEAVY
+from rich.console import Console, Group
+from rich.live import Live
+from rich.markup import escape
+from rich.panel import Panel
+from rich.table import Table
+from rich.text import Text
+
+from trilat_net.core.life.live_hand import HandInForce
+from trilat_net.core.step.ticks import NS_PER_S, LifeAlarm
+from trilat_net.log.site_log import compute_task_errors
+from trilat_net.net import topics
+from trilat_net.net.bus import Bus
+from trilat_net.net.clock import Clock
+from trilat_net.net.membership import read_messages, read_records
+from trilat_net.net.messages import Event, LinkStats, State
+from trilat_net.scenario import Scenario
+
+AGES = "age of each peer's sample"
+"""Heading of the column with the ages of the peers' samples."""
+HEADS = ("site", "time", "mode", "angles", "|e|", "torque", AGES, "held", "late", "overruns")
+"""Headings of the columns of the table."""
+NUMBERS = frozenset(("time", "|e|", "torque", "late", "overruns"))
+"""Headings of the columns that are aligned to the right."""
+TABLE_NS = NS_PER_S // 4
+"""Time between two updates of the table, in ns."""
+LINES_NS = 2 * NS_PER_S
+"""Time between two updates of the lines, in ns."""
+LOUD_EVENTS = frozenset(
+    ("lost", "left", "join", "unheard", "heard", "diverged", "failed", "refused", "clock fault")
+)
+"""Kinds of events whose sentences are printed."""
+
+SiteRow = Mapping[str, str]
+"""Texts of the row of a site, by the headings in `HEADS`."""
+
+
+def describe_site(
+    scenario: Scenario,
+    name: str,
+    record: State | None,
+    stats: LinkStats | None,
+    *,
+    ended: bool = False,
+    silent_s: float = 0.0,
+) -> SiteRow:
+    """Composes the row of a site from its newest record and statistics.
+
+    A site is a process that runs one arm and its control loop. A row of the display shows the
+    state of one site.
+
+    Args:
+        scenario: Scenario of the session.
+        name: Name of the site.
+        record: Result of the site's newest tick. None if none has arrived.
+        stats: Newest statistics of the site. None if none have arrived.
+        ended: True if the site has published its end.
+        silent_s: Time since a message of the site arrived, in s. 0 if one has just arrived.
+
+    Returns:
+        The texts by the headings of the columns. Unknown ones are empty.
+    """
+    row = dict.fromkeys(HEADS, "") | {"site": name, "mode": "braked"}
+    if stats is not None:
+        ages = []
+        for peer, age_us in stats.age_us.items():
+            has_arrived = age_us >= 0
+            age = f"{age_us / 1000:.0f} ms" if has_arrived else "none"
+            ages.append(f"{peer} {age}")
+        row |= {
+            "time": f"{stats.t_ns / NS_PER_S:.1f} s",
+            "mode": stats.mode,
+            AGES: ", ".join(ages),
+            "late": f"{stats.late_max_us} us",
+            "overruns": f"{stats.overruns}",
+        }
+
+    if record is not None:
+        row |= _describe_record(scenario, name, record)
+
+    if ended:
+        row["mode"] = "ended"
+    elif silent_s > 0.0:
+        row["mode"] = f"silent {silent_s:.0f} s"
+    return row
+
+
+def _describe_record(scenario: Scenario, name: str, record: State) -> SiteRow:
+    """Returns the texts of a site's row that follow from its newest record.
+
+    Args:
+        scenario: Scenario of the session.
+        name: Name of the site.
+        record: The record, which is the result of one tick of the site.
+
+    Returns:
+        Time, mode, joint angles, norm of the synchronisation error, largest torque, and whether
+        an operator moves the arm, by the headings of the columns.
+    """
+    position = np.array([record.x or record.q])
+    desired = np.array([record.q_des])
+    if record.x:
+        unit = "m"
+        error = compute_task_errors(position, desired, scenario.arms[name].axes)
+    else:
+        unit = "rad"
+        error = position - desired
+
+    hand = HandInForce.read(record.hand) if record.hand else None
+    return {
+        "time": f"{record.t_ns / NS_PER_S:.1f} s",
+        "mode": record.mode,
+        "angles": describe_angles(record.q),
+        "|e|": f"{np.linalg.norm(error):.4f} {unit}",
+        "torque": f"{max(map(abs, record.tau)):.2f} N m",
+        "held": _describe_hold(hand),
+    }
+
+
+def _describe_hold(hand: HandInForce | None) -> str:
+    """Returns the text of the column "held": whether a person or a program moves the arm.
+
+    Args:
+        hand: State of the operator in the record. None if nobody may move the arm during the
+            run.
+
+    Returns:
+        "yes" if an operator moves the arm. "fades" just after the operator has released it,
+        while the force is reduced to zero. "free" afterwards. Empty if nobody may move it.
+    """
+    if hand is None:
+        return ""
+    has_operator = hand.source != 0
+    if has_operator:
+        return "yes"
+    is_fading = hand.grip > 0.0
+    return "fades" if is_fading else "free"
+
+
+def describe_angles(q: Sequence[float]) -> str:
+    """Formats the joint angles of an arm for the display.
+
+    Args:
+        q: Joint angles in rad.
+
+    Returns:
+        The angles as one short text.
+    """
+    return " ".join(f"{angle:+.3f}" for angle in q) + " rad"
+
+
+def describe_row(row: SiteRow) -> str:
+    """Returns the state of a site as one line of text, for outputs without a table.
+
+    The line contains only the most important columns.
+
+    Args:
+        row: The texts of the row, by the headings of the columns.
+    """
+    headings_by_label = {
+        "|e|": "|e|",
+        "torque": "torque",
+        "age": AGES,
+        "hand": "held",
+        "late": "late",
+    }
+    parts = [f"{row['site']} {row['time']} {row['mode']}".strip(), row["angles"]]
+    for label, heading in headings_by_label.items():
+        if row[heading]:
+            parts.append(f"{label} {row[heading]}")
+    return "; ".join(parts)
+
+
+def frame_alarms(alarms: Sequence[tuple[str, LifeAlarm]]) -> list[Panel]:
+    """Composes a coloured panel for the terminal for each arm that needs attention.
+
+    A panel is red if the arm stays stopped until a user acts. It is yellow if the arm continues
+    by itself.
+
+    Args:
+        alarms: Pairs of the name of a site (the process that controls an arm) and its alarm.
+
+    Returns:
+        The panels in the order of the alarms. Each contains the reason, and advice to the user.
+    """
+    blocks = []
+    for name, alarm in alarms:
+        colour = "red" if alarm.word in ("FAULT", "STOPPED") else "yellow"
+        head = f" {name} {alarm.word} "
+        text = Text.assemble(
+            (head, f"bold reverse {colour}"), f"  {alarm.reason}\n", (alarm.advice, "bold")
+        )
+        blocks.append(Panel(text, box=HEAVY, border_style=f"bold {colour}"))
+    return blocks
+
+
+class SessionDisplay:
+    """Terminal output of a session: a table of the sites, and lines above it.
+
+    The object is a context manager that restores the terminal.
+
+    Args:
+        console: The terminal.
+        clock: Clock of this process.
+    """
+
+    def __init__(self, console: Console, clock: Clock) -> None:
+        self._console = console
+        self._clock = clock
+        # The table of the terminal. None if the output is a file or a pipe.
+        self._live = Live(console=console, auto_refresh=False) if console.is_terminal else None
+        self._updated_ns = clock.monotonic_ns()
+        self._title = ""
+
+    def __enter__(self) -> "SessionDisplay":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._live:
+            self._live.stop()
+
+    @property
+    def due(self) -> bool:
+        """True if enough time has passed since the last update of the display.
+
+        Updates are limited in rate, because drawing a terminal takes time and no reader could
+        follow.
+        """
+        period_ns = TABLE_NS if self._live else LINES_NS
+        return self._clock.monotonic_ns() - self._updated_ns >= period_ns
+
+    def say(self, text: str) -> None:
+        """Prints a line that stays in the terminal, above the table of the sites.
+
+        Args:
+            text: The line.
+        """
+        self._console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+    def show(
+        self, title: str, rows: Sequence[SiteRow], alarms: Sequence[tuple[str, LifeAlarm]] = ()
+    ) -> None:
+        """Shows the present state of the session: a table of the sites, and alarms above it.
+
+        Args:
+            title: Title of the table.
+            rows: Rows of the sites.
+            alarms: Name of the site and the alarm, for each alarm that is present.
+        """
+        self._updated_ns = self._clock.monotonic_ns()
+        if self._live is None:  # the output is not a terminal
+            alarm_lines = [f"*** {name} {alarm}" for name, alarm in alarms]
+            title_lines = [title] if title != self._title else []
+            self._title = title
+            row_lines = [describe_row(row) for row in rows if row["time"]]
+            for line in [*title_lines, *alarm_lines, *row_lines]:
+                self.say(line)
+            return
+
+        table = Table(title=escape(title), title_justify="left")
+        for head in HEADS:
+            table.add_column(head, justify="right" if head in NUMBERS else "left")
+        for row in rows:
+            table.add_row(*map(escape, row.values()))
+        # The table is started only now. If it was started before the `with` block, a signal
+        # before the first update would leave the terminal in a wrong state.
+        self._live.start()
+        self._live.update(Group(*frame_alarms(alarms), table), refresh=True)
+
+
+class SessionMonitor:
+    """Receives the messages of all sites of a session, and shows them on a display.
+
+    The program of a user who watches the session creates this object and calls `poll`
+    repeatedly.
+
+    Args:
+        bus: Network connection that reaches the session.
+        session: Name of the session.
+        scenario: Scenario of the session.
+        display: Display on which the state of each site is one row of a table.
+
+    Attributes:
+        latest: Newest statistics of each site, by name.
+        records: Newest record of each site, by name.
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        session: str,
+        scenario: Scenario,
+        display: SessionDisplay,
+    ) -> None:
+        self.latest: dict[str, LinkStats] = {}
+        self.records: dict[str, State] = {}
+        self._scenario = scenario
+        self._display = display
+        self._links = bus.inbox(topics.key(session, "*", topics.LINK), 256)
+        self._events = bus.inbox(topics.key(session, "*", topics.EVENT), 256)
+        self._states = {
+            name: bus.inbox(topics.key(session, name, topics.STATE), 1)
+            for name in scenario.names
+        }
+
+    def poll(self) -> None:
+        """Receives the messages that have arrived, and updates the display if that is due.
+
+        Important events are printed as lines above the table. The method does not wait.
+        """
+        scenario = self._scenario
+        for stats in read_messages(self._links, LinkStats):
+            if stats.site in self._states:
+                self.latest[stats.site] = stats
+        for event in read_messages(self._events, Event):
+            if event.kind in LOUD_EVENTS:
+                self._display.say(event.text)
+        for name, states in self._states.items():
+            for record in read_records(states, scenario.layout(name)):
+                self.records[name] = record
+
+        if self._display.due:
+            rows = [
+                describe_site(scenario, name, self.records.get(name), self.latest.get(name))
+                for name in scenario.names
+            ]
+            self._display.show(f"{scenario.name}, {scenario.duration_s:g} s", rows)

@@ -1,0 +1,634 @@
+"""Measures a network before a session: round trips by message size, rate and transport.
+
+The near end, the process on this machine, sends messages to the far end, a process on another
+machine (`trilat ping --answer`), which sends each of them back at once. The near end measures
+the round trip times and counts the lost messages. The results are compared with the delay and
+the loss that a scenario tolerates. The command is `trilat ping --benchmark`.
+
+Invariant:
+    - The benchmark measures what a session would experience. Its messages have the size, rate,
+      priority and network settings of samples, the states that sites send to each other in
+      every tick.
+    - The benchmark disturbs no session, because it uses a session name of its own.
+"""
+
+import math
+import os
+import struct
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+
+from trilat_net.core.step.vectors import Array
+from trilat_net.errors import RunFailed, ScenarioError, UsageError
+from trilat_net.files import require_libraries
+from trilat_net.net import topics
+from trilat_net.net.bus import Bus, StampedInbox
+from trilat_net.net.clock import Clock, SystemClock
+from trilat_net.net.connection import (
+    ENCRYPTED,
+    Connection,
+    find_free_endpoints,
+    secure_connection,
+)
+from trilat_net.net.member_keys import MemberKeys, create_keys, read_member_keys
+from trilat_net.net.messages import VERSION, PeerSample
+from trilat_net.net.zenoh_bus import ZenohBus
+from trilat_net.net.zenoh_config import ROLES, ROUTER
+from trilat_net.results import Result
+from trilat_net.scenario import Scenario, load_scenario
+from trilat_net.scenario.delay_models.kernel_delays import ConstantDelay
+
+SESSION = "benchmark"
+"""Name of the session under whose keys the messages of the benchmark travel."""
+NEAR = "near"
+FAR = "far"
+"""Names of the near end and the far end if they have no keys with a member's name."""
+PROTOCOLS = ("tcp", "tls", "quic")
+"""Transports that are measured if the far end runs on this machine."""
+SIZE_FACTORS = (1, 4, 16)
+"""Sizes of the messages, as multiples of the size of a sample of the scenario."""
+RATE_SHARES = (0.1, 1.0)
+"""Rates of the messages, as fractions of the tick rate of the scenario."""
+DEFAULT_S = 24.0
+"""Duration of all cases together, in s. With three transports, 18 cases take 1.33 s each."""
+CONNECT_NS = 20_000_000_000
+"""Longest wait for the far end, in ns."""
+MAX_LOST = 1e-3
+"""Largest tolerable fraction of lost samples."""
+_RETRY_NS = 50_000_000
+"""Time between two attempts to reach the far end, in ns."""
+_LAST_REPLY_NS = 500_000_000
+"""Longest wait for replies after the last message, in ns."""
+_HEADER = struct.Struct("<QQqB")
+"""Start of each message: identity of the near end, number of the message, time of sending in
+ns, and a byte that is 1 in a reply.
+"""
+
+
+def _parse_header(payload: bytes) -> tuple[int, ...] | None:
+    """Returns the fields of a message's header, or None if the message is too short."""
+    return _HEADER.unpack_from(payload) if len(payload) >= _HEADER.size else None
+
+
+def answer_benchmarks(bus: Bus, member: str) -> None:
+    """Sends each message of a benchmark back to its sender, until the connection is closed.
+
+    This is the work of the far end. The near end measures the round trip times.
+
+    Args:
+        bus: Network connection of the far end.
+        member: Name of the far end, under which its messages are published.
+    """
+    put = bus.publisher(topics.key(SESSION, member, topics.SAMPLE))
+
+    def answer(_: str, payload: bytes) -> None:
+        """Sends a message back, marked as a reply. Replies themselves are not sent back."""
+        header = _parse_header(payload)
+        if header is None:
+            return
+        *fields, is_reply = header
+        if not is_reply:
+            put(_HEADER.pack(*fields, 1) + payload[_HEADER.size :])
+
+    bus.tap(topics.key(SESSION, "*", topics.SAMPLE), answer)
+
+
+class NearEnd:
+    """Sends messages to the far end, and measures when they come back.
+
+    The far end sends each message back at once, so that the near end measures round trip times
+    with its own clock.
+
+    Args:
+        bus: Network connection of the near end.
+        clock: Clock of this process.
+        member: Name of the near end.
+    """
+
+    def __init__(self, bus: Bus, clock: Clock, member: str) -> None:
+        self._clock = clock
+        self._owner = int.from_bytes(os.urandom(8), "little")
+        self._number = 0
+        self._put = bus.publisher(topics.key(SESSION, member, topics.SAMPLE))
+        key = topics.key(SESSION, "*", topics.SAMPLE)
+        self._inbox: StampedInbox[tuple[int, ...] | None] = bus.stamped_inbox(
+            key, clock.monotonic_ns, _parse_header
+        )
+
+    def _send(self, size_bytes: int) -> None:
+        """Sends the next message, filled up with zeros to its size."""
+        sample = _HEADER.pack(self._owner, self._number, self._clock.monotonic_ns(), 0)
+        self._number += 1
+        self._put(sample.ljust(size_bytes, b"\0"))
+
+    def _read_replies(self) -> Iterator[tuple[int, int]]:
+        """Yields the number and the round trip time in ns of each reply that has arrived.
+
+        Replies to other near ends are ignored.
+        """
+        while (entry := self._inbox.poll()) is not None:
+            header, arrived_ns = entry
+            if header is not None:
+                owner, number, sent_ns, is_reply = header
+                if is_reply and owner == self._owner:
+                    yield number, arrived_ns - sent_ns
+
+    def wait_for_far_end(self) -> bool:
+        """Waits until the far end, the process that sends messages back, can be reached.
+
+        Messages are sent repeatedly, because the connection may not be complete yet.
+
+        Returns:
+            True once the far end has replied. False if it does not reply within `CONNECT_NS`.
+        """
+        clock = self._clock
+        until_ns = clock.monotonic_ns() + CONNECT_NS
+        while clock.monotonic_ns() < until_ns:
+            self._send(_HEADER.size)
+            clock.sleep_until(clock.monotonic_ns() + _RETRY_NS)
+            if any(self._read_replies()):
+                return True
+        return False
+
+    def measure(self, size_bytes: int, rate_hz: float, duration_s: float) -> Array:
+        """Sends messages at a constant rate, and measures their round trips.
+
+        Args:
+            size_bytes: Size of a message, in bytes.
+            rate_hz: Rate of the messages, in 1/s.
+            duration_s: Time for which messages are sent, in s. At least 10 messages are sent.
+
+        Returns:
+            Round trip time of each message in s. NaN for messages without a reply.
+        """
+        count = max(10, round(rate_hz * duration_s))
+        clock = self._clock
+        trips_s = np.full(count, np.nan)
+        first = self._number
+
+        def count_missing() -> int:
+            """Stores the round trip times of messages that have come back meanwhile.
+
+            Returns:
+                The number of messages of this measurement that have not come back yet.
+            """
+            for number, trip_ns in self._read_replies():
+                if number >= first:
+                    trips_s[number - first] = trip_ns / 1e9
+            return int(np.isnan(trips_s).sum())
+
+        begun_ns = clock.monotonic_ns()
+        for n in range(count):
+            clock.sleep_until(begun_ns + round(n * 1e9 / rate_hz))
+            self._send(size_bytes)
+            if n % 1000 == 0:
+                count_missing()  # empties the inbox, which would overflow otherwise
+        until_ns = clock.monotonic_ns() + _LAST_REPLY_NS
+        while count_missing() and clock.monotonic_ns() < until_ns:
+            clock.sleep_until(clock.monotonic_ns() + 5_000_000)
+        return trips_s
+
+
+def _open(
+    endpoint: str,
+    keys: MemberKeys | None,
+    *,
+    listens: bool,
+    insecure: bool,
+) -> tuple[ZenohBus, str]:
+    """Opens the network connection of a near or far end.
+
+    Args:
+        endpoint: Endpoint to listen at or to connect to.
+        keys: Keys of a site. They are used only if the endpoint is encrypted.
+        listens: True for the far end.
+        insecure: True to permit connections without keys, because everybody on the network is
+            trusted.
+
+    Returns:
+        The connection, and the name of the end: that of its keys, otherwise "near" or "far".
+
+    Raises:
+        UsageError: The endpoint is encrypted, and there are no keys or they are not those of a
+            site.
+    """
+    is_encrypted = endpoint.startswith(ENCRYPTED)
+    if is_encrypted and keys is None:
+        raise UsageError(
+            f"{endpoint}: an encrypted endpoint needs keys: give --keys DIR with the keys of a "
+            "site"
+        )
+    if is_encrypted and keys is not None and keys.member in (*ROLES, ROUTER):
+        raise UsageError(
+            "--keys: a benchmark sends messages as sites send samples, and so needs the keys "
+            f"of a site, not those of {keys.member}"
+        )
+
+    used_keys = keys if is_encrypted else None
+    if listens:
+        connection = Connection(listen=[endpoint])
+        name = FAR
+    else:
+        connection = Connection(connect=[endpoint])
+        name = NEAR
+
+    bus = secure_connection(connection, used_keys, insecure=insecure).open()
+    return bus, used_keys.member if used_keys else name
+
+
+def run_far_end(
+    endpoints: Sequence[str],
+    keys: str | Path | None,
+    stopped: Callable[[], bool],
+    duration_s: float = math.inf,
+    *,
+    insecure: bool = False,
+    say: Callable[[str], None] = lambda _: None,
+) -> None:
+    """Runs the far end of a benchmark, which sends every message back to the near end.
+
+    Args:
+        endpoints: Endpoints to listen at.
+        keys: Folder with the keys of a site, for encrypted endpoints.
+        stopped: Function that returns True to end the call.
+        duration_s: Longest duration, in s.
+        insecure: True to permit connections without keys, because everybody on the network is
+            trusted.
+        say: Function that prints a line for the user.
+
+    Raises:
+        UsageError: An endpoint or the keys cannot be used.
+    """
+    known = None if keys is None else read_member_keys(keys)
+    clock = SystemClock()
+    begun_ns = clock.monotonic_ns()
+    with ExitStack() as stack:
+        for endpoint in endpoints:
+            bus, member = _open(endpoint, known, listens=True, insecure=insecure)
+            answer_benchmarks(stack.enter_context(closing(bus)), member)
+        say(f"answers benchmarks at {', '.join(endpoints)}; Ctrl-C ends it")
+        while not stopped() and clock.monotonic_ns() - begun_ns < duration_s * 1e9:
+            clock.sleep_until(clock.monotonic_ns() + _RETRY_NS)
+
+
+@contextmanager
+def _run_local_far_end(duration_s: float) -> Iterator[tuple[list[str], Path]]:
+    """Runs a far end for all transports in a process on this machine, as a context manager.
+
+    Args:
+        duration_s: Duration of the benchmark, in s. The process ends some time later by itself.
+
+    Yields:
+        The endpoints of the far end, and the folder with the keys of the near end.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        near_keys, far_keys = create_keys(Path(folder) / "keys", [NEAR, FAR], days=1)
+        free = find_free_endpoints(len(PROTOCOLS))
+        endpoints = [
+            endpoint.replace("tcp", protocol)
+            for protocol, endpoint in zip(PROTOCOLS, free, strict=True)
+        ]
+        seconds = math.ceil(duration_s + 2 * CONNECT_NS / 1e9)
+        arguments = ["ping", "--keys", str(far_keys), "--seconds", str(seconds)]
+        for endpoint in endpoints:
+            arguments += ["--answer", endpoint]
+        child = subprocess.Popen(
+            [sys.executable, "-m", "trilat_net", *arguments],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        try:
+            yield endpoints, near_keys
+        finally:
+            child.terminate()
+            child.wait()
+
+
+class ScenarioNeeds(NamedTuple):
+    """Requirements of a scenario on the network.
+
+    Attributes:
+        sample_bytes: Size of a sample of the largest arm, in bytes.
+        rate_hz: Largest tick rate of a site, in 1/s.
+        playout_ms: Smallest play-out delay of the links. A play-out delay holds each sample
+            until it has a fixed age, and so replaces varying network delays by a constant one.
+        held_ms: Shortest time for which a link holds its samples, by a play-out delay or by the
+            constant delay that the scenario prescribes.
+        in_use_ms: Age of the samples that the sites use, as far as the scenario's links cause
+            it. None if the linear theory does not cover the scenario.
+        stable_ms: Intervals of the delay of all links for which the control loop is stable.
+            None if the linear theory does not cover the scenario.
+        words: Sentence for the user about these intervals, or the reason why the theory does
+            not cover the scenario.
+    """
+
+    sample_bytes: int
+    rate_hz: int
+    playout_ms: float
+    held_ms: float
+    in_use_ms: float | None
+    stable_ms: list[list[float]] | None
+    words: str
+
+
+def find_needs(scenario: Scenario) -> ScenarioNeeds:
+    """Computes the delay, the message size and the rate that a scenario needs of the network.
+
+    The delays for which the control loop is stable come from its linear analysis, which takes
+    as long as the command `trilat linear`.
+
+    Args:
+        scenario: The scenario, which describes the arms, their links and the run.
+    """
+    links = list(scenario.links.values())
+    held_ms = []
+    for link in links:
+        constant_ms = link.delay_ms if isinstance(link, ConstantDelay) else 0.0
+        held_ms.append(max(link.playout_ms, constant_ms))
+    rates_hz = [site.rate_hz for site in scenario.sites.values()]
+    # Links whose delay the benchmark measures are analysed with a delay of 1 ms: their actual
+    # delay is the result of the benchmark.
+    overrides = ["link.model=constant", "link.delay_ms=1"] if scenario.measured else []
+    in_use_ms: float | None = None
+    stable_ms: list[list[float]] | None = None
+    try:
+        require_libraries("scipy")
+        # Imported here because the far end does not need SciPy.
+        from trilat_net.analysis.theory.linear_analysis import analyse_linear_loop
+
+        loop = analyse_linear_loop(load_scenario(scenario, overrides))
+    except (ScenarioError, RunFailed, UsageError) as error:
+        description = f"theory does not know its delay margin: {error}"
+    else:
+        description = loop.margin.description
+        stable_ms = [
+            [1e3 * interval.low_s, 1e3 * interval.high_s] for interval in loop.margin.intervals
+        ]
+        if not overrides:
+            in_use_ms = 1e3 * float(loop.conditions.age_s.max())
+    return ScenarioNeeds(
+        sample_bytes=_measure_sample(scenario),
+        rate_hz=max(rates_hz),
+        playout_ms=min((link.playout_ms for link in links), default=0.0),
+        held_ms=min(held_ms, default=0.0),
+        in_use_ms=in_use_ms,
+        stable_ms=stable_ms,
+        words=description,
+    )
+
+
+def _measure_sample(scenario: Scenario) -> int:
+    """Returns the size in bytes of an encoded sample of the scenario's largest arm.
+
+    Larger integers take more bytes. The sample therefore contains large values, as late in a
+    long session.
+
+    Args:
+        scenario: The scenario.
+    """
+    coordinates = max(arm.counts.shared for arm in scenario.arms.values())
+    vectors = {name: [0.5] * coordinates for name in ("q", "qd", "tau_x")}
+    sample = PeerSample(
+        v=VERSION,
+        site=max(scenario.names, key=len),
+        boot=2**63,
+        tick=100_000,
+        sent_ns=2**60,
+        echo=[[n, 100_000, 2**60] for n in range(len(scenario.names) - 1)],
+        **vectors,
+    )
+    return len(msgspec.msgpack.encode(sample))
+
+
+def judge_network(needs: ScenarioNeeds, row: Mapping[str, Any]) -> dict[str, Any]:
+    """Judges whether a network is good enough for a scenario.
+
+    A sample is the state that a site publishes in each tick, a period of its control loop. The
+    receiver uses it from its first tick after the sample has arrived. Samples therefore have an
+    age of whole ticks. The delay of the network that counts is its 99th percentile. It has no
+    effect if it is shorter than the time for which the scenario itself holds samples. The
+    network is good if the loop is stable at that age, and if at most `MAX_LOST` of the samples
+    are lost.
+
+    Args:
+        needs: Requirements of the scenario.
+        row: Measurement at the scenario's own message size and rate.
+
+    Returns:
+        The fields of a verdict, as `trilat ping --benchmark --json` prints them. Times are None
+        if no message came back.
+    """
+    fields = {
+        "transport": row["transport"],
+        "good": False,
+        "lost_share": row["lost"] / row["sent"],
+    }
+    times = row["one_way_us"]
+    if times is None:
+        unknown = dict.fromkeys(("p99_ms", "age_ms", "spare_ms", "playout_ms"))
+        return {**fields, "hidden": False, **unknown}
+
+    period_ms = 1e3 / needs.rate_hz
+    p99_ms = times["p99"] / 1e3
+    # 1e-9 absorbs the rounding error of a delay of exactly a whole number of ticks.
+    ticks = max(1, math.ceil(max(p99_ms, needs.held_ms) / period_ms - 1e-9))
+    age_ms = max(period_ms * ticks, needs.in_use_ms or 0.0)
+    is_hidden = p99_ms <= needs.held_ms
+    # Upper end of the stable interval that contains the age, if there is one.
+    limits_ms = [high for low, high in needs.stable_ms or [] if low <= age_ms <= high]
+    is_tolerated = is_hidden if needs.stable_ms is None else bool(limits_ms)
+    return {
+        **fields,
+        "good": is_tolerated and fields["lost_share"] <= MAX_LOST,
+        "hidden": is_hidden,
+        "p99_ms": p99_ms,
+        "age_ms": age_ms,
+        "spare_ms": limits_ms[0] - age_ms if limits_ms else None,
+        "playout_ms": math.ceil(times["max"] / 1e3),
+    }
+
+
+@dataclass(frozen=True, repr=False)
+class NetworkBenchmark(Result):
+    """Result of measuring a network for a scenario, with a verdict for each transport.
+
+    A transport is the protocol that carries the messages: TCP, TLS or QUIC.
+
+    Attributes:
+        scenario: Name of the scenario.
+        duration_s: Duration of all cases together, in s.
+        needs: Requirements of the scenario.
+        rows: Measurements, one row per message size, message rate and transport.
+        judged: Verdict for each transport, whether it is good enough, see `judge_network`.
+        connect: Endpoints of the far end on another machine. Empty if both ends ran on this
+            machine, so that no network was measured.
+    """
+
+    scenario: str
+    duration_s: float
+    needs: ScenarioNeeds
+    rows: list[dict[str, Any]]
+    judged: list[dict[str, Any]]
+    connect: tuple[str, ...] = ()
+
+    @property
+    def good(self) -> bool:
+        """True if every transport that was measured is good enough for the scenario.
+
+        A transport is the protocol that carries the messages: TCP, TLS or QUIC.
+        """
+        return all(verdict["good"] for verdict in self.judged)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns the result as plain values, which can be written as JSON.
+
+        The keys are those that `trilat ping --benchmark --json` prints.
+        """
+        return {
+            "scenario": self.scenario,
+            "duration_s": self.duration_s,
+            "good": self.good,
+            "connect": list(self.connect),
+            "needs": self.needs._asdict(),
+            "transports": self.judged,
+            "rows": self.rows,
+        }
+
+    def to_rows(self) -> list[dict[str, Any]]:
+        """Returns the measurements as rows of a table, with times in us.
+
+        There is one row per message size, message rate and transport.
+        """
+        flat_rows = []
+        for row in self.rows:
+            times = row["one_way_us"] or dict.fromkeys(("p50", "p99", "max"))
+            flat = {key: value for key, value in row.items() if key != "one_way_us"}
+            flat |= {f"{name}_us": value for name, value in times.items()}
+            flat_rows.append(flat)
+        return flat_rows
+
+
+def ping_benchmark(
+    scenario: str | Path | Mapping[str, Any] | Scenario,
+    set: Mapping[str, Any] | Sequence[str] = (),  # noqa: A002 - the command's --set, by its name
+    *,
+    duration_s: float = DEFAULT_S,
+    connect: Sequence[str] | None = None,
+    keys: str | Path | None = None,
+) -> NetworkBenchmark:
+    """Measures a network and judges it for a scenario, as `trilat ping --benchmark` does.
+
+    >>> found = tn.ping_benchmark("p_d_margin", duration_s=2)
+    >>> [row["transport"] for row in found.to_dict()["transports"]]
+    ['tcp', 'tls', 'quic']
+
+    Args:
+        scenario: The name of a shipped scenario, a path, a TOML text, the tables of a scenario,
+            or a scenario.
+        set: Settings that replace those of the scenario, as in `{"link.model": "measured"}`.
+        duration_s: Duration of all cases together, in s.
+        connect: Endpoints at which `trilat ping --answer` runs. None starts a far end on this
+            machine, for TCP, TLS and QUIC.
+        keys: Folder with the keys of a site, for encrypted endpoints.
+
+    Returns:
+        The measurements and the verdicts.
+
+    Raises:
+        ScenarioError: The scenario is not valid.
+        UsageError: An endpoint or the keys cannot be used.
+        RunFailed: No far end replies at an endpoint.
+    """
+    loaded = load_scenario(scenario, set)
+    needs = find_needs(loaded)
+    far_endpoints = tuple(connect or ())
+    with ExitStack() as stack:
+        if not connect:
+            connect, keys = stack.enter_context(_run_local_far_end(duration_s))
+        member_keys = None if keys is None else read_member_keys(keys)
+        case_s = duration_s / (len(connect) * len(SIZE_FACTORS) * len(RATE_SHARES))
+        rows: list[dict[str, Any]] = []
+        for endpoint in connect:
+            rows += _measure_endpoint(endpoint, member_keys, needs, case_s)
+
+    # Only the case with the scenario's own message size and rate is judged.
+    scenario_case = (needs.sample_bytes, needs.rate_hz)
+    verdicts = [
+        judge_network(needs, row)
+        for row in rows
+        if (row["bytes"], row["rate_hz"]) == scenario_case
+    ]
+    return NetworkBenchmark(loaded.name, duration_s, needs, rows, verdicts, far_endpoints)
+
+
+def _measure_endpoint(
+    endpoint: str,
+    keys: MemberKeys | None,
+    needs: ScenarioNeeds,
+    case_s: float,
+) -> Iterator[dict[str, Any]]:
+    """Measures the transport of one endpoint, with all message sizes and rates.
+
+    Args:
+        endpoint: Endpoint of the far end.
+        keys: Keys of this end. None if the endpoint is not encrypted.
+        needs: Requirements of the scenario, which determine the sizes and rates.
+        case_s: Duration of each measurement, in s.
+
+    Yields:
+        One row per size and rate.
+
+    Raises:
+        RunFailed: No far end replies.
+    """
+    protocol = endpoint.partition("/")[0]
+    bus, member = _open(endpoint, keys, listens=False, insecure=False)
+    with closing(bus):
+        near = NearEnd(bus, SystemClock(), member)
+        if not near.wait_for_far_end():
+            port = endpoint.rpartition(":")[2]
+            raise RunFailed(
+                f"no program answered at {endpoint} within {CONNECT_NS // 10**9} s: on that "
+                f"machine, start trilat ping --answer {protocol}/0.0.0.0:{port}; over tls or "
+                "quic, also give --keys of another site"
+            )
+        for size_factor, rate_share in product(SIZE_FACTORS, RATE_SHARES):
+            size_bytes = size_factor * needs.sample_bytes
+            rate_hz = rate_share * needs.rate_hz
+            trips_s = near.measure(size_bytes, rate_hz, case_s)
+            yield {
+                "transport": protocol,
+                "bytes": size_bytes,
+                "rate_hz": rate_hz,
+                "sent": len(trips_s),
+                "lost": int(np.isnan(trips_s).sum()),
+                "one_way_us": _summarise_trips(trips_s),
+            }
+
+
+def _summarise_trips(trips_s: Array) -> dict[str, float] | None:
+    """Returns the median, the 99 % quantile and the maximum of the one-way times, in us.
+
+    A one-way time is half of a round trip.
+
+    Args:
+        trips_s: Round trip times in s, NaN for lost messages.
+
+    Returns:
+        The three values. None if all messages were lost.
+    """
+    one_way_us = trips_s[np.isfinite(trips_s)] / 2 * 1e6
+    if not len(one_way_us):
+        return None
+    p50, p99 = np.percentile(one_way_us, (50, 99))
+    return {"p50": float(p50), "p99": float(p99), "max": float(one_way_us.max(initial=0.0))}

@@ -1,0 +1,134 @@
+"""Publishes the states of a session's sites as ROS 2 topics.
+
+A site is a process that runs one arm. Its joint states, poses, torques and statistics become
+standard ROS messages on topics below `/<session>/<site>`, and the poses of its links become
+part of `/tf`.
+
+Invariant:
+    - A message is composed only while a ROS program subscribes to its topic, because composing
+      it takes time.
+    - The names of the topics (`topic_names`) and the content of the messages (`published`) are
+      the same as in a ROS bag that is exported from a log.
+"""
+
+from typing import NamedTuple
+
+from trilat_net.core.step.ticks import NS_PER_S
+from trilat_net.log.ros2.published import SiteMessages
+from trilat_net.log.ros2.topic_names import TopicTable
+from trilat_net.net.bus import Bus
+from trilat_net.net.clock import Clock
+from trilat_net.net.messages import LinkStats, State
+from trilat_net.net.ros2_graph import QualityOfService, Ros2Graph, TopicPublisher
+from trilat_net.scenario import Scenario
+
+from .running_session import ShareHistory
+
+RELIABLE = QualityOfService()
+"""Quality of service of most topics."""
+LATCHED = QualityOfService(latched=True, depth=1)
+"""Quality of service of topics whose last message late subscribers receive."""
+
+
+class BridgeEnds(NamedTuple):
+    """Connections of the bridge to its two ends: the ROS programs and the session.
+
+    Attributes:
+        graph: Connection to the ROS programs.
+        bus: Network connection to the session.
+        clock: Clock of this process.
+        session: Name of the session.
+        table: Names of the ROS topics, as the user has configured them.
+    """
+
+    graph: Ros2Graph
+    bus: Bus
+    clock: Clock
+    session: str
+    table: TopicTable
+
+    def topic(self, site: str, name: str) -> str:
+        """Returns the full name of a topic of a site.
+
+        Args:
+            site: Name of the site.
+            name: Short name of the topic, such as "joint_states".
+        """
+        return self.table.find(self.session, site, name)
+
+
+class SiteTopics:
+    """Publishes the records and statistics of one site on its ROS topics.
+
+    Args:
+        ends: Connections to ROS and to the session.
+        scenario: Scenario of the session.
+        site: Name of the site.
+        epoch_unix_ns: Start of the session in Unix time, in ns. Time stamps are counted from
+            it.
+        frames: Publisher of `/tf`, which all sites share.
+
+    Attributes:
+        frame: Name of the frame of the site's end effector.
+        shares: Weights with which the site follows its peers (the other sites), over time.
+        newest: Record (result of one tick of the site) that was published last. None before the
+            first one.
+    """
+
+    def __init__(
+        self,
+        ends: BridgeEnds,
+        scenario: Scenario,
+        site: str,
+        epoch_unix_ns: int,
+        frames: TopicPublisher,
+    ) -> None:
+        self._messages = SiteMessages(scenario, site, epoch_unix_ns)
+        self._frames = frames
+        self.frame = self._messages.frame
+        self.shares = ShareHistory(scenario, site)
+        self._publishers = {}
+        for name, channel in self._messages.topics.items():
+            quality = LATCHED if channel.latched else RELIABLE
+            topic = ends.topic(site, name)
+            self._publishers[name] = ends.graph.publisher(topic, channel.kind, quality)
+        self._publishers["robot_description"].put(self._messages.description)
+        self.newest: State | None = None
+
+    def _has_listener(self, topic: str) -> bool:
+        """Returns True if a ROS program subscribes to a topic."""
+        return self._publishers[topic].has_subscribers
+
+    def publish(self, record: State, rate_hz: float) -> None:
+        """Publishes a record on all topics that have subscribers.
+
+        A record is ignored if it is older than the last published record of the same process of
+        the site, or if it would exceed the rate.
+
+        Args:
+            record: Result of one tick of the site.
+            rate_hz: Largest number of records that are published per second of the session.
+        """
+        newest = self.newest
+        if newest is not None and record.boot == newest.boot:
+            period = int(record.t_ns * rate_hz) // NS_PER_S
+            newest_period = int(newest.t_ns * rate_hz) // NS_PER_S
+            if period <= newest_period:
+                return
+        self.newest = record
+        shares = self.shares.advance_to(record.t_ns)
+        for topic, data in self._messages.pack_record(record, shares, self._has_listener):
+            self._publishers[topic].put(data)
+        if self._frames.has_subscribers:
+            for data in self._messages.pack_frames(record):
+                self._frames.put(data)
+
+    def publish_statistics(self, stats: LinkStats) -> None:
+        """Publishes the statistics of the site on all topics that have subscribers.
+
+        Args:
+            stats: Statistics of the site's control loop and of its links.
+        """
+        for topic, data in self._messages.pack_statistics(stats):
+            if self._has_listener(topic):
+                self._publishers[topic].put(data)

@@ -1,0 +1,908 @@
+"""Controls a running session from Python: stops arms, changes links, moves arms, reads records.
+
+A session is a set of processes ("sites") that each run one arm, and that exchange the states of
+their arms over the network. `session` returns a `RunningSession`, whose methods send requests
+to the sites and return their replies. `hand` lets a program act as the operator of an arm.
+`start` starts a process of a session, as a terminal would.
+
+The commands `trilat stop`, `enable`, `reset`, `set`, `ping` and `hand` use the same functions.
+
+Invariant:
+    - Each call opens a connection to the session, and closes it at its end, as the command of
+      the same name does. A `RunningSession` therefore remains usable if sites come and go
+      between calls.
+"""
+
+import subprocess
+import sys
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext, suppress
+from pathlib import Path
+from typing import Any
+
+from sites.device_hand import DeviceHand
+from sites.devices import Device
+from trilat_net.errors import RunFailed, ScenarioError, SessionError, UsageError
+from trilat_net.net import topics
+from trilat_net.net.arm_client import Hand
+from trilat_net.net.bus import Bus
+from trilat_net.net.clock import Clock, SystemClock
+from trilat_net.net.connection import Connection, resolve_member_connection, secure_connection
+from trilat_net.net.discovery import (
+    REPLY_TIMEOUT_S,
+    connect_to_session,
+    find_members,
+    list_past_events,
+    send_change,
+)
+from trilat_net.net.membership import read_messages, read_records
+from trilat_net.net.messages import Event, Info, State
+from trilat_net.net.requests import ChangeReply, ChangeRequest, OrderName
+from trilat_net.net.zenoh_config import OPERATOR
+from trilat_net.scenario import Scenario, embedded_names_reader, find_site, parse_embedded
+from trilat_net.scenario.run_changes import parse_core_change
+from trilat_net.scenario.sample_uses import PictureDelay
+
+from .session_ping import PingReport, ping_session
+
+GATHERING_NS = 500_000_000
+"""Time that further sites have to reply after the first one, in ns.
+
+It applies to sessions that sites may leave, in which some sites may never reply.
+"""
+STATES_KEPT = 4096
+"""Number of records of each site that `RunningSession.states` keeps.
+
+A peer's sample that is in use is found among them by its tick.
+"""
+AHEAD_S = 0.5
+"""Time from the newest known tick of any site to the tick at which a session is ended, in s.
+
+Sites report their tick every 100 ms. Therefore the known ticks are slightly out of date.
+"""
+
+
+SOURCE = "the operator"
+"""Name of the person who sends the requests of this module, as the log mentions it."""
+
+
+def _never_stopped() -> bool:
+    """Returns False, as the function `stopped` of calls that are ended only by a time limit."""
+    return False
+
+
+class ShareHistory:
+    """Dominance factors of one site over time, with all changes that are known so far.
+
+    A dominance factor is the weight with which a site follows one of its peers. The scenario
+    states the factors at the start, and scripted changes. Users request further changes during
+    the session. Each change is a linear ramp from the present factors to other ones.
+    """
+
+    def __init__(self, scenario: Scenario, site: str) -> None:
+        self._scenario = scenario
+        self._site = site
+        self._later_ramps = scenario.scripted_ramps(site)
+        self._ramp = scenario.ramp(site, scenario.dominance[site], -1, 0.0)
+        self._shares_before = self._ramp.alpha
+
+    def add_change(self, change: str) -> None:
+        """Adds a change of the weights to the history, as an event of the site reports it.
+
+        Changes of other settings are ignored, and so are texts that do not describe a change.
+
+        Args:
+            change: Text of the change, from the field `command` of the event.
+        """
+        with suppress(ScenarioError):  # raised if the text is not a change
+            ramp = parse_core_change(self._scenario, self._site, change).ramp
+            # A ramp that starts before the present one was added earlier, from another event.
+            if ramp is not None and ramp.start_ns >= self._ramp.start_ns:
+                self._later_ramps.append(ramp)
+
+    def advance_to(self, t_ns: int) -> tuple[float, ...]:
+        """Computes the dominance factors of the site at a time.
+
+        A dominance factor is the weight with which a site follows one of its peers, the other
+        sites.
+
+        Args:
+            t_ns: The time, in ns after the start of the session. It must not be earlier than in
+                the previous call.
+
+        Returns:
+            One factor per peer, in the order of the site's peers.
+        """
+        started_ramps = sorted(ramp for ramp in self._later_ramps if ramp.start_ns <= t_ns)
+        # A ramp starts from the factors that the previous one had reached by then.
+        for ramp in started_ramps:
+            self._shares_before = self._interpolate(ramp.start_ns)
+            self._ramp = ramp
+        self._later_ramps = [ramp for ramp in self._later_ramps if ramp.start_ns > t_ns]
+        return self._interpolate(t_ns)
+
+    def _interpolate(self, t_ns: int) -> tuple[float, ...]:
+        """Returns the dominance factors at a time during or after the present ramp."""
+        ramp = self._ramp
+        if t_ns >= ramp.end_ns:
+            return ramp.alpha
+        progress = (t_ns - ramp.start_ns) / (ramp.end_ns - ramp.start_ns)
+        pairs = zip(self._shares_before, ramp.alpha, strict=True)
+        return tuple(before + progress * (after - before) for before, after in pairs)
+
+
+class RunningSession:
+    """A session that is running, to be controlled and observed from Python.
+
+    `session` creates this object. Most methods send a request to some sites, the processes that
+    run one arm each. They return the replies, one sentence for each site.
+
+    Args:
+        name: Name of the session.
+        connection: Endpoints of the session and keys of the member whose name is used.
+        bus: An open network connection to the session. None opens a connection in each call.
+        clock: Clock of this process. None creates one.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        connection: Connection,
+        bus: Bus | None = None,
+        clock: Clock | None = None,
+    ) -> None:
+        self.name = name
+        self._connection = connection
+        self._bus = bus
+        self._clock = clock or SystemClock()
+
+    @contextmanager
+    def reach(
+        self, member: str = OPERATOR, timeout_s: float = REPLY_TIMEOUT_S
+    ) -> Iterator[Bus]:
+        """Opens a network connection to the session, as a context manager.
+
+        In a session whose members prove their identities with keys, a request is accepted only
+        from a member that is permitted to send it. Most requests need the keys of the operator.
+
+        Args:
+            member: Name of the member under which the requests will be sent. If this object has
+                keys, they must be those of that member. If empty, the keys of any member are
+                accepted.
+            timeout_s: Longest wait for the reply of a site, in s.
+
+        Yields:
+            The connection. It is closed at the end of the `with` block, unless it was given to
+            this object.
+
+        Raises:
+            SessionError: No site replies in time.
+            UsageError: The keys are those of another member.
+        """
+        if self._bus is not None:
+            yield self._bus
+            return
+
+        if member:
+            self._connection.require(member)
+        with connect_to_session(
+            self._connection,
+            self._clock,
+            self.name,
+            # The names of the sites are read from the scenario that a site replies with.
+            embedded_names_reader(self.name),
+            stopped=_never_stopped,
+            timeout_s=timeout_s,
+        ) as bus:
+            assert bus is not None  # it is None only if the call was stopped
+            yield bus
+
+    @contextmanager
+    def reach_site(self, site: str, timeout_s: float) -> Iterator[tuple[Bus, Scenario]]:
+        """Waits until a site runs, and connects to its session, as a context manager.
+
+        A site is the process that controls one robot arm. The connection is closed at the end
+        of the `with` block.
+
+        Args:
+            site: Name of the site.
+            timeout_s: Longest wait, in s.
+
+        Yields:
+            The network connection, and the scenario (description) of the session.
+
+        Raises:
+            SessionError: The session has no such site, or the site does not run in time.
+        """
+        with self.reach(timeout_s=timeout_s) as bus:
+            give_up_ns = self._clock.monotonic_ns() + int(timeout_s * 1e9)
+            while True:
+                # Errors are ignored until the last attempt, which raises its error.
+                is_last_try = self._clock.monotonic_ns() >= give_up_ns
+                with nullcontext() if is_last_try else suppress(SessionError):
+                    info = self._find_running(bus, site)
+                    break
+                self._clock.sleep_until(self._clock.monotonic_ns() + 50_000_000)
+            yield bus, parse_embedded(info.scenario, self.name)
+
+    def lead(
+        self,
+        site: str,
+        device: Device,
+        *,
+        stopped: Callable[[], bool] = lambda: False,
+        say: Callable[[str], None] = print,
+        timeout_s: float = REPLY_TIMEOUT_S,
+    ) -> None:
+        """Moves an arm with an input device until the session ends.
+
+        The command `trilat hand --device` does the same.
+
+        Args:
+            site: Name of the site, the process that controls the arm. The scenario contains the
+                settings of the device for this site.
+            device: The input device.
+            stopped: Function that returns True to end the call earlier.
+            say: Function that receives each line of text for the user.
+            timeout_s: Longest wait until the session runs, in s.
+
+        Raises:
+            SessionError: The session does not exist, or does not begin in time.
+            UsageError: The scenario does not allow an input device to move that arm.
+        """
+        with (
+            self.reach_site(site, timeout_s) as (bus, scenario),
+            open_hand(
+                bus=bus,
+                clock=self._clock,
+                session=self.name,
+                site=site,
+                scenario=scenario,
+                source=type(device).__name__,
+                repeats=False,
+            ) as hand,
+        ):
+            live = scenario.sites[site].find_live_hand(is_open=True)
+            if live is None or live.mode != "tip":
+                raise UsageError(
+                    "a device can lead only an end effector: "
+                    f"the hand of {site} must have the mode 'tip'"
+                )
+            device_hand = DeviceHand(
+                hand=hand,
+                device=device,
+                settings=live.device,
+                clock=self._clock,
+                reach=scenario.arms[site].reach,
+            )
+            device_hand.run(stopped, lambda text: say(f"{site}: {text}"))
+            say(f"{site}: {device_hand.describe()}")
+
+    def stop(self, *sites: str) -> list[str]:
+        """Stops some arms at once, while the session continues.
+
+        The command `trilat stop` does the same. The other arms are not stopped.
+
+        Args:
+            *sites: Names of the sites whose arms are stopped. All sites if no name is given.
+
+        Returns:
+            One sentence per site: its reply, in the order of the sites.
+        """
+        return _read_replies(self.send_order(sites, "stop"))
+
+    def enable(self, *sites: str) -> list[str]:
+        """Lets arms that were stopped follow the other arms of the session again.
+
+        The command `trilat enable` does the same.
+
+        Args:
+            *sites: Names of the sites, the processes that each control one arm. All sites if no
+                name is given.
+
+        Returns:
+            The reply of each site as a sentence, in the order of the sites.
+        """
+        return _read_replies(self.send_order(sites, "enable"))
+
+    def reset(self, *sites: str) -> list[str]:
+        """Clears the fault of arms, so that they can be enabled again.
+
+        A fault whose reason persists is not cleared. The command `trilat reset` does the same.
+
+        Args:
+            *sites: Names of the sites. All sites if no name is given.
+
+        Returns:
+            One sentence per site: its reply, in the order of the sites.
+        """
+        return _read_replies(self.send_order(sites, "reset"))
+
+    def send_order(self, sites: Sequence[str], order: OrderName) -> list[ChangeReply]:
+        """Sends an order such as "stop" to some sites.
+
+        Args:
+            sites: Names of the sites. Empty addresses all sites, or all that are present if the
+                scenario allows sites to leave.
+            order: The order: "stop", "enable" or "reset".
+
+        Returns:
+            The reply of each site, accepted or refused.
+
+        Raises:
+            SessionError: The session has not begun or has no such site, or a site does not
+                reply.
+        """
+        with self.reach("" if order == "stop" else OPERATOR) as bus:
+            scenario, infos = self._find_sites(bus)
+            for name in sites:
+                if name not in scenario.names:
+                    known = f"its sites are {', '.join(scenario.names)}"
+                    raise SessionError(f"session {self.name!r} has no site {name!r}; {known}")
+            addressed = list(sites) or _list_present(scenario, infos)
+            for name in addressed:
+                if name not in infos or not infos[name].running:
+                    state = "has not begun" if name in infos else "did not answer"
+                    raise SessionError(f"session {self.name!r}: {name} {state}")
+            request = ChangeRequest(order=order, source=SOURCE)
+            return [self._send_change(bus, name, request) for name in addressed]
+
+    def _send_change(self, bus: Bus, site: str, request: ChangeRequest) -> ChangeReply:
+        """Sends a request to one site, and returns its reply, accepted or refused.
+
+        Raises:
+            SessionError: The site does not reply in time.
+        """
+        return send_change(
+            bus=bus, clock=self._clock, session=self.name, site=site, request=request
+        )
+
+    def end(self) -> list[str]:
+        """Ends the session regularly, as `trilat stop --end` does.
+
+        All sites end at the same time of the session, about half a second from now.
+
+        Returns:
+            One sentence per site: its reply, in the order of the sites.
+
+        Raises:
+            SessionError: The session has not begun, or a site does not reply.
+        """
+        with self.reach() as bus:
+            scenario, infos = self._find_sites(bus)
+            present = _list_present(scenario, infos)
+            missing = [name for name in present if name not in infos]
+            if missing:
+                raise SessionError(
+                    f"session {self.name!r}: these sites did not answer: {', '.join(missing)}"
+                )
+            waiting = [name for name in present if not infos[name].running]
+            if waiting:
+                names = ", ".join(waiting)
+                raise SessionError(
+                    f"session {self.name!r} has not begun: these sites wait for the others: "
+                    f"{names}"
+                )
+            times_s = [infos[name].ticks / scenario.sites[name].rate_hz for name in present]
+            request = ChangeRequest(stop_s=max(times_s) + AHEAD_S)
+            return [self._send_change(bus, name, request).text for name in present]
+
+    def _find_sites(self, bus: Bus) -> tuple[Scenario, dict[str, Info]]:
+        """Queries all sites of the session who they are, and collects their replies.
+
+        The search ends when all sites of the scenario have replied. If the scenario allows
+        sites to leave, it also ends `GATHERING_NS` after the first reply.
+
+        Returns:
+            The scenario of the session, and the replies by the name of the site.
+
+        Raises:
+            SessionError: No site replies.
+        """
+        clock = self._clock
+        infos: dict[str, Info] = {}
+        scenario: Scenario | None = None
+        first_reply_ns: int | None = None  # time of the first reply of a site
+
+        for info in self._find_members(bus):
+            if scenario is None and info.scenario:
+                scenario = parse_embedded(info.scenario, self.name)
+            if scenario is None or info.member not in scenario.sites:
+                continue
+            infos[info.member] = info
+            if first_reply_ns is None:
+                first_reply_ns = clock.monotonic_ns()
+            waited_ns = clock.monotonic_ns() - first_reply_ns
+            is_complete = len(infos) == len(scenario.names)
+            has_waited = scenario.sites_may_return and waited_ns > GATHERING_NS
+            if is_complete or has_waited:
+                return scenario, infos
+        if scenario is None:
+            raise SessionError(
+                f"no site of session {self.name!r} answers; "
+                "to try other endpoints, name them with --connect"
+            )
+        return scenario, infos
+
+    def _find_members(self, bus: Bus) -> Iterator[Info]:
+        """Asks all members of the session who they are, and yields their replies.
+
+        A member may reply several times. The replies end after `REPLY_TIMEOUT_S`.
+        """
+        return find_members(
+            bus, self._clock, self.name, stopped=_never_stopped, timeout_s=REPLY_TIMEOUT_S
+        )
+
+    def _find_running(self, bus: Bus, site: str) -> Info:
+        """Waits for the reply of one site, and checks that the site runs.
+
+        Args:
+            bus: Network connection that reaches the session.
+            site: Name of the site.
+
+        Returns:
+            The identity of the site.
+
+        Raises:
+            SessionError: The session has no such site or has not begun, or the site does not
+                reply in time.
+        """
+        read_names = embedded_names_reader(self.name)
+        for info in self._find_members(bus):
+            if info.member == site and not info.running:
+                raise SessionError(
+                    f"session {self.name!r} has not begun: {site} waits for the others"
+                )
+            if info.member == site:
+                return info
+            names = read_names(info.scenario) if info.scenario else ()
+            if names and site not in names:
+                known = f"its sites are {', '.join(names)}"
+                raise SessionError(f"session {self.name!r} has no site {site!r}; {known}")
+        raise SessionError(
+            f"site {site!r} of session {self.name!r} does not answer; "
+            "to try other endpoints, name them with --connect"
+        )
+
+    def set_link(self, link: str, **to: Any) -> str:
+        """Changes settings of a link while the session runs, as `trilat set link` does.
+
+        Args:
+            link: The link, as in "m1->s" for the direction from site m1 to site s.
+            **to: The new settings, as in `delay_ms=350`.
+
+        Returns:
+            The reply of the receiving site, which carries out the change, as a sentence.
+
+        Raises:
+            RunFailed: The site has refused the change.
+        """
+        return self._change(link.partition("->")[2], link=link, to=to)
+
+    def set_dominance(self, site: str, shares: Mapping[str, float], ramp_s: float = 1.0) -> str:
+        """Changes the weights with which a site follows its peers, as `trilat set dominance`.
+
+        Args:
+            site: Name of the site.
+            shares: New weight of each peer (the other sites that the site follows), as in
+                `{"m1": 0.9, "m2": 0.1}`.
+            ramp_s: Duration of the change, in s.
+
+        Returns:
+            The reply of the site, as a sentence.
+
+        Raises:
+            RunFailed: The site has refused the change.
+        """
+        return self._change(site, dominance=site, to=dict(shares), ramp_s=ramp_s)
+
+    def _change(self, site: str, **change: Any) -> str:
+        """Requests a change from a site, and returns its reply.
+
+        Raises:
+            RunFailed: The site has refused the change.
+        """
+        reply = self.change(site, ChangeRequest(**change))
+        if not reply.accepted:
+            raise RunFailed(f"refused: {reply.text}")
+        return reply.text
+
+    def change(self, site: str, request: ChangeRequest) -> ChangeReply:
+        """Requests a change from the site that carries it out.
+
+        Args:
+            site: Name of the site.
+            request: The requested change, for example of the delay of a link.
+
+        Returns:
+            The reply of the site, accepted or refused.
+
+        Raises:
+            SessionError: The session has no such site or has not begun, or the site does not
+                reply.
+        """
+        with self.reach() as bus:
+            self._find_running(bus, site)
+            return self._send_change(bus, site, request)
+
+    @contextmanager
+    def records(self, *sites: str) -> Iterator[Callable[[], list[State]]]:
+        """Subscribes to the records of some sites, as a context manager.
+
+        A record is the stored result of one tick of a site's control loop.
+
+        >>> with tn.session("paper").records("s") as receive:  # doctest: +SKIP
+        ...     [record.q_des for record in receive()]
+
+        Args:
+            *sites: Names of the sites. All sites if no name is given.
+
+        Yields:
+            A function that returns the records that have arrived since its last call.
+        """
+        with self.reach("") as bus:
+            inboxes = [
+                bus.inbox(topics.key(self.name, site, topics.STATE), 4096)
+                for site in sites or ("*",)
+            ]
+
+            def receive() -> list[State]:
+                """Returns the records of the sites that have arrived since the last call.
+
+                A record contains what a site measured and computed in one period of its control
+                loop. The list is empty if none has arrived.
+                """
+                return [record for inbox in inboxes for record in read_records(inbox)]
+
+            yield receive
+
+    @contextmanager
+    def states(self, as_site: str = "") -> Iterator[Callable[[], dict[str, State]]]:
+        """Subscribes to the newest record of each site, as a context manager.
+
+        A record is the result of one tick, a period of a site's control loop. With `as_site`,
+        the records are those that the user of that site sees. These are the newest record of
+        the site itself, and of each peer the record of the sample that the site uses at
+        present. That sample is older than the newest one, because the link delays it, or
+        because the scenario delays the picture (`[sites.NAME.view]`). A peer is missing if that
+        record was made before the subscription, or more than `STATES_KEPT` ticks ago.
+
+        >>> with tn.session("paper").states(as_site="m1") as find:  # doctest: +SKIP
+        ...     find()["s"].q
+
+        Args:
+            as_site: Name of the site whose view is returned. Empty returns the newest records.
+
+        Yields:
+            A function that returns one record of each site, by the name of the site.
+        """
+        with self.reach("") as bus:
+            inbox = bus.inbox(topics.key(self.name, "*", topics.STATE), STATES_KEPT)
+            latest_records: dict[str, deque[State]] = {}
+            picture_delay: PictureDelay | None = None  # created when the first record arrives
+
+            def find() -> dict[str, State]:
+                """Returns one record of each site, by the name of the site.
+
+                A record is the stored result of one tick, a period of a site's control loop.
+                Without `as_site`, it is the newest record that has arrived. With `as_site`, it
+                is the record of the pose that the user of that site sees. The dictionary is
+                empty until the first record has arrived.
+
+                The records that arrive from `inbox` are kept in `latest_records`, because the
+                user may see an older pose than the newest. `picture_delay` computes which tick
+                of each peer the user sees, as the scenario may delay the user's picture.
+                """
+                nonlocal picture_delay
+                for record in read_records(inbox):
+                    if record.site not in latest_records:
+                        latest_records[record.site] = deque(maxlen=STATES_KEPT)
+                    latest_records[record.site].append(record)
+                newest_records = {site: records[-1] for site, records in latest_records.items()}
+                if not as_site:
+                    return newest_records
+                if as_site not in newest_records:
+                    return {}
+
+                if picture_delay is None:
+                    # The site runs, because a record of it has arrived, and sends its scenario.
+                    info = self._find_running(bus, as_site)
+                    scenario = parse_embedded(info.scenario, self.name)
+                    picture_delay = PictureDelay(scenario, as_site)
+                user_record = newest_records[as_site]
+                visible_records = {as_site: user_record}
+                # The field `used` states which sample of each peer the control law used.
+                visible_ticks = picture_delay.advance_to(user_record.tick, user_record.used)
+                for peer, visible_tick in visible_ticks.items():
+                    for record in reversed(latest_records.get(peer, deque())):
+                        if record.tick == visible_tick:
+                            visible_records[peer] = record
+                            break
+                return visible_records
+
+            yield find
+
+    def mark(self, text: str) -> str:
+        """Stores a text in the log, as a mark of the present moment.
+
+        The first site of the scenario that is present publishes the mark as an event, which the
+        recorder stores.
+
+        Args:
+            text: Text of the mark, for a reader of the log.
+
+        Returns:
+            The reply of the site, as a sentence.
+        """
+        with self.reach() as bus:
+            scenario, infos = self._find_sites(bus)
+            first_present = next(name for name in scenario.names if name in infos)
+            return self._send_change(bus, first_present, ChangeRequest(mark=text)).text
+
+    @contextmanager
+    def episode(self, name: str) -> Iterator[Callable[[bool], None]]:
+        """Marks an episode, a part of the run with a name, in the log, as a context manager.
+
+        The beginning and the end of the `with` block are stored as marks. Tools that read the
+        log can then divide the run into episodes, for example one per attempt at a task.
+
+        >>> with tn.session("paper").episode("reach 3") as judge:  # doctest: +SKIP
+        ...     judge(True)
+
+        Args:
+            name: Name of the episode.
+
+        Yields:
+            A function that states whether the episode has succeeded. If it is called several
+            times, the last call counts. If it is never called, the log only says that the
+            episode ended.
+        """
+        judgements: list[bool] = []
+        self.mark(f"episode {name} begins")
+        try:
+            yield judgements.append
+        finally:
+            outcome = "ended"
+            if judgements:
+                has_succeeded = judgements[-1]
+                outcome = "succeeded" if has_succeeded else "failed"
+            self.mark(f"episode {name} {outcome}")
+
+    @contextmanager
+    def shares(self, site: str) -> Iterator[Callable[[], dict[str, float]]]:
+        """Subscribes to the weights with which a site follows its peers, as a context manager.
+
+        These weights, the dominance factors, may change during the session. The peers are the
+        other sites that the site follows.
+
+        Args:
+            site: Name of the site.
+
+        Yields:
+            A function that returns the present weights, by the name of the peer.
+        """
+        with self.reach("") as bus:
+            info = self._find_running(bus, site)
+            records = bus.inbox(topics.key(self.name, site, topics.STATE), 256)
+            events = bus.inbox(topics.key(self.name, site, topics.EVENT), 256)
+            scenario = parse_embedded(info.scenario, self.name)
+            now_ns = 0  # time of the newest record, since the epoch
+            history = ShareHistory(scenario, site)
+            # Changes from before the subscription.
+            for event in list_past_events(bus, self._clock, self.name, site):
+                history.add_change(event.command)
+
+            def find() -> dict[str, float]:
+                """Returns the present weight with which the site follows each other site.
+
+                The keys are the names of the other sites. The present time is the time of the
+                newest record that has arrived from the site.
+                """
+                nonlocal now_ns
+                for event in read_messages(events, Event):
+                    history.add_change(event.command)
+                for record in read_records(records):
+                    now_ns = max(now_ns, record.t_ns)
+                shares = history.advance_to(now_ns)
+                return dict(zip(scenario.peers(site), shares, strict=True))
+
+            yield find
+
+    def ping(self, count: int = 50, timeout_s: float = 3.0) -> PingReport:
+        """Measures the network of the session, as `trilat ping` does.
+
+        Args:
+            count: Number of pings to each member.
+            timeout_s: Longest wait for replies, in s.
+
+        Returns:
+            The round trip time to each member, the offset of its clock, and the delays of the
+            links between the sites.
+        """
+        report = ping_session(
+            connection=self._connection,
+            clock=self._clock,
+            session=self.name,
+            count=count,
+            timeout_s=timeout_s,
+            stopped=_never_stopped,
+        )
+        assert report is not None  # it is None only if the call was stopped
+        return report
+
+
+def session(
+    name: str,
+    *,
+    connect: Sequence[str] | None = None,
+    router: Sequence[str] | None = None,
+    keys: str | Path | None = None,
+) -> RunningSession:
+    """Returns an object that controls and observes a running session.
+
+    Its methods do the same as `trilat stop`, `set` and `ping`.
+
+    >>> paper = tn.session("paper")  # doctest: +SKIP
+    >>> paper.set_link("m1->s", delay_ms=350)  # doctest: +SKIP
+    >>> paper.stop("s"), paper.enable("s"), paper.ping()  # doctest: +SKIP
+
+    Args:
+        name: Name of the session.
+        connect: Endpoints of the session, as for --connect. None uses the session's own
+            endpoint on this machine.
+        router: Endpoints of routers to connect through instead, as for --router.
+        keys: Folder with the keys of the operator, as for --keys. To stop arms and to ping, the
+            keys of any member suffice.
+
+    Raises:
+        UsageError: An endpoint or the keys cannot be used.
+    """
+    connection = resolve_member_connection(None, connect, router)
+    return RunningSession(name, secure_connection(connection, keys, insecure=False))
+
+
+def start(*arguments: str | Path) -> "subprocess.Popen[bytes]":
+    """Starts a process of a session, as a terminal would.
+
+    The process runs until it ends by itself, or until the caller terminates it. The commands
+    are `trilat site`, `hand`, `record`, `router`, `replay`, `watch`, `live` and `ros2`.
+
+    >>> recorder = tn.start("record", "--session", "paper", "-o", "run.mcap")  # doctest: +SKIP
+    >>> player = tn.start("replay", "run.mcap", "--rate", "2")  # doctest: +SKIP
+    >>> player.wait()  # doctest: +SKIP
+
+    Args:
+        *arguments: The command and its arguments, without `trilat`.
+
+    Returns:
+        The process.
+    """
+    return subprocess.Popen([sys.executable, "-m", "trilat_net", *map(str, arguments)])
+
+
+@contextmanager
+def hand(
+    session: str,
+    site: str,
+    *,
+    connect: Sequence[str] | None = None,
+    router: Sequence[str] | None = None,
+    keys: str | Path | None = None,
+    source: str = "",
+    timeout_s: float = 5.0,
+) -> Iterator[Hand]:
+    """Lets a program move an arm of a live session, as its operator, as a context manager.
+
+    The arm is released at the end of the `with` block.
+
+    >>> with tn.hand("play", "m1") as hand:  # doctest: +SKIP
+    ...     hand.move(1.2, 0.4)
+    ...     hand.force, hand.pose
+
+    Args:
+        session: Name of the session, by default that of the scenario.
+        site: Site of the arm. Its scenario must have an operator of kind "live".
+        connect: Endpoints of the session, as for --connect. None uses the session's own
+            endpoint on this machine.
+        router: Endpoints of routers to connect through instead, as for --router.
+        keys: Folder with the keys of the operator, as for --keys.
+        source: Name of the program or person, which events of the session mention.
+        timeout_s: Longest wait until the session runs, in s.
+
+    Yields:
+        The connection to the arm.
+
+    Raises:
+        SessionError: There is no such session, or it does not begin.
+        UsageError: The scenario permits no live operator at that arm, or an endpoint cannot be
+            used.
+    """
+    connection = secure_connection(
+        resolve_member_connection(None, connect, router), keys, insecure=False
+    )
+    with (
+        RunningSession(session, connection).reach_site(site, timeout_s) as (bus, scenario),
+        open_hand(
+            bus=bus,
+            clock=SystemClock(),
+            session=session,
+            site=site,
+            scenario=scenario,
+            source=source,
+        ) as port,
+    ):
+        yield port
+
+
+def open_hand(
+    bus: Bus,
+    clock: Clock,
+    session: str,
+    site: str,
+    scenario: Scenario,
+    source: str = "",
+    *,
+    repeats: bool = True,
+) -> Hand:
+    """Opens the connection through which a program moves an arm.
+
+    Args:
+        bus: Network connection that reaches the site.
+        clock: Clock of this process.
+        session: Name of the session.
+        site: Site of the arm.
+        scenario: Scenario of the session.
+        source: Name of the program or person, which events of the session mention.
+        repeats: True if a thread repeats the last message regularly, so that the site knows
+            that the program is still there, see `Hand`.
+
+    Raises:
+        UsageError: The scenario permits no live operator at that arm.
+    """
+    find_site(scenario, site)
+    live = scenario.sites[site].find_live_hand(is_open=True)
+    if live is None:
+        open_sites = ", ".join(scenario.open_hands)
+        remedy = f"; the sites with such an operator are {open_sites}" if open_sites else ""
+        raise UsageError(
+            f"nobody can move the arm of {site}: "
+            f"the scenario has no operator of kind 'live' at this site{remedy}"
+        )
+
+    compute_pose = tuple if live.mode == "joint" else scenario.arms[site].end_effector
+    return Hand(
+        bus=bus,
+        clock=clock,
+        session=session,
+        site=site,
+        operator=live.actor,
+        compute_pose=compute_pose,
+        source=source,
+        repeats=repeats,
+    )
+
+
+def _read_replies(replies: Sequence[ChangeReply]) -> list[str]:
+    """Returns the texts of the replies if all sites have accepted.
+
+    Raises:
+        RunFailed: A site has refused. The message lists the refusals first.
+    """
+    accepted = [reply.text for reply in replies if reply.accepted]
+    refused = [reply.text for reply in replies if not reply.accepted]
+    if refused:
+        raise RunFailed("; ".join([*refused, *accepted]))
+    return accepted
+
+
+def _list_present(scenario: Scenario, infos: dict[str, Info]) -> list[str]:
+    """Lists the sites that a request to all sites addresses.
+
+    These are all sites of the scenario. If the scenario allows sites to leave, they are only
+    the running sites, as long as at least one site runs.
+    """
+    running = [name for name in scenario.names if name in infos and infos[name].running]
+    if running and scenario.sites_may_return:
+        return running
+    return list(scenario.names)

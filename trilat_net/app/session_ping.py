@@ -1,0 +1,381 @@
+"""Measures the network of a running session, and the delays of ROS 2 topics.
+
+A session is a run in which processes ("sites") each control one arm. Its members are the sites
+and the recorders, which write the log. A ping is a message to which a member replies at once.
+`ping_session` sends pings to all members of a session, and reports round trip times and the
+offsets of their clocks. It also reports the delays of the links between the sites, which the
+receiving sites measure themselves. `ping_topic` measures the delays of the messages on a ROS 2
+topic.
+
+Invariant:
+    - The measurement does not disturb the session. This process does not announce itself as a
+      member, so that the session does not wait for it.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from trilat_net.core.step.ticks import NS_PER_S
+from trilat_net.errors import RunFailed, ScenarioError, SessionError
+from trilat_net.net import topics
+from trilat_net.net.bus import Bus
+from trilat_net.net.clock import Clock
+from trilat_net.net.connection import Connection, default_endpoint
+from trilat_net.net.discovery import connect_to_session
+from trilat_net.net.membership import MemberQuery, read_messages
+from trilat_net.net.messages import Info, LinkStats
+from trilat_net.net.offset import exact_offset
+from trilat_net.net.pinging import PING_PACE_NS, Pinger
+from trilat_net.net.ros2_graph import Attachment, Ros2Graph
+from trilat_net.results import Result
+from trilat_net.scenario import parse_embedded
+
+POLL_NS = 1_000_000
+"""Longest pause between two polls, in ns."""
+GATHERING_NS = 600_000_000
+"""Time that further members have to reply after the first one, in ns."""
+PATIENCE_NS = 3_000_000_000
+"""Time after which missing replies to pings are given up, counted from when they are due, in
+ns.
+"""
+
+
+@dataclass(frozen=True, repr=False)
+class PingReport(Result):
+    """Result of a measurement of a session's network.
+
+    Attributes:
+        session: Name of the session.
+        members: One table row per member, with the round trip times of the pings, and the
+            offset of the member's clock from the clock of this process.
+        links: One table row per link, the directed connection between two sites, as the
+            receiving site measures it.
+    """
+
+    session: str
+    members: list[dict[str, Any]]
+    links: list[dict[str, Any]]
+
+    def to_rows(self) -> list[dict[str, Any]]:
+        """Returns the rows of the members, for a table or a data frame.
+
+        The links are left out, because they have other columns.
+        """
+        return self.members
+
+
+class SessionPing:
+    """Measures the network of a session once.
+
+    The caller calls `poll` repeatedly until `is_over` returns True, and then `report`.
+
+    The caller takes part in no control loop. It learns the members from their replies to a
+    query, measures the round trips to them by pings, and reads the delays of the links from the
+    statistics that the sites publish.
+
+    Args:
+        bus: Network connection that reaches the session.
+        clock: Clock of this process.
+        session: Name of the session.
+        count: Number of round trips to each member.
+
+    Attributes:
+        infos: Identity of each member that has replied, by name.
+        links: Newest statistics of each site, by name.
+        pinger: Sends the pings, and estimates the offsets of the clocks.
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        clock: Clock,
+        session: str,
+        count: int,
+    ) -> None:
+        self.infos: dict[str, Info] = {}
+        self.links: dict[str, LinkStats] = {}
+        self._clock = clock
+        self._session = session
+        self._trips_per_member = count
+        self._members = MemberQuery(bus, clock, session)
+        self._stats = bus.inbox(topics.key(session, "*", topics.LINK), 256)
+        self.pinger = Pinger(bus, clock, session, count)
+        self._first_ns: int | None = None
+
+    def poll(self) -> None:
+        """Receives the messages that have arrived, and sends pings and queries that are due.
+
+        The method does not wait.
+        """
+        for info in self._members.poll():
+            self.infos[info.member] = info
+            self._first_ns = self._first_ns or self._clock.monotonic_ns()
+        for stats in read_messages(self._stats, LinkStats):
+            self.links[stats.site] = stats
+        self.pinger.poll(self._boots)
+
+    @property
+    def _boots(self) -> set[int]:
+        """Numbers that identify the members that have replied. Their pings are evaluated."""
+        return {info.boot for info in self.infos.values()}
+
+    def is_over(self, timeout_ns: int, begun_ns: int) -> bool:
+        """Returns True once the pings to every member are complete, or have been given up.
+
+        The measurement lasts at least `GATHERING_NS` after the first reply of a member, because
+        further members may reply in this time. It is given up `PATIENCE_NS` after all pings
+        should have been sent.
+
+        Args:
+            timeout_ns: Longest wait for the first reply, in ns.
+            begun_ns: Time at which the measurement was started, on the clock of this process,
+                in ns.
+        """
+        now_ns = self._clock.monotonic_ns()
+        if self._first_ns is None:  # no member has replied
+            return now_ns - begun_ns > timeout_ns
+
+        since_first_reply_ns = now_ns - self._first_ns
+        sending_ns = self._trips_per_member * PING_PACE_NS  # needed to send all pings
+        give_up_after_ns = GATHERING_NS + sending_ns + PATIENCE_NS
+        is_complete = self.pinger.knows_clocks(self._boots)
+        is_given_up = since_first_reply_ns > give_up_after_ns
+        has_gathered_members = since_first_reply_ns > GATHERING_NS
+        return has_gathered_members and (is_complete or is_given_up)
+
+    def report(self) -> PingReport:
+        """Returns the delays and clock offsets that have been measured up to the present time.
+
+        The rows of the members (processes of the session) are sorted by name. The rows of the
+        links (one-way connections between two sites) are sorted by the name of the receiving
+        site. A value of -1 means that a delay was not measured.
+        """
+        members = [self._describe_member(info) for _, info in sorted(self.infos.items())]
+
+        links = []
+        for site, stats in sorted(self.links.items()):
+            for peer in stats.delay_us:
+                link = {
+                    "from": peer,
+                    "to": site,
+                    "delay_us": stats.delay_us[peer],
+                    "delay_max_us": stats.delay_max_us.get(peer, -1),
+                    "rtt_us": stats.rtt_us.get(peer, -1),
+                    "offset_us": stats.offset_us.get(peer, 0),
+                    "bound_us": stats.bound_us.get(peer, 0),
+                }
+                links.append(link)
+
+        return PingReport(self._session, members, links)
+
+    def _describe_member(self, info: Info) -> dict[str, Any]:
+        """Returns the row of a member in the report.
+
+        If the member has replied to pings, the row contains quantiles of the round trip time
+        and the jitter, which is the mean change from one round trip time to the next. If the
+        offset of the member's clock is known, the row contains it with its error bound.
+
+        Args:
+            info: Identity of the member.
+        """
+        trips = self.pinger.trips.get(info.boot)
+        has_same_clock = info.clock == self._clock.identity()
+        rtts_ns = tuple(trips.rtts_ns) if trips else ()
+        fields: dict[str, Any] = {
+            "member": info.member,
+            "host": info.host,
+            "running": info.running,
+            "ticks": info.ticks,
+            "answers": len(rtts_ns),
+            "same_clock": has_same_clock,
+        }
+        if rtts_ns:
+            ordered_ns = sorted(rtts_ns)
+            count = len(ordered_ns)
+            fields["rtt_us"] = {
+                "min": ordered_ns[0] / 1000,
+                "p50": ordered_ns[count // 2] / 1000,
+                "p99": ordered_ns[min(count - 1, count * 99 // 100)] / 1000,
+            }
+            changes_ns = [abs(following - rtt) for rtt, following in pairwise(rtts_ns)]
+            fields["jitter_us"] = sum(changes_ns) / max(1, len(changes_ns)) / 1000
+
+        estimate = trips.latest if trips else None
+        if has_same_clock:
+            estimate = exact_offset(0)
+        if estimate is not None:
+            bound_ns = estimate.error_bound_ns(estimate.local_ns, estimate.offset_ns)
+            fields["offset_ns"] = estimate.offset_ns
+            fields["bound_us"] = bound_ns / 1000
+        return fields
+
+
+def ping_session(
+    connection: Connection,
+    clock: Clock,
+    session: str,
+    count: int,
+    timeout_s: float,
+    stopped: Callable[[], bool],
+) -> PingReport | None:
+    """Measures the network of a running session once.
+
+    Args:
+        connection: Endpoints of the session, and keys.
+        clock: Clock of this process.
+        session: Name of the session.
+        count: Number of round trips to each member.
+        timeout_s: Longest wait for the first reply, in s.
+        stopped: Function that returns True to end the measurement.
+
+    Returns:
+        The results. None if `stopped` returned True.
+
+    Raises:
+        RunFailed: No member replied.
+    """
+
+    def read_site_names(text: str) -> tuple[str, ...]:
+        """Returns the names of the sites in the text of a scenario."""
+        try:
+            return parse_embedded(text, session).names
+        except ScenarioError:
+            # The scenario belongs to another version of this program. Without the names of the
+            # sites, only the default endpoint of the first site is known.
+            return ()
+
+    try:
+        with connect_to_session(
+            connection, clock, session, read_site_names, stopped=stopped, timeout_s=timeout_s
+        ) as bus:
+            if bus is None:
+                return None
+            ping = SessionPing(bus, clock, session, count)
+            begun_ns = clock.monotonic_ns()
+            while not ping.is_over(int(timeout_s * 1e9), begun_ns):
+                if stopped():
+                    return None
+                ping.poll()
+                clock.sleep_until(clock.monotonic_ns() + ping.pinger.pause_ns(POLL_NS))
+    except SessionError as error:
+        raise RunFailed(str(error)) from None
+    if not ping.infos:
+        endpoints = connection.connect or [default_endpoint(session, 0)]
+        raise RunFailed(
+            f"no member of session {session!r} answered at {', '.join(map(str, endpoints))} "
+            f"within {timeout_s:g} s; check the name of the session and whether the session "
+            "has ended, or name other endpoints with --connect"
+        )
+    return ping.report()
+
+
+@dataclass(frozen=True, repr=False)
+class TopicDelays(Result):
+    """Delays of the messages on a ROS 2 topic, for each program that publishes them.
+
+    A delay is the time from the time stamp with which a message was sent to its arrival at this
+    process. Between two machines it contains the offset of their clocks.
+
+    Attributes:
+        topic: Name of the topic.
+        lasted_s: Duration of the measurement, in s.
+        publishers: One table row per publisher, with the number and the delays of its messages.
+    """
+
+    topic: str
+    lasted_s: float
+    publishers: list[dict[str, Any]]
+
+    def to_rows(self) -> list[dict[str, Any]]:
+        """Returns one row per program that publishes on the topic, for a table or a data frame.
+
+        A row contains the number of messages of the program, and their delays.
+        """
+        return self.publishers
+
+
+def ping_topic(
+    graph: Ros2Graph,
+    clock: Clock,
+    topic: str,
+    lasts_s: float,
+    stopped: Callable[[], bool],
+) -> TopicDelays:
+    """Measures the delays of the messages on a ROS 2 topic.
+
+    Args:
+        graph: Connection to the ROS 2 programs.
+        clock: Clock of this process.
+        topic: Name of the topic.
+        lasts_s: Duration of the measurement, in s.
+        stopped: Function that returns True to end the measurement earlier.
+
+    Raises:
+        RunFailed: Nobody has published on the topic.
+    """
+    # Number and delay of each message, and the type of the messages, by publisher.
+    samples: dict[bytes, list[tuple[int, int]]] = {}
+    types: dict[bytes, str] = {}
+
+    def receive(kind: str, attachment: Attachment) -> None:
+        """Stores the number and the delay of a ROS 2 message for the program that sent it.
+
+        The function is called in a thread of the network library Zenoh.
+
+        Args:
+            kind: Type of the message.
+            attachment: Additional data of the message: its publisher, number and sending time.
+        """
+        delay_ns = clock.unix_ns() - attachment.sent_unix_ns
+        types[attachment.gid] = kind
+        samples.setdefault(attachment.gid, []).append((attachment.number, delay_ns))
+
+    graph.tap(topic, receive)
+    begun_ns = clock.monotonic_ns()
+    while not stopped() and clock.monotonic_ns() - begun_ns < lasts_s * NS_PER_S:
+        clock.sleep_until(clock.monotonic_ns() + 10 * POLL_NS)
+    lasted_s = (clock.monotonic_ns() - begun_ns) / NS_PER_S
+    if not samples:
+        raise RunFailed(
+            f"no publisher sent a message on /{topic} in {lasted_s:.3g} s: check the topic "
+            "with ros2 topic list, and the domain with --domain"
+        )
+
+    publishers = []
+    # The lists are copied, because messages still arrive.
+    for gid, publisher_samples in list(samples.items()):
+        # DDS calls a type "std_msgs::msg::dds_::Bool_" that ROS calls "std_msgs/msg/Bool".
+        kind = types[gid].replace("::dds_::", "/").replace("::", "/").removesuffix("_")
+        delays = _describe_delays(list(publisher_samples), lasted_s)
+        publishers.append({"gid": gid.hex(), "type": kind} | delays)
+    return TopicDelays(topic, lasted_s, publishers)
+
+
+def _describe_delays(samples: Sequence[tuple[int, int]], lasted_s: float) -> dict[str, Any]:
+    """Returns the row of a publisher, with a histogram of its delays.
+
+    Args:
+        samples: Number and delay in ns of each message that arrived. The publisher numbers its
+            messages consecutively, so that a gap in the numbers shows lost messages.
+        lasted_s: Duration of the measurement, in s.
+    """
+    numbers = {number for number, _ in samples}
+    sent = max(numbers) - min(numbers) + 1
+
+    delays_us = np.array([delay_ns for _, delay_ns in samples]) / 1e3
+    counts, edges_us = np.histogram(delays_us, bins=20)
+    quantiles_us = {}
+    for name, percent in (("min", 0.0), ("p50", 50.0), ("p99", 99.0), ("max", 100.0)):
+        quantiles_us[name] = float(np.percentile(delays_us, percent))
+
+    return {
+        "messages": len(samples),
+        "lost": sent - len(numbers),
+        "rate_hz": len(samples) / lasted_s,
+        "delay_us": quantiles_us,
+        "histogram": {"edges_us": edges_us.tolist(), "counts": counts.tolist()},
+    }

@@ -1,0 +1,1032 @@
+"""Computes the kinematics and dynamics of a serial chain of revolute and prismatic joints.
+
+Symbols: q, qd and qdd are the positions, velocities and accelerations of the n joints. M(q) is
+the inertia matrix, C the Coriolis matrix, G the gravity torque and tau the joint torque. The
+chain starts at the base. The frame of a link moves with the link, and the axis of the joint
+that moves the link is constant in this frame.
+
+Each link has ten inertial parameters about the origin of its own frame:
+
+    pi = (m, m c, Ixx, Ixy, Iyy, Ixz, Iyz, Izz)
+
+Here m is the mass, c the centre of mass, and Ixx to Izz are the moments of inertia. The vector
+theta, shape (10 n,), lists the parameters of all links. All dynamics are linear in theta.
+
+A spatial vector combines a linear part and an angular part at the origin of a frame. The
+Newton-Euler recursion goes from the base to the tip. It computes for link i, whose previous
+link is p:
+
+    V_i = X V_p + S qd      W_i = X W_p + S v      A_i = X A_p + S a + V_i x (S v)
+    f_i = I A_i + 1/2 (V_i x* I W_i + W_i x* I V_i - I (V_i x W_i))      tau_i = S' f_i
+
+- X transforms spatial vectors from the frame of link p to the frame of link i. S is the axis of
+  the joint as a spatial vector, and I the spatial inertia of the link. The product x is for two
+  velocities, and x* for a velocity and a force.
+- V is the velocity of the link. W is the velocity that the link would have if the joints moved
+  at the reference velocities v of a control law. A is its acceleration for the reference
+  accelerations a, and f is the spatial force on the link.
+
+The result is tau = M a + C v + G, in which C depends on qd. The product of V and W is
+symmetric. It corresponds to the Christoffel symbols. Therefore dM/dt - 2 C is skew-symmetric.
+
+The adaptive control law needs the product Y' r. Y is the regressor, the matrix for which Y
+theta = tau, and r = qd - v is the filtered error. The product is the gradient of r' tau with
+respect to theta. It is computed link by link with the vector V - W, without the matrix Y.
+
+Source: R. Featherstone, "Rigid Body Dynamics Algorithms" (2008), for spatial vectors,
+Newton-Euler and composite bodies; G. Niemeyer and J.-J. Slotine, "Performance in adaptive
+manipulator control", Int. J. Robotics Research 10 (1991), for the recursion of the adaptive
+law.
+
+Invariant:
+    - Compiled functions allocate no memory. They write their results into the array that holds
+      the data of the joints, one row per joint (see `chain_dtype`).
+    - Each sum has a fixed order, so that results are the same on every machine.
+"""
+
+from collections.abc import Sequence
+from functools import cache
+from math import sqrt
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..step.jit import leaf
+from ..step.vectors import Array, Row, RowArray, Vector
+from .elementary import sincos
+
+LINK_PARAMETERS = 10
+MAX_JOINTS = 12
+COULOMB_SPEED = 0.01
+"""Speed at which the smoothed Coulomb friction has 71 % of its full value, rad/s or m/s."""
+
+Three = tuple[float, float, float]
+Matrix = tuple[Three, Three, Three]
+Spatial = tuple[Three, Three]
+"""A spatial vector: its linear half and its angular half."""
+
+
+class ChainJoint(NamedTuple):
+    """One joint of a chain; theta contains the parameters of the link that it moves.
+
+    Attributes:
+        prismatic: True: the joint slides (m, N); false: it turns (rad, N m).
+        axis: Axis of motion in the link's frame, length 1.
+        rotation: Orientation of the link's frame in the previous link's frame at position 0,
+            three rows.
+        origin_m: Origin of the link's frame in the previous link's frame, m.
+        armature_kg_m2: Inertia of the drive at the joint, kg m^2; kg for a prismatic joint.
+        viscous: Friction per speed, N m s/rad or N s/m.
+        coulomb: Friction that hardly depends on the speed, N m or N, see `COULOMB_SPEED`.
+        lower: Position of the lower stop, rad or m; -inf without a stop.
+        upper: Position of the upper stop, rad or m; inf without a stop.
+        stop_stiffness: Stiffness of both stops, N m/rad or N/m.
+        stop_damping: Damping of both stops, N m s/rad or N s/m.
+    """
+
+    prismatic: bool
+    axis: Three
+    rotation: Matrix
+    origin_m: Three
+    armature_kg_m2: float = 0.0
+    viscous: float = 0.0
+    coulomb: float = 0.0
+    lower: float = -np.inf
+    upper: float = np.inf
+    stop_stiffness: float = 0.0
+    stop_damping: float = 0.0
+
+
+_DRIVE = (
+    "armature_kg_m2",
+    "viscous",
+    "coulomb",
+    "lower",
+    "upper",
+    "stop_stiffness",
+    "stop_damping",
+)
+_MOTIONS = ("V_lin", "V_ang", "W_lin", "W_ang", "A_lin", "A_ang", "f_lin", "f_ang")
+_TIP = ("J_lin", "J_ang", "p_base", "axis_base")
+
+
+@cache
+def chain_dtype(joints: int) -> np.dtype[np.void]:
+    """Returns the NumPy data type of the row that stores a joint of a chain.
+
+    A row contains the constants of the joint and the work space of the algorithms. A link is
+    the body that the joint moves, and its frame moves with it. Names with lin and ang are the
+    linear and the angular part of a spatial vector at the origin of this frame. Positions are
+    in m.
+
+    - Constants: the fields of `ChainJoint` for the axis and the drive; `origin`, the origin of
+      the link's frame in that of the previous link; `slide`, the axis of a prismatic joint in
+      the frame of the previous link, zero for other joints; and the matrices of Rodrigues'
+      formula (`build_chain`): `at_rest` is F, `by_sine` F [a] and `by_cosine` F [a]^2.
+    - Placement: R and p, the orientation and the origin of the link's frame in that of the
+      previous link. `R_base` is the orientation, `p_base` the origin and `axis_base` the axis
+      in the frame of the base.
+    - Motion: V, W, A and f of the recursion at the top of this module.
+    - Dynamics: `bias`, the torque C qd + G with friction, less the torque of the stops;
+      `composite`, the ten inertial parameters of the link and all links after it as one rigid
+      body; and M, the row of the inertia matrix.
+    - End effector: `J_lin` and `J_ang`, the column of its Jacobian.
+
+    Args:
+        joints: Number of joints of the chain, the length of a row of M.
+    """
+    matrices = ("at_rest", "by_sine", "by_cosine", "R", "R_base")
+    vectors = ("axis", "origin", "slide", "p", *_MOTIONS, *_TIP)
+    numbers = (*_DRIVE, "bias")
+
+    fields: list[Any] = [("prismatic", "i8")]
+    fields += [(name, "f8", (3, 3)) for name in matrices]
+    fields += [(name, "f8", (3,)) for name in vectors]
+    fields += [(name, "f8") for name in numbers]
+    fields.append(("composite", "f8", (LINK_PARAMETERS,)))
+    fields.append(("M", "f8", (joints,)))
+    return np.dtype((np.record, fields))
+
+
+def build_chain(joints: Sequence[ChainJoint], width: int = 0) -> RowArray:
+    """Returns the rows of the joints of a chain, shape (n,), see `chain_dtype`.
+
+    The rotation of a joint by the angle q about its axis a (Rodrigues) uses three constant
+    matrices, where F is the rotation at q = 0 and [a] the matrix of the cross product with a:
+
+        R = F + sin(q) F [a] + (1 - cos(q)) F [a]^2
+
+    Args:
+        joints: The joints.
+        width: Number of joints for which the rows have room; by default that of the chain.
+    """
+    rows = np.zeros(len(joints), chain_dtype(width or len(joints)))
+    row: Row
+    for row, joint in zip(rows, joints, strict=True):
+        x, y, z = joint.axis
+        cross_matrix = (
+            (0.0, -z, y),
+            (z, 0.0, -x),
+            (-y, x, 0.0),
+        )
+        row.prismatic = int(joint.prismatic)
+        row.axis = joint.axis
+        row.origin = joint.origin_m
+        row.at_rest = joint.rotation
+        if joint.prismatic:
+            row.slide = apply(joint.rotation, joint.axis)
+        else:
+            by_sine = multiply(joint.rotation, cross_matrix)
+            row.by_sine = by_sine
+            row.by_cosine = multiply(by_sine, cross_matrix)
+        for name in _DRIVE:
+            row[name] = getattr(joint, name)
+    return rows
+
+
+@leaf
+def three(a: Vector) -> Three:
+    """Returns the three numbers of an array as a tuple.
+
+    Compiled code handles a tuple without allocating memory.
+
+    Args:
+        a: A vector of length 3, for example a field of a joint's row.
+    """
+    return a[0], a[1], a[2]
+
+
+@leaf
+def put_three(a: Array, values: Three) -> None:
+    """Writes a vector, given as a tuple of three numbers, into an array of length 3.
+
+    Args:
+        a: The array, which is changed.
+        values: The three numbers.
+    """
+    x, y, z = values
+    a[0] = x
+    a[1] = y
+    a[2] = z
+
+
+@leaf
+def dot(a: Three, b: Three) -> float:
+    """Returns the scalar product a' b."""
+    x = a[0] * b[0]
+    y = a[1] * b[1]
+    z = a[2] * b[2]
+    return x + y + z
+
+
+@leaf
+def cross(a: Three, b: Three) -> Three:
+    """Returns the vector product a x b."""
+    x = a[1] * b[2] - a[2] * b[1]
+    y = a[2] * b[0] - a[0] * b[2]
+    z = a[0] * b[1] - a[1] * b[0]
+    return x, y, z
+
+
+@leaf
+def add(a: Three, b: Three) -> Three:
+    """Returns a + b."""
+    x = a[0] + b[0]
+    y = a[1] + b[1]
+    z = a[2] + b[2]
+    return x, y, z
+
+
+@leaf
+def subtract(a: Three, b: Three) -> Three:
+    """Returns a - b."""
+    x = a[0] - b[0]
+    y = a[1] - b[1]
+    z = a[2] - b[2]
+    return x, y, z
+
+
+@leaf
+def scale(factor: float, a: Three) -> Three:
+    """Returns factor * a."""
+    x = factor * a[0]
+    y = factor * a[1]
+    z = factor * a[2]
+    return x, y, z
+
+
+@leaf
+def rotate(R: Array, a: Three) -> Three:
+    """Returns the product R a, the vector `a` rotated by R.
+
+    Args:
+        R: Rotation matrix, shape (3, 3).
+        a: The vector.
+    """
+    x, y, z = a
+    first = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z
+    second = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z
+    third = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z
+    return first, second, third
+
+
+@leaf
+def rotate_back(R: Array, a: Three) -> Three:
+    """Returns the product R' a, the vector `a` rotated by the inverse of R.
+
+    Args:
+        R: Rotation matrix, shape (3, 3).
+        a: The vector.
+    """
+    x, y, z = a
+    first = R[0, 0] * x + R[1, 0] * y + R[2, 0] * z
+    second = R[0, 1] * x + R[1, 1] * y + R[2, 1] * z
+    third = R[0, 2] * x + R[1, 2] * y + R[2, 2] * z
+    return first, second, third
+
+
+def apply(a: Matrix, b: Three) -> Three:
+    """Returns the product a b of a matrix and a vector.
+
+    The sums have a fixed order, so that the result has the same bits on every machine.
+
+    Args:
+        a: The matrix, three rows of three numbers.
+        b: The vector, three numbers.
+    """
+    x, y, z = b
+    products = []
+    for a_x, a_y, a_z in a:
+        product = a_x * x + a_y * y + a_z * z
+        products.append(product)
+    first, second, third = products
+    return first, second, third
+
+
+def multiply(a: Matrix, b: Matrix) -> Matrix:
+    """Returns the product a b of two matrices of three rows.
+
+    The sums have a fixed order, so that the result has the same bits on every machine. The sums
+    of a linear algebra library may differ in the last bit.
+    """
+    columns: Any = zip(*b, strict=True)
+    product_columns = [apply(a, column) for column in columns]
+    rows: Any = zip(*product_columns, strict=True)
+    return tuple(rows)
+
+
+@leaf
+def place_joints(chain: RowArray, q: Vector) -> None:
+    """Computes the rotation R and the origin p of the frame of each link.
+
+    Both refer to the frame of the previous link, and are written into the rows of the joints.
+    `build_chain` gives the equation of R. Most other functions of this module use these
+    results, so this function must be called first after each change of the positions.
+
+    Args:
+        chain: Rows of the joints; written.
+        q: Positions of the joints, shape (n,), rad or m.
+    """
+    for i in range(chain.shape[0]):
+        row: Row = chain[i]
+        sine = 0.0
+        versine = 0.0
+        if row.prismatic == 0:
+            sine, cosine = sincos(q[i])
+            versine = 1.0 - cosine
+        for j in range(3):
+            for k in range(3):
+                at_rest = row.at_rest[j, k]
+                sine_part = sine * row.by_sine[j, k]
+                versine_part = versine * row.by_cosine[j, k]
+                row.R[j, k] = at_rest + sine_part + versine_part
+            displacement = q[i] * row.slide[j]
+            row.p[j] = row.origin[j] + displacement
+
+
+@leaf
+def _move(row: Row, linear: Three, angular: Three, rate: float) -> Spatial:
+    """Returns X V_p + S rate: the spatial velocity of a link from that of the previous link.
+
+    Args:
+        row: Row of the joint.
+        linear: Linear part of V_p, in the previous link's frame.
+        angular: Angular part of V_p, in the previous link's frame.
+        rate: Velocity of the joint.
+    """
+    p = three(row.p)
+    turning_velocity = cross(angular, p)
+    velocity_at_p = add(linear, turning_velocity)
+    link_linear = rotate_back(row.R, velocity_at_p)
+    link_angular = rotate_back(row.R, angular)
+    axis = three(row.axis)
+    joint_velocity = scale(rate, axis)
+    if row.prismatic == 0:
+        link_angular = add(link_angular, joint_velocity)
+    else:
+        link_linear = add(link_linear, joint_velocity)
+    return link_linear, link_angular
+
+
+@leaf
+def _momentum(pi: Vector, first: int, linear: Three, angular: Three) -> Spatial:
+    """Returns the spatial momentum I(pi) V of a link.
+
+    Args:
+        pi: Inertial parameters of the links.
+        first: Index of the link's first parameter.
+        linear: Linear part of V.
+        angular: Angular part of V.
+    """
+    m = pi[first]
+    mc_x = pi[first + 1]
+    mc_y = pi[first + 2]
+    mc_z = pi[first + 3]
+    I_xx = pi[first + 4]
+    I_xy = pi[first + 5]
+    I_yy = pi[first + 6]
+    I_xz = pi[first + 7]
+    I_yz = pi[first + 8]
+    I_zz = pi[first + 9]
+    x, y, z = angular
+    spin_x = I_xx * x + I_xy * y + I_xz * z
+    spin_y = I_xy * x + I_yy * y + I_yz * z
+    spin_z = I_xz * x + I_yz * y + I_zz * z
+    mc = (mc_x, mc_y, mc_z)
+    spin = (spin_x, spin_y, spin_z)
+    origin_momentum = scale(m, linear)
+    turning_momentum = cross(angular, mc)
+    linear_momentum = add(origin_momentum, turning_momentum)
+    moment = cross(mc, linear)
+    angular_momentum = add(moment, spin)
+    return linear_momentum, angular_momentum
+
+
+@leaf
+def _along_axis(row: Row, linear: Three, angular: Three) -> float:
+    """Returns S' f, the component of a spatial force along a joint's axis.
+
+    It is the torque of a revolute joint or the force of a prismatic joint.
+
+    Args:
+        row: Row of the joint.
+        linear: Linear part of f, the force.
+        angular: Angular part of f, the torque.
+    """
+    axis = three(row.axis)
+    along = angular if row.prismatic == 0 else linear
+    return dot(axis, along)
+
+
+@leaf
+def friction_torque(row: Row, speed: float) -> float:
+    """Returns the torque with which friction opposes the motion of a joint, N m or N.
+
+        f(v) = viscous v + coulomb x / sqrt(1 + x^2),    x = v / COULOMB_SPEED
+
+    It increases with the velocity v. The second term is a smooth form of dry friction.
+
+    Args:
+        row: Row of the joint, with the coefficients `viscous` and `coulomb`.
+        speed: Velocity v of the joint, rad/s or m/s.
+    """
+    x = speed / COULOMB_SPEED
+    smooth_sign = x / sqrt(1.0 + x * x)
+    viscous: float = row.viscous * speed
+    coulomb: float = row.coulomb * smooth_sign
+    return viscous + coulomb
+
+
+@leaf
+def _pass_force(row: Row, before: Row) -> None:
+    """Adds a link's spatial force to that of the previous link, in the previous link's frame.
+
+    Args:
+        row: Row of the link's joint.
+        before: Row of the previous joint, which is changed.
+    """
+    R = row.R
+    p = three(row.p)
+    force = rotate(R, three(row.f_lin))
+    link_torque = rotate(R, three(row.f_ang))
+    lever_torque = cross(p, force)
+    torque = add(link_torque, lever_torque)
+    total_force = add(three(before.f_lin), force)
+    total_torque = add(three(before.f_ang), torque)
+    put_three(before.f_lin, total_force)
+    put_three(before.f_ang, total_torque)
+
+
+@leaf
+def propagate_motion(
+    chain: RowArray, gravity: Vector, qd: Vector, v: Vector, a: Vector
+) -> None:
+    """Computes the velocities and the acceleration of each link, starting at the base.
+
+    These are spatial vectors, which combine an angular and a linear part. The velocity V
+    results from qd, the velocity W from v, and the acceleration A from a and gravity. They are
+    written into the rows of the joints, where `inverse_dynamics` and `parameter_gradient` read
+    them. `place_joints` must have been called for the same positions.
+
+    Args:
+        chain: Rows of the joints; written.
+        gravity: Gravitational acceleration in the base's frame, m/s^2, shape (3,).
+        qd: Velocities of the joints, shape (n,), rad/s or m/s.
+        v: Reference velocities, by which the Coriolis matrix C is multiplied, shape (n,).
+        a: Reference accelerations, by which the inertia matrix M is multiplied, shape (n,).
+    """
+    still = (0.0, 0.0, 0.0)
+    V_lin = still
+    V_ang = still
+    W_lin = still
+    W_ang = still
+    # A base that accelerates upwards has the same effect as gravity.
+    A_lin = (-gravity[0], -gravity[1], -gravity[2])
+    A_ang = still
+    for i in range(chain.shape[0]):
+        row: Row = chain[i]
+        V_lin, V_ang = _move(row, V_lin, V_ang, qd[i])
+        W_lin, W_ang = _move(row, W_lin, W_ang, v[i])
+        A_lin, A_ang = _move(row, A_lin, A_ang, a[i])
+        # V x (S v)
+        axis = three(row.axis)
+        joint_velocity = scale(v[i], axis)
+        if row.prismatic == 0:
+            linear_part = cross(V_lin, joint_velocity)
+            angular_part = cross(V_ang, joint_velocity)
+            A_lin = add(A_lin, linear_part)
+            A_ang = add(A_ang, angular_part)
+        else:
+            linear_part = cross(V_ang, joint_velocity)
+            A_lin = add(A_lin, linear_part)
+        put_three(row.V_lin, V_lin)
+        put_three(row.V_ang, V_ang)
+        put_three(row.W_lin, W_lin)
+        put_three(row.W_ang, W_ang)
+        put_three(row.A_lin, A_lin)
+        put_three(row.A_ang, A_ang)
+
+
+@leaf
+def _motion_cross(V: Spatial, W: Spatial) -> Spatial:
+    """Returns V x W of two spatial velocities."""
+    V_lin, V_ang = V
+    W_lin, W_ang = W
+    turned_W = cross(V_ang, W_lin)
+    moved_W = cross(V_lin, W_ang)
+    linear = add(turned_W, moved_W)
+    angular = cross(V_ang, W_ang)
+    return linear, angular
+
+
+@leaf
+def _force_cross(V: Spatial, f: Spatial) -> Spatial:
+    """Returns V x* f of a spatial velocity and a spatial force."""
+    V_lin, V_ang = V
+    force, torque = f
+    linear = cross(V_ang, force)
+    turned_torque = cross(V_ang, torque)
+    moved_force = cross(V_lin, force)
+    angular = add(turned_torque, moved_force)
+    return linear, angular
+
+
+@leaf
+def inverse_dynamics(
+    chain: RowArray, theta: Vector, v: Vector, a: Vector, torque: Array
+) -> None:
+    """Computes the joint torque that the reference motion requires.
+
+        M a + C(q, qd) v + G + armature a + friction(v)
+
+    M is the inertia matrix of the links, C the Coriolis matrix, G the gravity torque and
+    `armature` the inertia of the drives. The friction is taken at the reference velocity v and
+    not at qd. With r = qd - v, then r' (friction(qd) - friction(v)) >= 0: the difference to
+    the real friction can only dissipate energy. `propagate_motion` must have been called for
+    the same motion.
+
+    Args:
+        chain: Rows of the joints.
+        theta: Inertial parameters, ten per link, shape (10 n,).
+        v: Reference velocities, shape (n,), rad/s or m/s.
+        a: Reference accelerations, shape (n,), rad/s^2 or m/s^2.
+        torque: Written: the torque, shape (n,), N m or N.
+    """
+    n = chain.shape[0]
+    for i in range(n):
+        row: Row = chain[i]
+        first = LINK_PARAMETERS * i
+        V_lin = three(row.V_lin)
+        V_ang = three(row.V_ang)
+        W_lin = three(row.W_lin)
+        W_ang = three(row.W_ang)
+        A_lin = three(row.A_lin)
+        A_ang = three(row.A_ang)
+        V = (V_lin, V_ang)
+        W = (W_lin, W_ang)
+        V_x_W = _motion_cross(V, W)
+        I_V = _momentum(theta, first, V_lin, V_ang)
+        I_W = _momentum(theta, first, W_lin, W_ang)
+        I_A = _momentum(theta, first, A_lin, A_ang)
+        # V x* I W + W x* I V - I (V x W)
+        V_x_I_W = _force_cross(V, I_W)
+        W_x_I_V = _force_cross(W, I_V)
+        I_V_x_W = _momentum(theta, first, V_x_W[0], V_x_W[1])
+        force_sum = add(V_x_I_W[0], W_x_I_V[0])
+        torque_sum = add(V_x_I_W[1], W_x_I_V[1])
+        turning_force = subtract(force_sum, I_V_x_W[0])
+        turning_torque = subtract(torque_sum, I_V_x_W[1])
+        half_force = scale(0.5, turning_force)
+        half_torque = scale(0.5, turning_torque)
+        put_three(row.f_lin, add(I_A[0], half_force))
+        put_three(row.f_ang, add(I_A[1], half_torque))
+    for i in range(n - 1, -1, -1):
+        row = chain[i]
+        force = three(row.f_lin)
+        moment = three(row.f_ang)
+        rigid = _along_axis(row, force, moment)
+        drive = row.armature_kg_m2 * a[i]
+        friction = friction_torque(row, v[i])
+        torque[i] = rigid + drive + friction
+        if i > 0:
+            _pass_force(row, chain[i - 1])
+
+
+@leaf
+def _add_products(factor: float, x: Spatial, y: Spatial, first: int, gradient: Array) -> None:
+    """Adds one term x' I y of the product Y' r to the gradient of a link's parameters.
+
+    I is the spatial inertia of the link. It is linear in the ten inertial parameters
+
+        pi = (m, m c, Ixx, Ixy, Iyy, Ixz, Iyz, Izz),
+
+    the mass m, the vector m c with the centre of mass c, and the moments of inertia J. With the
+    linear parts x_lin and y_lin and the angular parts x_ang and y_ang, the term is
+
+        x' I y = m x_lin' y_lin
+               + (m c)' (cross(y_lin, x_ang) + cross(x_lin, y_ang))
+               + x_ang' J y_ang
+
+    The factors of the parameters in this sum are the derivatives with respect to them. J is
+    symmetric. Therefore Ixy, Ixz and Iyz stand in two elements each, and have two products.
+
+    Args:
+        factor: Factor of the term.
+        x: A spatial velocity: its linear part in m/s, then its angular part in rad/s.
+        y: A spatial velocity or acceleration, also with its linear part first.
+        first: Index of the link's first parameter, its mass, in `gradient`.
+        gradient: Gradient for all links, shape (10 n,). `factor` times the ten derivatives is
+            added to the entries from `first`, in the order of pi.
+    """
+    x_lin, x_ang = x
+    y_lin, y_ang = y
+    x_1, x_2, x_3 = x_ang
+    y_1, y_2, y_3 = y_ang
+    d_m = dot(x_lin, y_lin)
+    y_lin_x_x_ang = cross(y_lin, x_ang)
+    x_lin_x_y_ang = cross(x_lin, y_ang)
+    d_mc = add(y_lin_x_x_ang, x_lin_x_y_ang)
+    d_Ixx = x_1 * y_1
+    d_Ixy = x_1 * y_2 + x_2 * y_1
+    d_Iyy = x_2 * y_2
+    d_Ixz = x_1 * y_3 + x_3 * y_1
+    d_Iyz = x_2 * y_3 + x_3 * y_2
+    d_Izz = x_3 * y_3
+    gradient[first] += factor * d_m
+    for axis in range(3):
+        gradient[first + 1 + axis] += factor * d_mc[axis]
+    gradient[first + 4] += factor * d_Ixx
+    gradient[first + 5] += factor * d_Ixy
+    gradient[first + 6] += factor * d_Iyy
+    gradient[first + 7] += factor * d_Ixz
+    gradient[first + 8] += factor * d_Iyz
+    gradient[first + 9] += factor * d_Izz
+
+
+@leaf
+def parameter_gradient(chain: RowArray, gradient: Array) -> None:
+    """Computes Y' r, which drives the parameter estimate of the adaptive control law.
+
+    Y is the regressor, the matrix for which Y theta is the torque of the links in
+    `inverse_dynamics`, where theta are their inertial parameters. The filtered error r = qd - v
+    is the difference between the velocities qd and the reference velocities v of the joints.
+    `propagate_motion` must have been called for the same qd and v.
+
+    With the spatial velocity s = V - W, the product is the gradient of the sum of s' f over all
+    links. The symbols are those at the top of this module: V is the velocity of the link, W its
+    velocity at v, A its reference acceleration, I its spatial inertia and f the force. In
+
+        s' f = s' I A + 1/2 s' (V x* I W + W x* I V - I (V x W))
+
+    the identity s' (V x* F) = -(V x s)' F gives each term the form x' I y, which is linear in
+    the parameters of the link:
+
+        s' f = s' I A - 1/2 (V x s)' I W - 1/2 (W x s)' I V - 1/2 s' I (V x W)
+
+    Args:
+        chain: Data of the n joints, one row per joint.
+        gradient: Receives Y' r, ten numbers per link, shape (10 n,).
+    """
+    for i in range(chain.shape[0]):
+        row: Row = chain[i]
+        V_lin = three(row.V_lin)
+        V_ang = three(row.V_ang)
+        W_lin = three(row.W_lin)
+        W_ang = three(row.W_ang)
+        A_lin = three(row.A_lin)
+        A_ang = three(row.A_ang)
+        s_lin = subtract(V_lin, W_lin)
+        s_ang = subtract(V_ang, W_ang)
+        V = (V_lin, V_ang)
+        W = (W_lin, W_ang)
+        A = (A_lin, A_ang)
+        s = (s_lin, s_ang)
+        V_x_s = _motion_cross(V, s)
+        W_x_s = _motion_cross(W, s)
+        V_x_W = _motion_cross(V, W)
+
+        first = LINK_PARAMETERS * i
+        end = first + LINK_PARAMETERS
+        for p in range(first, end):
+            gradient[p] = 0.0
+        # The four terms of s' f, in the order of the equation.
+        _add_products(factor=1.0, x=s, y=A, first=first, gradient=gradient)
+        _add_products(factor=-0.5, x=V_x_s, y=W, first=first, gradient=gradient)
+        _add_products(factor=-0.5, x=W_x_s, y=V, first=first, gradient=gradient)
+        _add_products(factor=-0.5, x=s, y=V_x_W, first=first, gradient=gradient)
+
+
+@leaf
+def _add_composite(row: Row, before: Row) -> None:
+    """Adds a composite body to that of the previous link, about the previous link's origin.
+
+    A composite body is a link together with all links after it, as if they were rigidly
+    connected. The parallel-axis theorem is written out for the ten parameters of a body.
+
+    Args:
+        row: Row of the joint of the body.
+        before: Row of the previous joint, whose composite body is changed.
+    """
+    pi = row.composite
+    total = before.composite
+    R = row.R
+    m = pi[0]
+    p = three(row.p)
+    link_mc = (pi[1], pi[2], pi[3])
+    mc = rotate(R, link_mc)
+    # I is the inertia matrix about the origin of the link, in the axes of the link. It is
+    # symmetric. x, y and z are the columns of R I, and R I R' has the rows I_x, I_y and I_z.
+    column_1 = (pi[4], pi[5], pi[7])
+    column_2 = (pi[5], pi[6], pi[8])
+    column_3 = (pi[7], pi[8], pi[9])
+    x = rotate(R, column_1)
+    y = rotate(R, column_2)
+    z = rotate(R, column_3)
+    row_1 = (x[0], y[0], z[0])
+    row_2 = (x[1], y[1], z[1])
+    row_3 = (x[2], y[2], z[2])
+    I_x = rotate(R, row_1)
+    I_y = rotate(R, row_2)
+    I_z = rotate(R, row_3)
+    p_mc = dot(p, mc)
+    p_p = dot(p, p)
+    polar = 2.0 * p_mc + m * p_p
+    p_x, p_y, p_z = p
+    mc_x, mc_y, mc_z = mc
+    mp_x = m * p_x
+    mp_y = m * p_y
+    mp_z = m * p_z
+    # The moments of inertia about the previous link's origin.
+    I_xx = I_x[0] + polar
+    I_xx -= 2.0 * p_x * mc_x
+    I_xx -= mp_x * p_x
+    I_xy = I_x[1] - p_x * mc_y
+    I_xy -= p_y * mc_x
+    I_xy -= mp_x * p_y
+    I_yy = I_y[1] + polar
+    I_yy -= 2.0 * p_y * mc_y
+    I_yy -= mp_y * p_y
+    I_xz = I_x[2] - p_x * mc_z
+    I_xz -= p_z * mc_x
+    I_xz -= mp_x * p_z
+    I_yz = I_y[2] - p_y * mc_z
+    I_yz -= p_z * mc_y
+    I_yz -= mp_y * p_z
+    I_zz = I_z[2] + polar
+    I_zz -= 2.0 * p_z * mc_z
+    I_zz -= mp_z * p_z
+    total[0] += m
+    total[1] += mc_x + mp_x
+    total[2] += mc_y + mp_y
+    total[3] += mc_z + mp_z
+    total[4] += I_xx
+    total[5] += I_xy
+    total[6] += I_yy
+    total[7] += I_xz
+    total[8] += I_yz
+    total[9] += I_zz
+
+
+@leaf
+def mass_matrix(chain: RowArray, theta: Vector) -> None:
+    """Computes the inertia matrix M(q) of the arm, with the inertia of its drives.
+
+    M is written into the field `M` of the rows, the lower triangle only, because M is
+    symmetric. The method is that of composite rigid bodies (Featherstone). `place_joints` must
+    have been called for the same positions.
+
+    Args:
+        chain: Rows of the joints; written.
+        theta: Inertial parameters, ten per link, shape (10 n,).
+    """
+    n = chain.shape[0]
+    for i in range(n):
+        row: Row = chain[i]
+        first = LINK_PARAMETERS * i
+        for p in range(LINK_PARAMETERS):
+            row.composite[p] = theta[first + p]
+    still = (0.0, 0.0, 0.0)
+    for i in range(n - 1, -1, -1):
+        row = chain[i]
+        # The force that accelerates the composite body at the joint's unit acceleration.
+        axis = three(row.axis)
+        if row.prismatic == 0:
+            linear, angular = _momentum(row.composite, 0, still, axis)
+        else:
+            linear, angular = _momentum(row.composite, 0, axis, still)
+        rigid = _along_axis(row, linear, angular)
+        row.M[i] = rigid + row.armature_kg_m2
+        for j in range(i - 1, -1, -1):
+            link: Row = chain[j + 1]
+            linear = rotate(link.R, linear)
+            link_torque = rotate(link.R, angular)
+            lever_torque = cross(three(link.p), linear)
+            angular = add(link_torque, lever_torque)
+            row.M[j] = _along_axis(chain[j], linear, angular)
+        if i > 0:
+            _add_composite(row, chain[i - 1])
+
+
+@leaf
+def _stop_torque(row: Row, q: float, qd: float) -> float:
+    """Returns the torque of a joint's stops, a spring and a damper that never pull.
+
+    Args:
+        row: Row of the joint.
+        q: Position of the joint, rad or m.
+        qd: Velocity of the joint, rad/s or m/s.
+    """
+    damper = row.stop_damping * qd
+    if q < row.lower:
+        spring = row.stop_stiffness * (row.lower - q)
+        push: float = spring - damper
+        return max(push, 0.0)
+    if q > row.upper:
+        spring = row.stop_stiffness * (row.upper - q)
+        push = spring - damper
+        return min(push, 0.0)
+    return 0.0
+
+
+@leaf
+def _bias(chain: RowArray, theta: Vector, gravity: Vector, q: Vector, qd: Vector) -> None:
+    """Writes C qd + G + friction - stops into the field `bias` of the rows.
+
+    `place_joints` must have been called for the same positions.
+
+    Args:
+        chain: Rows of the joints.
+        theta: Inertial parameters, shape (10 n,).
+        gravity: Gravitational acceleration in the base's frame, m/s^2, shape (3,).
+        q: Joint positions, shape (n,).
+        qd: Joint velocities, shape (n,).
+    """
+    n = chain.shape[0]
+    still = (0.0, 0.0, 0.0)
+    V_lin = still
+    V_ang = still
+    A_lin = (-gravity[0], -gravity[1], -gravity[2])
+    A_ang = still
+    for i in range(n):
+        row: Row = chain[i]
+        V_lin, V_ang = _move(row, V_lin, V_ang, qd[i])
+        A_lin, A_ang = _move(row, A_lin, A_ang, 0.0)
+        # V x (S qd)
+        axis = three(row.axis)
+        joint_velocity = scale(qd[i], axis)
+        if row.prismatic == 0:
+            linear_part = cross(V_lin, joint_velocity)
+            angular_part = cross(V_ang, joint_velocity)
+            A_lin = add(A_lin, linear_part)
+            A_ang = add(A_ang, angular_part)
+        else:
+            linear_part = cross(V_ang, joint_velocity)
+            A_lin = add(A_lin, linear_part)
+        # I A + V x* I V
+        first = LINK_PARAMETERS * i
+        force, torque = _momentum(theta, first, A_lin, A_ang)
+        momentum = _momentum(theta, first, V_lin, V_ang)
+        V = (V_lin, V_ang)
+        turning_force, turning_torque = _force_cross(V, momentum)
+        put_three(row.f_lin, add(force, turning_force))
+        put_three(row.f_ang, add(torque, turning_torque))
+    for i in range(n - 1, -1, -1):
+        row = chain[i]
+        force = three(row.f_lin)
+        moment = three(row.f_ang)
+        rigid = _along_axis(row, force, moment)
+        friction = friction_torque(row, qd[i])
+        row.bias = rigid + friction
+        row.bias -= _stop_torque(row, q[i], qd[i])
+        if i > 0:
+            _pass_force(row, chain[i - 1])
+
+
+@leaf
+def put_model(
+    chain: RowArray,
+    theta: Vector,
+    gravity: Vector,
+    q: Vector,
+    qd: Vector,
+    M: Array,
+    bias: Array,
+) -> None:
+    """Computes the inertia matrix and the bias torque, for a control law that needs them.
+
+    The bias torque is C qd + G + friction - stops: Coriolis torque, gravity torque and joint
+    friction, less the torque of the stops. `place_joints` must have been called for the same
+    positions.
+
+    Args:
+        chain: Rows of the joints.
+        theta: Inertial parameters, ten per link, shape (10 n,).
+        gravity: Gravitational acceleration in the base's frame, m/s^2, shape (3,).
+        q: Joint positions, shape (n,), rad or m.
+        qd: Joint velocities, shape (n,), rad/s or m/s.
+        M: Written: the inertia matrix, shape (n, n).
+        bias: Written: the bias torque, shape (n,), N m or N.
+    """
+    _bias(chain=chain, theta=theta, gravity=gravity, q=q, qd=qd)
+    mass_matrix(chain, theta)
+    for i in range(chain.shape[0]):
+        row: Row = chain[i]
+        bias[i] = row.bias
+        for j in range(i + 1):
+            M[i, j] = M[j, i] = row.M[j]
+
+
+@leaf
+def find_acceleration(
+    chain: RowArray,
+    theta: Vector,
+    gravity: Vector,
+    q: Vector,
+    qd: Vector,
+    torque: Vector,
+    qdd: Array,
+) -> None:
+    """Computes the joint accelerations qdd that a torque causes, Eq. (8).
+
+        M qdd = torque - C qd - G - friction + stops
+
+    M is the inertia matrix, C qd the Coriolis torque, G the gravity torque and `stops` the
+    torque of the stops. M is factored in place as L D L', which needs no square roots.
+    `place_joints` must have been called for the same positions.
+
+    Args:
+        chain: Rows of the joints.
+        theta: Inertial parameters, ten per link, shape (10 n,).
+        gravity: Gravitational acceleration in the base's frame, m/s^2, shape (3,).
+        q: Joint positions, shape (n,), rad or m.
+        qd: Joint velocities, shape (n,), rad/s or m/s.
+        torque: The whole torque on the joints, shape (n,), N m or N.
+        qdd: Written: the accelerations, shape (n,), rad/s^2 or m/s^2.
+    """
+    n = chain.shape[0]
+    _bias(chain=chain, theta=theta, gravity=gravity, q=q, qd=qd)
+    mass_matrix(chain, theta)
+
+    # Factor row i of M, and substitute forwards.
+    for i in range(n):
+        row: Row = chain[i]
+        M_i = row.M
+        for j in range(i):
+            M_j = chain[j].M
+            for k in range(j):
+                pivot = chain[k].M[k]
+                product = M_i[k] * M_j[k]
+                M_i[j] -= product * pivot
+            M_i[j] /= M_j[j]
+        for k in range(i):
+            pivot = chain[k].M[k]
+            square = M_i[k] * M_i[k]
+            M_i[i] -= square * pivot
+        total = torque[i] - row.bias
+        for k in range(i):
+            total -= M_i[k] * qdd[k]
+        qdd[i] = total
+
+    # Divide by D, and substitute backwards.
+    for i in range(n - 1, -1, -1):
+        qdd[i] /= chain[i].M[i]
+        for k in range(i + 1, n):
+            qdd[i] -= chain[k].M[i] * qdd[k]
+
+
+@leaf
+def place_end_effector(chain: RowArray, tip: Vector) -> Three:
+    """Computes the pose of the end effector, its Jacobian and the orientations of the links.
+
+    All results are in the axes of the base. Except for the position of the end effector, they
+    are written into the data of the joints:
+
+    - `J_lin` and `J_ang`: the column of the Jacobian for this joint, which gives the linear and
+      the angular velocity of the end effector per velocity of the joint.
+    - `R_base`: the orientation of the link that the joint moves.
+    - `p_base` and `axis_base`: the position, in m, and the axis of the joint.
+
+    Args:
+        chain: Data of the joints, one row per joint. `place_joints` must have been called
+            before.
+        tip: Position of the end effector in the last link's frame, m, shape (3,).
+
+    Returns:
+        The position of the end effector, m.
+    """
+    n = chain.shape[0]
+    position = (0.0, 0.0, 0.0)
+    for i in range(n):
+        row: Row = chain[i]
+        R = row.R
+        R_base = row.R_base
+        if i == 0:
+            position = three(row.p)
+            for j in range(3):
+                put_three(R_base[j], three(R[j]))
+        else:
+            before = chain[i - 1].R_base
+            offset = rotate(before, three(row.p))
+            position = add(position, offset)
+            for k in range(3):
+                column = (R[0, k], R[1, k], R[2, k])
+                x, y, z = rotate(before, column)
+                R_base[0, k] = x
+                R_base[1, k] = y
+                R_base[2, k] = z
+        axis = rotate(R_base, three(row.axis))
+        put_three(row.axis_base, axis)
+        put_three(row.p_base, position)
+    tip_offset = rotate(chain[n - 1].R_base, three(tip))
+    position = add(position, tip_offset)
+    for i in range(n):
+        row = chain[i]
+        axis = three(row.axis_base)
+        if row.prismatic == 0:
+            lever = subtract(position, three(row.p_base))
+            put_three(row.J_lin, cross(axis, lever))
+            put_three(row.J_ang, axis)
+        else:
+            put_three(row.J_lin, axis)
+            put_three(row.J_ang, (0.0, 0.0, 0.0))
+    return position

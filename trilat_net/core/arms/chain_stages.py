@@ -1,0 +1,416 @@
+"""Computes those stages of a tick that depend on the arm, for a chain of n joints.
+
+A tick is one period of the control loop, and a stage is one of the eight steps in which
+`kernel` computes a tick. The dynamics of the arm are computed by recursions from joint to
+joint. The argument `chain` holds one row of numbers per joint, described in `chain_dtype`.
+
+Invariant:
+    - `two_link_stages` has the same functions for the planar two-link arm, and `kernel` calls
+      the functions of one module or the other.
+"""
+
+from math import isfinite
+
+from ..step.control import limit_torque, robust_torque
+from ..step.jit import leaf
+from ..step.site_setup import Law
+from ..step.vectors import Array, Row, RowArray, Vector
+from .chain import (
+    find_acceleration,
+    friction_torque,
+    inverse_dynamics,
+    parameter_gradient,
+    place_joints,
+    propagate_motion,
+    put_model,
+)
+from .exogenous import TorqueSourceRows, TorqueTable, put_torque_on_chain
+from .task_space import add_task_torque, update_pose, update_task_errors, update_wrench
+
+_ADAPTIVE = int(Law.ADAPTIVE)
+
+
+@leaf
+def place_chain(s: Row, chain: RowArray) -> None:
+    """Updates the frames of the joints and, in task space, the pose of the end effector.
+
+    The other functions of this module use the results. Therefore this function must be called
+    after each change of the joint positions.
+
+    Args:
+        s: State of the site (the process that runs the arm). If the site works in task space,
+            the pose of the end effector is written into it.
+        chain: Data of the joints, one row per joint; the frames are written into it.
+    """
+    place_joints(chain, s.q)
+    if s.task:
+        update_pose(s, chain)
+
+
+@leaf
+def update_errors(s: Row, chain: RowArray) -> None:
+    """Computes the tracking errors of a chain, and the reference motion of its control law.
+
+    These are the errors e of the position and ed of the velocity, the filtered error r, and the
+    reference velocity v and acceleration a. For the adaptive law, the product Y' r is computed
+    as well. It drives the estimate of the dynamic parameters; Y is the regressor of the arm's
+    dynamics.
+
+    Args:
+        s: State of the site (the process that runs the arm); the results are written into it.
+        chain: Data of the joints, one row per joint. `place_chain` must have been called
+            before.
+    """
+    if s.task:
+        update_task_errors(s)
+    else:
+        _update_joint_errors(s, chain.shape[0])
+    if s.law == _ADAPTIVE:
+        propagate_motion(chain=chain, gravity=s.gravity, qd=s.qd, v=s.v, a=s.a)
+        parameter_gradient(chain, s.Yr)
+
+
+@leaf
+def _update_joint_errors(s: Row, joints: int) -> None:
+    """Writes e, ed, v, a and r for sites that share joint angles."""
+    for i in range(joints):
+        s.e[i] = s.q[i] - s.q_des[i]
+        s.ed[i] = s.qd[i] - s.qd_des[i]
+        s.v[i] = -s.Lambda[i] * s.e[i]
+        s.a[i] = -s.Lambda[i] * s.ed[i]
+        s.r[i] = s.qd[i] - s.v[i]
+
+
+@leaf
+def advance_estimate(s: Row, gain_s: float, Yr: Vector) -> None:
+    """Integrates the adaptive law's estimate of the dynamic parameters over a time step.
+
+        theta_hat <- theta_hat - gain_s Gamma Y' r, limited to lower and upper bounds
+
+    Here theta_hat is the estimate of the parameters, such as masses. Gamma is the diagonal gain
+    of the adaptation, Y the regressor of the arm's dynamics, and r the filtered tracking error.
+
+    Args:
+        s: State of the site (the process that runs the arm), which contains theta_hat and
+            Gamma.
+        gain_s: Duration of the step, s.
+        Yr: The product Y' r, shape (P,) for P parameters.
+    """
+    for p in range(s.parameters):
+        step = gain_s * s.Gamma[p] * Yr[p]
+        estimate = s.theta_hat[p] - step
+        s.theta_hat[p] = min(max(estimate, s.low[p]), s.high[p])
+
+
+@leaf
+def update_torque(s: Row, chain: RowArray) -> None:
+    """Computes the motor torque of a built-in control law, limited to the range of the motors.
+
+    The law is either the adaptive law or a law that compensates a known gravity torque
+    (`control.damped_torque`). The adaptive law includes its robust term, a bounded torque
+    against disturbances.
+
+    Args:
+        s: State of the site (the process that runs the arm); the torque is written into it.
+        chain: Data of the joints, one row per joint. `place_chain` must have been called
+            before.
+    """
+    if s.law == _ADAPTIVE:
+        inverse_dynamics(chain=chain, theta=s.theta_hat, v=s.v, a=s.a, torque=s.tau)
+    else:
+        put_gravity(s, chain, s.known, s.tau)
+    if s.task:
+        add_task_torque(s=s, gains=s.Kd, values=s.ed, factor=-1.0, torque=s.tau)
+        if s.law != _ADAPTIVE:
+            add_task_torque(s=s, gains=s.K, values=s.e, factor=-1.0, torque=s.tau)
+            add_task_torque(s=s, gains=s.k_f, values=s.felt, factor=1.0, torque=s.tau)
+    for i in range(chain.shape[0]):
+        torque: float = s.tau[i]
+        if not s.task:
+            torque -= s.Kd[i] * s.ed[i]
+            if s.law != _ADAPTIVE:
+                reflected = s.k_f[i] * s.felt[i]
+                spring = s.K[i] * s.e[i]
+                torque += reflected - spring
+        if s.law == _ADAPTIVE:
+            torque -= s.Kp[i] * s.r[i]
+            # The inverse dynamics contain the friction in full.
+            uncompensated = 1.0 - s.friction[i]
+            if uncompensated != 0.0:
+                torque -= uncompensated * friction_torque(chain[i], s.v[i])
+            if s.rho[i] > 0.0:
+                torque -= robust_torque(s.rho[i], s.width[i], s.r[i])
+        else:
+            torque -= s.d[i] * s.qd[i]
+        s.tau[i] = limit_torque(torque, s.tau_limit[i])
+
+
+@leaf
+def put_gravity(s: Row, chain: RowArray, theta: Array, torque: Array) -> None:
+    """Computes the torque that holds the chain against gravity, for the given parameters.
+
+    It is the torque of the inverse dynamics without motion. `place_joints` must have been
+    called for the present positions.
+
+    Args:
+        s: Row of the site, with its settings and its state.
+        chain: Rows of the joints.
+        theta: Inertial parameters, shape (10 n,).
+        torque: Written: the torque, shape (n,), N m.
+    """
+    zeros = s.zeros
+    propagate_motion(chain=chain, gravity=s.gravity, qd=zeros, v=zeros, a=zeros)
+    inverse_dynamics(chain=chain, theta=theta, v=zeros, a=zeros, torque=torque)
+
+
+@leaf
+def put_gravity_torque(s: Row, chain: RowArray, q: Array, torque: Array) -> None:
+    """Computes the gravity torque of an arm with its true dynamic parameters.
+
+    Args:
+        s: Settings of the site (the process that runs the arm), with the parameters.
+        chain: Data of the n joints, one row per joint; their frames are updated.
+        q: Joint positions, shape (n,), rad or m.
+        torque: Receives the gravity torque, shape (n,), N m.
+    """
+    place_joints(chain, q)
+    put_gravity(s, chain, s.theta, torque)
+
+
+@leaf
+def update_model(s: Row, chain: RowArray) -> None:
+    """Computes the model of a chain of joints that a control law written by a user may read.
+
+    The model consists of the gravity torque G. If the law asks for more, the model also
+    contains the inertia matrix M and the bias torque. The bias torque is C qd + G plus
+    friction, minus the torque of the joint stops, where C is the Coriolis matrix and qd are the
+    joint velocities.
+
+    Args:
+        s: State of the site (the process that runs the arm); the model is written into it.
+        chain: Data of the joints, one row per joint. `place_joints` must have been called
+            before.
+    """
+    put_gravity(s, chain, s.known, s.G)
+    if s.needs_model != 0:
+        put_model(
+            chain=chain, theta=s.known, gravity=s.gravity, q=s.q, qd=s.qd, M=s.M, bias=s.bias
+        )
+
+
+@leaf
+def put_source_torque(
+    t_s: float,
+    s: Row,
+    chain: RowArray,
+    state: Array,
+    actors: TorqueSourceRows,
+    table: TorqueTable,
+    sampled: int,
+    torque: Array,
+) -> None:
+    """Computes the torque with which some of the operators and environments act on the arm.
+
+    A sampled operator or environment is evaluated once per period of the control loop, and its
+    torque is constant until the next period. All others act continuously.
+
+    Args:
+        t_s: Time since the start of the session, s.
+        s: Settings of the site (the process that runs the arm).
+        chain: Data of the n joints, one row per joint; their frames are updated.
+        state: Joint positions, followed by joint velocities, shape (2 n,).
+        actors: Operators and environments, one row for each.
+        table: Numbers of all operators and environments, for example recorded torques.
+        sampled: 1 for the torque of the sampled operators and environments, 0 for all others.
+        torque: Receives the torque on the arm, shape (n,), N m.
+    """
+    place_joints(chain, state)
+    qd = state[chain.shape[0] :]
+    put_torque_on_chain(
+        t_s=t_s,
+        q=state,
+        qd=qd,
+        tip=s.tip,
+        chain=chain,
+        actors=actors,
+        table=table,
+        sampled=sampled,
+        torque=torque,
+    )
+
+
+@leaf
+def update_external_torque(
+    t_s: float, s: Row, chain: RowArray, actors: TorqueSourceRows, table: TorqueTable
+) -> None:
+    """Computes the torque that operators and environments exert on the arm now.
+
+    The state of the site receives the whole torque, the part that stays constant until the next
+    period of the control loop, and the largest force of a wall.
+
+    Args:
+        t_s: Time since the start of the session, s.
+        s: State of the site (the process that runs the arm); written.
+        chain: Data of the joints, one row per joint; their frames are updated.
+        actors: Operators and environments, one row for each.
+        table: Numbers of all operators and environments, for example recorded torques.
+    """
+    place_joints(chain, s.q)
+    held_n = put_torque_on_chain(
+        t_s=t_s,
+        q=s.q,
+        qd=s.qd,
+        tip=s.tip,
+        chain=chain,
+        actors=actors,
+        table=table,
+        sampled=1,
+        torque=s.held,
+    )
+    now_n = put_torque_on_chain(
+        t_s=t_s,
+        q=s.q,
+        qd=s.qd,
+        tip=s.tip,
+        chain=chain,
+        actors=actors,
+        table=table,
+        sampled=0,
+        torque=s.on_arm,
+    )
+    s.wall_n = max(held_n, now_n)
+    for i in range(chain.shape[0]):
+        # Either `held` or `sensed` is zero.
+        s.on_arm[i] += s.held[i] + s.sensed[i]
+    if s.task:
+        update_wrench(s)
+
+
+@leaf
+def _put_acceleration(
+    t_s: float, s: Row, chain: RowArray, actors: TorqueSourceRows, table: TorqueTable
+) -> None:
+    """Writes the acceleration at a stage of the integrator into `stage_qdd`.
+
+    The torque is the held u plus the torque of the actors at the time and state of the stage.
+
+    Args:
+        t_s: Time of the stage, s since the epoch.
+        s: Row of the site, with `stage_q` and `stage_qd`.
+        chain: Rows of the joints.
+        actors: Rows of operators and environments.
+        table: Their numbers, for example recorded torques.
+    """
+    place_joints(chain, s.stage_q)
+    put_torque_on_chain(
+        t_s=t_s,
+        q=s.stage_q,
+        qd=s.stage_qd,
+        tip=s.tip,
+        chain=chain,
+        actors=actors,
+        table=table,
+        sampled=0,
+        torque=s.stage_torque,
+    )
+    for i in range(chain.shape[0]):
+        s.stage_torque[i] += s.u[i]
+    find_acceleration(
+        chain=chain,
+        theta=s.theta,
+        gravity=s.gravity,
+        q=s.stage_q,
+        qd=s.stage_qd,
+        torque=s.stage_torque,
+        qdd=s.stage_qdd,
+    )
+
+
+@leaf
+def _use_stage(s: Row, joints: int, weight: float, ahead_s: float) -> None:
+    """Completes a stage of the Runge-Kutta method, and prepares the next stage.
+
+    The method integrates the joint positions q and velocities qd over a period h. A stage is
+    one of its four evaluations of the derivatives (qd, qdd), where qdd is the acceleration:
+
+        q(t + h) = q(t) + h/6 (qd_1 + 2 qd_2 + 2 qd_3 + qd_4)        and the same for qd, qdd
+        q_{n+1}  = q(t) + ahead_s qd_n                               and the same for qd, qdd
+
+    The first line is the result, of which this function adds up the sum in brackets. The second
+    line is the state at which stage n + 1 evaluates the derivatives.
+
+    Args:
+        s: State of the site (the process that runs the arm). `q` and `qd` are the state at the
+            beginning of the period. `stage_q`, `stage_qd` and `stage_qdd` belong to this stage;
+            the first two are replaced by the state of the next stage. The sums `sum_qd` and
+            `sum_qdd` are updated.
+        joints: Number of joints.
+        weight: Weight of this stage in the sums: 1 or 2, in sixths.
+        ahead_s: Time of the next stage after the beginning of the period, s.
+    """
+    for i in range(joints):
+        s.sum_qd[i] += weight * s.stage_qd[i]
+        s.sum_qdd[i] += weight * s.stage_qdd[i]
+        # The order matters: the next `stage_q` needs the `stage_qd` of this stage.
+        s.stage_q[i] = s.q[i] + ahead_s * s.stage_qd[i]
+        s.stage_qd[i] = s.qd[i] + ahead_s * s.stage_qdd[i]
+
+
+@leaf
+def advance_arm(
+    t_s: float,
+    h_s: float,
+    s: Row,
+    chain: RowArray,
+    actors: TorqueSourceRows,
+    table: TorqueTable,
+) -> bool:
+    """Simulates the motion of the arm over one period of the control loop.
+
+    The motor torque is constant over the period. The method is the classical Runge-Kutta method
+    of fourth order. The joint positions and velocities at the end of the period are written
+    into the state of the site.
+
+    Args:
+        t_s: Time at the beginning of the period, in s since the start of the session.
+        h_s: The period, s.
+        s: State of the site (the process that runs the arm), with the motor torque `u`;
+            written.
+        chain: Data of the joints, one row per joint.
+        actors: Operators and environments, one row for each.
+        table: Numbers of all operators and environments, for example recorded torques.
+
+    Returns:
+        True if the result is finite. Otherwise False, and positions and velocities are
+        unchanged.
+    """
+    n = chain.shape[0]
+    for i in range(n):
+        s.stage_q[i] = s.q[i]
+        s.stage_qd[i] = s.qd[i]
+        s.sum_qd[i] = 0.0
+        s.sum_qdd[i] = 0.0
+    half = 0.5 * h_s
+    _put_acceleration(t_s=t_s, s=s, chain=chain, actors=actors, table=table)
+    _use_stage(s, n, 1.0, half)
+    _put_acceleration(t_s=t_s + half, s=s, chain=chain, actors=actors, table=table)
+    _use_stage(s, n, 2.0, half)
+    _put_acceleration(t_s=t_s + half, s=s, chain=chain, actors=actors, table=table)
+    _use_stage(s, n, 2.0, h_s)
+    _put_acceleration(t_s=t_s + h_s, s=s, chain=chain, actors=actors, table=table)
+    _use_stage(s, n, 1.0, 0.0)
+
+    sixth = h_s / 6.0
+    are_finite = True
+    for i in range(n):
+        q = s.q[i] + sixth * s.sum_qd[i]
+        qd = s.qd[i] + sixth * s.sum_qdd[i]
+        s.stage_q[i] = q
+        s.stage_qd[i] = qd
+        are_finite = are_finite and isfinite(q) and isfinite(qd)
+
+    if are_finite:
+        for i in range(n):
+            s.q[i] = s.stage_q[i]
+            s.qd[i] = s.stage_qd[i]
+    return are_finite

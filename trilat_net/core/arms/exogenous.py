@@ -1,0 +1,842 @@
+"""Computes the torques by which operators and environments act on an arm.
+
+An operator is a person or a program that moves the arm. An environment is, for example, a wall
+that the arm touches. Both are called actors in the code, because their torque is computed in
+the same way.
+
+Sign: This module computes the torque ON the arm. Records and the equations of the control laws
+use tau_x, the negative of this torque. The total torque of the joints is tau - tau_x, where tau
+is the torque of the motors.
+
+Invariant:
+    - The torque depends on time and on the state of the arm. Therefore it is computed anew at
+      each evaluation of the integrator, several times per period of the control loop.
+    - An actor that is marked `sampled` is evaluated once per period, and its torque is then
+      constant. A digital haptic device renders a wall in this way.
+"""
+
+import math
+from enum import IntEnum
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..plug.plugged import call_address, compile_to_address, list_numbers
+from ..step.jit import leaf
+from ..step.vectors import Array, Pair, Row, RowArray, Vector, count_started
+from .chain import Three, add, dot, place_end_effector, scale, three
+from .elementary import sincos
+from .two_link_arm import end_effector_jacobian, forward_kinematics
+
+
+class TorqueKind(IntEnum):
+    """The kinds of operators and environments.
+
+    - PULSE is a scripted torque, smooth at both ends.
+    - HAND and TASK_HAND are a spring and a damper towards a target that moves along a
+      minimum-jerk path, of the joints or of the end effector.
+    - RECORDED interpolates a table of torques.
+    - VISCOUS resists motion of the joints.
+    - WALL pushes the end effector out of a half-space, and never pulls.
+    - CHIRP is a sine whose frequency changes linearly with time, in repeated sweeps.
+    - MULTISINE is a sum of sines with the same amplitude.
+    - OWN_JOINTS and OWN_TIP call a user's compiled function, of the joints or of the end
+      effector.
+    - LIVE_TIP and LIVE_JOINT are a spring and a damper towards a target that a person moves
+      during the run; LIVE_FORCE is a force that a person sets, see `live_hand`.
+    """
+
+    PULSE = 0
+    HAND = 1
+    TASK_HAND = 2
+    RECORDED = 3
+    VISCOUS = 4
+    WALL = 5
+    CHIRP = 6
+    MULTISINE = 7
+    OWN_JOINTS = 8
+    OWN_TIP = 9
+    LIVE_TIP = 10
+    LIVE_FORCE = 11
+    LIVE_JOINT = 12
+
+
+SCRIPTED_KINDS = (TorqueKind.PULSE, TorqueKind.RECORDED, TorqueKind.CHIRP, TorqueKind.MULTISINE)
+"""The kinds whose torque is a function of time alone."""
+LIVE_KINDS = (TorqueKind.LIVE_TIP, TorqueKind.LIVE_FORCE, TorqueKind.LIVE_JOINT)
+"""The kinds that act only while a hand holds the arm. Their numbers are the largest, and leaves
+test for them by `>=`.
+"""
+OWN_KINDS = (TorqueKind.OWN_JOINTS, TorqueKind.OWN_TIP)
+"""The kinds that call a user's function."""
+
+
+class TorqueSource(NamedTuple):
+    """One operator or environment; the meaning of its vectors depends on its kind.
+
+    Attributes:
+        kind: The kind of operator or environment.
+        start_s: Start of the action, s since the epoch.
+        end_s: End of the action, s.
+        move_start_s: Start of the target's motion, s; CHIRP: start of the first sweep.
+        move_end_s: End of the target's motion, s; CHIRP: end of the first sweep.
+        a: PULSE, CHIRP: peak, N m. MULTISINE: amplitude of each sine, N m. HAND, TASK_HAND:
+            target before the motion, rad or m. WALL: a point of the wall, m. Live hand: target
+            or force.
+        b: HAND, TASK_HAND: target after the motion. WALL: the normal that points away from the
+            wall, length 1. CHIRP: frequencies at the start and the end of a sweep, Hz. Live
+            hand: Position of the target one second later.
+        K: Stiffness: HAND N m/rad, TASK_HAND N/m per axis, WALL N/m (first number).
+        B: Damping: HAND and VISCOUS N m s/rad, TASK_HAND N s/m per axis, WALL N s/m (first
+            number).
+        sampled: True: evaluated once per tick and held.
+        table: RECORDED: rows of time, s, and torque ON each joint, N m, shape (rows, 1 + n).
+            MULTISINE: Rows of frequency, Hz, and phase at the start, turns; further columns are
+            not used.
+        limit: Live hand: the largest norm of its force, N, or torque, N m.
+        grip: Live hand: part of its force that acts, 0 to 1.
+        model: User's kind: the object with its numbers and its function `act`, see `plugged`.
+    """
+
+    kind: TorqueKind
+    start_s: float = -math.inf
+    end_s: float = math.inf
+    move_start_s: float = 0.0
+    move_end_s: float = 0.0
+    a: tuple[float, ...] = ()
+    b: tuple[float, ...] = ()
+    K: tuple[float, ...] = ()
+    B: tuple[float, ...] = ()
+    sampled: bool = False
+    table: Array | None = None
+    limit: float = math.inf
+    grip: float = 0.0
+    model: Any = None
+
+
+_SCALARS = ("start_s", "end_s", "move_start_s", "move_end_s", "limit", "grip")
+_NUMBERS = ("a", "b", "K", "B")
+
+
+@cache
+def torque_source_dtype(width: int) -> np.dtype[np.void]:
+    """Returns the NumPy data type that stores the parameters of an operator or an environment.
+
+    There is one row per operator or environment. It contains the fields of `TorqueSource`, and
+    in addition:
+
+    - `table_first` and `table_count` select the rows of the common table that belong to this
+      operator or environment: recorded torques, sines, or parameters of a user's function.
+    - The other additional fields serve a function that a user wrote. `call` is its address. It
+      reads its input from `t_s` (time since the start of the session, s), `coordinates` (their
+      number), `at` (position of the arm, rad or m) and `speed` (derivative of `at`), and writes
+      the force or torque into `effort`, N or N m.
+
+    Args:
+        width: Largest length of the vectors of all operators and environments.
+    """
+    integers = ("kind", "sampled", "table_first", "table_count", "call", "coordinates")
+    scalars = (*_SCALARS, "t_s")
+    vectors = (*_NUMBERS, "at", "speed", "effort")
+    # Integers, scalars and vectors follow one another, all of 64 bits: the row has no gaps.
+    fields: list[Any] = [(name, "i8") for name in integers]
+    fields += [(name, "f8") for name in scalars]
+    fields += [(name, "f8", (width,)) for name in vectors]
+    return np.dtype((np.record, fields))
+
+
+TorqueSourceRows = NDArray[np.void]
+TorqueTable = Array
+SourceTorque = tuple[float, float, float]
+"""Torque ON each joint, N m, and the largest force of a wall in it, N."""
+
+_PULSE = int(TorqueKind.PULSE)
+_HAND = int(TorqueKind.HAND)
+_TASK_HAND = int(TorqueKind.TASK_HAND)
+_RECORDED = int(TorqueKind.RECORDED)
+_VISCOUS = int(TorqueKind.VISCOUS)
+_WALL = int(TorqueKind.WALL)
+_CHIRP = int(TorqueKind.CHIRP)
+_MULTISINE = int(TorqueKind.MULTISINE)
+_OWN_JOINTS, _OWN_TIP = map(int, OWN_KINDS)
+_LIVE_TIP, _LIVE_FORCE, _LIVE_JOINT = map(int, LIVE_KINDS)
+
+
+def torque_source_rows(
+    actors: tuple[TorqueSource, ...], joints: int = 2, axes: int = 2
+) -> tuple[TorqueSourceRows, TorqueTable]:
+    """Converts operators and environments to arrays, which compiled code can read.
+
+    Args:
+        actors: Operators and environments.
+        joints: Number of joints of the arm.
+        axes: Number of Cartesian axes: 2 for the planar arm, 3 for a chain of joints.
+
+    Returns:
+        An array with one row per operator or environment, and a table. The table contains
+        recorded torques and other lists of numbers. A row states which rows of the table belong
+        to it.
+    """
+    width = 1 + joints
+    rows = np.zeros(len(actors), torque_source_dtype(max(joints, axes)))
+    tables = [np.zeros((0, width))]
+    first = 0
+    row: Row
+    for row, actor in zip(rows, actors, strict=True):
+        for name in _SCALARS:
+            row[name] = getattr(actor, name)
+        for name in _NUMBERS:
+            numbers = getattr(actor, name)
+            row[name][: len(numbers)] = numbers
+        row.kind = int(actor.kind)
+        row.sampled = int(actor.sampled)
+        row.coordinates = axes if actor.kind is TorqueKind.OWN_TIP else joints
+        content = actor.table
+        if actor.kind in OWN_KINDS:
+            # The numbers of the user's model are stored in rows of the table.
+            row.call = compile_to_address(actor.model, "act", rows.dtype)
+            numbers = list_numbers(actor.model)
+            row_count = math.ceil(len(numbers) / width)
+            content = np.resize(numbers, (row_count, width))
+        if content is None:
+            continue
+        columns = np.shape(content)[1]
+        table = np.zeros((len(content), width))
+        table[:, :columns] = content
+        tables.append(table)
+        row.table_first = first
+        row.table_count = len(table)
+        first += len(table)
+    return rows, np.ascontiguousarray(np.concatenate(tables))
+
+
+@leaf
+def minimum_jerk(t_s: float, start_s: float, end_s: float) -> Pair:
+    """Returns the progress of a minimum-jerk motion, a smooth motion as of a human arm.
+
+        10 x^3 - 15 x^4 + 6 x^5,    x = (t - start) / (end - start)
+
+    After Flash and Hogan, "The coordination of arm movements", J. Neuroscience 5 (1985).
+
+    Args:
+        t_s: Time t, s.
+        start_s: Start of the motion, s.
+        end_s: End of the motion, s.
+
+    Returns:
+        The progress, 0 to 1, and its rate, 1/s.
+    """
+    if t_s <= start_s:
+        return 0.0, 0.0
+    if t_s >= end_s:
+        return 1.0, 0.0
+    duration_s = end_s - start_s
+    x = (t_s - start_s) / duration_s
+    rest = 1.0 - x
+    polynomial = 10.0 + x * (6.0 * x - 15.0)
+    progress = x * x * x * polynomial
+    rate = 30.0 * x * x * rest * rest / duration_s
+    return progress, rate
+
+
+@leaf
+def _spring_along(
+    actor: Row, i: int, progress: float, rate: float, at: float, speed: float
+) -> float:
+    """Returns the force of a hand's spring and damper along coordinate `i`, N or N m.
+
+        K (target - at) + B (target' - speed),    target = a + progress (b - a)
+
+    Args:
+        actor: The actor's row.
+        i: The coordinate.
+        progress: Progress of the target from `a` to `b`.
+        rate: Its derivative, 1/s.
+        at: Position of the arm along the coordinate, rad or m.
+        speed: Its derivative.
+    """
+    start: float = actor.a[i]
+    distance: float = actor.b[i] - start
+    target = start + progress * distance
+    target_speed = rate * distance
+    spring: float = actor.K[i] * (target - at)
+    damper: float = actor.B[i] * (target_speed - speed)
+    return spring + damper
+
+
+@leaf
+def _target_progress(actor: Row, t_s: float) -> Pair:
+    """Returns the progress of a target on its path from `a` to `b`, and its rate, 1/s.
+
+    A spring of an operator pulls the arm to this target. The target of a script moves along a
+    minimum-jerk path. The target of a live hand is at `a` and moves by b - a per second.
+
+    Args:
+        actor: Row of the operator, see `torque_source_dtype`.
+        t_s: Time since the epoch, the common start of the session, s.
+
+    Returns:
+        The progress, 0 to 1, for the position a + progress (b - a) of the target, and its
+        derivative, for the velocity rate (b - a).
+    """
+    is_live_hand = actor.kind >= _LIVE_TIP  # the live kinds have the largest numbers
+    if is_live_hand:
+        # `a` is the present target, and `b` the target one second later.
+        return 0.0, 1.0
+    return minimum_jerk(t_s, actor.move_start_s, actor.move_end_s)
+
+
+@leaf
+def _live_share(actor: Row, square: float) -> float:
+    """Returns the factor that reduces the force of a live hand to its grip and its limit.
+
+    A live hand is a person or program that moves the arm during the run. The part `grip` of its
+    force acts, and the norm of the force before this reduction is at most `limit`.
+
+    Args:
+        actor: Row of the live hand, with `grip`, 0 to 1, and `limit`, N or N m.
+        square: Square of the norm of the whole force, N^2 or N^2 m^2.
+    """
+    share: float = actor.grip
+    if square > actor.limit * actor.limit:
+        share *= actor.limit / math.sqrt(square)
+    return share
+
+
+@leaf
+def _spring_force(actor: Row, t_s: float, at: Vector, speed: Vector) -> Pair:
+    """Returns the force of an operator, who pulls the arm to a target, N or N m.
+
+    A spring and a damper act between the arm and the target along two coordinates. A live hand,
+    an operator who moves the arm during the run, is limited and acts only as far as it grips.
+    The kind LIVE_FORCE has no spring: its force is given.
+
+    Args:
+        actor: Row of the operator, see `torque_source_dtype`.
+        t_s: Time since the epoch, s.
+        at: Position of the arm along the coordinates, rad or m.
+        speed: Derivative of the position, rad/s or m/s.
+
+    Returns:
+        The force along each of the two coordinates.
+    """
+    progress, rate = _target_progress(actor, t_s)
+    x = _spring_along(actor=actor, i=0, progress=progress, rate=rate, at=at[0], speed=speed[0])
+    y = _spring_along(actor=actor, i=1, progress=progress, rate=rate, at=at[1], speed=speed[1])
+    is_scripted = actor.kind < _LIVE_TIP  # the live kinds have the largest numbers
+    if is_scripted:
+        return x, y
+    if actor.kind == _LIVE_FORCE:
+        # `a` is the given force, which replaces that of the spring.
+        x = actor.a[0]
+        y = actor.a[1]
+    square = x * x + y * y
+    share = _live_share(actor, square)
+    return share * x, share * y
+
+
+@leaf
+def _find_table_rows(actor: Row, t_s: float, table: TorqueTable) -> tuple[int, int, float]:
+    """Returns the two rows of a table around a time, and the fraction between them.
+
+    Args:
+        actor: Row of the actor.
+        t_s: Time since the epoch, s.
+        table: Tables of all actors.
+
+    Returns:
+        The indices of the rows, which are -1 outside of the table, and the fraction, 0 to 1.
+    """
+    first = actor.table_first
+    count = actor.table_count
+    last = first + count - 1
+    if count < 1 or t_s < table[first, 0] or t_s > table[last, 0]:
+        return -1, -1, 0.0
+    before = count_started(table, first, count, t_s) - 1
+    offset = max(min(before, count - 2), 0)
+    low = first + offset
+    high = min(low + 1, last)
+    low_s = table[low, 0]
+    span_s = table[high, 0] - low_s
+    fraction = (t_s - low_s) / span_s if span_s > 0.0 else 0.0
+    return low, high, fraction
+
+
+@leaf
+def _recorded_torque(actor: Row, t_s: float, table: TorqueTable) -> Pair:
+    """Returns the torque of a table by linear interpolation; zero outside of the table.
+
+    Args:
+        actor: Row of the actor.
+        t_s: Time since the epoch, s.
+        table: Tables of all actors.
+    """
+    low, high, x = _find_table_rows(actor, t_s, table)
+    if low < 0:
+        return 0.0, 0.0
+    first_step = table[high, 1] - table[low, 1]
+    second_step = table[high, 2] - table[low, 2]
+    first = table[low, 1] + x * first_step
+    second = table[low, 2] + x * second_step
+    return first, second
+
+
+@leaf
+def _sine_of_turns(turns: float) -> float:
+    """Returns sin(2 pi turns), with the whole turns removed first."""
+    fraction = turns - math.floor(turns)
+    s, _ = sincos(2.0 * math.pi * fraction)
+    return s
+
+
+@leaf
+def _chirp_size(actor: Row, t_s: float) -> float:
+    """Returns the sine of a chirp, a sine whose frequency changes linearly within a sweep.
+
+    With the frequencies f0 and f1 at the start and the end of a sweep, and the time x within
+    the present sweep, this is
+
+        sin(2 pi x (f0 + (f1 - f0) x / (2 span)))
+
+    Args:
+        actor: Row of the actor.
+        t_s: Time since the epoch, s.
+    """
+    first_hz = actor.b[0]
+    last_hz = actor.b[1]
+    span_s = actor.move_end_s - actor.move_start_s
+    x = t_s - actor.start_s
+    sweeps = math.floor(x / span_s)
+    x -= span_s * sweeps
+    # The mean frequency of the sweep so far.
+    rise_hz = 0.5 * (last_hz - first_hz)
+    mean_hz = first_hz + rise_hz / span_s * x
+    return _sine_of_turns(x * mean_hz)
+
+
+@leaf
+def _multisine_size(actor: Row, t_s: float, table: TorqueTable) -> float:
+    """Returns the sum of the sines of a multisine, each with amplitude 1.
+
+    Args:
+        actor: Row of the actor.
+        t_s: Time since the epoch, s.
+        table: Tables of all actors, here rows of frequency, Hz, and phase, turns.
+    """
+    total = 0.0
+    first = actor.table_first
+    elapsed_s = t_s - actor.start_s
+    for n in range(first, first + actor.table_count):
+        frequency_hz = table[n, 0]
+        phase_turns = table[n, 1]
+        turns = frequency_hz * elapsed_s + phase_turns
+        total += _sine_of_turns(turns)
+    return total
+
+
+@leaf
+def _scripted_size(actor: Row, t_s: float, table: TorqueTable) -> float:
+    """Returns the torque of a pulse, chirp or multisine as a multiple of `a`.
+
+    A pulse is sin^2(pi (t - start) / (end - start)), which is smooth at both ends as in Fig. 3
+    of the paper. The paper does not print the numbers of its pulses.
+
+    Args:
+        actor: Row of the actor.
+        t_s: Time since the epoch, s.
+        table: Tables of all actors.
+    """
+    if actor.kind == _PULSE:
+        elapsed_s = t_s - actor.start_s
+        duration_s = actor.end_s - actor.start_s
+        s, _ = sincos(math.pi * elapsed_s / duration_s)
+        return s * s
+    if actor.kind == _CHIRP:
+        return _chirp_size(actor, t_s)
+    return _multisine_size(actor, t_s, table)
+
+
+@leaf
+def _wall_force(actor: Row, at: Pair, speed: Pair) -> Pair:
+    """Returns the force of a wall on the end effector, N.
+
+    The force acts along the wall's normal and never pulls.
+
+    Args:
+        actor: Row of the wall.
+        at: Position of the end effector, m.
+        speed: Its velocity, m/s.
+    """
+    normal_x = actor.b[0]
+    normal_y = actor.b[1]
+    x = actor.a[0] - at[0]
+    y = actor.a[1] - at[1]
+    depth = x * normal_x + y * normal_y
+    if not depth > 0.0:
+        return 0.0, 0.0
+    outward = speed[0] * normal_x + speed[1] * normal_y
+    spring = actor.K[0] * depth
+    damper = actor.B[0] * outward
+    push = max(spring - damper, 0.0)
+    return push * normal_x, push * normal_y
+
+
+@leaf
+def _is_at_end_effector(actor: Row) -> bool:
+    """Returns True if an actor acts on the end effector, False if it acts on the joints."""
+    kind: int = actor.kind
+    return kind in (_TASK_HAND, _WALL, _OWN_TIP, _LIVE_TIP, _LIVE_FORCE)
+
+
+@leaf
+def _call_user_function(actor: Row, t_s: float, table: TorqueTable) -> None:
+    """Calls the compiled function of an operator or environment that a user wrote.
+
+    The function exchanges its numbers through the row of the actor: the caller has written the
+    position (`at`) and the velocity (`speed`), and the function writes the torque or force
+    (`effort`), which is zero until then.
+
+    Args:
+        actor: Row of the actor. `call` is the address of the function.
+        t_s: Time since the epoch (the common start of the session), s.
+        table: Tables of all actors. The rows `table_first` to `table_first + table_count` hold
+            the numbers of the user's model.
+    """
+    actor.t_s = t_s
+    for i in range(actor.coordinates):
+        actor.effort[i] = 0.0
+    first = actor.table_first
+    end = first + actor.table_count
+    numbers = table[first:end].reshape(-1)
+    call_address(actor.call, (numbers, actor))
+
+
+@leaf
+def _user_effort(actor: Row, t_s: float, at: Vector, speed: Vector, table: TorqueTable) -> Pair:
+    """Returns the effort of a user's function along two joints or axes, N m or N.
+
+    Args:
+        actor: Row of the actor.
+        t_s: Time since the epoch, s.
+        at: Position along the joints or axes, rad or m.
+        speed: Its derivative.
+        table: Tables of all actors.
+    """
+    for i in range(2):
+        actor.at[i] = at[i]
+        actor.speed[i] = speed[i]
+    _call_user_function(actor, t_s, table)
+    return actor.effort[0], actor.effort[1]
+
+
+@leaf
+def _end_effector_torque(
+    actor: Row, t_s: float, q: Vector, qd: Vector, lengths: Vector, table: TorqueTable
+) -> SourceTorque:
+    """Returns the joint torque J' F of an actor at the end effector, and |F| of a wall, N.
+
+    Args:
+        actor: Row of the actor.
+        t_s: Time since the epoch, s.
+        q: Joint angles, rad.
+        qd: Joint velocities, rad/s.
+        lengths: Lengths of the two links, m.
+        table: Tables of all actors.
+    """
+    _, at = forward_kinematics(lengths, q)
+    J_x, J_y = end_effector_jacobian(lengths, q)
+    speed_x = J_x[0] * qd[0] + J_x[1] * qd[1]
+    speed_y = J_y[0] * qd[0] + J_y[1] * qd[1]
+    speed = (speed_x, speed_y)
+    wall_n = 0.0
+    if actor.kind == _WALL:
+        force_x, force_y = _wall_force(actor, at, speed)
+        wall_n = math.sqrt(force_x * force_x + force_y * force_y)
+    elif actor.kind == _OWN_TIP:
+        force_x, force_y = _user_effort(actor=actor, t_s=t_s, at=at, speed=speed, table=table)
+    else:
+        force_x, force_y = _spring_force(actor, t_s, at, speed)
+    torque_0 = J_x[0] * force_x + J_y[0] * force_y
+    torque_1 = J_x[1] * force_x + J_y[1] * force_y
+    return torque_0, torque_1, wall_n
+
+
+@leaf
+def source_torque(
+    t_s: float, q: Vector, qd: Vector, lengths: Vector, actor: Row, table: TorqueTable
+) -> SourceTorque:
+    """Computes the torque with which a single operator or environment acts on the planar arm.
+
+    Args:
+        t_s: Time since the start of the session, s.
+        q: Joint angles, rad.
+        qd: Joint velocities, rad/s.
+        lengths: Lengths of the two links, m.
+        actor: Parameters of the operator or environment.
+        table: Recorded torques and other numbers of all operators and environments.
+
+    Returns:
+        The torques on the two joints, N m, and the force of the wall, N. The force is 0 if the
+        environment is not a wall.
+    """
+    if not actor.start_s <= t_s < actor.end_s:
+        return 0.0, 0.0, 0.0
+    if actor.kind == _HAND or actor.kind == _LIVE_JOINT:
+        torque = _spring_force(actor, t_s, q, qd)
+    elif actor.kind == _VISCOUS:
+        damping_0 = -actor.B[0] * qd[0]
+        damping_1 = -actor.B[1] * qd[1]
+        torque = (damping_0, damping_1)
+    elif actor.kind == _RECORDED:
+        torque = _recorded_torque(actor, t_s, table)
+    elif actor.kind == _OWN_JOINTS:
+        torque = _user_effort(actor=actor, t_s=t_s, at=q, speed=qd, table=table)
+    elif _is_at_end_effector(actor):
+        return _end_effector_torque(
+            actor=actor, t_s=t_s, q=q, qd=qd, lengths=lengths, table=table
+        )
+    else:
+        size = _scripted_size(actor, t_s, table)
+        scripted_0 = actor.a[0] * size
+        scripted_1 = actor.a[1] * size
+        torque = (scripted_0, scripted_1)
+    return torque[0], torque[1], 0.0
+
+
+@leaf
+def torque_on_arm(
+    t_s: float,
+    q: Vector,
+    qd: Vector,
+    lengths: Vector,
+    actors: TorqueSourceRows,
+    table: TorqueTable,
+    sampled: int,
+) -> SourceTorque:
+    """Computes the torque with which operators and environments act on the planar arm.
+
+    A sampled operator or environment is evaluated once per period of the control loop, and its
+    torque is constant until the next period. One call computes the torque of either the sampled
+    actors or all others.
+
+    Args:
+        t_s: Time since the start of the session, s.
+        q: Joint angles, rad.
+        qd: Joint velocities, rad/s.
+        lengths: Lengths of the two links, m.
+        actors: Operators and environments, one row for each.
+        table: Recorded torques and other numbers of all actors.
+        sampled: 1 for the torque of the sampled actors, 0 for all others.
+
+    Returns:
+        The torques on the two joints, N m, and the largest force of a wall, N.
+    """
+    total_0 = 0.0
+    total_1 = 0.0
+    largest_n = 0.0
+    for n in range(actors.shape[0]):
+        actor: Row = actors[n]
+        if actor.sampled == sampled:
+            torque = source_torque(
+                t_s=t_s, q=q, qd=qd, lengths=lengths, actor=actor, table=table
+            )
+            total_0 += torque[0]
+            total_1 += torque[1]
+            largest_n = max(largest_n, torque[2])
+    return total_0, total_1, largest_n
+
+
+@leaf
+def _force_in_space(
+    actor: Row, t_s: float, at: Three, speed: Three, table: TorqueTable
+) -> Three:
+    """Returns the force of an actor on an end effector in three dimensions, N.
+
+    Args:
+        actor: Row of the actor.
+        t_s: Time since the epoch, s.
+        at: Position of the end effector, m.
+        speed: Its velocity, m/s.
+        table: Tables of all actors.
+    """
+    if actor.kind == _OWN_TIP:
+        for i in range(3):
+            actor.at[i] = at[i]
+            actor.speed[i] = speed[i]
+        _call_user_function(actor, t_s, table)
+        return three(actor.effort)
+    if actor.kind != _WALL:
+        progress, rate = _target_progress(actor, t_s)
+        x = _spring_along(
+            actor=actor, i=0, progress=progress, rate=rate, at=at[0], speed=speed[0]
+        )
+        y = _spring_along(
+            actor=actor, i=1, progress=progress, rate=rate, at=at[1], speed=speed[1]
+        )
+        z = _spring_along(
+            actor=actor, i=2, progress=progress, rate=rate, at=at[2], speed=speed[2]
+        )
+        if actor.kind == _TASK_HAND:
+            return x, y, z
+        if actor.kind == _LIVE_FORCE:
+            x, y, z = three(actor.a)
+        square = x * x + y * y + z * z
+        share = _live_share(actor, square)
+        force = (x, y, z)
+        return scale(share, force)
+
+    # A wall.
+    normal = three(actor.b)
+    point = three(actor.a)
+    depth = dot(point, normal) - dot(at, normal)
+    if not depth > 0.0:
+        return 0.0, 0.0, 0.0
+    outward = dot(speed, normal)
+    spring = actor.K[0] * depth
+    damper = actor.B[0] * outward
+    push = max(spring - damper, 0.0)
+    return scale(push, normal)
+
+
+@leaf
+def _add_joint_torque(
+    actor: Row,
+    t_s: float,
+    q: Vector,
+    qd: Vector,
+    joints: int,
+    table: TorqueTable,
+    torque: Array,
+) -> None:
+    """Adds the torque of an actor that acts on the joints of a chain.
+
+    Args:
+        actor: Row of the actor.
+        t_s: Time since the epoch, s.
+        q: Joint positions, shape (n,).
+        qd: Joint velocities, shape (n,).
+        joints: Number n of joints.
+        table: Tables of all actors.
+        torque: Changed, shape (n,), N m.
+    """
+    if actor.kind == _HAND or actor.kind == _LIVE_JOINT:
+        progress, rate = _target_progress(actor, t_s)
+        share = 1.0
+        square = 0.0
+        if actor.kind == _LIVE_JOINT:
+            for i in range(joints):
+                pull = _spring_along(
+                    actor=actor, i=i, progress=progress, rate=rate, at=q[i], speed=qd[i]
+                )
+                square += pull * pull
+            share = _live_share(actor, square)
+        for i in range(joints):
+            pull = _spring_along(
+                actor=actor, i=i, progress=progress, rate=rate, at=q[i], speed=qd[i]
+            )
+            torque[i] += share * pull
+    elif actor.kind == _VISCOUS:
+        for i in range(joints):
+            torque[i] -= actor.B[i] * qd[i]
+    elif actor.kind == _RECORDED:
+        low, high, x = _find_table_rows(actor, t_s, table)
+        if low >= 0:
+            for i in range(joints):
+                recorded = table[low, 1 + i]
+                step = table[high, 1 + i] - recorded
+                torque[i] += recorded + x * step
+    elif actor.kind == _OWN_JOINTS:
+        for i in range(joints):
+            actor.at[i] = q[i]
+            actor.speed[i] = qd[i]
+        _call_user_function(actor, t_s, table)
+        for i in range(joints):
+            torque[i] += actor.effort[i]
+    else:
+        size = _scripted_size(actor, t_s, table)
+        for i in range(joints):
+            torque[i] += actor.a[i] * size
+
+
+@leaf
+def _tip_motion(qd: Vector, tip: Vector, chain: RowArray) -> tuple[Three, Three]:
+    """Returns position and velocity of a chain's end effector, m and m/s.
+
+    Its Jacobian remains in the chain's rows.
+
+    Args:
+        qd: Joint velocities, shape (n,).
+        tip: End effector in the last link's frame, m.
+        chain: Rows of the joints, after `place_joints`.
+    """
+    position = place_end_effector(chain, tip)
+    velocity = (0.0, 0.0, 0.0)
+    for i in range(chain.shape[0]):
+        column = three(chain[i].J_lin)
+        velocity = add(velocity, scale(qd[i], column))
+    return position, velocity
+
+
+@leaf
+def put_torque_on_chain(
+    t_s: float,
+    q: Vector,
+    qd: Vector,
+    tip: Vector,
+    chain: RowArray,
+    actors: TorqueSourceRows,
+    table: TorqueTable,
+    sampled: int,
+    torque: Array,
+) -> float:
+    """Computes the torque with which operators and environments act on a chain of joints.
+
+    A sampled operator or environment is evaluated once per period of the control loop, and its
+    torque is constant until the next period. One call computes the torque of either the sampled
+    actors or all others.
+
+    Args:
+        t_s: Time since the start of the session, s.
+        q: Joint positions, shape (n,), rad or m.
+        qd: Joint velocities, shape (n,), rad/s or m/s.
+        tip: Position of the end effector in the last link's frame, m.
+        chain: Data of the n joints, one row per joint. `place_joints` must have been called for
+            the same positions.
+        actors: Operators and environments, one row for each.
+        table: Recorded torques and other numbers of all actors.
+        sampled: 1 for the torque of the sampled actors, 0 for all others.
+        torque: Receives the torque on the arm, shape (n,), N m.
+
+    Returns:
+        The largest force of a wall, N. 0 if no wall is touched.
+    """
+    n = chain.shape[0]
+    for i in range(n):
+        torque[i] = 0.0
+    at = (0.0, 0.0, 0.0)
+    speed = (0.0, 0.0, 0.0)
+    has_motion = False
+    largest_n = 0.0
+    for m in range(actors.shape[0]):
+        actor: Row = actors[m]
+        is_active = actor.start_s <= t_s < actor.end_s
+        if actor.sampled != sampled or not is_active:
+            continue
+        if not _is_at_end_effector(actor):
+            _add_joint_torque(
+                actor=actor, t_s=t_s, q=q, qd=qd, joints=n, table=table, torque=torque
+            )
+            continue
+        if not has_motion:
+            at, speed = _tip_motion(qd, tip, chain)
+            has_motion = True
+        force = _force_in_space(actor=actor, t_s=t_s, at=at, speed=speed, table=table)
+        for i in range(n):
+            column = three(chain[i].J_lin)
+            torque[i] += dot(column, force)
+        if actor.kind == _WALL:
+            force_n = math.sqrt(dot(force, force))
+            largest_n = max(largest_n, force_n)
+    return largest_n

@@ -1,0 +1,264 @@
+"""Computes with rotation vectors (axis times angle, rad), with equal bits on any machine.
+
+The angular velocity of a changing rotation vector u is J(u) u', where J is the left Jacobian of
+the rotation group (J. Sola, J. Deray and D. Atchuthan, "A micro Lie theory for state estimation
+in robotics", arXiv 1812.01537, Eq. 145, 146). The arc tangent is that of S. Moshier's Cephes
+library.
+
+Invariant:
+    - A rotation vector is at most half a turn long.
+    - `rotation_matrix` and `rotation_vector` are inverse to each other.
+    - Only basic arithmetic and square roots are used, which all machines round alike.
+"""
+
+import math
+
+from ..step.jit import leaf
+from ..step.vectors import Array
+from .chain import Matrix, Three, add, cross, dot, scale
+from .elementary import sincos
+
+_SMALL = 1e-8
+"""Below this angle, rad, the sine equals the angle to the last bit."""
+_SHORT = 0.02
+"""Below this angle, rad, the first terms of a series are exact to the last bit, in contrast to
+closed forms.
+"""
+
+
+@leaf
+def arctan(x: float) -> float:
+    """Returns the arc tangent of a number from 0 to 1, rad (Cephes, `atan`).
+
+    The method is a rational function P / Q of x^2. Numbers above 0.66 are transformed first.
+    """
+    offset = 0.0
+    if x > 0.66:
+        # arctan(x) = pi / 4 + arctan((x - 1) / (x + 1))
+        offset = 0.25 * math.pi
+        x = (x - 1.0) / (x + 1.0)
+    z = x * x
+    P = -8.750608600031904122785e-1
+    P = P * z - 1.615753718733365076637e1
+    P = P * z - 7.500855792314704667340e1
+    P = P * z - 1.228866684490136173410e2
+    P = P * z - 6.485021904942025371773e1
+    Q = z + 2.485846490142306297962e1
+    Q = Q * z + 1.650270098316988542046e2
+    Q = Q * z + 4.328810604912902668951e2
+    Q = Q * z + 4.853903996359136964868e2
+    Q = Q * z + 1.945506571482613964425e2
+    return offset + (x + x * (z * P / Q))
+
+
+@leaf
+def rotation_matrix(vector: Three) -> Matrix:
+    """Returns the rotation matrix of a rotation vector, three rows.
+
+    A rotation vector has the direction of the axis, and its length is the angle in rad. The
+    formula is that of Rodrigues, with limits for small angles.
+    """
+    x, y, z = vector
+    angle = math.sqrt(x * x + y * y + z * z)
+    s, c = sincos(angle)
+    # The limits of the quotients for small angles.
+    by_sine = 1.0
+    by_cosine = 0.5
+    if angle > _SMALL:
+        by_sine = s / angle
+        by_cosine = (1.0 - c) / (angle * angle)
+    xx = by_cosine * x * x
+    yy = by_cosine * y * y
+    zz = by_cosine * z * z
+    xy = by_cosine * x * y
+    xz = by_cosine * x * z
+    yz = by_cosine * y * z
+    sx = by_sine * x
+    sy = by_sine * y
+    sz = by_sine * z
+    row_x = (1.0 - yy - zz, xy - sz, xz + sy)
+    row_y = (xy + sz, 1.0 - xx - zz, yz - sx)
+    row_z = (xz - sy, yz + sx, 1.0 - xx - yy)
+    return row_x, row_y, row_z
+
+
+@leaf
+def _quaternion(R: Array | Matrix) -> tuple[float, Three]:
+    """Returns the quaternion (w, v) of a rotation, with w >= 0.
+
+    The method starts from the largest component (Shepperd, 1978), and so never divides by a
+    small number.
+    """
+    xx, xy, xz = R[0]
+    yx, yy, yz = R[1]
+    zx, zy, zz = R[2]
+    trace = xx + yy + zz
+    if trace >= max(xx, yy, zz):
+        w = 1.0 + trace
+        v = (zy - yz, xz - zx, yx - xy)
+    elif xx >= yy and xx >= zz:
+        w = zy - yz
+        v = (1.0 + xx - yy - zz, xy + yx, xz + zx)
+    elif yy >= zz:
+        w = xz - zx
+        v = (xy + yx, 1.0 + yy - xx - zz, yz + zy)
+    else:
+        w = yx - xy
+        v = (xz + zx, yz + zy, 1.0 + zz - xx - yy)
+    x, y, z = v
+    length = math.sqrt(w * w + x * x + y * y + z * z)
+    if w < 0.0:
+        length = -length
+    return w / length, scale(1.0 / length, v)
+
+
+@leaf
+def rotation_vector(R: Array | Matrix) -> Three:
+    """Returns the rotation vector of a rotation matrix, rad.
+
+    A rotation vector has the direction of the axis, and its length is the angle.
+
+    Args:
+        R: The rotation matrix, three rows.
+    """
+    w, v = _quaternion(R)
+    x, y, z = v
+    square = x * x + y * y + z * z
+    n = math.sqrt(square)
+    if n < _SMALL:
+        return scale(2.0 / w, v)
+    # `arctan` takes arguments up to 1.
+    half_angle = arctan(n / w) if n <= w else 0.5 * math.pi - arctan(w / n)
+    angle = 2.0 * half_angle
+    return scale(angle / n, v)
+
+
+@leaf
+def relative_rotation(R: Array | Matrix, other: Array | Matrix) -> Three:
+    """Returns the rotation from the orientation `other` to the orientation R, in base axes.
+
+    Args:
+        R: Rotation matrix of the one orientation, three rows.
+        other: Rotation matrix of the other orientation, three rows.
+
+    Returns:
+        The rotation vector of R other', whose direction is the axis and whose length is the
+        angle in rad.
+    """
+    row_1 = other[0]
+    row_2 = other[1]
+    row_3 = other[2]
+    first = _times_rows(R[0], row_1, row_2, row_3)
+    second = _times_rows(R[1], row_1, row_2, row_3)
+    third = _times_rows(R[2], row_1, row_2, row_3)
+    return rotation_vector((first, second, third))
+
+
+@leaf
+def _times_rows(row: Three, a: Three, b: Three, c: Three) -> Three:
+    """Returns the scalar products of `row` with the three rows a, b and c."""
+    x = row[0]
+    y = row[1]
+    z = row[2]
+    with_a = x * a[0] + y * a[1] + z * a[2]
+    with_b = x * b[0] + y * b[1] + z * b[2]
+    with_c = x * c[0] + y * c[1] + z * c[2]
+    return with_a, with_b, with_c
+
+
+@leaf
+def compose_rotations(turn: Three, vector: Three) -> Three:
+    """Returns the rotation `vector`, followed by the rotation `turn` about base axes.
+
+    All three are rotation vectors: the direction is the axis, the length the angle in rad. With
+    the rotation matrices T of `turn` and R of `vector`, the result is the rotation vector of
+    T R. `relative_rotation` returns that of T X' for a matrix X. Therefore X is the inverse R'.
+
+    Args:
+        turn: Rotation vector of the second rotation.
+        vector: Rotation vector of the first rotation.
+    """
+    second_matrix = rotation_matrix(turn)
+    inverse_vector = scale(-1.0, vector)
+    first_matrix_inverse = rotation_matrix(inverse_vector)
+    return relative_rotation(second_matrix, first_matrix_inverse)
+
+
+@leaf
+def rotate_by_vector(turn: Three, vector: Three) -> Three:
+    """Returns a vector after a rotation.
+
+    Args:
+        turn: Rotation vector: its direction is the axis, its length the angle in rad.
+        vector: The vector to rotate.
+    """
+    x, y, z = rotation_matrix(turn)
+    return _times_rows(vector, x, y, z)
+
+
+@leaf
+def length(vector: Three) -> float:
+    """Returns the Euclidean length of a vector, in the unit of its numbers."""
+    return math.sqrt(dot(vector, vector))
+
+
+@leaf
+def angular_velocity(turn: Three, rate: Three) -> Three:
+    """Returns the angular velocity of a body whose rotation vector changes, rad/s.
+
+    The angular velocity differs from the derivative of the rotation vector as soon as the axis
+    changes too.
+
+    Args:
+        turn: The rotation vector, rad.
+        rate: The derivative of the rotation vector, rad/s.
+    """
+    angle = length(turn)
+    a2 = angle * angle
+    if angle < _SHORT:
+        a4 = a2 * a2
+        once_gain = 0.5 - a2 / 24.0 + a4 / 720.0
+        twice_gain = 1.0 / 6.0 - a2 / 120.0 + a4 / 5040.0
+    else:
+        s, c = sincos(angle)
+        once_gain = (1.0 - c) / a2
+        twice_gain = (angle - s) / (a2 * angle)
+    once = cross(turn, rate)
+    twice = cross(turn, once)
+    once_part = scale(once_gain, once)
+    twice_part = scale(twice_gain, twice)
+    correction = add(once_part, twice_part)
+    return add(rate, correction)
+
+
+@leaf
+def rotation_vector_rate(turn: Three, velocity: Three) -> Three:
+    """Returns the derivative of a rotation vector at an angular velocity, rad/s.
+
+    With the rotation vector u, its length a (the angle), and the angular velocity w about base
+    axes, the derivative is w times the inverse of the left Jacobian:
+
+        u' = w - 1/2 u x w + c u x (u x w),    c = (1 - (a / 2) cos(a / 2) / sin(a / 2)) / a^2
+
+    For small angles, c is the series 1/12 + a^2 / 720 + a^4 / 30240. The function is the
+    inverse of `angular_velocity`.
+
+    Args:
+        turn: The rotation vector u, rad.
+        velocity: The angular velocity w, rad/s.
+    """
+    angle = length(turn)
+    a2 = angle * angle
+    if angle < _SHORT:
+        a4 = a2 * a2
+        c = 1.0 / 12.0 + a2 / 720.0 + a4 / 30240.0
+    else:
+        half_angle = 0.5 * angle
+        sine, cosine = sincos(half_angle)
+        c = (1.0 - half_angle * cosine / sine) / a2
+    u_x_w = cross(turn, velocity)
+    u_x_u_x_w = cross(turn, u_x_w)
+    first_order_part = scale(-0.5, u_x_w)
+    second_order_part = scale(c, u_x_u_x_w)
+    correction = add(first_order_part, second_order_part)
+    return add(velocity, correction)

@@ -1,0 +1,425 @@
+"""Lets the end effectors of different arms follow each other (control in task space).
+
+Without task space, arms compare their joint angles, which requires equal arms.
+
+Symbols: q and qd are the positions and velocities of the joints, J is the Jacobian of the
+coordinates that are followed, and Jd its derivative. x is the pose of the end effector, and e
+the difference from the desired pose. The error decays with the rate Lambda, in 1/s. The
+transpose of a matrix is written J', and the derivative of a vector dx/dt.
+
+The control law needs a reference velocity v of the joints and its derivative a:
+
+    v = psi + J' y                J J' y     = -Lambda e - J psi
+    a = dpsi/dt + d(J' y)/dt      J J' dy/dt = -Lambda de/dt - Jd psi - J dpsi/dt
+                                               - (Jd J' + J Jd') y
+
+Here psi = -k (q - q_posture) pulls the joints to a preferred posture with the rate k, in 1/s,
+as far as this does not move the end effector. The second equation defines y. For the filtered
+error r = qd - v it follows that J r = dx/dt + Lambda e.
+
+Near singular poses, J J' is damped. The damping is zero while 1 / trace((J J')^-1) is above the
+square of `singular_value`. This number is a lower bound of the square of the least singular
+value of J.
+
+Source: Y.-C. Liu and N. Chopra, "Controlled synchronization of heterogeneous robotic
+manipulators in the task space", IEEE Trans. Robotics 28 (2012); damping after Y. Nakamura and
+H. Hanafusa, "Inverse kinematic solutions with singularity robustness", J. Dynamic Systems,
+Measurement, and Control 108 (1986).
+
+Invariant:
+    - All vectors of the task refer to a frame that all arms share. They have 3 numbers for a
+      position, m, or 6 for a pose with an orientation (`rotation_vector`).
+    - A coordinate that an arm does not follow has no effect on this arm.
+"""
+
+from ..step.jit import leaf
+from ..step.vectors import Array, Row, RowArray
+from .chain import Three, add, cross, place_end_effector, put_three, scale, subtract, three
+from .rotation import compose_rotations, relative_rotation, rotation_matrix
+
+POSITION = 3
+"""Number of a task's coordinates without an orientation."""
+POSE = 6
+"""Number of a task's coordinates with an orientation."""
+TINY = 1e-12
+"""Below this pivot of J J', the end effector cannot move along the axis at all."""
+
+
+@leaf
+def has_orientation(s: Row) -> bool:
+    """Returns True if the sites share poses, a position and an orientation.
+
+    It is False if they share only positions, or joint angles.
+    """
+    is_pose: bool = s.task != 0 and s.shared == POSE
+    return is_pose
+
+
+@leaf
+def count_linear_coordinates(s: Row) -> int:
+    """Returns the number of shared coordinates for which a difference is a plain subtraction.
+
+    They come first, and are all coordinates except those of an orientation.
+    """
+    return POSITION if has_orientation(s) else s.q_des.shape[0]
+
+
+@leaf
+def update_pose(s: Row, chain: RowArray) -> None:
+    """Computes the motion of the end effector from that of the joints.
+
+    The pose x, its velocity xd, the Jacobian J and the derivative of J are written into the row
+    of the site. The coordinates are a position, or a position and a rotation vector. They refer
+    to the frame that all arms share.
+
+    Args:
+        s: Row of the site, with the joint positions q and velocities qd; written. `tip` is the
+            end effector's position in the frame of the last link, m, `tip_back` the inverse of
+            its orientation in this frame, and `scale` the size of the shared coordinates in
+            relation to this arm.
+        chain: Rows of the chain, after `place_joints`.
+    """
+    # This also writes the frames of the links and the columns of J in base axes.
+    position = place_end_effector(chain, s.tip)
+    shared_position = scale(s.scale, position)
+    put_three(s.x[:3], shared_position)
+    if s.shared == POSE:
+        # The orientation of the end effector is R_base tip_back', which this function converts
+        # to a rotation vector.
+        last: Row = chain[chain.shape[0] - 1]
+        orientation = relative_rotation(last.R_base, s.tip_back)
+        put_three(s.x[3:], orientation)
+
+    # J and xd = J qd
+    J = s.J
+    xd = s.xd
+    for j in range(s.shared):
+        xd[j] = 0.0
+    for i in range(chain.shape[0]):
+        row: Row = chain[i]
+        rate = s.qd[i]
+        for j in range(3):
+            linear = s.scale * row.J_lin[j]
+            J[j, i] = linear
+            xd[j] += linear * rate
+            if s.shared == POSE:
+                angular = row.J_ang[j]
+                J[3 + j, i] = angular
+                xd[3 + j] += angular * rate
+    _update_jacobian_rate(s, chain, position)
+
+
+@leaf
+def _update_jacobian_rate(s: Row, chain: RowArray, tip: Three) -> None:
+    """Writes the derivative of J along qd.
+
+    The axes turn with their links, and the joints' origins move.
+
+    Args:
+        s: The site's row.
+        chain: The chain's rows, after `place_end_effector`.
+        tip: Position of the end effector in base axes, m.
+    """
+    zeros = (0.0, 0.0, 0.0)
+    angular_velocity = zeros
+    origin_velocity = zeros
+    tip_velocity = zeros
+    origin_before = zeros
+    for i in range(chain.shape[0]):
+        column = three(chain[i].J_lin)
+        joint_part = scale(s.qd[i], column)
+        tip_velocity = add(tip_velocity, joint_part)
+    for i in range(chain.shape[0]):
+        row: Row = chain[i]
+        axis = three(row.axis_base)
+        origin = three(row.p_base)
+        joint_velocity = scale(s.qd[i], axis)
+        # The previous link carries the joint's origin along.
+        link_vector = subtract(origin, origin_before)
+        link_velocity = cross(angular_velocity, link_vector)
+        origin_velocity = add(origin_velocity, link_velocity)
+        origin_before = origin
+        if row.prismatic == 0:
+            # The derivatives of the joint's columns, J_ang = axis and J_lin = axis x lever.
+            angular_velocity = add(angular_velocity, joint_velocity)
+            axis_rate = cross(angular_velocity, axis)
+            lever = subtract(tip, origin)
+            lever_rate = subtract(tip_velocity, origin_velocity)
+            axis_part = cross(axis_rate, lever)
+            lever_part = cross(axis, lever_rate)
+            linear = add(axis_part, lever_part)
+            angular = axis_rate
+        else:
+            # The derivatives of J_ang = 0 and J_lin = axis.
+            origin_velocity = add(origin_velocity, joint_velocity)
+            linear = cross(angular_velocity, axis)
+            angular = zeros
+        for j in range(3):
+            s.Jd[j, i] = s.scale * linear[j]
+            if s.shared == POSE:
+                s.Jd[3 + j, i] = angular[j]
+
+
+@leaf
+def update_orientation_reference(s: Row, links: RowArray) -> None:
+    """Computes the orientation that the end effector should reach, and its angular velocity.
+
+    The reference results from the own orientation R_i by a rotation towards the other arms. The
+    rotation vector is
+
+        -sum_j alpha_ij Log(R_i R_j')
+
+    where R_j is the orientation of arm j, alpha_ij the weight with which this arm follows it,
+    and Log converts a rotation matrix to a rotation vector. The angular velocity is the
+    weighted sum of the other arms' angular velocities. It is exact only if the orientations
+    agree.
+
+    Args:
+        s: State of the site (the process that runs this arm); the reference is written into it.
+        links: States of the links from the other arms, one row per link.
+    """
+    rotation_vector = three(s.x[3:])
+    orientation = rotation_matrix(rotation_vector)
+    difference = (0.0, 0.0, 0.0)
+    velocity = (0.0, 0.0, 0.0)
+    for j in range(links.shape[0]):
+        link: Row = links[j]
+        peer_vector = three(link.q[3:])
+        peer_orientation = rotation_matrix(peer_vector)
+        turn = relative_rotation(orientation, peer_orientation)
+        weighted_turn = scale(link.alpha, turn)
+        difference = add(difference, weighted_turn)
+        peer_velocity = scale(link.alpha, three(link.qd[3:]))
+        ramp_velocity = scale(-link.alpha_rate, turn)
+        link_velocity = add(peer_velocity, ramp_velocity)
+        velocity = add(velocity, link_velocity)
+    turn_back = scale(-1.0, difference)
+    reference = compose_rotations(turn_back, rotation_vector)
+    put_three(s.q_des[3:], reference)
+    put_three(s.qd_des[3:], velocity)
+
+
+@leaf
+def _factor(s: Row, damping: float) -> None:
+    """Writes the factors L D L' of J J' + damping I into the lower part of `s.A`.
+
+    L is a lower triangular matrix with ones on its diagonal, and D a diagonal matrix. They are
+    stored together: D on the diagonal of A, and L below it. Row by row, with the matrix
+    B = J J' + damping I,
+
+        L_jk D_k = B_jk - sum_{p < k} L_jp L_kp D_p    for k < j
+        D_j      = B_jj - sum_{p < j} L_jp^2 D_p
+
+    J has a row of zeros for each axis that is not followed. There 1 is added to the diagonal of
+    B, so that its pivot D_j is not zero. If another pivot vanishes, the arm cannot move along
+    the axis, and L is zero in its column.
+
+    Args:
+        s: Row of the site. `axes` is 1 for each axis that is followed, otherwise 0.
+        damping: The damping, in the unit of J J'. It is zero except near singular poses.
+    """
+    J = s.J
+    A = s.A
+    for j in range(s.shared):
+        for k in range(j + 1):
+            entry = 0.0  # of B, then of L or D
+            if k == j:
+                entry = damping + 1.0 - s.axes[j]
+            for i in range(s.joints):
+                entry += J[j, i] * J[k, i]
+            for p in range(k):
+                pivot = A[p, p]
+                product = A[j, p] * A[k, p]
+                entry -= product * pivot
+            if k < j:
+                pivot = A[k, k]
+                entry = entry / pivot if pivot > TINY else 0.0
+            A[j, k] = entry
+
+
+@leaf
+def _solve(s: Row, b: Array, y: Array) -> None:
+    """Writes the solution y of L D L' y = b, with the factors in `s.A`.
+
+    Args:
+        s: Row of the site.
+        b: Right-hand side, shape (m,).
+        y: Written, shape (m,).
+    """
+    A = s.A
+    m = s.shared
+    for j in range(m):
+        y[j] = b[j]
+        for k in range(j):
+            y[j] -= A[j, k] * y[k]
+    for j in range(m - 1, -1, -1):
+        pivot = A[j, j]
+        y[j] = y[j] / pivot if pivot > TINY else 0.0
+        for k in range(j + 1, m):
+            y[j] -= A[k, j] * y[k]
+
+
+@leaf
+def _factor_damped(s: Row) -> None:
+    """Factors J J' with the damping that it needs near singular poses.
+
+    The number 1 / trace((J J')^-1) is a lower bound of the square of the least singular value
+    of J. The damping is the amount by which it is below the square of `s.singular_value`, and
+    zero otherwise. The trace is that of the axes that are followed. It is computed from the
+    factors without damping, by solving for each column of the inverse.
+
+    Args:
+        s: Row of the site. J and its derivative Jd get rows of zeros for axes that are not
+            followed. The factors are written into A, see `_factor`. `b` and `y` are work space.
+    """
+    for j in range(s.shared):
+        mask = s.axes[j]
+        for i in range(s.joints):
+            s.J[j, i] *= mask
+            s.Jd[j, i] *= mask
+
+    _factor(s, 0.0)
+    limit = s.singular_value * s.singular_value
+    trace = 0.0
+    for j in range(s.shared):
+        pivot = s.A[j, j]
+        is_singular = not pivot > TINY  # also for NaN
+        if is_singular:
+            # The true trace is infinite. This value makes the lower bound practically zero.
+            trace = 1.0 / TINY
+        # Solving for a unit vector gives a column of the inverse.
+        for k in range(s.shared):
+            s.b[k] = 1.0 if k == j else 0.0
+        _solve(s, s.b, s.y)
+        diagonal = s.y[j]
+        trace += diagonal * s.axes[j]
+
+    lower_bound = 1.0 / trace if trace > 0.0 else limit
+    if lower_bound < limit:
+        damping = limit - lower_bound
+        _factor(s, damping)
+
+
+@leaf
+def _update_axis_errors(s: Row) -> None:
+    """Writes e and ed of the task; they are zero along axes that are not followed."""
+    for j in range(s.shared):
+        s.e[j] = s.x[j] - s.q_des[j]
+        s.ed[j] = s.xd[j] - s.qd_des[j]
+    if s.shared == POSE:
+        orientation = rotation_matrix(three(s.x[3:]))
+        reference = rotation_matrix(three(s.q_des[3:]))
+        turn = relative_rotation(orientation, reference)
+        put_three(s.e[3:], turn)
+    for j in range(s.shared):
+        mask = s.axes[j]
+        s.e[j] *= mask
+        s.ed[j] *= mask
+
+
+@leaf
+def update_task_errors(s: Row) -> None:
+    """Computes the errors of the end effector, and the reference motion of the joints.
+
+    The results are the errors e and ed of the coordinates that are followed, the reference
+    velocity v and acceleration a of the joints, and the filtered error r = qd - v. The
+    equations are at the top of this module.
+
+    The fields `stage_q` and `stage_qd`, which the integrator needs later, are overwritten with
+    intermediate results.
+
+    Args:
+        s: State of the site (the process that runs the arm); the results are written into it.
+    """
+    n = s.joints
+    m = s.shared
+    J = s.J
+    Jd = s.Jd
+    b = s.b
+    y = s.y
+    v = s.v
+    a = s.a
+    Jd_y = s.stage_q
+    J_y = s.stage_qd
+    _update_axis_errors(s)
+    _factor_damped(s)
+    k = s.posture_rate
+    # y, from J J' y = -Lambda e - J psi
+    for j in range(m):
+        b[j] = -s.Lambda[j] * s.e[j]
+        for i in range(n):
+            posture_error = s.q[i] - s.posture[i]
+            b[j] += J[j, i] * k * posture_error
+    # v and a start as psi and its derivative.
+    for i in range(n):
+        posture_error = s.q[i] - s.posture[i]
+        v[i] = -k * posture_error
+        a[i] = -k * s.qd[i]
+    _solve(s, b, y)
+    for i in range(n):
+        Jd_y[i] = 0.0
+        J_y[i] = 0.0
+        for j in range(m):
+            Jd_y[i] += Jd[j, i] * y[j]
+            J_y[i] += J[j, i] * y[j]
+    # y', from J J' y' = -Lambda e' - Jd (psi + J' y) - J (psi' + Jd' y)
+    for j in range(m):
+        b[j] = -s.Lambda[j] * s.ed[j]
+        for i in range(n):
+            rate = v[i] + J_y[i]
+            acceleration = a[i] + Jd_y[i]
+            Jd_part = Jd[j, i] * rate
+            J_part = J[j, i] * acceleration
+            b[j] -= Jd_part + J_part
+    _solve(s, b, y)
+    # v = psi + J' y and a = psi' + Jd' y + J' y'
+    for i in range(n):
+        v[i] += J_y[i]
+        a[i] += Jd_y[i]
+        for j in range(m):
+            a[i] += J[j, i] * y[j]
+        s.r[i] = s.qd[i] - v[i]
+
+
+@leaf
+def add_task_torque(s: Row, gains: Array, values: Array, factor: float, torque: Array) -> None:
+    """Adds the joint torque that exerts a force at the end effector.
+
+    The torque is factor J' (gains * values), where J is the Jacobian of the end effector.
+
+    Args:
+        s: Row of the site, with J.
+        gains: Gain per coordinate of the task.
+        values: Value per coordinate of the task.
+        factor: Factor of the force.
+        torque: Changed: the sum, shape (n,), N m.
+    """
+    for i in range(s.joints):
+        for j in range(s.shared):
+            force = gains[j] * values[j]
+            torque[i] += factor * s.J[j, i] * force
+
+
+@leaf
+def update_wrench(s: Row) -> None:
+    """Computes the force and torque at the end effector that correspond to tau_x.
+
+    This wrench is the solution of
+
+        J J' wrench = J tau_x
+
+    where J is the Jacobian of the end effector and tau_x the exogenous torque of the joints,
+    which comes from operators and environments. The torque ON the arm is -tau_x. J J' must have
+    been factored before, with its damping near singular poses (`update_task_errors`).
+
+    Args:
+        s: Row of the site, with the torque ON each joint in `on_arm`, N m. The wrench is
+            written into it, N and N m, one number per shared coordinate.
+    """
+    J_tau_x = s.b
+    for j in range(s.shared):
+        J_tau_x[j] = 0.0
+        for i in range(s.joints):
+            torque_on_joint = s.on_arm[i]
+            J_tau_x[j] -= s.J[j, i] * torque_on_joint
+    _solve(s, J_tau_x, s.wrench)

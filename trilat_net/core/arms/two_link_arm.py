@@ -1,0 +1,276 @@
+"""Computes the dynamics, the regressor and the kinematics of the planar two-link arm.
+
+Symbols: q are the joint angles, rad, qd their velocities, rad/s, g is the gravitational
+acceleration, m/s^2, `lengths` are the lengths of the two links, m, and theta are the five
+dynamic parameters, which combine masses, lengths and inertias. The regressor is the matrix
+whose product with theta is the torque of the arm's dynamics. Angles are measured from the
+horizontal; the second angle is relative to the first link.
+
+Source: "Adaptive Control of Dual User Teleoperation with Time Delay and Dynamic Uncertainty",
+Eq. (1)-(5), (8), (12), (24). Eq. (24) prints theta_5 = m2 l2, which holds only for lc2 = l2;
+here theta_5 = m2 lc2.
+
+Invariant:
+    - Each dynamic term is linear in theta, Eq. (5), and depends on theta, shape (5,), instead
+      of lengths and masses.
+    - Vectors are read by index and returned as tuples, matrices as tuples of rows (`vectors`).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..step.jit import leaf
+from ..step.vectors import Array, Five, Pair, Vector
+from .elementary import sincos
+
+JOINTS = 2
+PARAMETERS = 5
+
+
+class ArmLinks(NamedTuple):
+    """Lengths, masses and inertias of the two links, which `theta_from_links` converts.
+
+    Attributes:
+        l1_m: Length of the first link, m.
+        m1_kg: Mass of the first link, kg.
+        lc1_m: Distance from the first joint to the link's centre of mass, m.
+        I1_kg_m2: Inertia of the first link about its centre of mass, kg m^2.
+        l2_m: Length of the second link, m.
+        m2_kg: Mass of the second link, kg.
+        lc2_m: Distance from the second joint to the link's centre of mass, m.
+        I2_kg_m2: Inertia of the second link about its centre of mass, kg m^2.
+    """
+
+    l1_m: float
+    m1_kg: float
+    lc1_m: float
+    I1_kg_m2: float
+    l2_m: float
+    m2_kg: float
+    lc2_m: float
+    I2_kg_m2: float
+
+
+def theta_from_links(links: ArmLinks) -> Array:
+    """Returns the parameters theta on which the dynamics of the planar arm depend, Eq. (24).
+
+    The torque of the arm is linear in theta. The first three entries are inertial, in kg m^2;
+    the last two belong to gravity, in kg m.
+
+    Args:
+        links: Lengths, masses and inertias of the two links.
+
+    Returns:
+        The parameters, shape (5,).
+    """
+    l1, m1, lc1, I1, _, m2, lc2, I2 = links
+    inner_inertia = m1 * lc1**2
+    outer_inertia = m2 * (l1**2 + lc2**2)
+    theta_1 = inner_inertia + outer_inertia + I1 + I2
+    theta_2 = m2 * l1 * lc2
+    theta_3 = m2 * lc2**2 + I2
+    theta_4 = m1 * lc1 + m2 * l1
+    theta_5 = m2 * lc2
+    return np.array([theta_1, theta_2, theta_3, theta_4, theta_5])
+
+
+def is_positive_definite(theta: Array) -> bool:
+    """Returns True if the inertia matrix of the planar arm is positive definite in any pose.
+
+    Otherwise the parameters describe no real arm. With the angle q2 of the second joint, the
+    inertia matrix is
+
+        M = | theta_1 + 2 theta_2 cos(q2)    theta_3 + theta_2 cos(q2) |
+            | theta_3 + theta_2 cos(q2)      theta_3                   |
+
+        det M = theta_1 theta_3 - theta_3^2 - theta_2^2 cos(q2)^2
+
+    The determinant is smallest for the stretched arm, q2 = 0, so only this pose is checked. The
+    check has a margin for rounding.
+
+    Args:
+        theta: Dynamic parameters of the arm, shape (5,), see `theta_from_links`. The first
+            three are inertias, kg m^2.
+    """
+    theta_1 = theta[0]
+    theta_2 = theta[1]
+    theta_3 = theta[2]
+    least_determinant = theta_1 * theta_3 - theta_3**2 - theta_2**2
+    margin = 1e-9 * theta_1 * theta_3
+    return bool(theta_3 > 0.0 and least_determinant > margin)
+
+
+@leaf
+def inertia(theta: Vector, q: Vector) -> tuple[Pair, Pair]:
+    """Returns the inertia matrix M(q) of the arm, two rows, kg m^2.
+
+    See Section IV of the paper, and its Property 1.
+
+    Args:
+        theta: Parameters of the arm, shape (5,).
+        q: Joint angles, rad.
+    """
+    _, c2 = sincos(q[1])
+    m11 = theta[0] + 2.0 * theta[1] * c2
+    m12 = theta[2] + theta[1] * c2
+    m22 = theta[2]
+    first = (m11, m12)
+    second = (m12, m22)
+    return first, second
+
+
+@leaf
+def gravity(theta: Vector, g: float, q: Vector) -> Pair:
+    """Returns the gravity torque G(q) of the planar arm, N m per joint.
+
+    A torque of this size holds the arm.
+
+    Args:
+        theta: Parameters of the arm, shape (5,).
+        g: Gravitational acceleration, m/s^2.
+        q: Joint angles, rad.
+    """
+    s1, c1 = sincos(q[0])
+    s2, c2 = sincos(q[1])
+    c12 = c1 * c2 - s1 * s2
+    inner = theta[3] * g * c1
+    outer = theta[4] * g * c12
+    return inner + outer, outer
+
+
+@leaf
+def regressor(g: float, q: Vector, qd: Vector, v: Vector, a: Vector) -> tuple[Five, Five]:
+    """Returns the regressor Y(q, qd, v, a), two rows of five numbers.
+
+        Y theta = M(q) a + C(q, qd) v + G(q)
+
+    The vector theta has five parameters, see `theta_from_links`: three of the inertia and two
+    of gravity. With qi the angle of joint i, the equation of motion in these parameters is
+
+        M = | theta_1 + 2 theta_2 cos(q2)    theta_3 + theta_2 cos(q2) |
+            | theta_3 + theta_2 cos(q2)      theta_3                   |
+
+        C = theta_2 sin(q2) | -qd2    -(qd1 + qd2) |
+                            |  qd1     0           |
+
+        G = g | theta_4 cos(q1) + theta_5 cos(q1 + q2) |
+              | theta_5 cos(q1 + q2)                   |
+
+    Column j of Y contains the factors of theta_j. The paper prints Y(q, qd, qdd) only, Eq. (5),
+    which is the case v = qd and a = qdd. Eq. (12) needs the two velocities separately.
+
+    Args:
+        g: Gravitational acceleration, m/s^2.
+        q: Joint angles, rad.
+        qd: Joint velocities, on which C depends, rad/s.
+        v: Reference velocity, which C multiplies, rad/s.
+        a: Reference acceleration, which M multiplies, rad/s^2.
+
+    Returns:
+        The rows of Y for the torques of the first and the second joint.
+    """
+    s1, c1 = sincos(q[0])
+    s2, c2 = sincos(q[1])
+    c12 = c1 * c2 - s1 * s2  # cos(q1 + q2)
+    a1 = a[0]
+    a2 = a[1]
+    outer_rate = qd[0] + qd[1]
+    # The first row of C v is -theta_2 sin(q2) times this sum, the second row theta_2 times
+    # `centrifugal_2`.
+    coriolis_1 = qd[1] * v[0] + outer_rate * v[1]
+    centrifugal_2 = s2 * qd[0] * v[0]
+    # The factor of theta_2 in the first row of M a.
+    inertial_1 = c2 * (2.0 * a1 + a2)
+    y12 = inertial_1 - s2 * coriolis_1
+    y22 = c2 * a1 + centrifugal_2
+    gravity_1 = g * c1
+    gravity_12 = g * c12
+    first = (a1, y12, a2, gravity_1, gravity_12)
+    second = (0.0, y22, a1 + a2, 0.0, gravity_12)
+    return first, second
+
+
+@leaf
+def forward_dynamics(theta: Vector, g: float, q: Vector, qd: Vector, torque: Vector) -> Pair:
+    """Computes the joint accelerations of the planar arm that a torque causes.
+
+        qdd = M(q)^-1 (torque - C(q, qd) qd - G(q))
+
+    M is the inertia matrix, C the Coriolis matrix and G the gravity torque.
+
+    Args:
+        theta: Dynamic parameters of the arm, shape (5,).
+        g: Gravitational acceleration, m/s^2.
+        q: Joint angles, rad.
+        qd: Joint velocities, rad/s.
+        torque: Total torque of motors, operators and environments on the joints, N m.
+
+    Returns:
+        The accelerations qdd of the two joints, rad/s^2.
+    """
+    s1, c1 = sincos(q[0])
+    s2, c2 = sincos(q[1])
+    c12 = c1 * c2 - s1 * s2
+    qd1 = qd[0]
+    qd2 = qd[1]
+    m11 = theta[0] + 2.0 * theta[1] * c2
+    m12 = theta[2] + theta[1] * c2
+    m22 = theta[2]
+    h = -theta[1] * s2
+    coriolis_1 = h * qd2 * (2.0 * qd1 + qd2)
+    inner = theta[3] * g * c1
+    outer = theta[4] * g * c12
+    # The torques that accelerate the arm.
+    f1 = torque[0] - coriolis_1 - inner - outer
+    centrifugal_2 = h * qd1 * qd1
+    f2 = torque[1] + centrifugal_2 - outer
+    determinant = m11 * m22 - m12 * m12
+    qdd1 = (m22 * f1 - m12 * f2) / determinant
+    qdd2 = (m11 * f2 - m12 * f1) / determinant
+    return qdd1, qdd2
+
+
+@leaf
+def forward_kinematics(lengths: Vector, q: Vector) -> tuple[Pair, Pair]:
+    """Returns the positions of the elbow and the end effector for the joint angles.
+
+    Args:
+        lengths: Lengths of the two links, m.
+        q: Joint angles, rad.
+
+    Returns:
+        The position (x, y) of the elbow and that of the end effector, from the base, m.
+    """
+    s1, c1 = sincos(q[0])
+    s12, c12 = sincos(q[0] + q[1])
+    elbow_x = lengths[0] * c1
+    elbow_y = lengths[0] * s1
+    x = elbow_x + lengths[1] * c12
+    y = elbow_y + lengths[1] * s12
+    elbow = (elbow_x, elbow_y)
+    end_effector = (x, y)
+    return elbow, end_effector
+
+
+@leaf
+def end_effector_jacobian(lengths: Vector, q: Vector) -> tuple[Pair, Pair]:
+    """Returns the Jacobian of the end effector, which maps joint velocities to its velocity.
+
+    Args:
+        lengths: Lengths of the two links, m.
+        q: Joint angles, rad.
+
+    Returns:
+        Rows x and y, with a column per joint, m/rad.
+    """
+    s1, c1 = sincos(q[0])
+    s12, c12 = sincos(q[0] + q[1])
+    inner_x = lengths[0] * c1
+    outer_x = lengths[1] * c12
+    outer_y = lengths[1] * s12
+    x_by_first = -lengths[0] * s1 - outer_y
+    y_by_first = inner_x + outer_x
+    row_x = (x_by_first, -outer_y)
+    row_y = (y_by_first, outer_x)
+    return row_x, row_y

@@ -1,0 +1,416 @@
+"""Computes those stages of a tick that depend on the arm, for the planar two-link arm.
+
+A tick is one period of the control loop, and a stage is one of the eight steps in which
+`kernel` computes a tick. The loops over the two joints are written out, so that the compiled
+code keeps the numbers in registers.
+
+Invariant:
+    - `chain_stages` has the same functions for a chain of n joints. They have one more
+      argument, the rows of the joints. `kernel` calls the functions of one module or the other.
+"""
+
+from math import inf, isfinite
+
+from ..step import control
+from ..step.jit import leaf
+from ..step.site_setup import Law
+from ..step.vectors import Array, Pair, Row, Vector, five, pair, put
+from .exogenous import TorqueSourceRows, TorqueTable, torque_on_arm
+from .two_link_arm import forward_dynamics, inertia, regressor
+
+_ADAPTIVE = int(Law.ADAPTIVE)
+
+
+@leaf
+def update_errors(s: Row) -> None:
+    """Computes the tracking errors of the planar arm, and the regressor of its dynamics.
+
+    The results are the errors e of the position and ed of the velocity, the filtered error r,
+    the regressor Y, and the product Y' r. The regressor is the matrix whose product with the
+    dynamic parameters of the arm is a torque. Y' r drives the estimate of these parameters.
+
+    Args:
+        s: State of the site (the process that runs the arm), with q, qd and the reference; the
+            results are written into it.
+    """
+    q = pair(s.q)
+    qd = pair(s.qd)
+    Lambda = pair(s.Lambda)
+    e, ed, r = control.control_errors(q=q, qd=qd, q_des=s.q_des, qd_des=s.qd_des, Lambda=Lambda)
+    v = (-Lambda[0] * e[0], -Lambda[1] * e[1])
+    a = (-Lambda[0] * ed[0], -Lambda[1] * ed[1])
+    Y = regressor(g=s.g, q=q, qd=qd, v=v, a=a)
+    put(s.e, e)
+    put(s.ed, ed)
+    put(s.r, r)
+    put(s.Y[0], Y[0])
+    put(s.Y[1], Y[1])
+    Yr = control.regressor_transpose_times(Y, r)
+    put(s.Yr, Yr)
+
+
+@leaf
+def advance_estimate(s: Row, gain_s: float, Yr: Vector) -> None:
+    """Integrates the adaptive law's estimate of the dynamic parameters over a time step.
+
+    The result is limited to lower and upper bounds.
+
+    Args:
+        s: State of the site (the process that runs the arm), with the estimate, its gains and
+            its bounds; the estimate is changed.
+        gain_s: Duration of the step, s.
+        Yr: Product Y' r of the regressor Y and the filtered error r, shape (5,).
+    """
+    estimate = control.update_estimate(s.theta_hat, gain_s, s.Gamma, Yr)
+    projected = control.project_estimate(estimate, s.low, s.high)
+    put(s.theta_hat, projected)
+
+
+@leaf
+def update_torque(s: Row) -> None:
+    """Computes the motor torque of a built-in control law, limited to the range of the motors.
+
+    The adaptive law estimates the parameters of the arm:
+
+        tau = Y theta_hat - Kp r - Kd ed - rho r / sqrt(r^2 + width^2)
+
+    The last term is its robust term, a torque of at most rho against disturbances. It is left
+    out if rho is 0. The other law compensates a known gravity torque G:
+
+        tau = G(q) - K e - d qd - Kd ed + k_f felt
+
+    `control` explains the symbols, see `adaptive_torque`, `robust_torque` and `damped_torque`.
+
+    Args:
+        s: State of the site (the process that runs the arm), with the errors and the gains of
+            each joint; the torque is written into it.
+    """
+    # The limit applies to the sum of all terms, below.
+    no_limit = inf
+    if s.law == _ADAPTIVE:
+        Y = (five(s.Y[0]), five(s.Y[1]))
+        tau = control.adaptive_torque(
+            Y=Y, theta_hat=five(s.theta_hat), Kp=s.Kp, Kd=s.Kd, r=s.r, ed=s.ed, limit=no_limit
+        )
+        has_robust_term = s.rho[0] > 0.0 or s.rho[1] > 0.0
+        if has_robust_term:
+            robust_0 = control.robust_torque(s.rho[0], s.width[0], s.r[0])
+            robust_1 = control.robust_torque(s.rho[1], s.width[1], s.r[1])
+            tau = (tau[0] - robust_0, tau[1] - robust_1)
+    else:
+        tau = control.damped_torque(
+            theta=s.known,
+            g=s.g,
+            K=s.K,
+            d=s.d,
+            Kd=s.Kd,
+            k_f=s.k_f,
+            q=s.q,
+            qd=s.qd,
+            e=s.e,
+            ed=s.ed,
+            felt=s.felt,
+            limit=no_limit,
+        )
+    tau_0 = control.limit_torque(tau[0], s.tau_limit[0])
+    tau_1 = control.limit_torque(tau[1], s.tau_limit[1])
+    put(s.tau, (tau_0, tau_1))
+
+
+@leaf
+def put_gravity_torque(s: Row, torque: Array) -> None:
+    """Computes the gravity torque of the planar arm with its true dynamic parameters.
+
+    Args:
+        s: State of the site (the process that runs the arm), with the joint angles and
+            parameters.
+        torque: Receives the gravity torque, shape (2,), N m.
+    """
+    put_gravity(s, s.theta, torque)
+
+
+@leaf
+def put_gravity(s: Row, theta: Array, torque: Array) -> None:
+    """Computes the torque that holds the planar arm against gravity, for the given parameters.
+
+    The last two columns of the regressor, g cos q_1 and g cos(q_1 + q_2), belong to gravity.
+
+    Args:
+        s: Row of the site, after `update_errors`.
+        theta: Parameters of the arm, shape (5,).
+        torque: Written: the torque, shape (2,), N m.
+    """
+    inner = s.Y[0, 3] * theta[3]
+    outer = s.Y[1, 4] * theta[4]
+    put(torque, (inner + outer, outer))
+
+
+@leaf
+def update_model(s: Row) -> None:
+    """Computes the model of the planar arm for a user's law.
+
+    The model consists of the gravity torque G. If the law asks for them, it also contains the
+    inertia matrix M and the bias torque C qd + G, where C is the Coriolis matrix.
+    """
+    put_gravity(s, s.known, s.G)
+    if s.needs_model != 0:
+        q = pair(s.q)
+        qd = pair(s.qd)
+        M = inertia(s.known, q)
+        put(s.M[0], M[0])
+        put(s.M[1], M[1])
+        Y = regressor(g=s.g, q=q, qd=qd, v=qd, a=(0.0, 0.0))
+        for i in range(2):
+            s.bias[i] = 0.0
+            for p in range(5):
+                s.bias[i] += Y[i][p] * s.known[p]
+
+
+@leaf
+def put_source_torque(
+    t_s: float,
+    s: Row,
+    state: Vector,
+    actors: TorqueSourceRows,
+    table: TorqueTable,
+    sampled: int,
+    torque: Array,
+) -> None:
+    """Computes the torque with which some operators and environments act on the planar arm.
+
+    A sampled operator or environment is evaluated once per period of the control loop, and its
+    torque is constant until the next period. All others act continuously.
+
+    Args:
+        t_s: Time since the start of the session, s.
+        s: Settings of the site (the process that runs the arm).
+        state: Two joint angles in rad, followed by two joint velocities in rad/s.
+        actors: Operators and environments, one row for each.
+        table: Numeric data of all operators and environments, for example recorded torques.
+        sampled: 1 for the torque of the sampled operators and environments, 0 for all others.
+        torque: Receives the torque on the arm, shape (2,), N m.
+    """
+    q = (state[0], state[1])
+    qd = (state[2], state[3])
+    on_arm = torque_on_arm(
+        t_s=t_s,
+        q=q,
+        qd=qd,
+        lengths=pair(s.lengths),
+        actors=actors,
+        table=table,
+        sampled=sampled,
+    )
+    put(torque, (on_arm[0], on_arm[1]))
+
+
+@leaf
+def update_external_torque(
+    t_s: float, s: Row, actors: TorqueSourceRows, table: TorqueTable
+) -> None:
+    """Computes the torque that operators and environments exert on the planar arm now.
+
+    It is the sum of up to three parts:
+
+    - The torque of the sampled operators and environments. They are evaluated once per period
+      of the control loop, and their torque is held until the next period.
+    - The torque of all others, which act continuously. It is computed again while the arm moves
+      during the period.
+    - If the arm is real or simulated elsewhere (`external`), the torque that was measured.
+
+    Args:
+        t_s: Time since the start of the session, s.
+        s: State of the site (the process that runs the arm); written. `on_arm` receives the
+            whole torque and `held` the first part, N m. `wall_n` receives the largest force of
+            a wall, N. `sensed` is the measured torque, N m.
+        actors: Operators and environments, one row for each.
+        table: Numeric data of all operators and environments, for example recorded torques.
+    """
+    q = pair(s.q)
+    qd = pair(s.qd)
+    lengths = pair(s.lengths)
+    held_0, held_1, held_wall_n = torque_on_arm(
+        t_s=t_s, q=q, qd=qd, lengths=lengths, actors=actors, table=table, sampled=1
+    )
+    continuous_0, continuous_1, continuous_wall_n = torque_on_arm(
+        t_s=t_s, q=q, qd=qd, lengths=lengths, actors=actors, table=table, sampled=0
+    )
+    put(s.held, (held_0, held_1))
+    s.wall_n = max(held_wall_n, continuous_wall_n)
+    total_0 = continuous_0 + held_0
+    total_1 = continuous_1 + held_1
+    put(s.on_arm, (total_0, total_1))
+    is_measured = s.external != 0
+    if is_measured:
+        for i in range(2):
+            s.on_arm[i] += s.sensed[i]
+
+
+@leaf
+def add_scaled(x: Vector, step_s: float, rate: Vector) -> Pair:
+    """Returns x + step_s * rate, a linear step of two numbers over the duration `step_s`."""
+    first = x[0] + step_s * rate[0]
+    second = x[1] + step_s * rate[1]
+    return first, second
+
+
+@leaf
+def _acceleration(
+    t_s: float,
+    q: Pair,
+    qd: Pair,
+    u: Vector,
+    theta: Vector,
+    g: float,
+    lengths: Vector,
+    actors: TorqueSourceRows,
+    table: TorqueTable,
+) -> Pair:
+    """Returns qdd at a stage of the integrator, rad/s^2.
+
+    The torque is the held u plus the torque of the actors at the time and state of the stage.
+
+    Args:
+        t_s: Time of the stage, s since the epoch.
+        q: Joint angles, rad.
+        qd: Joint velocities, rad/s.
+        u: Held torque, shape (2,), N m.
+        theta: Parameters of the arm, shape (5,).
+        g: Gravitational acceleration, m/s^2.
+        lengths: Lengths of the two links, m.
+        actors: Rows of operators and environments.
+        table: Their numbers, for example recorded torques.
+    """
+    on_arm = torque_on_arm(
+        t_s=t_s, q=q, qd=qd, lengths=lengths, actors=actors, table=table, sampled=0
+    )
+    torque = (on_arm[0] + u[0], on_arm[1] + u[1])
+    return forward_dynamics(theta=theta, g=g, q=q, qd=qd, torque=torque)
+
+
+@leaf
+def rk4_step(
+    t_s: float,
+    h_s: float,
+    q: Vector,
+    qd: Vector,
+    u: Vector,
+    theta: Vector,
+    g: float,
+    lengths: Vector,
+    actors: TorqueSourceRows,
+    table: TorqueTable,
+) -> tuple[Pair, Pair]:
+    """Simulates the motion of the planar arm over one period of the control loop.
+
+    The method is the classical Runge-Kutta method of fourth order. Operators and environments
+    act continuously, except for those that are marked as sampled.
+
+    Args:
+        t_s: Time at the beginning of the period, in s since the start of the session.
+        h_s: The period, s.
+        q: Joint angles at the beginning, rad.
+        qd: Joint velocities at the beginning, rad/s.
+        u: Torque that is constant over the period, shape (2,), N m: the torque of the motors,
+            and of sampled operators and environments.
+        theta: Dynamic parameters of the arm, shape (5,).
+        g: Gravitational acceleration, m/s^2.
+        lengths: Lengths of the two links, m.
+        actors: Operators and environments, one row for each.
+        table: Numeric data of all operators and environments, for example recorded torques.
+
+    Returns:
+        Joint angles and joint velocities at the end of the period.
+    """
+    half = 0.5 * h_s
+    sixth = h_s / 6.0
+    q1 = (q[0], q[1])
+    v1 = (qd[0], qd[1])
+    a1 = _acceleration(
+        t_s=t_s, q=q1, qd=v1, u=u, theta=theta, g=g, lengths=lengths, actors=actors, table=table
+    )
+    q2 = add_scaled(q1, half, v1)
+    v2 = add_scaled(v1, half, a1)
+    a2 = _acceleration(
+        t_s=t_s + half,
+        q=q2,
+        qd=v2,
+        u=u,
+        theta=theta,
+        g=g,
+        lengths=lengths,
+        actors=actors,
+        table=table,
+    )
+    q3 = add_scaled(q1, half, v2)
+    v3 = add_scaled(v1, half, a2)
+    a3 = _acceleration(
+        t_s=t_s + half,
+        q=q3,
+        qd=v3,
+        u=u,
+        theta=theta,
+        g=g,
+        lengths=lengths,
+        actors=actors,
+        table=table,
+    )
+    q4 = add_scaled(q1, h_s, v3)
+    v4 = add_scaled(v1, h_s, a3)
+    a4 = _acceleration(
+        t_s=t_s + h_s,
+        q=q4,
+        qd=v4,
+        u=u,
+        theta=theta,
+        g=g,
+        lengths=lengths,
+        actors=actors,
+        table=table,
+    )
+    v_sum_0 = v1[0] + 2.0 * v2[0] + 2.0 * v3[0] + v4[0]
+    v_sum_1 = v1[1] + 2.0 * v2[1] + 2.0 * v3[1] + v4[1]
+    a_sum_0 = a1[0] + 2.0 * a2[0] + 2.0 * a3[0] + a4[0]
+    a_sum_1 = a1[1] + 2.0 * a2[1] + 2.0 * a3[1] + a4[1]
+    q_next = add_scaled(q1, sixth, (v_sum_0, v_sum_1))
+    qd_next = add_scaled(v1, sixth, (a_sum_0, a_sum_1))
+    return q_next, qd_next
+
+
+@leaf
+def advance_arm(
+    t_s: float, h_s: float, s: Row, actors: TorqueSourceRows, table: TorqueTable
+) -> bool:
+    """Simulates the motion of the arm in one period (Runge-Kutta method of fourth order).
+
+    The torque `s.u` is held over the period. The joint angles q and velocities qd at its end
+    are written into the row of the site.
+
+    Args:
+        t_s: Time at the beginning of the period, s since the epoch.
+        h_s: The period, s.
+        s: Row of the site; written.
+        actors: Rows of operators and environments.
+        table: Their numbers, for example recorded torques.
+
+    Returns:
+        False if the result is not finite. Then q and qd are unchanged.
+    """
+    q, qd = rk4_step(
+        t_s=t_s,
+        h_s=h_s,
+        q=pair(s.q),
+        qd=pair(s.qd),
+        u=pair(s.u),
+        theta=five(s.theta),
+        g=s.g,
+        lengths=pair(s.lengths),
+        actors=actors,
+        table=table,
+    )
+    is_finite = isfinite(q[0]) and isfinite(q[1]) and isfinite(qd[0]) and isfinite(qd[1])
+    if not is_finite:
+        return False
+    put(s.q, q)
+    put(s.qd, qd)
+    return True

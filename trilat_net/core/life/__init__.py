@@ -1,0 +1,1 @@
+"""The modes of a site from its start to its end, its safeguards, and hands that move it live."""

@@ -1,0 +1,671 @@
+"""Computes how a person or program pulls an arm, from its messages during a run.
+
+A person or program that moves an arm during the run is called a live hand. Its messages contain
+goals. A target moves towards the newest goal, and a simulated spring pulls the arm to the
+target. The force of the spring is multiplied by the grip, a number from 0 to 1.
+
+Rules:
+
+- A new hold starts with no force at the pose of the arm. The grip grows from 0 to 1 within
+  `GRIP_NS`. If the grip of an earlier hold has not faded yet, the new hold continues from it.
+- The target moves in a straight line to the newest goal. This takes a quarter more than the
+  time between the last two messages, so that the target does not stop if a message is late.
+- After a silence of `SILENCE_NS`, the target comes to rest and the grip fades to 0.
+- A goal that the arm cannot reach is moved to the nearest point that it can reach.
+- The acceleration and the speed of the target are limited. At the distance d from its goal, the
+  speed is at most
+
+      v(d) = a h (D / (n + 1) + n / 2)                                                     (L1)
+      D = d / (a h^2),    n = floor((sqrt(1 + 8 D) - 1) / 2)
+
+  where a is the acceleration limit and h the period of the control loop. From this speed the
+  target stops exactly at the goal in n more periods, and each period is slower by a h.
+  Therefore a target that starts at rest does not overshoot a goal at rest. If the goal moves
+  back along the line, the overshoot is at most V^2 / (2 a) + V h / 2 at the speed limit V.
+
+Invariant:
+    - `advance_hand` contains all of these rules. Its result depends only on its stored state
+      and on the messages that were received before the control period.
+    - The result is stored in the record of each control period. Therefore a log repeats what
+      people did without their messages.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+from ..step.jit import leaf
+from ..step.vectors import Array, Vector
+
+SILENCE_NS = 200_000_000
+"""A longer silence of the holder releases the arm."""
+GRIP_NS = 100_000_000
+"""Time in which a grip becomes firm, and time in which it fades."""
+GLIDE_NS = 50_000_000
+"""Longest time of a glide to the goal, unless a limit of the target prolongs it."""
+
+ANOTHER_HOLDS = "hand: another one holds the arm"
+OUT_OF_ORDER = "hand: out of order"
+TAKEN = "takes hold"
+RELEASED = "lets go"
+SILENT = "is silent: let go"
+"""Outcomes of a message or a silence: refusals, and changes of the holder."""
+
+
+class HandReach(NamedTuple):
+    """Region of the goals that an arm can reach: a spherical shell, a box, or both.
+
+    The region may be larger than what the arm can really reach.
+
+    Attributes:
+        centre: Centre of the shell, m. Empty if there is no shell.
+        inner_m: Inner radius of the shell, m.
+        outer_m: Outer radius of the shell, m.
+        low: Smallest coordinates of the box, rad or m. Empty if there is no box.
+        high: Largest coordinates of the box, rad or m.
+    """
+
+    centre: Vector = ()
+    inner_m: float = 0.0
+    outer_m: float = math.inf
+    low: Vector = ()
+    high: Vector = ()
+
+    def find_nearest(self, goal: Sequence[float]) -> tuple[float, ...]:
+        """Moves a goal into the reachable region; a reachable goal stays unchanged.
+
+        The goal is moved to the nearest point of the box, and then to the nearest point of the
+        spherical shell.
+
+        Args:
+            goal: The goal, rad or m.
+        """
+        nearest = tuple(goal)
+        if self.low:
+            nearest = tuple(
+                min(max(x, low), high)
+                for x, low, high in zip(goal, self.low, self.high, strict=True)
+            )
+        if not self.centre:
+            return nearest
+        offset = [x - middle for x, middle in zip(nearest, self.centre, strict=True)]
+        radius = math.sqrt(sum(x * x for x in offset))
+        if self.inner_m <= radius <= self.outer_m:
+            return nearest
+        allowed_m = min(max(radius, self.inner_m), self.outer_m)
+        if radius == 0.0:
+            # From the centre all directions are equally near: choose the first axis.
+            offset[0] = 1.0
+            radius = 1.0
+        factor = allowed_m / radius
+        pairs = zip(offset, self.centre, strict=True)
+        return tuple(middle + factor * x for x, middle in pairs)
+
+
+class HandRules(NamedTuple):
+    """Limits for a person or program that moves an arm during the run.
+
+    The person or program sends goals. A target moves smoothly to the newest goal, and the arm
+    is pulled to the target. In some cases the goal and the target are forces instead of
+    positions.
+
+    Attributes:
+        size: Number of coordinates of a target, one per axis or one per joint.
+        rate_hz: Rate of the control loop, Hz.
+        speed_limit: Largest speed of the target, m/s or rad/s.
+        starts_at_arm: True if the target is a position, which starts at the pose of the arm.
+            False if it is a force, which starts at 0.
+        max_goal_norm: Largest norm of an accepted goal, m, rad or N.
+        acceleration_limit: Largest acceleration of the target, m/s^2 or rad/s^2; inf for no
+            limit.
+        reach: Region of the goals that the arm can reach.
+    """
+
+    size: int
+    rate_hz: int
+    speed_limit: float = math.inf
+    starts_at_arm: bool = True
+    max_goal_norm: float = math.inf
+    acceleration_limit: float = math.inf
+    reach: "HandReach" = HandReach()
+
+
+class HandCommand(NamedTuple):
+    """Message by which a person or program moves an arm during the run.
+
+    Attributes:
+        source: Identifies the sender, a random number above 0.
+        number: Counts the goals of the sender. If two messages have the same number, the goal
+            is unchanged.
+        grip: True if the sender holds the arm, False to release it.
+        target: The goal to which the sender pulls the arm, m or rad. If the sender pushes with
+            a force instead, this is the force, N.
+        sent_ns: Time of sending by the sender's clock, ns.
+    """
+
+    source: int
+    number: int
+    grip: bool
+    target: tuple[float, ...]
+    sent_ns: int
+
+
+class HandMemory(NamedTuple):
+    """State of a live hand, a person or program that moves an arm, from tick to tick.
+
+    Attributes:
+        source: Sender that holds the arm; 0: nobody, though a grip may still fade.
+        number: Number of the newest accepted message; -1 without a message.
+        grip: Firmness of the grip, 0 to 1.
+        target: Position of the target, which the arm follows, m or rad, or the force, N.
+        rate: Velocity of the target.
+        goal: Position to which the target moves, or the force.
+        arrives_ns: Time at which the target arrives at the goal, ns since the epoch, the common
+            start of the session.
+        sent_ns: Time of sending of the goal's message, ns.
+        received_ns: Time of the tick that accepted the newest message, ns since the epoch.
+        before: The last sender that released the arm, and the number of its last message.
+    """
+
+    source: int = 0
+    number: int = -1
+    grip: float = 0.0
+    target: tuple[float, ...] = ()
+    rate: tuple[float, ...] = ()
+    goal: tuple[float, ...] = ()
+    arrives_ns: int = 0
+    sent_ns: int = 0
+    received_ns: int = 0
+    before: tuple[int, int] = (0, -1)
+
+
+class HandInForce(NamedTuple):
+    """What a live hand, a person or program that moves an arm, does in one tick.
+
+    The fields are in the order of the record's field `hand`.
+
+    Attributes:
+        grip: Firmness of the grip, 0 to 1.
+        number: Number of the newest message that the hand follows; -1: nobody holds the arm.
+        source: Sender that holds the arm; 0: nobody.
+        target: Position that the arm follows, m or rad, or the force, N, in the tick.
+        rate: Velocity of the target.
+    """
+
+    grip: float
+    number: int
+    source: int
+    target: tuple[float, ...]
+    rate: tuple[float, ...]
+
+    @classmethod
+    def read(cls, vector: Sequence[float]) -> "HandInForce":
+        """Reads from a record what a person or program did with the arm in a control period.
+
+        Args:
+            vector: Field `hand` of the record. It contains the numbers of all fields of this
+                class, in their order.
+        """
+        size = (len(vector) - 3) // 2
+        grip, number, source, *numbers = vector
+        return cls(
+            grip=grip,
+            number=int(number),
+            source=int(source),
+            target=tuple(numbers[:size]),
+            rate=tuple(numbers[size:]),
+        )
+
+
+class HandStep(NamedTuple):
+    """What a person or program does with an arm in one control period.
+
+    Attributes:
+        memory: State for the next period.
+        vector: Grip, target and velocity of the target in this period, in the form of
+            `HandInForce`.
+        refused: For each message that had no effect, the reason.
+        changes: Who took hold of the arm or left it, in order. Each entry contains the sender
+            of the messages, and TAKEN, RELEASED or SILENT (no message for too long).
+    """
+
+    memory: HandMemory
+    vector: list[float]
+    refused: tuple[str, ...] = ()
+    changes: tuple[tuple[int, str], ...] = ()
+
+
+def count_hand_numbers(size: int) -> int:
+    """Computes the length of the field `hand` of a record.
+
+    The field states what a person or program did with the arm in a control period. It contains
+    the numbers of a `HandInForce`.
+
+    Args:
+        size: Number of coordinates of the target to which the arm is pulled.
+    """
+    return 3 + 2 * size
+
+
+def empty_hand_vector(size: int) -> list[float]:
+    """Returns the field `hand` of a record for a control period in which nobody holds the arm.
+
+    Args:
+        size: Number of coordinates of the target to which a holder would pull the arm.
+    """
+    return [0.0, -1.0, 0.0, *[0.0] * (2 * size)]
+
+
+def advance_hand(
+    rules: HandRules,
+    memory: HandMemory,
+    t_ns: int,
+    commands: Sequence[HandCommand],
+    locate: Callable[[], Sequence[float]],
+) -> HandStep:
+    """Computes how a person or program pulls the arm in one control period.
+
+    The person or program sends goals. A target moves smoothly to the newest goal, and the arm
+    is pulled to the target. This function moves the target by one period, accepts the messages,
+    ends the hold of a sender that is silent for too long, and chooses the next velocity of the
+    target.
+
+    Args:
+        rules: Limits of the goals and of the target's motion.
+        memory: State after the previous period.
+        t_ns: Nominal time of the period, ns since the start of the session.
+        commands: Messages received since the previous period, in order.
+        locate: Function that returns the present pose of the arm, in the coordinates of the
+            target.
+
+    Returns:
+        The action in this period, and the state for the next period.
+    """
+    refused: list[str] = []
+    changes: list[tuple[int, str]] = []
+    now = _move_target(rules, memory) if memory.target else memory
+    for command in commands:
+        now, outcome = _accept_command(
+            rules=rules, memory=now, t_ns=t_ns, command=command, locate=locate
+        )
+        if outcome in (TAKEN, RELEASED):
+            changes.append((command.source, outcome))
+        elif outcome:
+            refused.append(outcome)
+
+    if now.source and t_ns - now.received_ns > SILENCE_NS:
+        changes.append((now.source, SILENT))
+        # One less: the silent holder may repeat its number and so take hold again.
+        now = _release(now, now.number - 1)
+
+    if not now.target:
+        return HandStep(now, empty_hand_vector(rules.size), tuple(refused), tuple(changes))
+    rate = _find_rate(rules, now, t_ns) if now.source else _find_fading_rate(rules, now)
+    now = now._replace(rate=rate)
+    vector = [now.grip, float(now.number), float(now.source), *now.target, *now.rate]
+    return HandStep(now, vector, tuple(refused), tuple(changes))
+
+
+def _move_target(rules: HandRules, memory: HandMemory) -> HandMemory:
+    """Returns the state one period later: the target has moved, the grip is firmer or weaker.
+
+    The target moves with its velocity `rate`. The grip, a factor of the force from 0 to 1,
+    grows while a sender holds the arm, and fades after that. It needs GRIP_NS for the whole
+    range. When it has faded, nobody holds the arm, and no target is left.
+
+    Args:
+        rules: Limits of the hand, and the rate of the control loop.
+        memory: State after the previous tick (period of the loop), with a target.
+    """
+    h_s = 1.0 / rules.rate_hz
+    # The period, 1e9 / rate_hz in ns, as a part of GRIP_NS.
+    grip_step = 1e9 / (GRIP_NS * rules.rate_hz)
+    # A list instead of a generator: it is faster, and this runs in each tick.
+    target = tuple([x + v * h_s for x, v in zip(memory.target, memory.rate, strict=True)])
+    is_held = memory.source != 0
+    if is_held:
+        return memory._replace(target=target, grip=min(memory.grip + grip_step, 1.0))
+
+    grip = max(memory.grip - grip_step, 0.0)
+    if grip > 0.0:
+        return memory._replace(target=target, grip=grip)
+    # Only the last sender is remembered, because its old messages may still arrive.
+    return HandMemory(before=memory.before)
+
+
+@leaf
+def find_stopping_speed(distance: float, acceleration: float, h_s: float) -> float:
+    """Returns the largest speed from which a target can stop within a distance, Eq. (L1).
+
+    The target moves in steps of one period h, with an acceleration of at most a. With the unit
+    a h of speed and a h^2 of distance, the speed falls by 1 per period, and the distance to the
+    goal is D. The target can stop from the whole speed n in n more periods, which takes the
+    distance n (n + 1) / 2. Therefore n is the largest integer with n (n + 1) / 2 <= D. The
+    remaining distance is divided among the n + 1 periods:
+
+        speed = n + (D - n (n + 1) / 2) / (n + 1) = D / (n + 1) + n / 2
+
+    Args:
+        distance: Distance to the goal, m or rad.
+        acceleration: Largest acceleration a, m/s^2 or rad/s^2.
+        h_s: Period h of the ticks, s.
+
+    Returns:
+        The speed, m/s or rad/s.
+    """
+    speed_step = acceleration * h_s
+    D = distance / (speed_step * h_s)
+    n = math.floor(0.5 * (math.sqrt(1.0 + 8.0 * D) - 1.0))
+    return speed_step * (D / (n + 1.0) + 0.5 * n)
+
+
+_plain_stopping_speed = getattr(find_stopping_speed, "py_func", find_stopping_speed)
+"""The same function, uncompiled: a call from Python into compiled code takes longer than these
+few operations.
+"""
+
+
+@leaf
+def glide(
+    first: int,
+    rate_hz: int,
+    grip: float,
+    arrives_ns: int,
+    speed_limit: float,
+    acceleration: float,
+    goal: Array,
+    target: Array,
+    rate: Array,
+    rows: Array,
+) -> float:
+    """Computes how the target of a held arm moves in a series of ticks without a message.
+
+    The result equals that of `advance_hand`, bit for bit, but one compiled call computes all of
+    the ticks.
+
+    Args:
+        first: The first tick.
+        rate_hz: Tick rate of the site, Hz.
+        grip: Firmness of the grip before, 0 to 1.
+        arrives_ns: Time at which the target arrives at the goal, ns since the epoch.
+        speed_limit: Largest speed of the target, m/s or rad/s.
+        acceleration: Largest acceleration of the target, m/s^2 or rad/s^2; inf: no limit.
+        goal: The goal, shape (size,).
+        target: The target before; changed, shape (size,).
+        rate: Its velocity before; changed, shape (size,).
+        rows: Written: one row per tick as `HandInForce`, except number and source.
+
+    Returns:
+        The firmness of the grip afterwards.
+    """
+    h_s = 1.0 / rate_hz
+    grip_step = 1e9 / (GRIP_NS * rate_hz)
+    size = target.shape[0]
+    for n in range(rows.shape[0]):
+        t_ns = (first + n) * 1_000_000_000 // rate_hz
+        grip = min(grip + grip_step, 1.0)
+        left_s = max((arrives_ns - t_ns) * 1e-9, h_s)
+        if acceleration < math.inf:
+            _glide_tick(
+                left_s=left_s,
+                h_s=h_s,
+                speed_limit=speed_limit,
+                acceleration=acceleration,
+                goal=goal,
+                target=target,
+                rate=rate,
+            )
+        else:
+            square = 0.0
+            for i in range(size):
+                target[i] += rate[i] * h_s
+                rate[i] = (goal[i] - target[i]) / left_s
+                square += rate[i] * rate[i]
+            speed = math.sqrt(square)
+            factor = speed_limit / speed if speed > speed_limit else 1.0
+            for i in range(size):
+                rate[i] *= factor
+        rows[n, 0] = grip
+        for i in range(size):
+            rows[n, 3 + i] = target[i]
+            rows[n, 3 + size + i] = rate[i]
+    return grip
+
+
+@leaf
+def _glide_tick(
+    left_s: float,
+    h_s: float,
+    speed_limit: float,
+    acceleration: float,
+    goal: Array,
+    target: Array,
+    rate: Array,
+) -> None:
+    """Moves a target by a tick, and changes its velocity as `_find_limited_rate` does.
+
+    Args:
+        left_s: Time that remains until the target arrives at the goal, s.
+        h_s: The period, s.
+        speed_limit: Largest speed of the target, m/s or rad/s.
+        acceleration: Largest acceleration of the target, m/s^2 or rad/s^2.
+        goal: The goal, shape (size,).
+        target: The target; changed, shape (size,).
+        rate: Its velocity; changed, shape (size,).
+    """
+    size = target.shape[0]
+    square = 0.0
+    for i in range(size):
+        target[i] += rate[i] * h_s
+        offset = goal[i] - target[i]
+        square += offset * offset
+    distance = math.sqrt(square)
+    stopping_speed = find_stopping_speed(distance, acceleration, h_s)
+    speed = min(speed_limit, min(distance / left_s, stopping_speed))
+    speed_per_distance = speed / distance if distance > 0.0 else 0.0
+    square = 0.0
+    for i in range(size):
+        desired_rate = speed_per_distance * (goal[i] - target[i])
+        change = desired_rate - rate[i]
+        square += change * change
+    change_norm = math.sqrt(square)
+    largest_change = acceleration * h_s
+    factor = largest_change / change_norm if change_norm > largest_change else 1.0
+    for i in range(size):
+        desired_rate = speed_per_distance * (goal[i] - target[i])
+        rate[i] += factor * (desired_rate - rate[i])
+
+
+def _accept_command(
+    rules: HandRules,
+    memory: HandMemory,
+    t_ns: int,
+    command: HandCommand,
+    locate: Callable[[], Sequence[float]],
+) -> tuple[HandMemory, str]:
+    """Returns the state after a message, and the outcome of the message.
+
+    Args:
+        rules: Limits of the hand.
+        memory: State before the message.
+        t_ns: Nominal time of the tick, ns since the epoch.
+        command: The message.
+        locate: Function that returns the arm's pose now.
+
+    Returns:
+        The state, and the outcome: a reason why the message has no effect, a change of the
+        holder, or "" for an ordinary message.
+    """
+    if memory.source not in (0, command.source):
+        return memory, ANOTHER_HOLDS
+
+    # Messages may arrive out of order or twice.
+    last = memory.number if memory.source else memory.before[1]
+    is_known = memory.source or memory.before[0] == command.source
+    if is_known:
+        is_repeated = command.number == last and not memory.source
+        if command.number < last or is_repeated:
+            return memory, OUT_OF_ORDER
+
+    if not command.grip:
+        if not memory.source:
+            return memory, ""
+        return _release(memory, command.number), RELEASED
+    if not memory.source:
+        return _take_hold(rules, memory, t_ns, command, locate), TAKEN
+    memory = memory._replace(received_ns=t_ns)
+    if command.number == memory.number:
+        return memory, ""
+
+    period_ns = 1_000_000_000 // rules.rate_hz
+    between_messages_ns = command.sent_ns - memory.sent_ns
+    # A quarter more, so that the target does not stop when the next message is a little late.
+    glide_ns = between_messages_ns * 5 // 4
+    glide_ns = min(max(glide_ns, period_ns), GLIDE_NS)
+    return _aim(rules, memory, command, t_ns + glide_ns), ""
+
+
+def _take_hold(
+    rules: HandRules,
+    memory: HandMemory,
+    t_ns: int,
+    command: HandCommand,
+    locate: Callable[[], Sequence[float]],
+) -> HandMemory:
+    """Returns the state after a message by which a sender takes hold of a free arm.
+
+    A simulated spring pulls the arm to a target, which moves to the goal of the message. The
+    grip is the factor of the spring's force, 0 to 1. While the grip of an earlier hold fades,
+    its target still exists and moves. The new hold then continues with this grip, target and
+    velocity, so that the force does not jump. Otherwise it starts without force, at the pose of
+    the arm.
+
+    Args:
+        rules: Limits of the hand.
+        memory: State before the message. Nobody holds the arm.
+        t_ns: Nominal time of the tick, ns since the epoch, the common start of the session.
+        command: The message.
+        locate: Function that returns the arm's pose now.
+
+    Returns:
+        The state. The target arrives at its goal after GLIDE_NS.
+    """
+    zeros = (0.0,) * rules.size
+    is_earlier_grip_fading = bool(memory.target)
+    if is_earlier_grip_fading:
+        target = memory.target
+    elif rules.starts_at_arm:
+        target = tuple(map(float, locate()))
+    else:
+        target = zeros  # the target is a force
+    held = HandMemory(
+        source=command.source,
+        number=command.number,
+        grip=memory.grip,
+        target=target,
+        rate=memory.rate or zeros,
+        received_ns=t_ns,
+        before=memory.before,
+    )
+    arrives_ns = t_ns + GLIDE_NS
+    return _aim(rules, held, command, arrives_ns)
+
+
+def _aim(
+    rules: HandRules, memory: HandMemory, command: HandCommand, arrives_ns: int
+) -> HandMemory:
+    """Returns the state with the goal of a message, moved within reach.
+
+    Args:
+        rules: Limits of the hand.
+        memory: State before the message.
+        command: The message.
+        arrives_ns: Time at which the target arrives at the goal, ns since the epoch.
+    """
+    goal = rules.reach.find_nearest(command.target)
+    return memory._replace(
+        number=command.number, goal=goal, arrives_ns=arrives_ns, sent_ns=command.sent_ns
+    )
+
+
+def _release(memory: HandMemory, number: int) -> HandMemory:
+    """Returns the state of a fading grip.
+
+    Args:
+        memory: State before the release.
+        number: Messages of the sender up to this number are outdated.
+    """
+    before = (memory.source, number)
+    return HandMemory(grip=memory.grip, target=memory.target, rate=memory.rate, before=before)
+
+
+def _find_fading_rate(rules: HandRules, memory: HandMemory) -> tuple[float, ...]:
+    """Returns the velocity of a target that comes to rest while its grip fades."""
+    speed = math.sqrt(sum(v * v for v in memory.rate))
+    slower = speed - rules.acceleration_limit / rules.rate_hz
+    if slower <= 0.0:
+        return (0.0,) * len(memory.rate)
+    return tuple(slower / speed * v for v in memory.rate)
+
+
+def _find_limited_rate(
+    rules: HandRules, memory: HandMemory, left_s: float
+) -> tuple[float, ...]:
+    """Returns the velocity of a target whose speed and acceleration are limited.
+
+    The desired velocity points to the goal. Its size is the smallest of three speeds: the speed
+    limit, the speed that reaches the goal in the time that is left, and the largest speed from
+    which the target can stop at the goal, Eq. (L1) at the top of this module. The velocity
+    changes from the last to the desired velocity in a straight line, by at most the
+    acceleration limit times the period.
+
+    The norms of velocities and accelerations are limited. The last and the desired velocity
+    lie within the speed limit, and so does any velocity between them.
+
+    Args:
+        rules: The limits of the hand.
+        memory: Its state, with the target already moved, the goal, and the last velocity
+            `rate`, m/s or rad/s.
+        left_s: Time that remains until the target arrives at the goal, s.
+
+    Returns:
+        The velocity of the target, m/s or rad/s per coordinate.
+    """
+    h_s = 1.0 / rules.rate_hz
+    offset = [goal - x for goal, x in zip(memory.goal, memory.target, strict=True)]
+    # `_glide_tick` computes the same in compiled code. Loops add in the same order as it does.
+    squared_distance = 0.0
+    for x in offset:
+        squared_distance += x * x
+    distance = math.sqrt(squared_distance)
+
+    arriving_speed = distance / left_s
+    stopping_speed = _plain_stopping_speed(distance, rules.acceleration_limit, h_s)
+    speed = min(rules.speed_limit, arriving_speed, stopping_speed)
+    speed_per_distance = speed / distance if distance > 0.0 else 0.0
+    changes = [speed_per_distance * x - v for x, v in zip(offset, memory.rate, strict=True)]
+
+    squared_change = 0.0
+    for change in changes:
+        squared_change += change * change
+    change_norm = math.sqrt(squared_change)
+    largest_change = rules.acceleration_limit * h_s
+    factor = largest_change / change_norm if change_norm > largest_change else 1.0
+    return tuple(v + factor * change for v, change in zip(memory.rate, changes, strict=True))
+
+
+def _find_rate(rules: HandRules, memory: HandMemory, t_ns: int) -> tuple[float, ...]:
+    """Returns the velocity of a target towards its goal, within the limits of the hand.
+
+    Args:
+        rules: Limits of the hand.
+        memory: State, with the target already moved.
+        t_ns: Nominal time of the tick, ns since the epoch.
+    """
+    left_s = max((memory.arrives_ns - t_ns) * 1e-9, 1.0 / rules.rate_hz)
+    if rules.acceleration_limit < math.inf:
+        return _find_limited_rate(rules, memory, left_s)
+    rate = [(goal - x) / left_s for goal, x in zip(memory.goal, memory.target, strict=True)]
+    speed = math.sqrt(sum(v * v for v in rate))
+    factor = rules.speed_limit / speed if speed > rules.speed_limit else 1.0
+    return tuple(factor * v for v in rate)

@@ -1,0 +1,358 @@
+"""Runs a user's hand program, which acts as the operator of an arm.
+
+The program decides at a fixed rate. For each decision it receives a view of what its site, the
+process that runs the arm, knows in a tick (period of the control loop). It returns a target for
+the arm or a force on it.
+
+Invariant:
+    - A decision that is based on tick k acts a fixed time after tick k, wherever the program
+      runs. A decision that arrives later than this acts at once.
+    - The action is an input of the tick and is stored with it, so a log repeats the action
+      without the program.
+"""
+
+import math
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from ...errors import count_nouns
+from ..plug.user_law import PeerView
+from ..step.site_arrays import SiteArrays
+from ..step.site_setup import Layout
+from ..step.ticks import tick_ns
+from ..step.vectors import Array
+from .live_hand import (
+    SILENCE_NS,
+    HandCommand,
+    HandMemory,
+    HandRules,
+    HandStep,
+    advance_hand,
+    glide,
+)
+
+PROGRAM = 1
+"""The source that a record names for each action of a hand program."""
+
+
+class HandContext(NamedTuple):
+    """Facts that a hand program receives before the run.
+
+    >>> class Still:
+    ...     def __init__(self, facts: tn.HandContext) -> None:
+    ...         self.size = facts.size
+    ...     def act(self, now: tn.HandView) -> list[float]:
+    ...         return [0.0] * self.size
+
+    Attributes:
+        site: Site whose arm the program holds.
+        peers: Names of the peers, in scenario order.
+        mode: "tip": the program moves the end effector; "joint": it turns the joints; "force":
+            it pushes.
+        size: Count of the numbers of an action: one per axis, m or N, or one per joint, rad.
+        rate_hz: Rate of decisions, Hz.
+        delay_s: Time from a view to the action that is based on it, s.
+        speed_limit: Largest speed of the target, m/s or rad/s; inf for a program that pushes.
+        limit: Largest force, N, or largest norm of the torques, N m.
+        seed: Seed for random numbers, derived from the scenario and the site.
+    """
+
+    site: str
+    peers: tuple[str, ...]
+    mode: str
+    size: int
+    rate_hz: int
+    delay_s: float
+    speed_limit: float
+    limit: float
+    seed: int
+
+
+class HandView(NamedTuple):
+    """The knowledge of a site at a tick, as its hand program sees it.
+
+    >>> def act(self, now: tn.HandView) -> list[float]:
+    ...     return now.pose + 0.3 * (self.goal_m - now.pose)
+
+    Attributes:
+        k: The tick.
+        t_s: Nominal time of the tick since the epoch, s.
+        q: Joint angles of the arm, rad, shape (n,).
+        qd: Joint velocities, rad/s.
+        pose: Pose of the arm in the coordinates of the hand: its end effector, m, or its
+            joints, rad.
+        q_des: The reference of the previous tick, rad or m, shape (m,).
+        tau_x: Exogenous torque of the previous tick, N m; the torque ON the arm is its
+            negative.
+        target: The hand's current target, m or rad, or its force, N; zeros while it does not
+            hold the arm.
+        grip: Firmness of the hand's grip, 0 to 1.
+        peers: The peers in scenario order, by the samples that were in use at the previous
+            tick: q and qd have m numbers, and ages are those at this tick.
+    """
+
+    k: int
+    t_s: float
+    q: Array
+    qd: Array
+    pose: Array
+    q_des: Array
+    tau_x: Array
+    target: Array
+    grip: float
+    peers: tuple[PeerView, ...]
+
+
+class HandProgram(Protocol):
+    """Interface of a program, written by a user, that moves an arm as an operator would.
+
+    The class of the program is called with two kinds of arguments: a `HandContext`, and the
+    settings of the program as keyword arguments.
+    """
+
+    def act(self, now: HandView) -> Sequence[float] | None:
+        """Decides what the program does with the arm, from what the site knows at a tick.
+
+        Args:
+            now: State of the arm, its target and its peers.
+
+        Returns:
+            The target of the end effector, m, or of the joints, rad, or a force, N, as the
+            program's mode says. None releases the arm.
+        """
+
+
+class OwnHand:
+    """Runs a user's program that moves an arm during a simulation or a live session.
+
+    At regular times, the program gets a view of what the site (the process that runs the arm)
+    knows, and decides where to pull the arm. The decision acts after a delay, like the reaction
+    time of a person.
+
+    Args:
+        rules: Limits of the program's actions.
+        period_ticks: Time from one decision to the next, in periods of the control loop.
+        delay_ticks: Time from a view to the start of the action that is based on it, in periods
+            of the control loop.
+        locate: Function that computes the pose of the arm from its joint angles, in the
+            coordinates in which the program acts.
+    """
+
+    def __init__(
+        self,
+        rules: HandRules,
+        period_ticks: int,
+        delay_ticks: int,
+        locate: Callable[[Sequence[float]], Sequence[float]],
+    ) -> None:
+        self._rules = rules
+        self.period_ticks = period_ticks
+        self.delay_ticks = delay_ticks
+        self._locate = locate
+        self._due: deque[tuple[int, HandCommand]] = deque()
+        self._memory = HandMemory()
+        self._newest = -1
+
+    def is_decision_tick(self, k: int) -> bool:
+        """Returns True if the user's program makes a decision in control period k."""
+        return k % self.period_ticks == 0
+
+    def find_next_event(self, k: int) -> int:
+        """Returns the first tick after `k` at which a decision is made or starts to act."""
+        next_decision = (k // self.period_ticks + 1) * self.period_ticks
+        return min([next_decision, *(due for due, _ in self._due if due > k)])
+
+    def build_view(self, k: int, arrays: SiteArrays, layout: Layout) -> HandView:
+        """Collects what the user's program may know when it decides how to pull the arm.
+
+        Args:
+            k: Control period of the decision. Its results have not been computed yet.
+            arrays: State of the site (the process that runs the arm) after the previous period.
+            layout: Lengths of the site's vectors.
+        """
+        # NumPy reads fields of plain arrays faster than those of records.
+        site = np.asarray(arrays.site)
+        links = np.asarray(arrays.links)
+        n = layout.joints
+        m = layout.shared
+        q = site["q"][0, :n].copy()
+        return HandView(
+            k=k,
+            t_s=k / self._rules.rate_hz,
+            q=q,
+            qd=site["qd"][0, :n].copy(),
+            pose=np.asarray(self._locate(q.tolist()), dtype=np.float64),
+            q_des=site["q_des"][0, :m].copy(),
+            tau_x=0.0 - site["on_arm"][0, :n],
+            target=np.array(self._memory.target or (0.0,) * self._rules.size),
+            grip=self._memory.grip,
+            peers=self._view_peers(k, links, m),
+        )
+
+    def _view_peers(self, k: int, links: Any, coordinates: int) -> tuple[PeerView, ...]:
+        """Returns the peers at tick `k`, by the samples in use at the previous tick.
+
+        Args:
+            k: The tick.
+            links: Rows of the site's links.
+            coordinates: Count of numbers in the vectors of a peer.
+        """
+        now_ns = tick_ns(k, self._rules.rate_hz)
+        vectors = {name: links[name][:, :coordinates].copy() for name in ("q", "qd", "tau_x")}
+        alpha = links["alpha"].tolist()
+        used = links["used"].tolist()
+        rates_hz = links["rate_hz"].tolist()
+        new = links["new"].tolist()
+        peers = []
+        for j in range(len(links)):
+            stamp_ns = tick_ns(max(used[j], 0), rates_hz[j])
+            peers.append(
+                PeerView(
+                    alpha=alpha[j],
+                    tick=used[j],
+                    age_s=(now_ns - stamp_ns) * 1e-9,
+                    new=new[j],
+                    q=vectors["q"][j],
+                    qd=vectors["qd"][j],
+                    tau_x=vectors["tau_x"][j],
+                )
+            )
+        return tuple(peers)
+
+    def accept_decision(self, k: int, goal: Sequence[float] | None) -> None:
+        """Schedules a decision of the program, which acts after the delay of the program.
+
+        A decision is ignored if it is based on an older view than an earlier decision.
+
+        Args:
+            k: Control period whose view of the arm the decision is based on.
+            goal: Position to which the program pulls the arm, m or rad, or the force, N. None
+                to release the arm.
+
+        Raises:
+            ValueError: The goal has the wrong number of coordinates, is not finite, or is too
+                large.
+        """
+        numbers: tuple[float, ...] = ()
+        if goal is not None:
+            numbers = tuple(float(number) for number in goal)
+        if goal is not None and len(numbers) != self._rules.size:
+            count = count_nouns(len(numbers), "number")
+            raise ValueError(f"the action has {count}, not {self._rules.size}")
+        if not all(map(math.isfinite, numbers)):
+            raise ValueError(f"the action {list(numbers)} is not finite")
+        norm = math.hypot(*numbers)
+        largest_norm = self._rules.max_goal_norm
+        if norm > largest_norm:
+            raise ValueError(
+                f"the action has a norm of {norm:g}, but at most {largest_norm:g} is accepted"
+            )
+        if k <= self._newest:
+            return
+
+        self._newest = k
+        self._schedule(k, k + self.delay_ticks, numbers, grip=goal is not None)
+
+    def release(self, k: int) -> None:
+        """Makes the program release the arm in control period k.
+
+        All earlier decisions of the program that have not yet taken effect are cancelled.
+        """
+        self._due.clear()
+        self._schedule(k, k, (), grip=False)
+
+    def _schedule(self, k: int, due: int, target: tuple[float, ...], *, grip: bool) -> None:
+        """Appends the command of tick `k`, which acts at tick `due`.
+
+        Args:
+            k: Tick of the view on which the command is based.
+            due: Tick in which the command acts.
+            target: Target or force; empty if the arm is released.
+            grip: True if the program holds the arm.
+        """
+        command = HandCommand(
+            source=PROGRAM,
+            number=k // self.period_ticks,
+            grip=grip,
+            target=target,
+            sent_ns=tick_ns(due, self._rules.rate_hz),
+        )
+        self._due.append((due, command))
+
+    def advance_to(self, k: int, read_angles: Callable[[], Sequence[float]]) -> HandStep:
+        """Computes how the program pulls the arm in the next control period.
+
+        Args:
+            k: Number of the control period. It must follow the period of the previous call.
+            read_angles: Function that returns the joint angles, rad.
+
+        Returns:
+            The action in this period and the state for the next period, see `advance_hand`.
+        """
+        commands = []
+        while self._due and self._due[0][0] <= k:
+            commands.append(self._due.popleft()[1])
+        step = advance_hand(
+            rules=self._rules,
+            memory=self._memory,
+            t_ns=tick_ns(k, self._rules.rate_hz),
+            commands=commands,
+            locate=lambda: self._locate(read_angles()),
+        )
+        self._memory = step.memory
+        return step
+
+    def advance_span(
+        self, k: int, end: int, read_angles: Callable[[], Sequence[float]]
+    ) -> Array:
+        """Computes how the program pulls the arm in several control periods at once.
+
+        One compiled call computes the span of periods. It ends before the next period in which
+        the program makes a decision or a decision starts to act. The results are exactly those
+        of repeated calls of `advance_to`.
+
+        Args:
+            k: The first control period.
+            end: The span ends before this period at the latest.
+            read_angles: Function that returns the joint angles in period k, rad.
+
+        Returns:
+            One row per period, in the form of `HandInForce`.
+        """
+        size = self._rules.size
+        rate_hz = self._rules.rate_hz
+        first = self.advance_to(k, read_angles).vector
+        last = max(min(self.find_next_event(k), end), k + 1)
+        rows = np.zeros((last - k, 3 + 2 * size))
+        rows[0] = first
+        memory = self._memory
+        silence_ns = tick_ns(last - 1, rate_hz) - memory.received_ns
+        if not memory.source or silence_ns > SILENCE_NS:
+            # The program does not hold the arm, or its silence may end its grip.
+            for n in range(1, len(rows)):
+                rows[n] = self.advance_to(k + n, read_angles).vector
+            return rows
+
+        target = np.array(memory.target)
+        rate = np.array(memory.rate)
+        grip = glide(
+            first=k + 1,
+            rate_hz=rate_hz,
+            grip=memory.grip,
+            arrives_ns=memory.arrives_ns,
+            speed_limit=self._rules.speed_limit,
+            acceleration=self._rules.acceleration_limit,
+            goal=np.array(memory.goal),
+            target=target,
+            rate=rate,
+            rows=rows[1:],
+        )
+        rows[1:, 1] = memory.number
+        rows[1:, 2] = memory.source
+        self._memory = memory._replace(
+            grip=grip, target=tuple(target.tolist()), rate=tuple(rate.tolist())
+        )
+        return rows

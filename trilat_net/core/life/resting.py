@@ -1,0 +1,405 @@
+"""Brings an arm to rest where it is, and keeps it there.
+
+An arm rests while its site (the process that runs the arm) waits for other sites, is stopped,
+or has a fault. Each joint follows a reference, the position q_ref with the velocity qd_ref,
+which slows down smoothly to zero.
+
+Reference: It starts at the angle q and the velocity qd of the joint. In each period h of the
+control loop, its speed falls by the factor
+
+    1 - h / T_left,    T_left = max(LEAST_STOP_S - t, max_i |qd_ref_i| / a_i)
+
+where t is the time since the start, in s, and a_i the deceleration that half of the torque
+limit of joint i gives. The reference is never faster than the joint, and stops when the joint
+reverses. While the arm is fast or a torque is at its limit, q_ref moves along with a joint that
+moves away from it.
+
+Torque: The control law computes a torque for this reference. It is replaced by the known or
+estimated gravity torque if the law cannot be used, see `rests_by_law`. In both cases these
+terms are added:
+
+    w - B s,    s = qd - qd_ref + Lambda (q - q_ref),    dw/dt = -k B s
+
+- B is the damping in N m s/rad, and k = 1 / (4 `RestGains.time_s`). Lambda is the convergence
+  rate, in 1/s: the rate of the adaptive law in joint space, otherwise `REST_RATE_1_S`.
+- w carries a constant load, for example unknown gravity. It starts as the part of the last
+  torque that the law does not explain, times 1 - max B |qd| / tau_limit. While the arm brakes,
+  w loses B |qd| in each period in which it acts in the direction of motion.
+
+An arm is fast while B |qd| of some joint exceeds its torque limit `tau_limit`. The limit on the
+rate of the torque does not delay braking: against the motion, the torque may change by B |qd|
+more per period.
+
+Invariant:
+    - The reference of a joint keeps its direction and never becomes faster.
+    - While an arm brakes, no term but w acts in the direction of motion, and w adds at most the
+      energy h w^2 / 2 B per period. docs/coming-to-rest.md derives this.
+    - Once the reference rests and no torque is limited, the energy function of the adaptive law
+      in joint space plus 1/2 w' (k B)^-1 w never rises.
+"""
+
+from math import inf, isfinite
+
+from ..step.control import limit_torque
+from ..step.jit import leaf
+from ..step.row_fields import SiteRow
+from ..step.site_setup import LEAST_STOP_S, Law, StaleAction
+from ..step.ticks import NS_PER_S, LifeReason, Mode
+from ..step.vectors import Array
+
+REST_RATE_1_S = 3.0
+"""Lambda of an arm at rest whose law has no Lambda of joints, 1/s."""
+
+_ROUNDING_S = 1e-9
+"""Rounding error of the last step of a reference, s: below it the reference rests."""
+
+_WAITING = int(Mode.WAITING)
+_HOLD = int(Mode.HOLD)
+_FAULT = int(Mode.FAULT)
+_STOPPED = int(Mode.STOPPED)
+_NOT_FINITE = int(LifeReason.NOT_FINITE)
+_GLIDE = int(StaleAction.GLIDE)
+_ADAPTIVE = int(Law.ADAPTIVE)
+_USER = int(Law.USER)
+_KNOWN = int(Law.KNOWN)
+
+
+@leaf
+def rests(site: SiteRow) -> bool:
+    """Returns True if the arm comes to rest or is at rest in the present mode.
+
+    This is the case in the modes WAITING, HOLD, FAULT and STOPPED, but only if the rule of the
+    site for silent peers is `StaleAction.GLIDE`. Under the other rules, these modes do not stop
+    the arm smoothly.
+    """
+    still = site.mode in (_WAITING, _HOLD, _FAULT, _STOPPED)
+    return bool(still and site.on_stale == _GLIDE)
+
+
+@leaf
+def find_brake_ratio(site: SiteRow) -> float:
+    """Returns how far the brake of the arm exceeds what its torque limits permit.
+
+    This is the largest ratio of B |qd| to the torque limit over the joints, where B is the
+    damping of the arm at rest and qd the joint velocity. Above 1 the damping alone needs more
+    torque than the joint has.
+    """
+    ratio = 0.0
+    for i in range(site.joints):
+        brake = site.damping[i] * abs(site.qd[i])
+        ratio = max(ratio, brake / site.tau_limit[i])
+    return ratio
+
+
+@leaf
+def is_fast(site: SiteRow) -> bool:
+    """Returns True if the damping B of some joint alone would exceed its torque limit.
+
+    The torque of the damping is B |qd|, where qd is the velocity of the joint.
+    """
+    fast: bool = find_brake_ratio(site) > 1.0
+    return fast
+
+
+@leaf
+def rests_by_law(site: SiteRow) -> bool:
+    """Returns True if the control law can hold the arm at rest.
+
+    Otherwise the known or estimated gravity torque holds the arm, and the estimate of the
+    dynamic parameters is not updated. This is the case in any of these situations:
+
+    - The law was written by a user, and does not declare with `holds = True` that it works
+      without the motion of other arms.
+    - The law works in task space, and is not the built-in law that knows the gravity torque.
+    - The law computed a number that is not finite.
+    - The arm is too fast, see `is_fast`.
+    """
+    holds = site.law != _USER or site.holds != 0
+    learns_in_task = site.task != 0 and site.law != _KNOWN
+    failed = site.reason == _NOT_FINITE
+    usable = holds and not learns_in_task and not failed
+    return bool(usable and not is_fast(site))
+
+
+@leaf
+def enter_rest(t_ns: int, mode: int, reason: int, site: SiteRow) -> None:
+    """Enters a mode in which the arm comes to rest, and starts its rest reference.
+
+    The rest reference is the position that the joints follow until they stand still. An arm
+    that rests already keeps its reference, unless its control law failed now or before.
+
+    Args:
+        t_ns: Time, ns since the epoch, the common start of the session.
+        mode: The mode to enter.
+        reason: Reason of the change of mode, a `LifeReason`.
+        site: Row of the site, the state of one arm with its controller; changed.
+    """
+    failed = reason == _NOT_FINITE or site.reason == _NOT_FINITE
+    keeps_reference = rests(site) and not failed
+    site.mode = mode
+    site.reason = reason
+    if keeps_reference:
+        return
+    site.return_from_ns = t_ns
+    for i in range(site.joints):
+        _write_rest_reference(site, i, site.q[i], site.qd[i])
+
+
+@leaf
+def _read_rest_reference(site: SiteRow, i: int) -> tuple[float, float]:
+    """Returns the rest reference of joint i, rad, and its rate, rad/s."""
+    if site.task:
+        return site.q_rest[i], site.qd_rest[i]
+    return site.q_held[i], site.qd_held[i]
+
+
+@leaf
+def _write_rest_reference(site: SiteRow, i: int, q: float, qd: float) -> None:
+    """Stores the rest reference of a joint, the motion that brings the joint to rest.
+
+    In joint space, the sites share joint angles. The fields `q_held` and `qd_held` have one
+    number per joint, and no other use while the arm rests. In task space, the sites share poses
+    of the end effector. Then these fields have one number per coordinate of the pose, and the
+    joints need `q_rest` and `qd_rest`. `_read_rest_reference` reads the same fields.
+
+    Args:
+        site: State of the site (the process that runs the arm); changed.
+        i: Index of the joint.
+        q: Position of the reference, rad.
+        qd: Velocity of the reference, rad/s.
+    """
+    if site.task:
+        site.q_rest[i] = q
+        site.qd_rest[i] = qd
+    else:
+        site.q_held[i] = q
+        site.qd_held[i] = qd
+
+
+@leaf
+def _find_remaining_s(elapsed_s: float, site: SiteRow) -> float:
+    """Returns the time T_left until the reference rests, s.
+
+    Args:
+        elapsed_s: Time since the start of the rest, s.
+        site: Row of the site.
+    """
+    remaining_s = LEAST_STOP_S - elapsed_s
+    for i in range(site.joints):
+        _, rate = _read_rest_reference(site, i)
+        remaining_s = max(remaining_s, abs(rate) / site.deceleration[i])
+    return remaining_s
+
+
+@leaf
+def advance_rest_reference(t_ns: int, ticks: int, site: SiteRow) -> None:
+    """Slows down the reference that brings the joints to rest, by one or more periods.
+
+    The rules are at the top of this module.
+
+    Args:
+        t_ns: Time of the present period of the control loop, ns since the start of the session.
+        ticks: Number of periods since the last call. It is more than 1 if the site (the process
+            that runs the arm) was too slow and missed periods.
+        site: State of the site; the reference is changed.
+    """
+    if t_ns == site.return_from_ns:
+        return  # the reference starts in this tick
+
+    step_s = ticks / site.rate_hz
+    # The time from the start of the rest to the previous tick.
+    elapsed_s = (t_ns - site.return_from_ns) * 1e-9 - step_s
+    remaining_s = _find_remaining_s(elapsed_s, site)
+    factor = 0.0
+    if remaining_s > step_s + _ROUNDING_S:
+        factor = 1.0 - step_s / remaining_s
+    fast = is_fast(site)
+    for i in range(site.joints):
+        qd = site.qd[i]
+        q_ref, rate_before = _read_rest_reference(site, i)
+        rate = factor * rate_before
+        if rate * qd <= 0.0:
+            rate = 0.0
+        elif abs(rate) > abs(qd):
+            rate = qd
+        step = 0.5 * step_s * (rate_before + rate)
+        is_limited = abs(site.tau[i]) >= site.tau_limit[i]
+        if fast or is_limited:
+            # Without the law, or at its limit, the torque does not pay for a growing distance
+            # from the reference. The spring would later return that distance as energy of its
+            # own, so the reference moves along with the joint.
+            q_before = site.q_before[i]
+            joint_step = site.q[i] - q_before
+            distance = q_before - q_ref
+            if (joint_step - step) * distance >= 0.0:
+                step = joint_step
+        _write_rest_reference(site, i, q_ref + step, rate)
+
+
+@leaf
+def _brakes(t_ns: int, site: SiteRow) -> bool:
+    """Returns True while the arm brakes, which is the first part of its rest.
+
+    An arm at rest follows a reference, a position of each joint that slows down to zero
+    velocity. The arm brakes for at least LEAST_STOP_S, while the reference of a joint moves,
+    and while the arm is fast (its damping alone exceeds a torque limit).
+
+    Args:
+        t_ns: Time, ns since the epoch, the common start of the session.
+        site: Row of the site. While the arm is at rest, `return_from_ns` is the start of the
+            rest.
+    """
+    elapsed_ns = t_ns - site.return_from_ns
+    brakes = elapsed_ns < LEAST_STOP_S * NS_PER_S or is_fast(site)
+    for i in range(site.joints):
+        _, reference_velocity = _read_rest_reference(site, i)
+        brakes = brakes or reference_velocity != 0.0
+    return brakes
+
+
+@leaf
+def put_rest_reference(site: SiteRow, q: Array, qd: Array) -> None:
+    """Computes the reference of an arm at rest, in the coordinates of its control law.
+
+    In joint space, the coordinates are the joint angles. The reference is the motion that
+    brings the joints to rest.
+
+    In task space, the coordinates describe the pose of the end effector. Their reference is the
+    present pose and its velocity, so that the law sees no error. `add_rest_torque` brings the
+    joints to rest instead, by a reference of their own.
+
+    The forces on other arms, which some laws reflect, are cleared, so that they do not move the
+    resting arm.
+
+    Args:
+        site: State of the site (the process that runs the arm). `task` is 1 in task space, and
+            0 in joint space. `felt` is cleared, the weighted forces on the other arms.
+        q: Receives the reference, one number per coordinate, rad or m.
+        qd: Receives the velocity of the reference, rad/s or m/s.
+    """
+    for i in range(q.shape[0]):
+        if site.task:
+            q[i] = site.x[i]
+            qd[i] = site.xd[i]
+        else:
+            q[i], qd[i] = _read_rest_reference(site, i)
+        site.felt[i] = 0.0
+
+
+@leaf
+def _find_slip(site: SiteRow, i: int) -> float:
+    """Returns s = qd - qd_ref + Lambda (q - q_ref) of joint i, rad/s."""
+    q_ref, qd_ref = _read_rest_reference(site, i)
+    Lambda = REST_RATE_1_S
+    if site.law == _ADAPTIVE and not site.task:
+        Lambda = site.Lambda[i]
+    error = site.q[i] - q_ref
+    slip: float = site.qd[i] - qd_ref + Lambda * error
+    return slip
+
+
+@leaf
+def _shrink(torque: float, change: float) -> float:
+    """Returns a torque less a change of the same sign, or zero if the change is larger."""
+    return torque - change if abs(torque) > abs(change) else 0.0
+
+
+@leaf
+def add_rest_torque(k: int, t_ns: int, site: SiteRow) -> None:
+    """Adds damping and an integral term to the torque of an arm at rest, and limits the sum.
+
+    The sum w - B s is added to the torque `tau`. B is the damping in N m s/rad, and s the
+    filtered deviation of a joint from its reference in rad/s. The torque before the limit is
+    stored in `u`.
+
+    The integral term w, in N m, carries a constant load, for example unknown gravity:
+
+    - At the start of the rest, it is the part of the previous torque that the control law does
+      not explain. The faster the arm moves, the smaller this part is made; it is zero in the
+      first tick of a run, which has no previous torque.
+    - While the arm brakes, w may act in the direction of motion and so delay the stop. Then its
+      magnitude is reduced by B |qd| in each tick, at most to zero. qd is the joint velocity.
+    - After this tick, `advance_rest` integrates it.
+
+    Args:
+        k: Number of the control period.
+        t_ns: Time of the period, ns since the start of the session.
+        site: State of the site (the process that runs the arm); changed. `tau_held` is w, and
+            `return_from_ns` the start of the rest.
+    """
+    starts_to_rest = t_ns == site.return_from_ns
+    brakes = _brakes(t_ns, site)
+    # The part of an unexplained torque that is kept, smaller for a faster arm.
+    kept_part = 0.0
+    if k > site.first:
+        kept_part = max(0.0, 1.0 - find_brake_ratio(site))
+    for i in range(site.joints):
+        qd = site.qd[i]
+        damping = site.damping[i]
+        w = site.tau_held[i]
+        if starts_to_rest:
+            unexplained = site.tau_before[i] - site.tau[i]
+            w = kept_part * unexplained
+        acts_along_motion = w * qd > 0.0
+        if brakes and acts_along_motion:
+            w = _shrink(w, damping * qd)
+        torque = site.tau[i] + w - damping * _find_slip(site, i)
+        if not isfinite(torque):
+            torque = 0.0
+            w = 0.0
+        site.tau_held[i] = w
+        site.u[i] = torque
+        site.tau[i] = limit_torque(torque, site.tau_limit[i])
+
+
+@leaf
+def advance_rest(site: SiteRow) -> None:
+    """Updates the integral term w of the torque that holds an arm at rest.
+
+    The term w carries a constant load, for example unknown gravity. In each period h of the
+    control loop, it changes by
+
+        -h k B s,    s = qd - qd_ref + Lambda (q - q_ref)
+
+    where q and qd are the position and velocity of a joint, q_ref and qd_ref those of the
+    reference that brings it to rest, Lambda a rate in 1/s, and k B the integral gain.
+
+    If a limit has cut off a part of the torque, w does not change in the direction of this
+    part. Otherwise it would grow without effect (windup).
+
+    Args:
+        site: State of the site (the process that runs the arm). For each joint, `tau_held` is w
+            in N m, which is changed, and `integral` is k B in N m/rad. `u` is the torque before
+            its limits and `tau` after them, N m.
+    """
+    for i in range(site.joints):
+        slip = _find_slip(site, i)
+        step = -site.integral[i] * slip / site.rate_hz
+        cut_off = site.u[i] - site.tau[i]
+        # A step is not finite if the motion is not; it must not get into w.
+        if isfinite(step) and cut_off * step <= 0.0:
+            site.tau_held[i] += step
+
+
+@leaf
+def limit_torque_rate(site: SiteRow) -> None:
+    """Limits the change of the torque from the previous control period to the present one.
+
+    Before the first period the torque is zero. While an arm comes to rest, the torque against
+    the motion of a joint may change by B |qd| more in a period. B is the damping of the arm at
+    rest in N m s/rad, and qd the velocity of the joint in rad/s.
+
+    Args:
+        site: State of the site (the process that runs the arm); its torque `tau` is limited.
+    """
+    braking = rests(site)
+    for i in range(site.joints):
+        rate_limit = site.tau_rate[i]
+        if rate_limit < inf:
+            largest_change = rate_limit / site.rate_hz
+            before = site.tau_before[i]
+            brake = site.damping[i] * site.qd[i] if braking else 0.0
+            low = before - largest_change - max(brake, 0.0)
+            high = before + largest_change - min(brake, 0.0)
+            tau = site.tau[i]
+            site.tau[i] = min(max(tau, low), high)

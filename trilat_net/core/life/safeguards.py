@@ -1,0 +1,127 @@
+"""Limits the speed of a site's reference, and blends its torque after a rest.
+
+A site is a process that runs one arm. The reference is the position that its control law aims
+at. When an arm leaves its rest, the torque changes gradually from the torque that holds the arm
+to the torque of the law.
+
+Invariant:
+
+- The reference moves no faster than its speed limit, whatever the peers (the sites that it
+  follows) do.
+- A reference without a speed limit is not changed.
+"""
+
+from math import inf, isfinite
+
+from ..arms.chain import put_three, scale, three
+from ..arms.rotation import compose_rotations, relative_rotation, rotation_matrix
+from ..arms.task_space import count_linear_coordinates, has_orientation
+from ..step.jit import leaf
+from ..step.row_fields import SiteRow
+
+BLEND_S = 0.1
+"""Duration of the change from the torque at rest to that of the law, s."""
+
+
+@leaf
+def limit_reference(k: int, site: SiteRow) -> None:
+    """Limits the speed of the reference, the position that the arm follows.
+
+    The reference moves from its value in the previous tick by at most the permitted step. A
+    reference that was held back catches up later. At the first tick it starts from the pose of
+    the arm.
+
+    Args:
+        k: The tick.
+        site: Row of the site, whose reference is changed.
+    """
+    if k == site.first:
+        for i in range(site.shared):
+            site.q_followed[i] = site.x[i] if site.task else site.q[i]
+    if has_orientation(site) and site.qd_des_limit[3] < inf:
+        _limit_turn(site)
+    count = min(site.shared, count_linear_coordinates(site))
+    for i in range(count):
+        limit = site.qd_des_limit[i]
+        if limit == inf:
+            continue
+        q_before = site.q_followed[i]
+        step = site.q_des[i] - q_before
+        largest_step = limit / site.rate_hz
+        if abs(step) > largest_step:
+            sign = 1.0 if step > 0.0 else -1.0
+            site.q_des[i] = q_before + sign * largest_step
+            site.qd_des[i] = sign * limit
+        else:
+            rate = site.qd_des[i]
+            site.qd_des[i] = min(max(rate, -limit), limit)
+
+
+@leaf
+def _limit_turn(site: SiteRow) -> None:
+    """Limits how fast the orientation of the reference turns, about each axis of the base.
+
+    The reference is the pose that the arm follows. It may turn from its orientation in the
+    previous tick (period of the control loop) by at most the limit times the period, about each
+    axis. If it turns too far, the whole rotation vector of the turn is multiplied by the same
+    factor, so that the direction of its axis is kept. The reference then turns at the velocity
+    of the shortened turn.
+
+    Args:
+        site: State of the site (the process that runs the arm). Its coordinates 0 to 2 are a
+            position, and 3 to 5 a rotation vector in rad. `q_followed` is the reference in the
+            previous tick. `q_des` and `qd_des`, the new reference and its velocity, are
+            limited. `qd_des_limit` contains the limits of the velocity, rad/s.
+    """
+    vector_before = three(site.q_followed[3:])
+    orientation_before = rotation_matrix(vector_before)
+    desired_orientation = rotation_matrix(three(site.q_des[3:]))
+    turn = relative_rotation(desired_orientation, orientation_before)
+    # The largest factor with which the turn is within the limits of all three axes.
+    factor = 1.0
+    for axis in range(3):
+        angle = abs(turn[axis])
+        largest_angle = site.qd_des_limit[3 + axis] / site.rate_hz
+        if angle * factor > largest_angle:
+            factor = largest_angle / angle
+    if factor < 1.0:
+        limited_turn = scale(factor, turn)
+        velocity = scale(factor * site.rate_hz, turn)
+        # The orientation before, followed by the limited turn.
+        put_three(site.q_des[3:], compose_rotations(limited_turn, vector_before))
+        put_three(site.qd_des[3:], velocity)
+    # The velocity of a turn that was not shortened comes from the peers, and may be above the
+    # limit although the turn is not. That of a shortened turn only loses rounding errors here.
+    for i in range(3, 6):
+        limit = site.qd_des_limit[i]
+        rate = site.qd_des[i]
+        site.qd_des[i] = min(max(rate, -limit), limit)
+
+
+@leaf
+def is_torque_finite(site: SiteRow) -> bool:
+    """Returns True if the torque that the control law wrote is finite for each joint.
+
+    NaN is found too. Therefore a law that wrote no torque is noticed.
+    """
+    finite = True
+    for i in range(site.joints):
+        finite = finite and isfinite(site.tau[i])
+    return finite
+
+
+@leaf
+def return_to_law(t_ns: int, site: SiteRow) -> None:
+    """Blends the torque of an arm that leaves its rest into the torque of the control law.
+
+    The torque changes linearly within BLEND_S, so that the arm does not jerk.
+
+    Args:
+        t_ns: Time, ns since the epoch, the common start of the session.
+        site: Row of the site, whose torque `tau` is changed.
+    """
+    elapsed_s = (t_ns - site.return_from_ns) * 1e-9
+    progress = min(elapsed_s / BLEND_S, 1.0)
+    for i in range(site.joints):
+        at_rest = site.tau_held[i]
+        site.tau[i] = at_rest + progress * (site.tau[i] - at_rest)

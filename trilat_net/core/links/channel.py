@@ -1,0 +1,206 @@
+"""Computes when a simulated network delivers each sample, or that it loses the sample.
+
+A link is the directed connection between two sites, the processes that run one arm each. A
+sample is the state that a site sends in one tick (period of its control loop), and its stamp is
+the number of this tick. A link delays each sample, and may lose or duplicate it.
+
+Invariant (law L4 of docs/design.md):
+
+- What happens to sample m depends only on the key of the link (the seed of its random numbers),
+  on m, and on the network model in force at the stamp of m.
+- Models with a memory (bursts of loss, correlated delays, order of samples) advance from sample
+  to sample by index, in whatever order samples arrive.
+"""
+
+from ..step.jit import leaf
+from ..step.row_fields import LinkRow
+from ..step.ticks import tick_ns
+from ..step.vectors import IntArray, Points, Row, RowArray
+from .delay import (
+    COPY,
+    DELAY,
+    DUPLICATE,
+    LOSS,
+    DelayKind,
+    clamp_delay_us,
+    custom_delay_us,
+    draw_delay_us,
+    next_ar1_value,
+    sine_delay_us,
+    trace_delay_us,
+)
+from .philox import DrawKey, uniforms
+
+LOST = -1
+"""Stands for the due time of a lost sample."""
+
+_AR1 = int(DelayKind.AR1)
+_SINE = int(DelayKind.SINE)
+_TRACE = int(DelayKind.TRACE)
+_MEASURED = int(DelayKind.MEASURED)
+_CUSTOM = int(DelayKind.CUSTOM)
+
+
+@leaf
+def _in_outage(stamp_ns: int, link: LinkRow, points: Points) -> bool:
+    """Returns True if a stamp lies in an outage of the link, its end excluded."""
+    for n in range(link.outage_first, link.outage_first + link.outage_count):
+        if points[n, 0] <= stamp_ns < points[n, 1]:
+            return True
+    return False
+
+
+@leaf
+def _draw_loss(sample: int, fresh: bool, link: LinkRow, model: Row) -> bool:
+    """Advances the chain of losses by one sample, and returns True if the sample is lost.
+
+    The chain of Gilbert and Elliott has a good and a bad state, each with a probability of
+    loss. A fresh chain starts in its stationary distribution, where the bad state has the
+    probability enter / (enter + leave).
+
+    Args:
+        sample: Index of the sample.
+        fresh: True for the first sample of the model.
+        link: Row of the link, whose state is changed.
+        model: Model in force.
+    """
+    if model.loss_good == 0.0 and model.enter == 0.0:
+        return False
+    u, v = uniforms(link.key, sample, LOSS, 0)
+    if fresh:
+        # A product and not a quotient: enter + leave may be zero.
+        link.bad = u * (model.enter + model.leave) < model.enter
+    elif link.bad:
+        link.bad = u >= model.leave
+    else:
+        link.bad = u < model.enter
+    probability: float = model.loss_bad if link.bad else model.loss_good
+    return v < probability
+
+
+@leaf
+def _delay_us(
+    sample: int, stamp_ns: int, fresh: bool, link: LinkRow, model: Row, points: Points
+) -> int:
+    """Returns the delay of a sample, us, or LOST if a trace says that the sample is lost.
+
+    Args:
+        sample: Index of the sample.
+        stamp_ns: Stamp of the sample, ns since the epoch.
+        fresh: True for the first sample of the model.
+        link: Row of the link.
+        model: Model in force.
+        points: The site's traces.
+    """
+    key: DrawKey = link.key
+    if model.kind == _MEASURED:
+        return 0
+    if model.kind == _TRACE:
+        return trace_delay_us(stamp_ns, model, points)
+    if model.kind == _SINE:
+        return clamp_delay_us(sine_delay_us(stamp_ns, model))
+    if model.kind == _AR1:
+        link.memory = next_ar1_value(
+            key=key, sample=sample, correlation=model.weight, before=link.memory, fresh=fresh
+        )
+        return clamp_delay_us(model.location + model.scale * link.memory)
+    if model.kind == _CUSTOM:
+        return clamp_delay_us(
+            custom_delay_us(
+                key=key, sample=sample, stamp_ns=stamp_ns, model=model, points=points
+            )
+        )
+    return clamp_delay_us(draw_delay_us(key, sample, DELAY, model))
+
+
+@leaf
+def _due_ns(
+    sample: int, stamp_ns: int, fresh: bool, link: LinkRow, model: Row, points: Points
+) -> int:
+    """Computes when a link delivers a sample, or that the link loses it.
+
+    This function must be called once for each sample, in the order of the indices. The models
+    of bursts of loss and of correlated delays have a state, which it advances. Therefore loss
+    and delay are drawn even for a sample that is lost for another reason.
+
+    Args:
+        sample: Index of the sample, the state that the sender sent in the tick (period of its
+            control loop) of this number.
+        stamp_ns: Time at which the sample was sent, ns since the epoch, the common start of the
+            session.
+        fresh: True for the first sample of the model, with which the model's state starts.
+        link: State of the link, with the seed `key` of its random numbers; changed. `copies`
+            counts the duplicated samples, and `due_before` is the latest due time so far, ns.
+        model: Model of delay and loss in force, a row of LINK_MODEL_DTYPE.
+        points: Delay traces and outages of all links of the receiver.
+
+    Returns:
+        The due time, at which the link delivers the sample, ns since the epoch. LOST if the
+        link loses the sample.
+    """
+    lost = _draw_loss(sample, fresh, link, model)
+    delay_us = _delay_us(
+        sample=sample, stamp_ns=stamp_ns, fresh=fresh, link=link, model=model, points=points
+    )
+    lost_by_trace = delay_us < 0
+    if lost or lost_by_trace or _in_outage(stamp_ns, link, points):
+        return LOST
+
+    if model.duplicate > 0.0:
+        u, _ = uniforms(link.key, sample, DUPLICATE, 0)
+        is_duplicated = u < model.duplicate
+        if is_duplicated:
+            link.copies += 1
+            # The receiver uses whichever of the two arrives first. The kinds before AR1 are
+            # distributions, from which the copy gets a delay of its own. With all other kinds,
+            # the copy has the delay of the sample and changes nothing.
+            draws_delay_of_copy = model.kind < _AR1
+            if draws_delay_of_copy:
+                copy_us = clamp_delay_us(draw_delay_us(link.key, sample, COPY, model))
+                delay_us = min(delay_us, copy_us)
+
+    # The play-out buffer of the receiver keeps each sample for at least `playout_us`.
+    due_ns: int = stamp_ns + max(delay_us, model.playout_us) * 1000
+    if model.in_order == 1:
+        # A sample waits for all older samples.
+        due_ns = max(due_ns, link.due_before)
+    link.due_before = max(due_ns, link.due_before)
+    return due_ns
+
+
+@leaf
+def schedule_deliveries(
+    sample: int, link: LinkRow, models: RowArray, dues: IntArray, points: Points
+) -> None:
+    """Computes at which times a simulated link delivers its samples, up to a given sample.
+
+    A link connects one site (the process that runs one arm) to another. A sample is the state
+    that the sender sends in one period of its control loop. The model of the link's delay and
+    loss may change at planned times. Each sample follows the model in force when the sample was
+    sent.
+
+    Args:
+        sample: Index of the last sample to compute. Earlier samples are not computed twice.
+        link: State of the link; changed.
+        models: Models of the link's delay and loss, in the order in which they come into force.
+        dues: Receives the delivery times in ns since the start of the session, or LOST. It is a
+            ring: sample m is stored at m modulo its length.
+        points: Delay traces and outages of all links of the receiver.
+    """
+    kept = dues.shape[0]
+    while link.scheduled < sample:
+        m = link.scheduled + 1
+        fresh = m == 0
+        stamp_ns = tick_ns(m, link.rate_hz)
+        while link.model + 1 < link.models and models[link.model + 1].from_ns <= stamp_ns:
+            link.model += 1
+            fresh = True
+        dues[m % kept] = _due_ns(
+            sample=m,
+            stamp_ns=stamp_ns,
+            fresh=fresh,
+            link=link,
+            model=models[link.model],
+            points=points,
+        )
+        link.scheduled = m

@@ -1,0 +1,397 @@
+"""Computes by how much a simulated network delays each sample.
+
+Two sites, the processes that run one arm each, are connected by a link in each direction. In
+each period of its control loop, a site sends a sample with the state of its arm. The periods
+are numbered, and this number is the index of the sample. The stamp of the sample is the time at
+which it was sent. A delay model is a distribution of delays, a function of time, or a recorded
+trace.
+
+Invariant (law L4 of docs/design.md):
+    - A delay depends only on the seed of the link and on the index and the stamp of the sample.
+      Therefore a run can be repeated exactly. Delays are rounded to whole microseconds.
+    - Only the model AR1, with correlated delays, also depends on the previous sample. It
+      processes the samples in the order in which they were sent, not in which they arrive.
+"""
+
+import math
+from collections.abc import Sequence
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+
+from ..plug.plugged import call_address
+from ..step.jit import leaf
+from ..step.vectors import Points, Row, count_started
+from .philox import DrawKey, standard_gamma, standard_normal, uniforms
+
+MAX_DELAY_US = 10_000_000
+"""Largest delay; the tail of a distribution is cut off here."""
+
+
+class DelayKind(IntEnum):
+    """The kinds of delay, with the meaning of the four parameters of a `LinkModel`.
+
+    Times are in us.
+
+    - CONSTANT: location.
+    - UNIFORM: from location - scale to location + scale.
+    - NORMAL: mean `location`, deviation `scale`; negative draws are repeated.
+    - GAMMA: shape `extra`, scale `scale`.
+    - LOG_NORMAL: exp of a normal number of mean `location` and deviation `scale`.
+    - HYPER_EXPONENTIAL: `location` plus an exponential number, of mean `extra` with the
+      probability `weight`, otherwise of mean `scale`.
+    - AR1: mean `location`, deviation `scale`, correlation `weight` from sample to sample; cut
+      off at zero.
+    - SINE: location + scale sin(2 pi t / extra + weight).
+    - TRACE: a table of delays by time.
+    - MEASURED: no delay is injected; a sample is used as soon as it arrives.
+    - CUSTOM: a compiled function in a file of its own; never above `location`.
+    """
+
+    CONSTANT = 0
+    UNIFORM = 1
+    NORMAL = 2
+    GAMMA = 3
+    LOG_NORMAL = 4
+    HYPER_EXPONENTIAL = 5
+    AR1 = 6
+    SINE = 7
+    TRACE = 8
+    MEASURED = 9
+    CUSTOM = 10
+
+
+class TraceEnd(IntEnum):
+    """What a trace, a table of delays by time, does after its last point.
+
+    It holds the last delay, or starts again.
+    """
+
+    HOLD = 0
+    LOOP = 1
+
+
+class LinkModel(NamedTuple):
+    """Effect of a link on its samples, from a stamp on until the next model applies.
+
+    The stamp of a sample is the time at which it was sent.
+
+    Attributes:
+        from_ns: First stamp to which the model applies, ns since the epoch.
+        kind: A `DelayKind`, which defines `location`, `scale`, `extra` and `weight`.
+        at_end: A `TraceEnd`, for a trace.
+        trace_first: First row in the site's table of the points of a trace, or of the numbers
+            of a CUSTOM model.
+        trace_count: Number of these rows.
+        loss_good: Probability that a sample is lost in the good state.
+        loss_bad: Probability that a sample is lost in the bad state.
+        enter: Probability of a change from good to bad, per sample.
+        leave: Probability of a change from bad to good, per sample.
+        duplicate: Probability that a sample has a copy, with another delay.
+        in_order: 1: no sample is released before an older sample; 0: the newest sample counts.
+        playout_us: Least delay of each sample, us (play-out buffer).
+        call: Address of the function of a CUSTOM model, see `plugged`.
+        key: Input of that function: the key of the link.
+        sample: Input: the index of the sample.
+        stamp_ns: Input: the stamp of the sample, ns since the epoch.
+        drawn_us: Output: the delay, us.
+    """
+
+    from_ns: int = 0
+    kind: int = DelayKind.CONSTANT
+    location: float = 0.0
+    scale: float = 0.0
+    extra: float = 0.0
+    weight: float = 0.0
+    at_end: int = TraceEnd.HOLD
+    trace_first: int = 0
+    trace_count: int = 0
+    loss_good: float = 0.0
+    loss_bad: float = 0.0
+    enter: float = 0.0
+    leave: float = 1.0
+    duplicate: float = 0.0
+    in_order: int = 0
+    playout_us: int = 0
+    call: int = 0
+    key: int = 0
+    sample: int = 0
+    stamp_ns: int = 0
+    drawn_us: float = 0.0
+
+
+LINK_MODEL_DTYPE = np.dtype(
+    (
+        np.record,
+        [
+            (name, "f8" if kind is float else "i8")
+            for name, kind in LinkModel.__annotations__.items()
+        ],
+    )
+)
+
+
+_LARGEST_NORMAL = 8.6
+_LARGEST_EXPONENTIAL = 36.8
+"""Largest magnitudes of draws, at the least uniform number 2^-53 (see `unit_interval`):
+sqrt(-2 log 2^-53) by Box and Muller, and -log 2^-53.
+"""
+
+
+def _longest_us(model: LinkModel, trace: Points | None) -> float:
+    """Returns an upper bound of the delays of a model, us.
+
+    The bound follows from the bounds of the model's random numbers: the largest normal number
+    is `_LARGEST_NORMAL`, and the largest exponential number of mean 1 is
+    `_LARGEST_EXPONENTIAL`. The limit MAX_DELAY_US is not applied, except to the log-normal
+    delay, whose exponential might overflow.
+
+    Args:
+        model: The model. `DelayKind` states what its numbers `location`, `scale`, `extra` and
+            `weight` mean for each kind of delay.
+        trace: Points of its trace, rows of time and delay, see `Points`; None for other kinds.
+    """
+    location = model.location
+    scale = model.scale
+    extra = model.extra
+    weight = abs(model.weight)
+    if model.kind == DelayKind.GAMMA:
+        # Marsaglia and Tsang draw d (1 + x / sqrt(9 d))^3 with a normal number x, see
+        # `standard_gamma`. They draw a shape below 1 as the shape increased by 1.
+        d = extra + (extra < 1.0) - 1.0 / 3.0
+        return scale * d * (1.0 + _LARGEST_NORMAL / math.sqrt(9.0 * d)) ** 3
+
+    if model.kind == DelayKind.LOG_NORMAL:
+        largest_exponent = math.log(MAX_DELAY_US)
+        return math.exp(min(location + _LARGEST_NORMAL * scale, largest_exponent))
+
+    if model.kind == DelayKind.AR1:
+        # With the correlation c, draw n samples ago counts sqrt(1 - c^2) c^n. The sum over all
+        # past draws, each at its largest, is sqrt(1 - c^2) / (1 - c).
+        gain = math.sqrt((1.0 + weight) / (1.0 - weight)) if weight < 1.0 else math.inf
+        return location + _LARGEST_NORMAL * scale * gain
+
+    longest_in_trace_us = 0.0 if trace is None else float(np.max(trace[:, 1], initial=0))
+    bounds_us = {
+        DelayKind.CONSTANT: location,
+        DelayKind.UNIFORM: location + scale,
+        DelayKind.NORMAL: location + _LARGEST_NORMAL * scale,
+        DelayKind.HYPER_EXPONENTIAL: location + _LARGEST_EXPONENTIAL * max(scale, extra),
+        DelayKind.SINE: location + abs(scale),
+        DelayKind.TRACE: longest_in_trace_us,
+        DelayKind.MEASURED: 0.0,
+        DelayKind.CUSTOM: location,
+    }
+    return bounds_us[DelayKind(model.kind)]
+
+
+def max_delay_us(models: Sequence[LinkModel], traces: Sequence[Points | None]) -> int:
+    """Computes an upper bound of the delays on a link.
+
+    The bound decides for how many delayed samples the receiver reserves memory. It includes the
+    play-out buffer, a minimum delay that the receiver adds to reduce jitter.
+
+    Args:
+        models: The delay models that apply to the link, one after another.
+        traces: For each model its recorded trace, a table of delays over time. None for a model
+            without a trace.
+
+    Returns:
+        The bound, us.
+    """
+    bounds_us = []
+    for model, trace in zip(models, traces, strict=True):
+        longest_us = min(_longest_us(model, trace), MAX_DELAY_US)
+        bounds_us.append(max(math.ceil(longest_us) + 1, model.playout_us))
+    return min(MAX_DELAY_US, max(bounds_us))
+
+
+LOSS = 0
+DUPLICATE = 1
+DELAY = 2
+COPY = 5
+"""Purposes of draws. DELAY and COPY also reserve the two purposes that follow them, see
+`standard_gamma`.
+"""
+
+_UNIFORM = int(DelayKind.UNIFORM)
+_NORMAL = int(DelayKind.NORMAL)
+_GAMMA = int(DelayKind.GAMMA)
+_LOG_NORMAL = int(DelayKind.LOG_NORMAL)
+_HYPER = int(DelayKind.HYPER_EXPONENTIAL)
+_LOOP = int(TraceEnd.LOOP)
+
+
+@leaf
+def draw_delay_us(key: DrawKey, sample: int, purpose: int, model: Row) -> float:
+    """Draws a random delay from a distribution that has no memory, us, not rounded.
+
+    The random numbers are a function of the key, the sample and the purpose. Therefore the same
+    arguments always give the same delay. `DelayKind` states what the parameters `location`,
+    `scale`, `extra` and `weight` of the model mean for each distribution.
+
+    Args:
+        key: Key of the link, from which all its random numbers follow.
+        sample: Index of the sample, the state that a site sends in one tick.
+        purpose: Selects random numbers that are independent of each other: DELAY for the
+            sample, COPY for its duplicate.
+        model: Model of the delay, a row of LINK_MODEL_DTYPE.
+
+    Returns:
+        The delay. If the model has no such distribution, it is the constant `location`.
+    """
+    location: float = model.location
+    scale: float = model.scale
+    extra: float = model.extra
+    if model.kind == _UNIFORM:
+        u, _ = uniforms(key, sample, purpose, 0)
+        return location + scale * (2.0 * u - 1.0)
+    if model.kind == _NORMAL:
+        # The mean is not negative, so each attempt succeeds with a probability of at least 1/2.
+        # If all attempts fail, the delay is the mean.
+        for attempt in range(64):
+            x = location + scale * standard_normal(key, sample, purpose, attempt)
+            if x >= 0.0:
+                return x
+    if model.kind == _GAMMA:
+        return scale * standard_gamma(key, sample, purpose, extra)
+    if model.kind == _LOG_NORMAL:
+        return math.exp(location + scale * standard_normal(key, sample, purpose, 0))
+    if model.kind == _HYPER:
+        # u selects one of two exponential distributions, and v is the draw from it.
+        u, v = uniforms(key, sample, purpose, 0)
+        mean = extra if u < model.weight else scale
+        return location - mean * math.log(v)
+    return location
+
+
+@leaf
+def next_ar1_value(
+    key: DrawKey, sample: int, correlation: float, before: float, fresh: bool
+) -> float:
+    """Returns the next number of a random sequence whose neighbours are correlated.
+
+        x_m = c x_{m-1} + sqrt(1 - c^2) n_m,  n_m standard normal
+
+    This is an AR(1) sequence. Each of its numbers has the mean 0 and the deviation 1.
+
+    Args:
+        key: Key of the link, from which all its random numbers follow.
+        sample: Index m of the sample.
+        correlation: Correlation c of neighbours.
+        before: Number x_{m-1} of the previous sample.
+        fresh: True: the sequence starts here, with x_m = n_m.
+    """
+    draw = standard_normal(key, sample, DELAY, 0)
+    if fresh:
+        return draw
+    return correlation * before + math.sqrt(1.0 - correlation * correlation) * draw
+
+
+@leaf
+def sine_delay_us(stamp_ns: int, model: Row) -> float:
+    """Computes the delay of a sample on a link whose delay is a sine function of time.
+
+        delay(t) = mean + amplitude sin(2 pi t / period + phase)
+
+    Args:
+        stamp_ns: Stamp of the sample, the time t at which it was sent, ns since the epoch, the
+            common start of the session.
+        model: Model of the delay, a row of LINK_MODEL_DTYPE. The mean is `location`, the
+            amplitude `scale` and the period `extra`, all in us. The phase is `weight`, in rad.
+
+    Returns:
+        The delay, us, not rounded.
+    """
+    mean_us: float = model.location
+    amplitude_us: float = model.scale
+    period_us = model.extra
+    phase_rad = model.weight
+    stamp_us = stamp_ns * 1e-3
+    turns = stamp_us / period_us
+    return mean_us + amplitude_us * math.sin(2.0 * math.pi * turns + phase_rad)
+
+
+@leaf
+def trace_delay_us(stamp_ns: int, model: Row, points: Points) -> int:
+    """Returns the delay of a sample on a link with a trace, a table of delays by time.
+
+    The delay is that of the last point at or before the stamp. A trace that loops starts again
+    after its last point, which lasts as long as the point before it.
+
+    Args:
+        stamp_ns: Stamp of the sample, the time at which it was sent, ns since the epoch.
+        model: Model of the delay, a row of LINK_MODEL_DTYPE.
+        points: Points of all traces, rows of time and delay, us.
+
+    Returns:
+        The delay, us. It is -1 if the sample is lost.
+    """
+    first = model.trace_first
+    count = model.trace_count
+    t_us = stamp_ns // 1000
+    if model.at_end == _LOOP and count > 1:
+        end_us = points[first + count - 1, 0]
+        t_us %= 2 * end_us - points[first + count - 2, 0]
+    index = count_started(points, first, count, t_us) - 1
+    delay_us: int = points[first + max(index, 0), 1]
+    return delay_us
+
+
+@leaf
+def draw_pair(now: Row, index: int, attempt: int) -> tuple[float, float]:
+    """Returns two uniform random numbers for a delay model that a user wrote.
+
+    Equal arguments give equal numbers, in every process. Therefore a run can be repeated
+    exactly.
+
+    Args:
+        now: The argument that the user's function received, with the seed of the link.
+        index: Index of the draw. Usually it is the index of the sample whose delay is computed.
+        attempt: Counts the draws for one index from 0, for methods that reject some draws.
+    """
+    return uniforms(np.uint64(now.key), index, DELAY, attempt)
+
+
+@leaf
+def custom_delay_us(
+    key: DrawKey, sample: int, stamp_ns: int, model: Row, points: Points
+) -> float:
+    """Computes the delay of a sample by the compiled function of a user's delay model.
+
+    The delay is limited to the maximum that the user's model declares. The function has two
+    arguments: the parameters of the user's model, and the row of the delay model. It reads its
+    input from the fields `key`, `sample` and `stamp_ns` of the row, and writes the delay into
+    the field `drawn_us`, see `plugged`.
+
+    Args:
+        key: Seed of all random numbers of the link.
+        sample: Index of the sample.
+        stamp_ns: Time at which the sample was sent, ns since the start of the session.
+        model: The delay model, a row of LINK_MODEL_DTYPE. The field `call` is the address of
+            the function. The field `location` is the maximum delay, us.
+        points: Table with the parameters of all models, which are floats in an array of
+            integers. Each row holds two of them.
+
+    Returns:
+        The delay in us, not rounded.
+    """
+    # The key is an unsigned number, the field a signed one with the same bits.
+    model.key = np.int64(key)
+    model.sample = sample
+    model.stamp_ns = stamp_ns
+
+    first = model.trace_first
+    count = model.trace_count
+    model_parameters = points[first : first + count].reshape(-1).view(np.float64)
+    call_address(model.call, (model_parameters, model))
+    drawn_us: float = min(model.drawn_us, model.location)
+    return drawn_us
+
+
+@leaf
+def clamp_delay_us(delay_us: float) -> int:
+    """Returns a delay in whole microseconds, limited to the range from 0 to `MAX_DELAY_US`."""
+    rounded_us = math.floor(delay_us + 0.5)
+    return int(min(max(rounded_us, 0.0), float(MAX_DELAY_US)))

@@ -1,0 +1,404 @@
+"""Computes the weights with which arms follow each other, and the reference of an arm.
+
+A site is a process that runs one arm. Site i follows site j with the weight alpha_ij, which is
+called dominance factor or share. The reference of site i, the position that its control law
+aims at, is the sum of alpha_ij q_j, where q_j is the position of arm j.
+
+In the stability proof, the matrix Upsilon = I - alpha describes the coupling, with the identity
+I. The energy function of the proof weights site i with the number beta_i.
+
+Invariant:
+    - Each row of the matrix alpha sums to 1, and its diagonal is zero.
+    - beta is the LEFT null vector of Upsilon.
+    - Factors change along ramps. Every row sums to 1 during a ramp too. The factors at a time
+      depend only on this time and the ramps.
+    - If samples from another site stay away, the reference stops. It later returns smoothly
+      from the held pose along the polynomial 3 x^2 - 2 x^3, with x from 0 to 1.
+
+Source: Eq. (6), (7), (20) of the paper on which this project is based (docs/references.md). The
+paper uses beta = (1, 1, 1). This is the right null vector of Upsilon, and a left null vector
+only if the columns sum to 1 as well. The left null vector of an irreducible matrix is its
+Perron vector, which is positive and unique up to its length.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..step.jit import leaf
+from ..step.row_fields import LinkRow, SiteRow
+from ..step.site_setup import StaleAction
+from ..step.ticks import Mode, tick_ns
+from ..step.vectors import Array, RowArray, put
+from .lost_peers import regroup
+
+ROW_SUM_TOLERANCE = 1e-9
+
+
+def find_row_problem(row: Array, site: int) -> str | None:
+    """Returns the reason why a row of the dominance matrix is not valid, Eq. (7).
+
+    The row contains the weights with which one site follows the others. They must lie between 0
+    and 1 and sum to 1, and the site must not follow itself.
+
+    Args:
+        row: Dominance factors of one site, shape (N,).
+        site: Index of that site.
+
+    Returns:
+        A clause for an error message. None if the row is valid.
+    """
+    if not np.isfinite(row).all():
+        return "shares must be finite numbers"
+    if row[site] != 0.0:
+        return f"a site does not follow itself, yet its own share is {row[site]:g}"
+    if (row < 0.0).any() or (row > 1.0).any():
+        return "shares must lie between 0 and 1"
+    if abs(row.sum() - 1.0) > ROW_SUM_TOLERANCE:
+        return f"shares must sum to 1, Eq. (7), and sum to {row.sum():.12g}"
+    return None
+
+
+def find_reach(alpha: Array) -> NDArray[np.bool_]:
+    """Returns which sites each site follows, directly or through other sites.
+
+    A site follows another one if its dominance factor, the weight of that site, is above 0.
+
+    Args:
+        alpha: Dominance matrix, shape (N, N): row i contains the weights with which site i
+            follows the other sites.
+
+    Returns:
+        Shape (N, N): true at [i, j] if site i follows site j, directly or through others.
+    """
+    reach: NDArray[np.bool_] = (alpha > 0.0) | np.eye(len(alpha), dtype=bool)
+    # Each squaring doubles the length of the paths.
+    for _ in range(len(alpha).bit_length()):
+        reach = reach @ reach
+    return reach
+
+
+def is_irreducible(alpha: Array) -> bool:
+    """Returns True if every site follows every other site, directly or through others.
+
+    The stability theorem needs this property of the dominance matrix.
+
+    Args:
+        alpha: Dominance matrix, shape (N, N): row i contains the weights with which site i
+            follows the other sites.
+    """
+    return bool(find_reach(alpha).all())
+
+
+def find_balancing_weights(alpha: Array) -> Array | None:
+    """Returns weights D > 0 with D_i alpha_ij = D_j alpha_ji, if the matrix is reversible.
+
+    This equation is called detailed balance. It has a solution if the products of the dominance
+    factors around each circle of sites are equal in both directions (Kolmogorov), as in
+    alpha12 alpha23 alpha31 = alpha13 alpha32 alpha21 for three sites. Then the eigenvalues of
+    alpha are real. Links out of a group of sites that reach each other belong to no circle and
+    are ignored.
+
+    Args:
+        alpha: Dominance matrix, shape (N, N): row i contains the weights with which site i
+            follows the other sites.
+
+    Returns:
+        D, shape (N,), with D = 1 at the first site of each group. None if no D exists.
+    """
+    reach = find_reach(alpha)
+    followed = reach & reach.T & (alpha > 0.0)
+    D = np.zeros(len(alpha))
+    for first in range(len(alpha)):
+        if D[first]:
+            continue
+        D[first] = 1.0
+        waiting = [first]
+        while waiting:
+            i = waiting.pop()
+            for j in np.flatnonzero(followed[i]).tolist():
+                forward = D[i] * alpha[i, j]
+                share_back = alpha[j, i]
+                imbalance = abs(forward - D[j] * share_back)
+                if not D[j] and share_back:
+                    D[j] = forward / share_back
+                    waiting.append(j)
+                elif imbalance > ROW_SUM_TOLERANCE * forward:
+                    return None
+    return D
+
+
+def perron_vector(alpha: Array) -> Array:
+    """Returns the weights beta of the sites in the energy function of the stability proof.
+
+    They are the positive solution of beta' = beta' alpha with the sum 1, which the paper writes
+    as beta' Upsilon = 0. The method is the elimination of Grassmann, Taksar and Heyman (1985).
+    It contains no subtraction. Therefore each entry is accurate to a few units in the last
+    place even if the dominance factors differ by many orders of magnitude.
+
+    Args:
+        alpha: Irreducible dominance matrix, shape (N, N), see `is_irreducible`.
+
+    Returns:
+        The weights, shape (N,).
+
+    Raises:
+        ValueError: alpha is reducible: the weight of some site is zero, or beta is not unique.
+    """
+    if not is_irreducible(alpha):
+        raise ValueError("alpha is reducible: beta has a zero entry or is not unique")
+    a = alpha.copy()
+    size = len(a)
+    # Eliminate the last site: its followers follow its peers instead.
+    for last in range(size - 1, 0, -1):
+        row = a[last, :last]
+        a[:last, last] /= row.sum()
+        column = a[:last, last]
+        a[:last, :last] += np.outer(column, row)
+    beta = np.zeros(size)
+    beta[0] = 1.0
+    for site in range(1, size):
+        beta[site] = beta[:site] @ a[:site, site]
+    normalised: Array = beta / beta.sum()
+    return normalised
+
+
+RAMP_COLUMNS = 2
+"""Columns of a ramp before its factors.
+
+A ramp is a row: its start and its end, ns, and then the dominance factor of each peer at its
+end.
+"""
+
+
+@leaf
+def _interpolate(
+    t_ns: float, start_ns: float, end_ns: float, before: float, after: float
+) -> float:
+    """Returns the factor at time t of a linear change from `before` to `after`.
+
+    Args:
+        t_ns: Time t, ns since the epoch.
+        start_ns: Start of the change.
+        end_ns: End of the change.
+        before: Factor at the start.
+        after: Factor at the end.
+    """
+    if t_ns >= end_ns:
+        return after
+    progress = (t_ns - start_ns) / (end_ns - start_ns)
+    return before + (after - before) * progress
+
+
+@leaf
+def apply_ramps(t_ns: int, count: int, ramps: Array, links: RowArray) -> None:
+    """Computes the dominance factors and their derivatives at time t, for each link.
+
+    A dominance factor is the weight with which the site follows a peer. It changes by ramps,
+    linear changes over time. A ramp starts at the factors that the previous ramp has at that
+    time, complete or not.
+
+    Args:
+        t_ns: The time, ns since the epoch, the common start of the session.
+        count: Number of filled rows of `ramps`.
+        ramps: Ramps in the order of their starts, shape (R, RAMP_COLUMNS + P); row 0 holds
+            the factors at the epoch.
+        links: Rows of the links, shape (P,); written.
+    """
+    for j in range(links.shape[0]):
+        link: LinkRow = links[j]
+        column = RAMP_COLUMNS + j
+        before = ramps[0, column]
+        current = 0
+        for n in range(1, count):
+            if t_ns < ramps[n, 0]:
+                break
+            before = _interpolate(
+                t_ns=ramps[n, 0],
+                start_ns=ramps[current, 0],
+                end_ns=ramps[current, 1],
+                before=before,
+                after=ramps[current, column],
+            )
+            current = n
+        start_ns = ramps[current, 0]
+        end_ns = ramps[current, 1]
+        after = ramps[current, column]
+        link.alpha = _interpolate(
+            t_ns=t_ns, start_ns=start_ns, end_ns=end_ns, before=before, after=after
+        )
+        link.alpha_rate = 0.0
+        if t_ns < end_ns:
+            duration_s = (end_ns - start_ns) * 1e-9
+            link.alpha_rate = (after - before) / duration_s
+
+
+def fold_ramps(t_ns: int, count: int, ramps: Array) -> int:
+    """Removes old changes of the dominance factors from a table, to make room for new changes.
+
+    The dominance factors are the weights with which an arm follows the other arms. Each change
+    is a ramp in time. The last ramp that has started is kept, because it may still be in
+    progress. Its start values are stored in row 0. Therefore `apply_ramps` computes exactly the
+    same factors as before for all times from `t_ns` on.
+
+    The table changes as follows, if m is the row of the last ramp that has started:
+
+        row 0                   factors at the start of the session
+                                -> factors at the start of ramp m
+        rows 1 to m - 1         older ramps, removed
+        rows m to count - 1     -> rows 1 to count - m
+
+    Args:
+        t_ns: Present time, ns since the start of the session.
+        count: Number of filled rows of `ramps`.
+        ramps: Ramps in the order of their starts, shape (R, RAMP_COLUMNS + P) for P peers;
+            changed in place. A row contains the start and the end of a ramp, ns, and the P
+            factors at its end.
+
+    Returns:
+        The number of rows that are left.
+    """
+    last_started = int(np.searchsorted(ramps[1:count, 0], t_ns, side="right"))
+    if last_started < 2:
+        return count  # no ramp is older than the last one that has started
+
+    # The factors at the start of the current ramp, from ramp to ramp.
+    factors = ramps[0, RAMP_COLUMNS:].copy()
+    current = 0
+    for following in range(1, last_started + 1):
+        start_ns, end_ns = ramps[current, :RAMP_COLUMNS]
+        for j, factor_at_end in enumerate(ramps[current, RAMP_COLUMNS:]):
+            factors[j] = _interpolate(
+                t_ns=ramps[following, 0],
+                start_ns=start_ns,
+                end_ns=end_ns,
+                before=factors[j],
+                after=factor_at_end,
+            )
+        current = following
+
+    ramps[0, RAMP_COLUMNS:] = factors
+    rows_left = 1 + count - last_started
+    ramps[1:rows_left] = ramps[last_started:count].copy()
+    return rows_left
+
+
+_RUN = int(Mode.RUN)
+_DIVERGED = int(Mode.DIVERGED)
+_HOLD = int(Mode.HOLD)
+_BRAKE = int(Mode.BRAKE)
+_RETURN = int(Mode.RETURN)
+_USE = int(StaleAction.USE)
+_ACT_BRAKE = int(StaleAction.BRAKE)
+
+
+@leaf
+def any_peer_stale(t_ns: int, age_ns: int, links: RowArray) -> bool:
+    """Returns True if the last sample of some peer that the site follows is too old.
+
+    A peer from which no sample is in use counts as if its last sample were of the epoch, the
+    common start of the session.
+
+    Args:
+        t_ns: Time, ns since the epoch.
+        age_ns: Largest age, ns.
+        links: Rows of the site's links.
+    """
+    for j in range(links.shape[0]):
+        link: LinkRow = links[j]
+        stamp_ns = tick_ns(max(link.used, 0), link.rate_hz)
+        if link.alpha > 0.0 and t_ns - stamp_ns > age_ns:
+            return True
+    return False
+
+
+@leaf
+def update_stale_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
+    """Stops the reference of a site while a peer is silent, and resumes it afterwards.
+
+    A site is the process that runs one arm, and the reference is the position that its arm
+    follows. A peer, a site that it follows, is silent if its last sample is too old. In mode
+    HOLD the reference stays where it was. In BRAKE it is the pose that the arm had when the
+    peer fell silent. In RETURN the reference moves smoothly back to the position q_des that the
+    peers ask for:
+
+        reference = q_held + s (q_des - q_held),    s = 3 x^2 - 2 x^3
+
+    Here q_held is the reference before the return, and x the elapsed part of the time
+    `return_ns`, from 0 to 1.
+
+    Args:
+        t_ns: Time, ns since the start of the session.
+        site: State of the site, whose reference is q_des; changed.
+        links: States of the site's links, one row per peer.
+    """
+    if site.on_stale == _USE or site.mode == _DIVERGED:
+        return
+    stale = any_peer_stale(t_ns, site.stale_ns, links)
+    follows = site.mode == _RUN or site.mode == _RETURN
+    stopped = site.mode == _HOLD or site.mode == _BRAKE
+    if stale and follows:
+        braking = site.on_stale == _ACT_BRAKE
+        for i in range(site.q_held.shape[0]):
+            pose = site.x[i] if site.task else site.q[i]
+            site.q_held[i] = pose if braking else site.q_followed[i]
+        site.mode = _BRAKE if braking else _HOLD
+        site.return_from_ns = 0
+    elif not stale and stopped:
+        site.mode = _RETURN
+        site.return_from_ns = t_ns
+
+    elapsed_ns = t_ns - site.return_from_ns
+    if site.mode == _RETURN and elapsed_ns >= site.return_ns:
+        site.mode = _RUN
+    if site.mode == _RUN:
+        return  # the reference is that of the peers
+
+    x = elapsed_ns / site.return_ns if site.mode == _RETURN else 0.0
+    share = x * x * (3.0 - 2.0 * x)
+    share_rate = 6.0 * x * (1.0 - x) / (site.return_ns * 1e-9)
+    for i in range(site.q_held.shape[0]):
+        held = site.q_held[i]
+        distance = site.q_des[i] - held
+        site.q_des[i] = held + share * distance
+        site.qd_des[i] = share * site.qd_des[i] + share_rate * distance
+
+
+@leaf
+def update_reference(t_ns: int, site: SiteRow, links: RowArray, ramps: Array) -> None:
+    """Computes the reference of a site, which the arm follows, from the samples of its peers.
+
+        q_des  = sum_j alpha_ij q_j                                  Eq. (6)
+        qd_des = sum_j (alpha_ij qd_j + alpha_ij' q_j)
+        felt   = -sum_j alpha_ij tau_x_j
+
+    Here q_j, qd_j and tau_x_j are the position, velocity and exogenous torque in the sample of
+    peer j, alpha_ij is the weight of this peer and alpha_ij' its derivative. The torque `felt`
+    is that of operators and environments on the peers' arms. The sums have the order of the
+    scenario, on which their bits depend.
+
+    Args:
+        t_ns: Time, ns since the epoch, the common start of the session.
+        site: Row of the site; written.
+        links: Rows of the site's links.
+        ramps: Changes of the dominance factors, see `apply_ramps`.
+    """
+    if site.ramps > 1 or site.degrades:
+        apply_ramps(t_ns, site.ramps, ramps, links)
+    if site.degrades:
+        regroup(t_ns, site, links)
+    put(site.q_followed, site.q_des)
+    put(site.qd_followed, site.qd_des)
+    for i in range(site.q_des.shape[0]):
+        q_des = 0.0
+        qd_des = 0.0
+        felt = 0.0
+        for j in range(links.shape[0]):
+            link: LinkRow = links[j]
+            alpha = link.alpha
+            q = link.q[i]
+            q_des += alpha * q
+            qd_des += alpha * link.qd[i] + link.alpha_rate * q
+            felt -= alpha * link.tau_x[i]
+        site.q_des[i] = q_des
+        site.qd_des[i] = qd_des
+        site.felt[i] = felt

@@ -1,0 +1,351 @@
+"""Simulates the delay of a network link, at its receiving end.
+
+A site is a process that runs one arm, and a link is the one-way connection from one site to
+another. In each tick, a period of its control loop, a site sends a sample, which is the state
+of its arm. The sample carries the number of the tick, which is called its stamp. The receiver
+keeps each sample until its simulated delivery time, which is called the due time.
+
+Samples wait in a ring buffer, which is called the calendar of the link. It has a page for each
+of the next ticks of the receiver. `accept_sample` writes a sample into the page of the tick
+that will use it, unless this page holds a newer sample. `release_sample` reads the page of the
+present tick. Both take the same time for any delay. Due times are kept longer than samples, for
+as long as a late sample or a duplicate may arrive.
+
+Invariant (law L2 of docs/design.md):
+    - The due time of a sample is an integer in ns. It follows from the time at which the sample
+      was sent, and from the link's model of delay and loss. The sample is used from the
+      receiver's first tick at or after its due time, but never at the time when it was sent.
+    - The actual arrival has no influence if it is before the due time. On a link without a
+      simulated delay, a sample is used as soon as it arrives.
+    - The newest sample wins: an older sample never replaces a newer one.
+"""
+
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from ..step.jit import leaf
+from ..step.row_fields import LinkRow, SampleRow, row_dtype
+from ..step.ticks import NS_PER_S, first_tick_at, tick_ns
+from ..step.vectors import Array, IntArray, Points, Row, RowArray, put
+from .channel import LOST, schedule_deliveries
+from .delay import MAX_DELAY_US, DelayKind
+
+
+@cache
+def link_dtype(shared: int) -> np.dtype[np.void]:
+    """Returns the NumPy data type of the row that stores the state of a link, see `LinkRow`.
+
+    A link is the connection from one peer. A site has one row per peer, in scenario order.
+
+    Args:
+        shared: Number of coordinates that sites share, the length of the row's vectors.
+    """
+    return row_dtype("link", {"shared": shared})
+
+
+@cache
+def sample_dtype(shared: int) -> np.dtype[np.void]:
+    """Returns the NumPy data type of a sample that waits until its simulated delay has passed.
+
+    A sample is the state that another arm's process sends, see `SampleRow`.
+
+    Args:
+        shared: Number of coordinates of a sample: joint angles, or coordinates of the end
+            effector.
+    """
+    return row_dtype("sample", {"shared": shared})
+
+
+class ChannelArrays(NamedTuple):
+    """Numbers that another control law sends, in the order in which this law reads them.
+
+    C is the count of these numbers. If the arrays are for several peers (the processes of other
+    arms) or for several sites (the receivers), they have additional first axes.
+
+    Attributes:
+        waiting: Numbers that came with the samples whose simulated delay has not passed, one
+            row per entry of the ring buffer `LinkArrays.calendar`, shape (pages, C).
+        received: Numbers that came with the sample in use, shape (C,). Zeros before the first
+            sample.
+        columns: For each number its index among all numbers that arrive with a sample, shape
+            (C,). -1 if the other law does not send the number, which is then 0.
+    """
+
+    waiting: Array
+    received: Array
+    columns: IntArray
+
+
+class LinkArrays(NamedTuple):
+    """Arrays that hold the state of a link, the one-way connection from another arm's process.
+
+    Attributes:
+        state: State of the link, shape (1,), see `link_dtype`.
+        models: Models of the link's delay and loss, in the order in which they come into force.
+        dues: Times at which the newest samples (states of the other arm) are to be delivered,
+            in ns since the start of the session. LOST for a lost sample. This is a ring buffer:
+            sample m is at index m modulo the length. After the arrival of the sample, the entry
+            becomes `_FILED` minus the time.
+        calendar: Ring buffer of the samples whose delay has not passed, see `sample_dtype`.
+        points: Traces and outages of all links of the receiver, shape (n, 2).
+        channel: Further numbers that the other control law sends. None if the law of the
+            receiver does not read them.
+    """
+
+    state: RowArray
+    models: RowArray
+    dues: IntArray
+    calendar: RowArray
+    points: Points
+    channel: ChannelArrays | None
+
+
+AHEAD_LIMIT_S = 10
+AHEAD_LIMIT_NS = AHEAD_LIMIT_S * NS_PER_S
+"""Largest lead of a stamp over the receiver; a sample further ahead is refused."""
+
+_MEASURED = int(DelayKind.MEASURED)
+
+
+_FILED = LOST - 1
+"""Marks samples that have arrived: due times are never negative, so `_FILED - due` is at most
+this, and LOST is above it.
+"""
+
+
+def span_ticks(span_ns: int, rate_hz: int) -> int:
+    """Returns the number of ticks that span a time, rounded up.
+
+    The result is that of `first_tick_at`, in plain Python: callers need no compiled core.
+
+    Args:
+        span_ns: The time, ns.
+        rate_hz: Tick rate, Hz.
+    """
+    return -(-span_ns * rate_hz // NS_PER_S)
+
+
+def calendar_pages(
+    rate_hz: int, delay_us: int = MAX_DELAY_US, ahead_ns: int = AHEAD_LIMIT_NS
+) -> int:
+    """Computes how many entries the ring buffer needs in which delayed samples wait.
+
+    A sample is the state that another arm's process sends. The ring buffer is called the
+    calendar, and its entries pages. There is one page for each period of the receiver's control
+    loop in which a sample may be used first. The default arguments give the largest number that
+    any link needs.
+
+    Args:
+        rate_hz: Rate of the receiver's control loop, Hz.
+        delay_us: Longest delay, us.
+        ahead_ns: Longest time by which the clock of a sender may be ahead of the receiver, ns.
+
+    Returns:
+        The number of pages, a power of two, so that a modulo is a mask of the lower bits.
+    """
+    longest_wait_ticks = span_ticks(delay_us * 1000 + ahead_ns, rate_hz)
+    # Two ticks more: the present tick, and a reserve of one tick for rounding.
+    # 1 << n.bit_length() is the next power of two above n.
+    least_pages = longest_wait_ticks + 2
+    return 1 << least_pages.bit_length()
+
+
+@leaf
+def release_tick(tick: int, rate_hz: int, link: LinkArrays) -> int:
+    """Computes in which period of the receiver's control loop a sample is used first.
+
+    A sample is the state that a sender publishes in one period of its own control loop.
+
+    Args:
+        tick: Number of the period in which the sample was sent.
+        rate_hz: Rate of the receiver's control loop, Hz.
+        link: Arrays of the link.
+
+    Returns:
+        The number of the receiver's period, if the sample arrives in time. LOST if the link
+        loses the sample, or if the sample is so old that its delivery time is no longer stored.
+    """
+    row: LinkRow = link.state[0]
+    dues = link.dues
+    # Computes the due times, the times of delivery, up to this sample if that is not done yet.
+    schedule_deliveries(
+        sample=tick, link=row, models=link.models, dues=dues, points=link.points
+    )
+    kept = dues.shape[0]
+    due_ns = dues[tick % kept]  # a ring buffer
+    # The entry of an older sample contains the due time of a newer one.
+    oldest_kept = row.scheduled - kept + 1
+    if due_ns == LOST or tick < oldest_kept:
+        return LOST
+
+    # After the arrival of a sample, the entry is `_FILED` minus the due time.
+    has_arrived = due_ns <= _FILED
+    if has_arrived:
+        due_ns = _FILED - due_ns
+    # A sample is never used at the time when it was sent.
+    stamp_ns = tick_ns(tick, row.rate_hz)
+    return first_tick_at(max(due_ns, stamp_ns + 1), rate_hz)
+
+
+@leaf
+def _is_far_ahead(k: int, rate_hz: int, tick: int, peer_rate_hz: int) -> bool:
+    """Returns True if a sample's stamp is more than AHEAD_LIMIT_S ahead of tick k.
+
+    Args:
+        k: Present tick of the receiver.
+        rate_hz: Tick rate of the receiver, Hz.
+        tick: Stamp of the sample.
+        peer_rate_hz: Tick rate of the sender, Hz.
+    """
+    # Compare whole seconds first: the nanoseconds of a hostile stamp would overflow int64.
+    if tick // peer_rate_hz > k // rate_hz + AHEAD_LIMIT_S + 1:
+        return True
+    return tick_ns(tick, peer_rate_hz) - tick_ns(k, rate_hz) > AHEAD_LIMIT_NS
+
+
+@leaf
+def _file_sent(channel: ChannelArrays | None, page: int, sent: Array) -> None:
+    """Files the numbers that a peer's law sent with a sample in a page of the calendar.
+
+    Args:
+        channel: Arrays of these numbers; None if the receiver's law ignores them.
+        page: Index of the page.
+        sent: Numbers as they arrived.
+    """
+    if channel is None:
+        return
+    for c in range(channel.columns.shape[0]):
+        column = channel.columns[c]
+        channel.waiting[page, c] = sent[column] if column >= 0 else 0.0
+
+
+@leaf
+def _use_sent(channel: ChannelArrays | None, page: int) -> None:
+    """Brings the numbers that a peer's law sent with a released sample into use.
+
+    Args:
+        channel: Arrays of these numbers; None if the receiver's law ignores them.
+        page: Index of the sample's page.
+    """
+    if channel is not None:
+        put(channel.received, channel.waiting[page])
+
+
+@leaf
+def accept_sample(
+    k: int,
+    rate_hz: int,
+    tick: int,
+    q: Array,
+    qd: Array,
+    tau_x: Array,
+    sent: Array,
+    link: LinkArrays,
+) -> None:
+    """Stores a sample that arrived, until its simulated delay has passed.
+
+    A sample is the state of a peer, the process of another arm. A sample that arrives after its
+    delivery time is used in the present tick, unless a newer sample is in use. Samples that
+    cannot be used are counted as refused, lost or duplicate.
+
+    Args:
+        k: Present tick, the number of the receiver's control period.
+        rate_hz: Rate of the receiver's control loop, Hz.
+        tick: Tick of the peer in which it sent the sample.
+        q: Joint angles or pose of the peer, rad or m.
+        qd: Derivative of q.
+        tau_x: External torque of the peer, N m; the torque ON its arm is the negative.
+        sent: Further numbers from the control law of the peer. They are ignored if the law of
+            the receiver does not read them.
+        link: Arrays of the link; written.
+    """
+    row: LinkRow = link.state[0]
+    dues = link.dues
+    calendar = link.calendar
+    row.accepted += 1
+    if tick < 0 or (tick > row.scheduled and _is_far_ahead(k, rate_hz, tick, row.rate_hz)):
+        row.refused += 1
+        return
+
+    index = tick % dues.shape[0]
+    has_due = row.scheduled - dues.shape[0] < tick <= row.scheduled
+    if has_due and dues[index] <= _FILED:
+        row.duplicate += 1
+        return
+
+    release = release_tick(tick, rate_hz, link)
+    if release == LOST:
+        row.lost += 1
+        return
+    if release < k:
+        model: Row = link.models[row.model]
+        if model.kind != _MEASURED:  # on a measured link every sample is due before it arrives
+            row.late += 1
+        release = k
+    # The driver has made room for stamps in range, see `CalendarSizer`.
+    if release - k >= calendar.shape[0]:
+        row.refused += 1
+        return
+    dues[index] = _FILED - dues[index]
+    if tick <= row.used:
+        row.superseded += 1
+        return
+
+    page = release & (calendar.shape[0] - 1)
+    slot: SampleRow = calendar[page]
+    if slot.tick >= 0:
+        row.superseded += 1
+    if slot.tick < tick:
+        slot.tick = tick
+        put(slot.q, q)
+        put(slot.qd, qd)
+        put(slot.tau_x, tau_x)
+        _file_sent(link.channel, page, sent)
+
+
+@leaf
+def release_sample(k: int, rate_hz: int, link: LinkArrays) -> None:
+    """Puts into use the newest sample of a peer whose delay has passed in tick k.
+
+    If there is no such sample, the last sample stays in use. This function must be called once
+    in each tick of the receiver, in order. Otherwise samples stay in the calendar, the ring
+    buffer with a page per tick in which `accept_sample` has put them.
+
+    The due times of all samples with a stamp up to the time t_k of the tick are computed here,
+    so that the first sample after a long silence costs no more than any other.
+
+    Args:
+        k: Tick of the receiver.
+        rate_hz: Tick rate of the receiver, Hz.
+        link: Arrays of the link; written.
+    """
+    row: LinkRow = link.state[0]
+    row.new = 0
+    calendar = link.calendar
+    # The last tick of the peer that has begun by now.
+    peer_tick = k if row.rate_hz == rate_hz else k * row.rate_hz // rate_hz
+    schedule_deliveries(
+        sample=peer_tick, link=row, models=link.models, dues=link.dues, points=link.points
+    )
+
+    # The page of tick k. The number of pages is a power of two, so a modulo is a mask.
+    page = k & (calendar.shape[0] - 1)
+    waiting: SampleRow = calendar[page]
+    newest = waiting.tick
+    is_page_empty = newest < 0
+    if is_page_empty:
+        return
+
+    waiting.tick = -1  # empties the page
+    if newest > row.used:
+        row.used = newest
+        row.used_ns = tick_ns(k, rate_hz)
+        row.new = 1
+        put(row.q, waiting.q)
+        put(row.qd, waiting.qd)
+        put(row.tau_x, waiting.tau_x)
+        _use_sent(link.channel, page)
+    else:
+        row.superseded += 1  # a newer sample is in use

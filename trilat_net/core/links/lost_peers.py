@@ -1,0 +1,249 @@
+"""Lets an arm continue without a lost peer, whose weight the other peers get.
+
+A site is a process that runs one arm. Its peers are the other sites, from which it receives
+samples (states of their arms). A site follows each peer with a certain weight, the dominance
+factor or share. A peer is lost if no sample of it could be used for some time.
+
+Invariant:
+    - All decisions follow from the samples in use and from the stored state of the site. They
+      are made in each tick, a period of the control loop.
+    - A site only continues without a peer if the remaining sites all reach each other without
+      it, and if the site still follows another peer. Otherwise the arm stops.
+    - The reference, the position that the arm follows, never jumps. It moves smoothly to the
+      position of the remaining peers, and later back if the lost peer returns.
+
+The field `gone` of a link stores the state of the peer. It is 0 while the peer is present, and
+-1 while the peer is lost. After the return of the peer, it is the time of the return, in ns
+since the start of the session.
+"""
+
+from ..arms.chain import add, scale, three
+from ..arms.rotation import length, relative_rotation, rotation_matrix
+from ..arms.task_space import count_linear_coordinates, has_orientation
+from ..step.jit import leaf
+from ..step.row_fields import LinkRow, SiteRow
+from ..step.ticks import LifeReason
+from ..step.vectors import RowArray
+
+BACK_NS = 250_000_000
+"""Time for which a dropped peer must be heard before it gets its share again, ns."""
+
+_DROPPED = int(LifeReason.DROPPED)
+_RESTORED = int(LifeReason.RESTORED)
+
+
+@leaf
+def _can_drop(lost: int, t_ns: int, site: SiteRow, links: RowArray) -> bool:
+    """Returns True if the site may go on without a peer that is lost.
+
+    A site is the process that runs one arm. Its peers are the other sites, from which it
+    receives samples. The remaining sites are this site and the peers that it still hears, apart
+    from the lost one. This site must still follow at least one of them, and they must all reach
+    each other, where a site reaches the sites that it follows, directly or through others.
+
+    It suffices to compare two sets with the remaining sites: the sites that this site reaches,
+    and the sites that reach this site. The sets grow from this site until nothing can be added.
+    A set of sites is an integer with one bit per site.
+
+    Args:
+        lost: Index of the peer that is lost.
+        t_ns: Time, ns since the epoch, the common start of the session.
+        site: Row of the site.
+        links: Rows of the site's links, one per peer. `bit` is the bit of the peer, `followed`
+            the set of the sites that the peer follows, and `alpha` the weight with which this
+            site follows the peer.
+    """
+    remaining = site.bit
+    followed = 0  # the remaining sites that this site follows
+    for j in range(links.shape[0]):
+        link: LinkRow = links[j]
+        is_present = link.gone == 0.0 and link.used >= 0
+        if j != lost and is_present and t_ns - link.used_ns <= site.stale_ns:
+            remaining |= link.bit
+            if link.alpha > 0.0:
+                followed |= link.bit
+
+    reached = site.bit
+    reaching = site.bit
+    # A shortest path has at most one step per peer, and each sweep adds at least one step.
+    for _ in range(links.shape[0]):
+        reached |= followed
+        for j in range(links.shape[0]):
+            link = links[j]
+            if reached & link.bit:
+                reached |= link.followed & remaining
+            if remaining & link.bit and link.followed & reaching:
+                reaching |= link.bit
+    return followed != 0 and reached == remaining and reaching == remaining
+
+
+@leaf
+def _is_orientation_near(back: int, site: SiteRow, links: RowArray) -> bool:
+    """Returns True if a returning peer turns the reference by at most the alignment limit.
+
+    The reference, the orientation that the arm follows, is a weighted mean of the orientations
+    of the peers. With the rotation vector u_j from the orientation of peer j to that of the
+    site, and the weight alpha_j, the mean over the present peers is
+
+        mean = sum_j alpha_j u_j / sum_j alpha_j
+
+    The returning peer with the rotation vector u and the weight alpha changes it by
+
+        |u - mean| alpha / (sum_j alpha_j + alpha)
+
+    The turn between two orientations is at most as long as the difference of their rotation
+    vectors from the site's own orientation.
+
+    Args:
+        back: Index of the returning peer.
+        site: Row of the site, with its own pose x. The last three coordinates of a pose are the
+            rotation vector of its orientation, rad. `align_limit` is the limit.
+        links: Rows of the site's links, one per peer, with the pose q of the peer. `gone` is 0
+            for a present peer. The weights of the present peers must not all be 0.
+    """
+    orientation = rotation_matrix(three(site.x[3:]))
+    total = 0.0  # the sum of the weights of the present peers
+    sum_of_turns = (0.0, 0.0, 0.0)
+    for j in range(links.shape[0]):
+        link: LinkRow = links[j]
+        is_present = link.gone == 0.0
+        if is_present:
+            peer_orientation = rotation_matrix(three(link.q[3:]))
+            turn = relative_rotation(orientation, peer_orientation)
+            sum_of_turns = add(sum_of_turns, scale(link.alpha, turn))
+            total += link.alpha
+
+    link = links[back]
+    peer_orientation = rotation_matrix(three(link.q[3:]))
+    turn = relative_rotation(orientation, peer_orientation)
+    difference = add(turn, scale(-1.0 / total, sum_of_turns))
+    turn_of_reference = length(difference) * link.alpha / (total + link.alpha)
+    near: bool = turn_of_reference <= site.align_limit
+    return near
+
+
+@leaf
+def _is_near(back: int, site: SiteRow, links: RowArray) -> bool:
+    """Returns True if a returning peer moves the reference by at most the alignment limit.
+
+    The reference, the position that the arm follows, is the mean of the positions of the peers
+    with their weights alpha. The limit applies to each linear coordinate, a position or a joint
+    angle, and to the orientation as a whole.
+
+    Args:
+        back: Index of the returning peer.
+        site: Row of the site, with the limit `align_limit`, m or rad.
+        links: Rows of the site's links, one per peer, with the position q of the peer. `gone`
+            is 0 for a present peer. The weights of the present peers must not all be 0.
+    """
+    if has_orientation(site) and not _is_orientation_near(back, site, links):
+        return False
+    for i in range(count_linear_coordinates(site)):
+        # Sums over the present peers, of alpha q and of alpha.
+        weighted_sum = 0.0
+        total = 0.0
+        for j in range(links.shape[0]):
+            link: LinkRow = links[j]
+            is_present = link.gone == 0.0
+            if is_present:
+                weighted_sum += link.alpha * link.q[i]
+                total += link.alpha
+        link = links[back]
+        weighted_sum_with_peer = weighted_sum + link.alpha * link.q[i]
+        reference_with_peer = weighted_sum_with_peer / (total + link.alpha)
+        reference_without_peer = weighted_sum / total
+        # The comparison is false for NaN, which must not count as near.
+        is_within_limit = abs(reference_with_peer - reference_without_peer) <= site.align_limit
+        if not is_within_limit:
+            return False
+    return True
+
+
+@leaf
+def _redistribute_shares(links: RowArray) -> bool:
+    """Divides the shares of lost peers among the other peers, in proportion to their shares.
+
+        alpha_j / sum alpha,  with the derivative by the quotient rule; 0 for a lost peer
+
+    Returns:
+        False, without a change, if no other peer has a share.
+    """
+    total = 0.0
+    total_rate = 0.0
+    any_lost = False
+    for j in range(links.shape[0]):
+        link: LinkRow = links[j]
+        if link.gone == 0.0:
+            total += link.alpha
+            total_rate += link.alpha_rate
+        else:
+            any_lost = True
+
+    if not any_lost:
+        return True
+    if total <= 0.0:
+        return False
+
+    for j in range(links.shape[0]):
+        link = links[j]
+        if link.gone == 0.0:
+            numerator = link.alpha_rate * total - link.alpha * total_rate
+            link.alpha_rate = numerator / (total * total)
+            link.alpha /= total
+        else:
+            link.alpha = 0.0
+            link.alpha_rate = 0.0
+    return True
+
+
+@leaf
+def regroup(t_ns: int, site: SiteRow, links: RowArray) -> None:
+    """Adapts the dominance factors of a site to peers that are lost or have returned.
+
+    A site is the process that runs one arm, and its peers are the other sites. A dominance
+    factor is the weight with which the site follows a peer. The factors of lost peers are
+    redistributed to the others. Before the call `alpha` of a link is the planned factor,
+    afterwards the factor in force.
+
+    The field `gone` of a link is the state of its peer:
+
+    - 0: present. If the peer falls silent and can be spared, it becomes lost.
+    - -1: lost. When the peer is heard again, the field becomes the time of its return.
+    - Above 0: time of the return, ns. If the peer falls silent again, it is lost again. After
+      BACK_NS it becomes present, if it is near enough for the reference not to move far.
+
+    Args:
+        t_ns: Time, ns since the epoch, the common start of the session.
+        site: Row of the site; changed. `regrouped` becomes the reason if a peer was dropped or
+            restored in this tick, otherwise 0.
+        links: Rows of the site's links; changed. A peer is silent if its last sample came into
+            use more than `site.stale_ns` ago. `dispensable` is 1 if the site may drop the peer.
+    """
+    site.regrouped = 0
+    for j in range(links.shape[0]):
+        link: LinkRow = links[j]
+        is_followed = link.alpha > 0.0
+        was_ever_heard = link.used >= 0
+        if not is_followed or not was_ever_heard:
+            continue
+
+        is_silent = t_ns - link.used_ns > site.stale_ns
+        is_present = link.gone == 0.0
+        is_lost = link.gone < 0.0
+        if is_present:
+            if is_silent and link.dispensable and _can_drop(j, t_ns, site, links):
+                link.gone = -1.0
+                site.regrouped = _DROPPED
+        elif is_silent:
+            link.gone = -1.0
+        elif is_lost:
+            link.gone = float(t_ns)
+        elif t_ns - link.gone >= BACK_NS and _is_near(j, site, links):
+            link.gone = 0.0
+            site.regrouped = _RESTORED
+
+    # A change of the shares may leave all of them to lost peers: then no peer counts as lost.
+    if not _redistribute_shares(links):
+        for j in range(links.shape[0]):
+            link = links[j]
+            link.gone = 0.0

@@ -1,0 +1,565 @@
+"""Compiles a user's control law, so that it runs at the speed of the simulation kernel.
+
+A control law is a class with a method `torque`, which computes the torque of an arm. This
+module compiles that method with Numba. The compiled method returns exactly the same numbers as
+the Python method, down to the last bit, so that a law can be developed in plain Python and
+compiled later.
+
+Invariant:
+    - The gains of a law are passed in a row of floats, so that new gains need no compilation.
+      Only another number of joints or peers, or other vectors, compile the law again.
+    - The kernel calls a law by its address, so that no law recompiles the kernel.
+    - An index out of range and a division by zero raise as they do in plain Python.
+"""
+
+import dis
+import hashlib
+import re
+from collections.abc import Callable, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar, cast
+
+import numba
+import numpy as np
+from numba.core import types
+from numba.core.errors import NumbaError
+from numba.extending import register_jitable
+
+from ...errors import LawFailed, ScenarioError
+from ..links.link import ChannelArrays
+from ..step.control import limit_torque
+from ..step.jit import bind_leaf, compile_named, leaf
+from ..step.site_arrays import SiteArrays
+from ..step.site_setup import SiteSetup
+from ..step.vectors import Array, Row, RowArray
+from .law_channel import SentVector
+from .law_view import PlainLaw, update_law_view
+from .plugged import call_address, digest_sibling_sources, find_address
+from .user_law import (
+    LawInput,
+    LawResults,
+    check_results,
+    describe_failure,
+    law_name,
+    list_remembered,
+)
+
+_CHECKED: Any = {"_nrt": False, "boundscheck": True}
+T = TypeVar("T")
+
+
+def compiled(law: T) -> T:
+    """Marks a control law, or a function that its `torque` calls, to be compiled (decorator).
+
+    >>> @tn.compiled
+    ... class Damper:
+    ...     def __init__(self, facts):
+    ...         pass
+    ...     def torque(self, now):
+    ...         for i in range(now.joints):
+    ...             now.tau[i] = -now.qd[i]
+
+    A class with memory needs `remembers`. Code that Numba cannot compile is refused when a site
+    is built.
+    """
+    if not isinstance(law, type):
+        # called from a law in plain Python it stays a Python function, which takes any objects
+        function: Any = law
+        callable_from_python: T = register_jitable(**_CHECKED)(function)
+        return callable_from_python
+    law.is_compiled = True  # type: ignore[attr-defined]
+    return cast(T, law)
+
+
+def is_compiled(law: Any) -> bool:
+    """Returns True if the `torque` method of a law is compiled when a site is built.
+
+    The law's class must be marked with `compiled`. If Numba is disabled, nothing is compiled.
+    """
+    config: Any = numba.config
+    return bool(getattr(law, "is_compiled", False)) and not config.DISABLE_JIT
+
+
+@leaf
+def _all_finite(values: Array) -> bool:
+    """Returns True if no number of an array is NaN or infinite."""
+    are_finite = True
+    for i in range(values.shape[0]):
+        are_finite = are_finite and np.isfinite(values[i])
+    return are_finite
+
+
+@leaf
+def law_stage(
+    k: int,
+    t_ns: int,
+    address: int,
+    law: Array,
+    site: RowArray,
+    links: RowArray,
+    chain: RowArray | None,
+    channel: ChannelArrays,
+    sent: Array,
+) -> None:
+    """Computes the torque of one tick by a compiled law (stage 6 of a tick).
+
+    The row's field `asked` is 1 while the law runs. An exception that is raised meanwhile comes
+    from the law.
+
+    Args:
+        k: The tick.
+        t_ns: Nominal time of the tick, ns since the epoch, the common start of the session.
+        address: Address of the law's machine code.
+        law: Numbers of the law, those that it keeps from tick to tick first; changed.
+        site: Row of the site, in which the torque is written.
+        links: Rows of the site's links.
+        chain: Rows of the chain of joints, or None for the planar arm.
+        channel: Vectors that the peers' laws sent.
+        sent: Written: the vectors that this law sends.
+
+    Raises:
+        FloatingPointError: A result is not finite.
+    """
+    update_law_view(k=k, t_ns=t_ns, site=site, links=links, chain=chain)
+    s: Row = site[0]
+    s.asked = 1
+    call_address(address, (law, site, links, channel.received, sent))
+    is_torque_finite = _all_finite(s.tau[: s.joints])
+    is_estimate_finite = _all_finite(s.theta_hat)
+    is_sent_finite = _all_finite(sent)
+    if not (is_torque_finite and is_estimate_finite and is_sent_finite):
+        raise FloatingPointError
+    if not _all_finite(law[: s.remembered]):
+        raise FloatingPointError
+    for i in range(s.joints):
+        s.tau[i] = limit_torque(s.tau[i], s.tau_limit[i])
+    s.asked = 0
+
+
+class _Form(NamedTuple):
+    """Layouts for which a law is compiled. Laws with equal forms share the compiled code.
+
+    Attributes:
+        law: Layout of the law's numbers.
+        site: Layout of the site's row.
+        link: Layout of the links' rows.
+        received: Layout of the vectors that a peer sends, or None if there are none.
+        to_all: Layout of the vectors that go to all peers, or None if there are none.
+        sent: Layout of the vectors that go to one peer alone, or None if there are none.
+        peers: Number of peers.
+    """
+
+    law: np.dtype[np.void]
+    site: np.dtype[np.void]
+    link: np.dtype[np.void]
+    received: np.dtype[np.void] | None
+    to_all: np.dtype[np.void] | None
+    sent: np.dtype[np.void] | None
+    peers: int
+
+
+def _vectors_dtype(vectors: Sequence[SentVector], width: int = 0) -> np.dtype[np.void] | None:
+    """Returns the layout of vectors that stand one after another, or None if there are none.
+
+    Args:
+        vectors: The vectors.
+        width: Count of numbers in an array's row, if the row is longer than the vectors.
+    """
+    if not vectors:
+        return None
+    lengths = [vector.length for vector in vectors]
+    layout: Any = {
+        "names": [vector.name for vector in vectors],
+        "formats": [("f8", (length,)) for length in lengths],
+        "offsets": [8 * sum(lengths[:n]) for n in range(len(lengths))],
+        "itemsize": 8 * (width or sum(lengths)),
+    }
+    return np.dtype((np.record, layout))
+
+
+@cache
+def _compile_law(torque: Callable[..., Any], form: _Form) -> Any:
+    """Returns the compiled form of a law's `torque`.
+
+    Its arguments are the law's numbers, the site's row, its links' rows, and the arrays of the
+    received and the sent vectors. They are views of arrays, from which the compiled function
+    builds the law's input. Laws of this package are stored on disk, laws of users are compiled
+    in each process.
+
+    Args:
+        torque: The method of the law's class.
+        form: Layouts of the arguments.
+
+    Raises:
+        NumbaError: The law cannot be compiled.
+    """
+    law_dtype = form.law
+    received_dtype = form.received
+    to_all_dtype = form.to_all
+    sent_dtype = form.sent
+    law_size = form.law.itemsize // 8
+    to_all_size = 0 if to_all_dtype is None else to_all_dtype.itemsize // 8
+    peer_size = 0 if sent_dtype is None else sent_dtype.itemsize // 8
+    sent_end = to_all_size + form.peers * peer_size
+    compute = numba.njit(**_CHECKED)(torque)
+
+    def call(law: Any, site: Any, links: Any, received: Any, sent: Any) -> None:
+        """Collects the input of the control law, and calls the law's method `torque`.
+
+        Nothing is copied: the law reads and writes the arrays of its site, the process that
+        runs one arm. The numbers and vectors come as arrays of floats. A view of a part of such
+        an array gives the law the same memory as a record, whose fields have the names of the
+        numbers or vectors.
+
+        Args:
+            law: Numbers of the law: its gains and what it remembers.
+            site: Row of the site, shape (1,).
+            links: Rows of the links from the peers, the other sites, in scenario order.
+            received: Vectors that came from each peer, one row per peer.
+            sent: Vectors that this law sends: those for all peers, then those for each peer.
+        """
+        s = site[0]
+        # A layout that is None stands for vectors that do not exist. Numba knows the layouts
+        # when it compiles, and removes the branch whose type does not apply.
+        from_peers = () if received_dtype is None else received.reshape(-1).view(received_dtype)
+        to_peers = () if sent_dtype is None else sent[to_all_size:sent_end].view(sent_dtype)
+        to_all = None if to_all_dtype is None else sent[:to_all_size].view(to_all_dtype)[0]
+        now = LawInput(
+            k=s.k,
+            t_s=s.t_s,
+            h_s=s.h_s,
+            q=s.q,
+            qd=s.qd,
+            q_des=s.q_des,
+            qd_des=s.qd_des,
+            felt=s.felt,
+            joints=s.joints,
+            coordinates=s.shared,
+            tau=s.tau,
+            peers=links,
+            received=from_peers,
+            sent=to_peers,
+            to_all=to_all,
+            tau_x=s.tau_x,
+            tau_before=s.tau_before,
+            q_before=s.q_before,
+            gravity=s.G,
+            theta_hat=s.theta_hat,
+            inertia=s.M,
+            bias=s.bias,
+        )
+        # `compute` is the compiled method, whose `self` is the record of the law's numbers.
+        compute(law[:law_size].view(law_dtype)[0], now)
+
+    numba_types: Any = numba
+    site_type = numba_types.typeof(np.zeros(1, form.site))
+    link_type = numba_types.typeof(np.zeros(1, form.link))
+    floats = types.float64
+    signature = types.none(floats[::1], site_type, link_type, floats[:, ::1], floats[::1])
+    sources = digest_sibling_sources(torque)
+    if sources:
+        text = f"{sources} {torque.__module__} {torque.__qualname__} {form}"
+        digest = hashlib.sha256(text.encode()).hexdigest()
+        return compile_named(call, f"law_{digest[:32]}", signature, **_CHECKED)
+    function = numba.njit(signature, **_CHECKED)(call)
+    if any(known.return_type != types.none for known in compute.nopython_signatures):
+        raise NumbaError(
+            "torque returns a value, but a compiled law must write the torque to now.tau "
+            "instead"
+        )
+    return function
+
+
+def _read_numbers(law: Any) -> dict[str, np.ndarray[Any, Any]]:
+    """Collects the numbers of a law, which the compiled law stores in a row of an array.
+
+    These are the attributes of the instance, and the attributes of its class whose names occur
+    in the method `torque`. Each of them needs a fixed type:
+
+    - Integers that do not change, such as counts and indices, remain integers. Booleans that
+      do not change become integers.
+    - All other numbers become floats, also integers that may change: the numbers that the law
+      remembers from tick to tick, attributes that `torque` assigns, and lists, whose elements
+      it can assign. A tick is a period of the control loop.
+
+    Args:
+        law: An instance of the law's class.
+
+    Returns:
+        Numbers by name, as arrays: first those that the law remembers, in their order, then the
+        others in alphabetical order. Attributes that are not numbers are left out.
+    """
+    # The byte code of `torque` names the attributes that it reads and assigns. It does not tell
+    # whether they belong to the law, so names of attributes of other objects are included.
+    code = list(dis.get_instructions(type(law).torque))
+    written = {step.argval for step in code if step.opname == "STORE_ATTR"}
+    access = ("LOAD_ATTR", "LOAD_METHOD", "STORE_ATTR")
+    used = {step.argval for step in code if step.opname in access}
+    # Functions that `torque` calls may use any attribute of the instance.
+    used |= vars(law).keys()
+
+    remembered = list_remembered(law)
+    others = sorted(name for name in used if hasattr(law, name))
+    numbers_by_name = {}
+    for name in dict.fromkeys([*remembered, *others]):
+        value = getattr(law, name)
+        try:
+            numbers = np.asarray(value)
+        except ValueError:  # a list of rows with different lengths
+            continue
+        kind = numbers.dtype.kind
+        is_numeric = kind in "fiub"  # float, integer, unsigned integer or boolean
+        if not is_numeric or not numbers.size:
+            continue
+        may_change = name in remembered or name in written or isinstance(value, list)
+        dtype = np.float64 if may_change or kind == "f" else np.int64
+        numbers_by_name[name] = numbers.astype(dtype)
+    return numbers_by_name
+
+
+def _explain(error: Exception, law: Any) -> str:
+    """Returns a sentence that says which part of a law Numba cannot compile.
+
+    The messages of Numba are long and name types of Numba. Frequent causes are recognised and
+    explained in the terms of a law; otherwise the first sentence of the message is returned.
+
+    Args:
+        error: The error of Numba.
+        law: An instance of the law's class.
+    """
+    text = re.sub(r"\x1b\[[0-9;]*m", "", str(error))
+    file = re.escape(Path(type(law).torque.__code__.co_filename).name)
+    line_numbers = re.findall(rf'{file}"?,? (?:line |\()(\d+)', text)
+    location = f" (line {line_numbers[-1]})" if line_numbers else ""
+
+    if "NRT required" in text or "returning of array" in text:
+        return (
+            f"the law creates an array or a list{location}: compute number by number, as in "
+            "now.tau[i] = -now.qd[i]; create lists in __init__, and let torque write into them"
+        )
+    attribute = re.search(r"Unknown attribute '(\w+)' of type Record", text)
+    if isinstance(error, KeyError):
+        return _explain_attribute(error.args[0], law, location)
+    if attribute:
+        return _explain_attribute(attribute[1], law, location)
+    unknown = re.search(r"Untyped global name '(\w+)'", text)
+    if unknown:
+        return (
+            f"the law uses {unknown[1]}{location}, which is neither a number nor a function "
+            "with @trilat_net.compiled"
+        )
+
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    noise = ("Failed in", "File", "During", "-", "^", "<", "[")
+    sentences = [line for line in lines if not line.startswith(noise)]
+    return f"{(sentences or lines)[0].rstrip('.:')}{location}"
+
+
+def _explain_attribute(name: str, law: Any, location: str) -> str:
+    """Returns a sentence that says why a compiled law cannot use an attribute.
+
+    Args:
+        name: Name of the attribute.
+        law: An instance of the law's class.
+        location: Line of the law, as in " (line 12)"; empty if unknown.
+    """
+    if not hasattr(law, name):
+        problem = "does not exist"
+    elif callable(getattr(law, name)):
+        return (
+            f"the law calls the method self.{name}{location}: use a function with "
+            "@trilat_net.compiled instead"
+        )
+    else:
+        kind = type(getattr(law, name)).__name__
+        problem = f"is of type {kind}"
+    return (
+        f"self.{name} {problem}{location}, but must be a number, or a list of numbers of fixed "
+        "length"
+    )
+
+
+class CompiledLaw:
+    """A user's compiled control law, with the arrays of the site that it controls.
+
+    `plug_law` creates the object. The site calls `compute` once per tick.
+
+    Args:
+        law: An instance of the law's class.
+        setup: Setup of the site.
+        arrays: Arrays of the site; their vectors may be longer than the site's.
+        sent: Vectors that the law sends, in the site's record, see `LawChannel`.
+
+    Attributes:
+        row: Numbers of the law, those that it keeps from tick to tick first.
+        address: Address of its machine code.
+
+    Raises:
+        ScenarioError: Numba cannot compile the law.
+    """
+
+    def __init__(self, law: Any, setup: SiteSetup, arrays: SiteArrays, sent: Array) -> None:
+        path = f"sites.{setup.name}.control.law"
+        numbers = _read_numbers(law)
+        remembered = list_remembered(law)
+        missing = [name for name in remembered if name not in numbers]
+        if missing:
+            raise ScenarioError(
+                f"{law_name(law)}: the attribute {missing[0]}, which the law keeps from tick "
+                "to tick, must be a number or a list of numbers",
+                path=path,
+            )
+
+        channel = arrays.channel
+        received_size = 0 if channel is None else channel.received.shape[-1]
+        fields: Any = [(name, value.dtype, value.shape) for name, value in numbers.items()]
+        form = _Form(
+            law=np.dtype((np.record, fields or [("nothing", "f8")])),
+            site=arrays.site.dtype,
+            link=arrays.links.dtype,
+            received=_vectors_dtype(setup.received_vectors, received_size),
+            to_all=_vectors_dtype(setup.channel.select_vectors(per_peer=False)),
+            sent=_vectors_dtype(setup.channel.select_vectors(per_peer=True)),
+            peers=len(setup.links),
+        )
+        try:
+            self._function = _compile_law(type(law).torque, form)
+        except (NumbaError, KeyError) as error:
+            raise ScenarioError(
+                f"{law_name(law)} cannot be compiled: {_explain(error, law)}", path=path
+            ) from None
+
+        self.address = find_address(self._function)
+        row = np.zeros(1, form.law)
+        for name, value in numbers.items():
+            row[0][name] = value
+        self.row: Array = row.view(np.float64)
+        self._law = law
+        self._name = setup.name
+        self._arrays = arrays
+        self._sent = sent
+        self._stage = law_stage
+        self._remembered = sum(numbers[name].size for name in remembered)
+        arrays.site["remembered"] = self._remembered
+
+    def bind(self) -> None:
+        """Compiles the stage that calls the law, for the types of this site's arrays.
+
+        The stage is `law_stage`, which `compute` calls in each tick, a period of the control
+        loop. The compilation takes seconds. Without this call, the first tick would wait for
+        it.
+        """
+        arrays = self._arrays
+        assert arrays.channel is not None
+        # Only the types of the arguments count: any integers serve as tick and time.
+        example_tick = 0
+        example_t_ns = 0
+        self._stage = bind_leaf(
+            law_stage,
+            example_tick,
+            example_t_ns,
+            self.address,
+            self.row,
+            arrays.site,
+            arrays.links,
+            arrays.chain,
+            arrays.channel,
+            self._sent,
+        )
+
+    def compute(self, k: int, t_ns: int) -> list[float]:
+        """Computes the torque of one control period by a call of the compiled law.
+
+        The torque and the vectors that the law sends to other sites are written into the arrays
+        of this site (the process that runs the arm).
+
+        Args:
+            k: Number of the control period.
+            t_ns: Nominal time of the period, ns since the start of the session.
+
+        Returns:
+            The numbers that the law remembers for the next period.
+
+        Raises:
+            LawFailed: The law raised an exception, or returned an invalid result.
+        """
+        a = self._arrays
+        assert a.channel is not None
+        try:
+            self._stage(
+                k, t_ns, self.address, self.row, a.site, a.links, a.chain, a.channel, self._sent
+            )
+        except Exception as error:  # the user's code may raise anything
+            raise self.find_failure(error) or error from None
+        return self.memory
+
+    @property
+    def memory(self) -> list[float]:
+        """Numbers that the law keeps from tick to tick, as they are now.
+
+        A record contains them, so that `restore` can continue the run from there.
+        """
+        memory: list[float] = self.row[: self._remembered].tolist()
+        return memory
+
+    def restore(self, memory: Sequence[float]) -> None:
+        """Restores the law to its state after a tick, from the record of that tick.
+
+        Args:
+            memory: Numbers that `memory` returned after the tick.
+        """
+        self.row[: self._remembered] = memory
+
+    def find_failure(self, error: Exception) -> LawFailed | None:
+        """Describes how the user's control law failed, if an exception came from the law.
+
+        Args:
+            error: An exception that was raised while the torque of a control period was
+                computed.
+
+        Returns:
+            An exception that names the law and the reason. None if the error has another
+            origin.
+        """
+        s: Row = self._arrays.site[0]
+        if not s.asked:
+            return None
+        if isinstance(error, FloatingPointError):
+            results = LawResults(
+                torque=s.tau.tolist(),
+                theta_hat=s.theta_hat.tolist(),
+                memory=self.memory,
+                sent=self._sent.tolist(),
+            )
+            try:
+                check_results(self._law, self._name, s.k, results)
+            except LawFailed as failure:
+                return failure
+        return describe_failure(self._law, self._name, int(s.k), error)
+
+
+def plug_law(
+    law: Any, setup: SiteSetup, arrays: SiteArrays, sent: Array
+) -> PlainLaw | CompiledLaw:
+    """Connects a user's control law to a site, so that the law can compute torques.
+
+    A site is the process that runs one arm. The law is compiled if its class is marked for
+    compilation; otherwise it runs as plain Python.
+
+    Args:
+        law: An instance of the law's class.
+        setup: Setup of the site.
+        arrays: Arrays of the site, which the law reads and writes.
+        sent: Array for the numbers that the law sends to other sites, see `LawChannel`.
+
+    Returns:
+        The law, ready for use.
+
+    Raises:
+        ScenarioError: The law is to be compiled, and Numba cannot compile it.
+    """
+    arrays.site["needs_model"] = getattr(law, "needs_model", False)
+    arrays.site["holds"] = getattr(law, "holds", False)
+    kind = CompiledLaw if is_compiled(law) else PlainLaw
+    return kind(law, setup, arrays, sent)

@@ -1,0 +1,192 @@
+"""Describes the numbers that a control law sends to other arms besides the motion.
+
+A site is a process that runs one arm, and its peers are the other sites. Some control laws send
+vectors of numbers to their peers, for example wave variables or energies. A vector either goes
+to all peers, or each peer gets a vector of its own.
+
+In each tick, a period of the control loop, the site stores all numbers that its law sends in
+the field `ch` of its record. A peer receives the part that is meant for it. Therefore the
+records of the sender show what each peer received.
+
+Invariant:
+    - The field contains first the vectors for all peers. The vectors for a single peer follow,
+      peer by peer in the order in which the scenario, the description of the experiment, lists
+      the sites.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+from ...errors import count_nouns
+
+MAX_SENT = 16
+"""Largest count of numbers per joint that a law sends to a peer."""
+MAX_RECORD_SENT = 1024
+"""Largest count of numbers that a law sends to all its peers together; each record has them."""
+
+
+class SentVector(NamedTuple):
+    """Vector that a law sends at every tick.
+
+    Attributes:
+        name: Name of the vector, as the law uses it.
+        unit: Unit of its numbers.
+        length: Count of its numbers.
+        per_peer: True: each peer gets its own vector; false: all peers get the same vector.
+    """
+
+    name: str
+    unit: str
+    length: int
+    per_peer: bool = False
+
+
+class SentEntry(NamedTuple):
+    """One number that a law sends.
+
+    Attributes:
+        vector: Vector of the number.
+        peer: Peer that alone gets the vector, or "" if all peers get it.
+        position: Position of the number in the vector, from 0.
+    """
+
+    vector: SentVector
+    peer: str
+    position: int
+
+    @property
+    def key(self) -> str:
+        """Label of the vector to which the number belongs, for example "E" or "u[m2]".
+
+        The label is the name of the vector. If only one peer (another arm's process) receives
+        the vector, the name of this peer follows in brackets.
+        """
+        return f"{self.vector.name}[{self.peer}]" if self.peer else self.vector.name
+
+    def __str__(self) -> str:
+        return f"{self.key}[{self.position}]"
+
+
+class LawChannel(NamedTuple):
+    """All vectors that the control law of an arm sends to the control laws of other arms.
+
+    The vectors are in the order in which a record stores them.
+
+    Attributes:
+        vectors: The vectors. Vectors that all peers (the other arms) receive come before
+            vectors of which each peer gets its own.
+        peers: Number of peers.
+    """
+
+    vectors: tuple[SentVector, ...] = ()
+    peers: int = 0
+
+    def select_vectors(self, *, per_peer: bool) -> tuple[SentVector, ...]:
+        """Returns the vectors that go to all peers, or those that go to each peer alone.
+
+        Args:
+            per_peer: True: the vectors that go to each peer alone; false: those that go to all.
+        """
+        return tuple(vector for vector in self.vectors if vector.per_peer is per_peer)
+
+    def count_numbers(self, *, per_peer: bool) -> int:
+        """Counts the numbers of all vectors that have the same kind of receiver.
+
+        Args:
+            per_peer: True for the vectors of which each peer (the process of another arm) gets
+                its own. The result is then the count for a single peer. False for the vectors
+                that all peers receive.
+        """
+        return sum(vector.length for vector in self.select_vectors(per_peer=per_peer))
+
+    @property
+    def received_size(self) -> int:
+        """Count of the numbers that one peer receives with each sample."""
+        return sum(vector.length for vector in self.vectors)
+
+    @property
+    def record_size(self) -> int:
+        """Number of floating-point numbers that the law sends in a period of the control loop.
+
+        This is the length of the field `ch` of a record. A vector of which each peer (the
+        process of another arm) gets its own counts once for each peer.
+        """
+        to_all = self.count_numbers(per_peer=False)
+        to_each = self.count_numbers(per_peer=True)
+        return to_all + self.peers * to_each
+
+    def find_columns(self, vectors: Sequence[SentVector]) -> list[int]:
+        """Finds the numbers that another control law reads, among those that this law sends.
+
+        Args:
+            vectors: The vectors that the other law reads.
+
+        Returns:
+            For each number of these vectors its index among the numbers that this law sends to
+            a peer. The index is -1 for the numbers of a vector that this law does not send.
+        """
+        start = 0
+        starts = {}
+        for vector in self.vectors:
+            starts[vector.name] = start
+            start += vector.length
+        columns = []
+        for vector in vectors:
+            for n in range(vector.length):
+                is_sent = vector.name in starts
+                columns.append(starts[vector.name] + n if is_sent else -1)
+        return columns
+
+    def entries(self, peers: Sequence[str]) -> Iterator[SentEntry]:
+        """Describes each number that the law sends in a period of the control loop.
+
+        The numbers are in the order of the field `ch` of a record, which stores them.
+
+        Args:
+            peers: Names of the sites that run the other arms, in the order of the scenario.
+
+        Yields:
+            The vector to which the number belongs, its receiver, and its position in the
+            vector.
+        """
+        to_each = self.select_vectors(per_peer=True)
+        groups = [("", self.select_vectors(per_peer=False))]
+        groups += [(peer, to_each) for peer in peers]
+        for peer, vectors in groups:
+            for vector in vectors:
+                for n in range(vector.length):
+                    yield SentEntry(vector, peer, n)
+
+    def select_for_peer(self, sent: Sequence[float], peer_index: int) -> Sequence[float]:
+        """Returns those of the sent numbers that one peer receives.
+
+        Args:
+            sent: All numbers that the law sent in a tick, as the record contains them.
+            peer_index: Index of the peer among the sender's peers.
+        """
+        to_all = self.count_numbers(per_peer=False)
+        to_each = self.count_numbers(per_peer=True)
+        if not to_each:
+            return sent
+        start = to_all + peer_index * to_each
+        return [*sent[:to_all], *sent[start : start + to_each]]
+
+
+def join_received(channels: Sequence[LawChannel]) -> tuple[SentVector, ...]:
+    """Returns all vectors that a law may receive from its peers, each name once.
+
+    Args:
+        channels: Vectors that the laws of the peers send.
+
+    Raises:
+        ValueError: Two peers send vectors with the same name and different lengths.
+    """
+    by_name: dict[str, SentVector] = {}
+    for channel in channels:
+        for vector in channel.vectors:
+            other = by_name.setdefault(vector.name, vector)
+            if other.length != vector.length:
+                count = count_nouns(vector.length, "number")
+                problem = f"peers send {vector.name} with different lengths"
+                raise ValueError(f"{problem}, {other.length} and {count}")
+    return tuple(by_name.values())

@@ -1,0 +1,110 @@
+"""Describes the energies with which a control law proves that it is passive.
+
+A control law is passive if it never gives more energy than it received. Some laws keep an
+account of their energy: the energy that they sent to other arms, took from other arms, stored
+and dissipated. Such a law has a method that computes this account from the records of a run,
+which contain the numbers of each period of the control loop. After the run, a check compares
+the account with the motion of the arms.
+
+Invariant:
+    - The energy that arm i takes from arm j is never more than the energy that the law of arm j
+      sent and that has arrived.
+    - The stored energy of a law is never below zero, and its dissipated energy never falls.
+    - From these two rules it follows that the arms get no more energy than they gave.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..step.vectors import Array, IntArray
+
+
+class PeerRecords(NamedTuple):
+    """Numbers that a control law received from another arm and sent to it, in K periods.
+
+    In each period of its control loop, a site (the process that runs one arm) sends a sample
+    with its state. The law uses the newest sample that has arrived.
+
+    Attributes:
+        tick: Number of the period in which the used sample was sent, shape (K,). -1 before the
+            first sample.
+        received: Vectors that came with this sample, by name, each of shape (K, length). Zeros
+            before the first sample.
+        sent: Vectors that the law sent to this arm alone, by name, each of shape (K, length).
+    """
+
+    tick: IntArray
+    received: Mapping[str, Array]
+    sent: Mapping[str, Array]
+
+
+class LawRecords(NamedTuple):
+    """Records of the site of a law: K ticks, one row per tick.
+
+    Attributes:
+        h_s: The period, s.
+        q: Joint angles, shape (K, n), rad.
+        qd: Joint velocities, shape (K, n), rad/s.
+        tau: Control torque within its limits, shape (K, n), N m.
+        tau_x: Exogenous torque, shape (K, n), N m; the torque ON the arm is its negative.
+        to_all: Vectors that went to all peers, by name, shape (K, length).
+        memory: The law's memory after the tick, by the names of `remembers`, shape (K, length).
+        peers: The peers in scenario order.
+    """
+
+    h_s: float
+    q: Array
+    qd: Array
+    tau: Array
+    tau_x: Array
+    to_all: Mapping[str, Array]
+    memory: Mapping[str, Array]
+    peers: Sequence[PeerRecords]
+
+
+class LawEnergies(NamedTuple):
+    """Energies of a law in K ticks, J, shape (K,) or (K, parts) each.
+
+    Flows are sums since the beginning. Each part, for instance that of a joint, must not be
+    below zero by itself.
+
+    Attributes:
+        gave: Per peer, the energy that was sent to it.
+        took: Per peer, the energy that the law took out of the energy that the peer sent, part
+            by part.
+        port: Energy that the arm gave to the law, by the law's own account. None if the energy
+            is computed from the records.
+        store: Energy that the law stores.
+        taken: Energy that the law has dissipated, by its own formula. None if it is the
+            remainder of the other energies.
+        observed: Per peer, the energy that the site knows to remain of the energy sent by the
+            peer; () if the law does not observe it.
+        weight: Weight of the arm's energy in the sum over all sites.
+        gravity: Factor of gravity that the law compensates; the work of this torque is no work
+            of the law.
+    """
+
+    gave: Sequence[Array]
+    took: Sequence[Array]
+    port: Array | None = None
+    store: Array | None = None
+    taken: Array | None = None
+    observed: Sequence[Array] = ()
+    weight: float = 1.0
+    gravity: float = 1.0
+
+
+def sum_work(tau: Array, q: Array) -> Array:
+    """Returns the work of a joint torque since the first tick, for each tick, J, shape (K,).
+
+    A torque is held from each tick to the next. Its work in this period is the torque times the
+    step of the joint angles, summed over the joints. The first number is 0.
+
+    Args:
+        tau: Torque held from each tick to the next, shape (K, n), N m.
+        q: Joint angles at each tick, shape (K, n), rad.
+    """
+    steps: Array = np.einsum("kj,kj->k", tau[:-1], np.diff(q, axis=0))
+    return np.concatenate([[0.0], np.cumsum(steps)])

@@ -1,0 +1,286 @@
+"""Gives a control law its input in each tick: the motion of its arm and of its peers.
+
+A tick is one period of the control loop. The state of a site, the process that runs an arm, is
+stored in rows of arrays, which the compiled stages of a tick read and write. A compiled law
+reads the rows directly. For a law in plain Python, this module copies the rows to lists and
+writes the results back.
+
+Invariant:
+    - The compiled and the plain form of a law see the same numbers.
+    - A vector that the law sends to its peers keeps its numbers until the law writes it again.
+"""
+
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from ...errors import count_nouns
+from ..arms import chain_stages, two_link_stages
+from ..step.jit import bind_leaf, leaf
+from ..step.site_arrays import SiteArrays
+from ..step.site_setup import SiteSetup
+from ..step.ticks import tick_ns
+from ..step.vectors import Array, Row, RowArray
+from .law_channel import SentVector
+from .user_law import LawInput, LawVector, PeerView, UserLaw, call_law, read_memory, restore_law
+
+
+@leaf
+def _update_model(s: Row, chain: RowArray | None) -> None:
+    """Writes the gravity torque G, the inertia matrix M and the bias torque of the arm.
+
+    Args:
+        s: Row of the site.
+        chain: Rows of the chain of joints, or None for the planar arm.
+    """
+    if chain is None:
+        two_link_stages.update_model(s)
+    else:
+        chain_stages.update_model(s, chain)
+
+
+@leaf
+def update_law_view(
+    k: int, t_ns: int, site: RowArray, links: RowArray, chain: RowArray | None
+) -> None:
+    """Prepares the input of a user's control law: time, arm model and ages of the samples.
+
+    A sample is the state that another arm sends. All other parts of the input exist already.
+    The torque is set to NaN, so that a law that does not write its torque is noticed.
+
+    Args:
+        k: Number of the control period.
+        t_ns: Nominal time of the period, ns since the start of the session.
+        site: State of the site (the process that runs the arm), shape (1,); written.
+        links: States of the links from the other sites, one row per link; written.
+        chain: Data of the joints, one row per joint. None for the planar two-link arm.
+    """
+    s: Row = site[0]
+    s.k = k
+    s.t_s = k / s.rate_hz
+    s.h_s = 1.0 / s.rate_hz
+    for i in range(s.tau.shape[0]):
+        s.tau_x[i] = 0.0 - s.on_arm[i]
+        s.tau[i] = np.nan
+    if s.theta_known != 0:
+        _update_model(s, chain)
+    for j in range(links.shape[0]):
+        link: Row = links[j]
+        link.tick = link.used
+        stamp_ns = tick_ns(max(link.used, 0), link.rate_hz)
+        link.age_s = (t_ns - stamp_ns) * 1e-9
+
+
+_PER_JOINT = ("q", "qd", "tau_x", "tau_before", "q_before", "tau", "gravity", "bias")
+_PER_COORDINATE = ("q_des", "qd_des", "felt")
+_IN_ROW = {"gravity": "G"}
+"""Fields of the site's row whose names differ from those of a law's input."""
+_FIRST_PEER_VECTOR = PeerView._fields.index("q")
+"""Index of the first vector in `PeerView`: q, qd and tau_x come last, after single numbers."""
+
+
+def _name_vectors(vectors: Sequence[SentVector], numbers: list[float]) -> SimpleNamespace:
+    """Returns a namespace of vectors, filled with consecutive numbers.
+
+    Args:
+        vectors: Names and lengths of the vectors.
+        numbers: Their numbers, one vector after another. Further numbers are ignored.
+    """
+    named = SimpleNamespace()
+    first = 0
+    for vector in vectors:
+        end = first + vector.length
+        setattr(named, vector.name, LawVector(numbers[first:end]))
+        first = end
+    return named
+
+
+class PlainLaw:
+    """A user's control law in plain Python, with the arrays of the site that it controls.
+
+    In each tick the law receives lists, and its results are written into the site's row.
+
+    Args:
+        law: The law.
+        setup: Setup of the site.
+        arrays: Arrays of the site; their vectors may be longer than the site's.
+        sent: Vectors that the law sends, in the site's record, see `LawChannel`.
+    """
+
+    def __init__(self, law: UserLaw, setup: SiteSetup, arrays: SiteArrays, sent: Array) -> None:
+        channel = setup.channel
+        layout = setup.layout
+        n = layout.joints
+        m = layout.shared
+        self._law = law
+        self._setup = setup
+        self._arrays = arrays
+        self._sent = sent
+        self._update = update_law_view
+
+        site = arrays.site[0]
+        self._views: dict[str, Array] = {}
+        for name in _PER_JOINT:
+            field = _IN_ROW.get(name, name)
+            self._views[name] = site[field][:n]
+        for name in _PER_COORDINATE:
+            self._views[name] = site[name][:m]
+        self._views["theta_hat"] = site["theta_hat"][: layout.parameters]
+        self._inertia = site["M"][:n, :n]
+        self._limit = site["tau_limit"][:n]
+
+        self._peer_columns: list[Any] = []
+        for name in PeerView._fields:
+            column = arrays.links[name]
+            is_vector = column.ndim > 1
+            self._peer_columns.append(column[:, :m] if is_vector else column)
+
+        self._received = None if arrays.channel is None else arrays.channel.received
+        self._receives = setup.received_vectors
+        self._sends_to_all = channel.select_vectors(per_peer=False)
+        self._sends_to_peer = channel.select_vectors(per_peer=True)
+        self._to_all_size = channel.count_numbers(per_peer=False)
+        self._peer_size = channel.count_numbers(per_peer=True)
+
+    def bind(self) -> None:
+        """Compiles the function that collects the input of the control law.
+
+        Without this call, the first period of the control loop would wait for the compilation.
+        """
+        a = self._arrays
+        self._update = bind_leaf(update_law_view, 0, 0, a.site, a.links, a.chain)
+
+    def compute(self, k: int, t_ns: int) -> list[float]:
+        """Computes the torque of one control period by a call of the user's law.
+
+        The torque, the parameter estimate and the vectors for other sites are written into the
+        arrays of this site (the process that runs the arm).
+
+        Args:
+            k: Number of the control period.
+            t_ns: Nominal time of the period, ns since the start of the session.
+
+        Returns:
+            The numbers that the law remembers for the next period.
+
+        Raises:
+            LawFailed: The law raised an exception, or returned an invalid result.
+        """
+        arrays = self._arrays
+        # Write the input of the law into the arrays, and read it from there as lists.
+        self._update(k, t_ns, arrays.site, arrays.links, arrays.chain)
+        law_input = self._read(k)
+        results = call_law(self._law, self._setup.name, law_input, self._collect_sent)
+
+        # `call_law` has checked that the results are finite and of the right length.
+        limit = self._limit
+        self._views["tau"][:] = np.clip(results.torque, -limit, limit)
+        self._views["theta_hat"][:] = results.theta_hat
+        self._sent[:] = results.sent
+        return results.memory
+
+    @property
+    def memory(self) -> list[float]:
+        """Numbers that the law remembers for the next period of the control loop.
+
+        They are stored with the results of each period. `restore` can continue the run from
+        them.
+        """
+        return read_memory(self._law)
+
+    def restore(self, memory: Sequence[float]) -> None:
+        """Restores the law to its state after a tick, from the record of that tick.
+
+        Args:
+            memory: Numbers that `memory` returned after the tick.
+        """
+        restore_law(self._law, self._setup.name, memory)
+
+    def _read(self, k: int) -> LawInput:
+        """Collects the input of the control law for one tick, a period of the control loop.
+
+        `update_law_view` must have written the arrays before. All numbers are copied from them
+        to lists, which plain Python reads faster than arrays.
+
+        The input also contains the vectors that the law sends to the laws of its peers (other
+        arms), with the numbers of the previous tick. The law overwrites them, and
+        `_collect_sent` reads the new numbers. In the array they have the order of a record:
+        first the vectors that go to all peers, then for each peer those that go to it alone.
+
+        Args:
+            k: Number of the tick.
+
+        Returns:
+            The input.
+        """
+        setup = self._setup
+        # One column per field of `PeerView`, in their order, with one entry per peer.
+        columns: list[Any] = [column.tolist() for column in self._peer_columns]
+        vector_columns = columns[_FIRST_PEER_VECTOR:]
+        columns[_FIRST_PEER_VECTOR:] = [map(LawVector, rows) for rows in vector_columns]
+        peers = tuple(map(PeerView, *columns))
+
+        received = [] if self._received is None else self._received.tolist()
+        from_peers = [_name_vectors(self._receives, numbers) for numbers in received]
+
+        sent = self._sent.tolist()
+        to_peers = []
+        for j in range(len(peers)):
+            first_to_peer = self._to_all_size + j * self._peer_size
+            to_peers.append(_name_vectors(self._sends_to_peer, sent[first_to_peer:]))
+
+        vectors = {}
+        for name, view in self._views.items():
+            vectors[name] = LawVector(view.tolist())
+        return LawInput(
+            k=k,
+            t_s=k / setup.rate_hz,
+            h_s=1.0 / setup.rate_hz,
+            joints=setup.layout.joints,
+            coordinates=setup.layout.shared,
+            peers=peers,
+            received=tuple(from_peers),
+            sent=tuple(to_peers),
+            to_all=_name_vectors(self._sends_to_all, sent),
+            inertia=LawVector(map(LawVector, self._inertia.tolist())),
+            **vectors,
+        )
+
+    def _collect_sent(self, now: LawInput) -> list[float]:
+        """Returns the numbers of all vectors that the law sends, in the order of the record.
+
+        Args:
+            now: Input of the tick, which contains the vectors that the law wrote.
+
+        Raises:
+            ValueError: A vector has another length than the law declares.
+        """
+        sent = _collect_vectors(self._sends_to_all, now.to_all, "to_all")
+        for j, to_peer in enumerate(now.sent):
+            sent += _collect_vectors(self._sends_to_peer, to_peer, f"sent[{j}]")
+        return sent
+
+
+def _collect_vectors(declared: Sequence[SentVector], vectors: Any, name: str) -> list[float]:
+    """Returns the numbers of a law's vectors one after another.
+
+    Args:
+        declared: Vectors that the law declares.
+        vectors: Values of the vectors, as attributes.
+        name: Name of `vectors` in the law's input, for errors.
+
+    Raises:
+        ValueError: A vector has another length than the law declares.
+    """
+    numbers: list[float] = []
+    for vector in declared:
+        values = list(getattr(vectors, vector.name))
+        if len(values) != vector.length:
+            required = count_nouns(vector.length, "number")
+            raise ValueError(
+                f"{name}.{vector.name} must have {required}, but has {len(values)}"
+            )
+        numbers += map(float, values)
+    return numbers

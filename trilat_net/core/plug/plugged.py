@@ -1,0 +1,232 @@
+"""Compiles models that users write in Python, so that the simulation can call them.
+
+A model describes an operator who moves an arm, an environment that the arm touches, or the
+delays of a network. It consists of numbers, its parameters, and of a function. The simulation
+calls the function with the parameters and with a row of an array. The function reads its input
+from the row and writes its result into it.
+
+Invariant:
+    - A function is compiled again only if the shapes of its parameters or the fields of the row
+      change. The values of the parameters are stored in a table, so new values need no
+      compilation.
+    - The simulation itself is never compiled again for a new function, because it calls the
+      function by its address.
+"""
+
+import hashlib
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+from numba.core import cgutils, types
+from numba.extending import intrinsic
+
+from ..step.jit import compile_named
+from ..step.vectors import Array
+
+_OPTIONS: Any = {"_nrt": False, "error_model": "numpy"}
+_config: Any = numba.config
+_PLAIN: dict[int, Callable[..., None]] = {}
+"""The functions by the numbers that replace their addresses if Numba is disabled."""
+
+
+@intrinsic
+def _call_compiled(_context: Any, address: Any, arguments: Any) -> Any:
+    """Generates the call of a compiled function, which returns nothing, by its address.
+
+    Numba calls this function when it compiles a caller of `call_address`. An exception of the
+    called function propagates to its caller.
+
+    Args:
+        _context: Numba's typing context.
+        address: Numba's type of the address, an integer.
+        arguments: Numba's type of the tuple of arguments.
+
+    Returns:
+        The signature, as Numba expects it of an intrinsic, and the function that generates the
+        LLVM code of the call.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        """Generates the LLVM code of the call `function(*arguments)` by the function's address.
+
+        The address is a value at run time. Therefore the compiled caller does not depend on the
+        function, and is not compiled again for another one. Numba calls `generate` while it
+        compiles the caller. Arguments, result and exceptions are passed as in all functions
+        that Numba compiles.
+
+        Args:
+            context: Numba's description of the target processor.
+            builder: Appends LLVM instructions to the caller.
+            signature: Types of the two arguments of the intrinsic: an integer, and a tuple with
+                one type per argument of the function.
+            values: LLVM values of the same two arguments: the address of the function, and the
+                tuple of its arguments.
+
+        Returns:
+            The LLVM value of None, which is the result of the call in Python.
+        """
+        convention = context.call_conv
+        address_value, tuple_value = values
+        argument_types = tuple(signature.args[1])
+        # Convert the address, an integer, to a pointer to a function that returns None.
+        function_type = convention.get_function_type(types.none, argument_types)
+        pointer = builder.inttoptr(address_value, function_type.as_pointer())
+        unpack: Any = cgutils.unpack_tuple
+        argument_values = unpack(builder, tuple_value)
+        # A compiled function returns a status, which states whether it raised an exception. If
+        # so, the caller returns at once with the same status.
+        status, _ = convention.call_function(
+            builder, pointer, types.none, argument_types, argument_values
+        )
+        with builder.if_then(status.is_error, likely=False):
+            convention.return_status_propagate(builder, status)
+        return context.get_dummy_value()  # Numba represents None by an arbitrary value
+
+    # A Numba type that is called with types of arguments is a signature: this one returns None.
+    return types.none(address, arguments), generate
+
+
+def _call_plain(address: int, arguments: tuple[Any, ...]) -> None:
+    """Calls a function by the number that replaces its address while Numba is disabled."""
+    function = _PLAIN[address]
+    function(*arguments)
+
+
+call_address: Any = _call_plain if _config.DISABLE_JIT else _call_compiled
+"""Calls the function at an address with a tuple of arguments; its exceptions propagate."""
+
+
+def digest_sibling_sources(function: Callable[..., Any]) -> str:
+    """Computes a hash of all source files in the folder of a function.
+
+    Compiled code is stored on disk under this hash. After a change of a source file, the hash
+    is different, and the function is compiled again.
+
+    Args:
+        function: A function.
+
+    Returns:
+        The hash. Empty if the function is not part of this package; its code is not stored.
+    """
+    folder = Path(function.__code__.co_filename).parent
+    if not folder.is_relative_to(Path(__file__).parents[1]):
+        return ""
+    files = sorted(folder.glob("*.py"))
+    sources = [file.read_bytes() for file in files]
+    return hashlib.sha256(b"".join(sources)).hexdigest()
+
+
+def find_address(compiled: Any) -> int:
+    """Returns the address of a compiled function, at which machine code can call it.
+
+    Args:
+        compiled: Function that Numba compiled for one signature.
+    """
+    result = compiled.get_compile_result(compiled.nopython_signatures[0])
+    return int(result.library.get_pointer_to_function(result.fndesc.llvm_func_name))
+
+
+def _find_numbers(model: Any) -> dict[str, Array]:
+    """Returns the fields of a model that are numbers, by name, as arrays of floats."""
+    numbers = {}
+    for name in model.__struct_fields__:
+        value = np.asarray(getattr(model, name))
+        is_number = value.dtype.kind in "fiub"
+        if is_number:
+            numbers[name] = value.astype(np.float64)
+    return numbers
+
+
+def list_numbers(model: Any) -> Array:
+    """Returns all parameters of a user's model in one array, in the order of its fields.
+
+    Args:
+        model: A model of an operator, an environment or network delays.
+
+    Returns:
+        The numbers. The array is empty if the model has no parameters.
+    """
+    values = _find_numbers(model).values()
+    fields = [value.ravel() for value in values]
+    # A model without numbers gives an empty array.
+    return np.concatenate([np.zeros(0), *fields])
+
+
+@cache
+def _compile(
+    function: Callable[..., None], form: np.dtype[np.void], row: np.dtype[np.void]
+) -> Any:
+    """Compiles a function of a user's model, so that machine code can call it.
+
+    The function takes the parameters of its model as a record. The simulation has the
+    parameters as an array of floats. Therefore the result takes this array, and gives the
+    function a view of it as a record.
+
+    Args:
+        function: The function of the model, called with the parameters and with a row.
+        form: Layout of the parameters: name and shape of each one, all of them floats.
+        row: Layout of the row, from which the function reads its input and into which it
+            writes its result.
+
+    Returns:
+        The compiled function, called with the array of the parameters and with the row. If
+        Numba is disabled, a Python function.
+    """
+    count = form.itemsize // 8  # floats of 8 bytes
+    compute = numba.njit(**_OPTIONS)(function)
+
+    def call(numbers: Any, now: Any) -> None:
+        """Calls the function with the parameters of its model as a record.
+
+        Args:
+            numbers: The parameters, possibly followed by other floats.
+            now: The row.
+        """
+        model = numbers[:count].view(form)[0]
+        compute(model, now)
+
+    if _config.DISABLE_JIT:
+        return call
+    numba_types: Any = numba
+    row_type = numba_types.from_dtype(row)
+    signature = types.none(types.float64[::1], row_type)
+    sources = digest_sibling_sources(function)
+    is_part_of_this_package = bool(sources)
+    if is_part_of_this_package:
+        # The machine code is stored on disk, under a name from all that it depends on.
+        text = f"{sources} {function.__module__} {function.__qualname__} {form} {row}"
+        digest = hashlib.sha256(text.encode()).hexdigest()
+        return compile_named(call, f"own_{digest[:32]}", signature, **_OPTIONS)
+    # A user's function may depend on files that are unknown: it is compiled in each process.
+    return numba.njit(signature, **_OPTIONS)(call)
+
+
+def compile_to_address(model: Any, name: str, row: np.dtype[np.void]) -> int:
+    """Compiles a function of a user's model, and returns the address of its machine code.
+
+    Args:
+        model: A model of an operator, an environment or network delays. The compiled function
+            is called with the parameters of the model and with a row of an array.
+        name: Name of the function in the class of the model.
+        row: Data type of the row.
+
+    Returns:
+        The address. If Numba is disabled, a number under which the Python function is
+        registered.
+    """
+    fields: Any = []
+    for field, value in _find_numbers(model).items():
+        fields.append((field, value.dtype, value.shape))
+    if not fields:
+        fields.append(("nothing", "f8"))
+    function = getattr(type(model), name)
+    form = np.dtype((np.record, fields))
+    call = _compile(function, form, row)
+    if _config.DISABLE_JIT:
+        _PLAIN[id(call)] = call
+        return id(call)
+    return find_address(call)

@@ -1,0 +1,437 @@
+"""Calls a user's control law in plain Python: its input, its results and its memory.
+
+A control law is a class with a method `torque`, which computes the torque of an arm in each
+tick (period) of the control loop. Between ticks a law may keep numbers, its memory.
+
+Invariant:
+    - A law is a function of its input and its memory: equal inputs and an equal memory give
+      equal torques.
+    - The record of each tick, its stored result, contains the memory. A run can therefore be
+      resumed from the middle of its log.
+"""
+
+import math
+import operator
+from collections.abc import Callable, Iterator, Sequence
+from numbers import Real
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from ...errors import LawFailed, count_nouns
+from ..step.vectors import Vector
+
+MAX_LAW_MEMORY = 1024
+"""Largest count of numbers in a law's memory, which each record contains."""
+
+
+class LawContext(NamedTuple):
+    """Facts that a law receives before the run.
+
+    >>> class Damper:
+    ...     def __init__(self, facts: tn.LawContext, d: float = 2.0) -> None:
+    ...         self.d = [d] * facts.joints
+
+    Attributes:
+        site: Name of the site, the process that runs one arm.
+        rate_hz: Tick rate of the site, Hz.
+        g_m_s2: Gravitational acceleration, m/s^2.
+        lengths_m: Lengths of the two links, m.
+        theta: The arm's true parameters, shape (5,), for a law that knows them; () if they are
+            unknown, as for a real arm that was not identified.
+        tau_limit_nm: Largest torque of a joint, N m; one number, or one per joint.
+        joints: Number of joints of the arm.
+        coordinates: Count of numbers in q, qd and tau_x of a peer: one per joint, or one per
+            coordinate of the end effector.
+        peers: Names of the peers, in scenario order.
+    """
+
+    site: str
+    rate_hz: int
+    g_m_s2: float
+    lengths_m: tuple[float, float]
+    theta: tuple[float, ...]
+    tau_limit_nm: Vector
+    joints: int = 2
+    coordinates: int = 2
+    peers: tuple[str, ...] = ()
+
+
+def _make_operator(operate: Callable[[Any, Any], Any]) -> Any:
+    """Returns an arithmetic method of `LawVector` that works number by number.
+
+    Args:
+        operate: The operation on two numbers, for example `operator.add`.
+
+    Returns:
+        The method. Its arguments are the vector of which it is a method, and the other operand.
+    """
+
+    def compute(vector: "LawVector", other: Any) -> Any:
+        """Applies the operation `operate` to two vectors, or to a vector and a number.
+
+        Args:
+            vector: The first vector.
+            other: A vector with as many numbers, or a single number.
+
+        Returns:
+            The resulting vector. NotImplemented if `other` is of another type.
+        """
+        if isinstance(other, Real):
+            return LawVector([operate(number, other) for number in vector])
+        if not isinstance(other, list | tuple):
+            # Python then asks `other`: a NumPy array computes the result itself, as an array.
+            return NotImplemented
+        if len(other) != len(vector):
+            count = count_nouns(len(vector), "number")
+            raise ValueError(
+                f"cannot combine a vector of {count} with a vector of {len(other)}"
+            )
+        return LawVector(map(operate, vector, other))
+
+    return compute
+
+
+class LawVector(list[Any]):
+    """List of numbers with arithmetic, in which a law in plain Python receives its vectors.
+
+    Operations act number by number, as in `-5.0 * (now.q - now.q_des) - 2.0 * now.qd`. The
+    other operand is a number, or a list with as many numbers.
+    """
+
+    __add__ = __radd__ = __iadd__ = _make_operator(operator.add)
+    __sub__ = _make_operator(operator.sub)
+    __rsub__ = _make_operator(lambda right, left: left - right)
+    __mul__ = __rmul__ = __imul__ = _make_operator(operator.mul)
+    __truediv__ = _make_operator(operator.truediv)
+
+    def __neg__(self) -> "LawVector":
+        return LawVector(map(operator.neg, self))
+
+
+class PeerView(NamedTuple):
+    """Peer as a law sees it in a tick: its sample in use, or its start pose at rest.
+
+    A sample is the state that a peer published in one of its ticks.
+
+    Attributes:
+        alpha: Dominance factor of the peer now, the weight with which this site follows it.
+        tick: Stamp of the sample in use, a tick of the peer; -1 before the first sample.
+        age_s: Age of that sample, s; before the first sample, the time since the epoch.
+        new: 1 if the sample came into use at this tick, else 0.
+        q: Joint angles or coordinates of the sample, rad or m.
+        qd: Derivative of q, rad/s or m/s.
+        tau_x: Exogenous torque of the peer, N m or N; the torque ON its arm is the negative.
+    """
+
+    alpha: float
+    tick: int
+    age_s: float
+    new: int
+    q: LawVector
+    qd: LawVector
+    tau_x: LawVector
+
+
+class LawInput(NamedTuple):
+    """Input of a law in a tick, and the places for its results.
+
+    A vector has one number per joint, or one per coordinate that the sites share.
+
+    >>> def torque(self, now: tn.LawInput) -> list[float]:
+    ...     return [-d * speed for d, speed in zip(self.d, now.qd)]
+
+    In plain Python the vectors are `LawVector`, which has arithmetic. A compiled law uses their
+    numbers one by one.
+
+    Attributes:
+        k: The tick.
+        t_s: Nominal time since the epoch, s.
+        h_s: The period, s.
+        q: Joint angles, rad.
+        qd: Joint velocities, rad/s.
+        q_des: Reference of Eq. (6), rad.
+        qd_des: Derivative of q_des, rad/s.
+        felt: Torque on the peers' arms as received, weighted by dominance, N m.
+        joints: Number of joints.
+        coordinates: Count of numbers in the vectors of a peer.
+        tau: Torque of each joint, N m, written by the law and then limited.
+        peers: The peers in scenario order.
+        received: Per peer the vectors that its law sent with the sample in use, by name; zeros
+            before the first sample, and for a vector that the peer's law does not send.
+        sent: Per peer the vectors that go to this peer alone, written by the law; a vector that
+            is not written keeps its numbers.
+        to_all: Vectors that go to all peers, also written by the law.
+        tau_x: Exogenous torque of this tick, N m; the torque ON the arm is its negative.
+        tau_before: Torque of the previous tick, within its limits, N m; zeros at tick 0.
+        q_before: Joint angles of the previous tick, rad; the start pose at tick 0.
+        gravity: Torque that holds the arm, N m; zeros if its parameters are unknown.
+        theta_hat: Estimate in the record, written by the law; otherwise it does not change.
+        inertia: M(q), one row per joint, for a law with `needs_model`; otherwise zeros.
+        bias: C qd + G (for a chain with friction, less the torque of its stops), N m, for a law
+            with `needs_model`; otherwise zeros.
+    """
+
+    k: int
+    t_s: float
+    h_s: float
+    q: LawVector
+    qd: LawVector
+    q_des: LawVector
+    qd_des: LawVector
+    felt: LawVector
+    joints: int = 2
+    coordinates: int = 2
+    tau: Any = ()
+    peers: Sequence[PeerView] = ()
+    received: Sequence[Any] = ()
+    sent: Sequence[Any] = ()
+    to_all: Any = None
+    tau_x: LawVector = LawVector()
+    tau_before: LawVector = LawVector()
+    q_before: LawVector = LawVector()
+    gravity: LawVector = LawVector()
+    theta_hat: Any = ()
+    inertia: LawVector = LawVector()
+    bias: LawVector = LawVector()
+
+
+class UserLaw(Protocol):
+    """Interface of a control law that a user writes in Python.
+
+    The class of the law is called with a `LawContext`, which describes the arm, and with the
+    entries of the table `[control]` of the scenario as keyword arguments. The method `torque`
+    is called in each period of the control loop.
+
+    Optional attributes and methods:
+
+    - If `torque` needs numbers from earlier periods, the law must declare them, so that a run
+      can be repeated. Either the class lists the names of these attributes in `remembers`, or a
+      method `memory()` returns the numbers and a method `recall(memory)` restores them.
+    - An attribute `theta_hat` with a number per dynamic parameter is stored in the records.
+    - `holds = True` states that the law knows the other arms only through the reference, the
+      position that its arm follows. Its torque is then also used while the arm is at rest.
+    """
+
+    def torque(self, now: LawInput) -> Sequence[float] | None:
+        """Computes the motor torque of each joint in a period of the control loop.
+
+        The program limits the torque to the range of the motors afterwards.
+
+        Args:
+            now: State of the arm and of the other arms. The law may also write results into it,
+                for example numbers for other arms.
+
+        Returns:
+            The torques, N m. None if the law has written them into `now.tau`.
+        """
+
+
+UserLawFactory = Callable[[LawContext], UserLaw]
+
+
+def call_law(
+    law: UserLaw, site: str, now: LawInput, collect_sent: Callable[[LawInput], list[float]]
+) -> "LawResults":
+    """Calls a law in a tick and returns its results.
+
+    Args:
+        law: The law.
+        site: Name of the site.
+        now: Input of the tick.
+        collect_sent: Function that returns the numbers of the vectors that the law sends.
+
+    Raises:
+        LawFailed: The law raised, or its results are not finite numbers of the right count.
+    """
+    try:
+        returned = law.torque(now)
+        if returned is None and all(map(math.isnan, now.tau)):
+            raise TypeError("torque returned None and did not write now.tau")
+        torque_numbers = now.tau if returned is None else returned
+        estimate_numbers = getattr(law, "theta_hat", now.theta_hat)
+        torque = [float(value) for value in torque_numbers]
+        estimate = [float(value) for value in estimate_numbers]
+        results = LawResults(torque, estimate, read_memory(law), collect_sent(now))
+    except LawFailed:  # the watchdog has stopped the law
+        raise
+    except (Exception, SystemExit) as error:
+        raise describe_failure(law, site, now.k, error) from error
+
+    required_lengths = (
+        ("torque", torque, now.joints),
+        ("theta_hat", estimate, len(now.theta_hat)),
+    )
+    for name, values, length in required_lengths:
+        if len(values) != length:
+            problem = f"{name} has {count_nouns(len(values), 'number')}, not {length}"
+            raise _law_error(law, site, now.k, problem)
+    check_results(law, site, now.k, results)
+    return results
+
+
+class LawResults(NamedTuple):
+    """Results of a user's law in one tick, as `call_law` returns them.
+
+    They are the torque of each joint, the estimate of the arm's parameters, the memory that the
+    law keeps for the next tick, and the numbers that it sends to its peers.
+    """
+
+    torque: list[float]
+    theta_hat: list[float]
+    memory: list[float]
+    sent: list[float]
+
+
+def check_results(law: UserLaw, site: str, tick: int, results: LawResults) -> None:
+    """Checks that the results of a law are finite and that its memory is not too large.
+
+    Args:
+        law: The law, for the error.
+        site: Name of the site, for the error.
+        tick: The tick, for the error.
+        results: Results of the law.
+
+    Raises:
+        LawFailed: A check fails. The error states the first problem.
+    """
+    count = len(results.memory)
+    if count > MAX_LAW_MEMORY:
+        numbers = count_nouns(count, "number")
+        problem = f"memory has {numbers}, at most {MAX_LAW_MEMORY} are kept"
+        raise _law_error(law, site, tick, problem)
+    for name, values in zip(results._fields, results, strict=True):
+        if all(map(math.isfinite, values)):
+            continue
+        for n, value in enumerate(values):
+            if not math.isfinite(value):
+                problem = f"{name}[{n}] must be a finite number, but is {value}"
+                raise _law_error(law, site, tick, problem)
+
+
+def describe_failure(
+    law: UserLaw, site: str, tick: int | None, error: BaseException
+) -> LawFailed:
+    """Returns the error by which a site reports that its control law raised an exception.
+
+    Args:
+        law: The law.
+        site: Name of the site.
+        tick: The tick. None if the exception was raised outside of a tick.
+        error: The exception.
+    """
+    problem = _one_line(error)
+    if "LawVector" in problem:
+        problem += "; for more than + - * / make it an array, as in numpy.asarray(now.q)"
+    return _law_error(law, site, tick, problem)
+
+
+def _flatten(value: Any) -> Iterator[float]:
+    """Yields the numbers of a value in order: of a number, or of nested lists."""
+    if isinstance(value, Real):
+        yield float(value)
+        return
+    for entry in value:
+        yield from _flatten(entry)
+
+
+def _fill(value: Any, numbers: Iterator[float]) -> Any:
+    """Returns a value of the same form as `value`, filled with the next numbers.
+
+    This is the inverse of `_flatten`. Types are kept: an integer attribute stays an integer as
+    long as its number is integral.
+
+    Args:
+        value: A number, an array, or nested lists of numbers.
+        numbers: The numbers, which are consumed in order.
+    """
+    if isinstance(value, bool):
+        return bool(next(numbers))
+    if isinstance(value, Real):
+        number = next(numbers)
+        return int(number) if isinstance(value, int) and number.is_integer() else number
+    if isinstance(value, np.ndarray):
+        entries = [next(numbers) for _ in range(value.size)]
+        return np.array(entries, value.dtype).reshape(value.shape)
+    return type(value)(_fill(entry, numbers) for entry in value)
+
+
+def list_remembered(law: Any) -> tuple[str, ...]:
+    """Returns the names of the attributes that a law keeps from tick to tick.
+
+    The law's class lists them in `remembers`. Empty for a law without memory.
+    """
+    return tuple(getattr(law, "remembers", ()))
+
+
+def read_memory(law: Any) -> list[float]:
+    """Returns the numbers that a law keeps from tick to tick.
+
+    They come from the law's method `memory` if it has one, otherwise from the attributes that
+    its class lists in `remembers`.
+    """
+    if callable(getattr(law, "memory", None)):
+        return [float(value) for value in law.memory()]
+    numbers: list[float] = []
+    for name in list_remembered(law):
+        numbers += _flatten(getattr(law, name))
+    return numbers
+
+
+def write_memory(law: Any, memory: Sequence[float]) -> None:
+    """Gives a control law the numbers that it remembered from earlier control periods.
+
+    If the law has a method `recall`, the numbers are passed to this method. Otherwise they are
+    written into the attributes that the class of the law lists in `remembers`.
+
+    Args:
+        law: The law, which is changed.
+        memory: Numbers that `read_memory` returned.
+    """
+    if callable(getattr(law, "recall", None)):
+        law.recall(memory)
+        return
+    numbers = iter(memory)
+    for name in list_remembered(law):
+        setattr(law, name, _fill(getattr(law, name), numbers))
+
+
+def restore_law(law: UserLaw, site: str, memory: Sequence[float]) -> None:
+    """Restores the state that a control law had after a recorded control period.
+
+    Args:
+        law: The law, which is changed.
+        site: Name of the process that runs the arm, for the text of the exception.
+        memory: Numbers that the law remembered, from the record of the period.
+
+    Raises:
+        LawFailed: The law raised an exception.
+    """
+    try:
+        write_memory(law, memory)
+    except (Exception, SystemExit) as error:
+        raise describe_failure(law, site, None, error) from error
+
+
+def law_name(law: UserLaw) -> str:
+    """Returns the name of a law as a scenario writes it, "module:Class"."""
+    return f"{type(law).__module__}:{type(law).__qualname__}"
+
+
+def _law_error(law: UserLaw, site: str, tick: int | None, problem: str) -> LawFailed:
+    """Returns the error for a problem with the results of a law.
+
+    Args:
+        law: The law.
+        site: Name of the site.
+        tick: The tick; None outside of a tick.
+        problem: The problem, a sentence for the user.
+    """
+    return LawFailed(problem, site=site, code=law_name(law), tick=tick)
+
+
+def _one_line(error: BaseException) -> str:
+    """Returns the type of an exception and the first line of its message."""
+    kind = type(error).__name__
+    lines = str(error).strip().splitlines()
+    return f"{kind}: {lines[0]}" if lines else kind

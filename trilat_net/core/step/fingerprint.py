@@ -1,0 +1,109 @@
+"""Computes a fingerprint of the platform's arithmetic, to tell where runs repeat exactly.
+
+Simulations are reproducible to the last bit only on platforms with equal arithmetic. The
+fingerprint is a hash of the results of a fixed computation. This computation consists of many
+sines and cosines, and of a short simulation of two arms that follow each other over a network
+with random delays.
+
+A log of a run contains the fingerprint of the platform that wrote it. When a log is verified,
+the run is computed again. The results must be equal to the last bit only if the fingerprint of
+the present platform is the same (law L5 of docs/design.md).
+"""
+
+import hashlib
+from functools import cache
+
+import numpy as np
+
+from ..arms.elementary import sincos
+from ..arms.exogenous import TorqueKind, TorqueSource
+from ..arms.two_link_arm import PARAMETERS, ArmLinks, theta_from_links
+from ..links.delay import DelayKind, LinkModel
+from .jit import leaf
+from .site_setup import Gains, Law, LinkSetup, Scheme, SiteSetup
+from .site_step import Site
+from .ticks import Arrival, TickInput
+from .vectors import Array
+
+_TICKS = 200
+_LINK = LinkModel(kind=DelayKind.GAMMA, extra=2.7, scale=900.0, playout_us=2_000)
+
+
+@leaf
+def _compute_sines(angles: Array, results: Array) -> None:
+    """Writes the sines and cosines of angles into the two rows of `results`."""
+    for n in range(angles.shape[0]):
+        results[0, n], results[1, n] = sincos(angles[n])
+
+
+def _build_setup(name: str, peer: str, q0: tuple[float, float]) -> SiteSetup:
+    """Returns the setup of a site of the short run whose results are hashed.
+
+    Args:
+        name: Name of the site.
+        peer: Name of its only peer.
+        q0: Start pose, rad.
+    """
+    theta = theta_from_links(
+        ArmLinks(
+            l1_m=1.0,
+            m1_kg=1.1,
+            lc1_m=0.5,
+            I1_kg_m2=0.09,
+            l2_m=0.9,
+            m2_kg=0.8,
+            lc2_m=0.4,
+            I2_kg_m2=0.05,
+        )
+    )
+    return SiteSetup(
+        name=name,
+        rate_hz=1000,
+        scheme=Scheme.SECOND_ORDER,
+        gains=Gains(
+            Law.ADAPTIVE,
+            Lambda=(1.0, 1.3),
+            Kp=(1.0, 0.7),
+            Kd=(3.0, 2.1),
+            Gamma=(1.0,) * PARAMETERS,
+            theta_hat0=(0.3 * theta).tolist(),
+        ),
+        theta=theta,
+        g_m_s2=9.81,
+        lengths_m=(1.0, 0.9),
+        tau_limit_nm=200.0,
+        qd_limit_rad_s=100.0,
+        q0=q0,
+        qd0=(0.1, -0.2),
+        actors=(TorqueSource(TorqueKind.PULSE, 0.01, 0.15, a=(3.0, 2.0)),),
+        links=(
+            LinkSetup(
+                peer=peer, alpha=1.0, rate_hz=1000, q0=(0.0, 0.0), key=7, models=(_LINK,)
+            ),
+        ),
+    )
+
+
+@cache
+def compute_fingerprint() -> str:
+    """Returns a fingerprint of the arithmetic of this platform, sixteen hexadecimal digits.
+
+    It is a hash of many sines and cosines and of a short run of two sites. Two platforms with
+    the same fingerprint can be expected to compute the same bits.
+    """
+    angles = np.linspace(-12.0, 12.0, 4001)
+    results = np.empty((2, len(angles)))
+    _compute_sines(angles, results)
+    digest = hashlib.sha256(results.tobytes())
+    a = Site(_build_setup("a", "b", (0.6, -0.4)))
+    b = Site(_build_setup("b", "a", (-0.5, 0.8)))
+    record_a = a.step(TickInput(0))
+    record_b = b.step(TickInput(0))
+    for k in range(1, _TICKS):
+        from_b = Arrival(0, k - 1, record_b.q, record_b.qd)
+        from_a = Arrival(0, k - 1, record_a.q, record_a.qd)
+        record_a = a.step(TickInput(k, [from_b]))
+        record_b = b.step(TickInput(k, [from_a]))
+        numbers = [r.q + r.qd + r.tau + r.theta_hat for r in (record_a, record_b)]
+        digest.update(np.array(numbers).tobytes())
+    return digest.hexdigest()[:16]

@@ -1,0 +1,762 @@
+"""Simulates all sites of an experiment in one compiled call, for studies of many runs.
+
+A site is an arm with its control loop. The run takes place in virtual time: the clock of the
+simulation jumps from one tick (period of the loop) to the next. Such a run writes no log. It
+keeps only the largest errors and speeds and a few sums.
+
+Invariant:
+
+- The call uses the same compiled functions as `Site.step`, which computes a single tick.
+- The ticks are computed in the same order as in an ordinary run in virtual time: by nominal
+  time, and at equal times in the order of the sites in the scenario file.
+- The numbers are equal to those of an ordinary run, bit for bit.
+"""
+
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from ..arms import chain_stages, two_link_stages
+from ..arms.exogenous import TorqueSourceRows, TorqueTable
+from ..arms.task_space import POSITION
+from ..links.link import LinkArrays, accept_sample, release_sample
+from ..plug.compiled_law import law_stage
+from .jit import leaf
+from .kernel import act_stages, channel_of, reference_stages, torque_stage
+from .row_fields import ProgressRow, SiteRow, SumsRow, row_dtype
+from .site_arrays import SiteArrays
+from .ticks import BUCKETS_PER_S, Mode, tick_ns
+from .vectors import Array, IntArray, Row, RowArray
+
+NEVER_NS = 2**63 - 1
+"""The time of the next tick of a site that has made all its ticks, ns."""
+
+PROGRESS_DTYPE = row_dtype("progress", {})
+"""The layout of a site's progress, see `ProgressRow`."""
+
+
+class RecentRecords(NamedTuple):
+    """Latest records of a site, kept as long as another site may still need them.
+
+    A site is the process that runs one arm. A record contains the numbers that a site computes
+    in one period of its control loop. The arrays are ring buffers. If they are for several
+    sites, they have an additional first axis for the site.
+
+    Attributes:
+        t_ns: Times of the records, in ns since the start of the session. The length is a power
+            of two.
+        rows: Floating-point numbers of the records, one row per record, see `Layout.columns`.
+    """
+
+    t_ns: IntArray
+    rows: Array
+
+
+@cache
+def sums_dtype(joints: int) -> np.dtype[np.void]:
+    """Returns the NumPy data type of the sums from which the metrics of a run are computed.
+
+    `SumsRow` lists the sums, for example of squared errors and squared torques.
+
+    Args:
+        joints: Number of joints of the arm.
+    """
+    return row_dtype("sums", {"joints": joints})
+
+
+_DIVERGED = int(Mode.DIVERGED)
+
+
+def max_over_joints(buckets: Array) -> Array:
+    """Computes the largest position error and joint speed of an arm in each interval of time.
+
+    Args:
+        buckets: Statistics of an arm with n joints in K intervals of time, which are called
+            buckets, shape (K, 3 n). `run_until` writes them. Each row consists of three groups
+            of n columns, one column per joint: the largest position error |e| in rad, the
+            largest joint speed |qd| in rad/s, and the last joint angle q in rad.
+
+    Returns:
+        The largest |e| in rad and the largest |qd| in rad/s over all joints, shape (K, 2).
+    """
+    joints = buckets.shape[1] // 3
+    errors_and_speeds = buckets[:, : 2 * joints]
+    by_quantity_and_joint = errors_and_speeds.reshape(-1, 2, joints)
+    peaks: Array = by_quantity_and_joint.max(axis=2)
+    return peaks
+
+
+@leaf
+def _first_sent(s: SiteRow) -> int:
+    """Returns the first column of the numbers that a law sends in its site's row of floats."""
+    shared_vectors = 5 if s.task else 2
+    return 4 * s.joints + shared_vectors * s.shared + s.parameters
+
+
+class ReplayedInputs(NamedTuple):
+    """Inputs of a recorded run, which a simulation of all N sites repeats.
+
+    A site is a process that runs one arm. Each site has P peers, the other sites, whose samples
+    (states) it receives. A tick is one period of the control loop of a site.
+
+    Attributes:
+        first: Index into `samples` of the first arrival, by site, peer and tick. For K ticks
+            the shape is (N, P, K + 1). If K is 0, each sample arrives at the first tick after
+            it was sent.
+        samples: The ticks in which the peers sent the samples, in the order of arrival.
+        hands: What the person or program that moves the arm does, by site and tick. The shape
+            is (N, K, 1 + 2 m). The numbers are the firmness of the grip from 0 to 1, the m
+            coordinates of the target, and the target one second later. If K is 0, nobody holds
+            the arms.
+        hand_indices: For each site the index of this person or program among its operators and
+            environments, shape (N,). -1 if there is none.
+    """
+
+    first: IntArray
+    samples: IntArray
+    hands: Array
+    hand_indices: IntArray
+
+
+@leaf
+def _accept_record(
+    k: int, rate_hz: int, peer: SiteRow, sample: int, sent: RecentRecords, link: LinkArrays
+) -> None:
+    """Reads the sample of a peer from its record, and stores it as an arrival at the receiver.
+
+    A site is the process that runs one arm. The receiver is a site, and the peer another site,
+    whose samples (states) it receives. A record contains the results of one tick, a period of
+    the control loop. With n joints, m coordinates that the sites share and P parameters, its
+    floating-point numbers are
+
+        q (n), qd (n), q_des (m), qd_des (m), tau (n), tau_x (n), theta_hat (P),
+        x (m), xd (m), wrench (m),                                  only in task space
+        the numbers that the control law of the peer sends
+
+    Sites that share joint angles send q, qd and tau_x. Sites in task space send the pose x, its
+    velocity xd and the external wrench on the end effector instead.
+
+    Args:
+        k: Present tick of the receiver.
+        rate_hz: Tick rate of the receiver, Hz.
+        peer: State of the peer.
+        sample: Tick in which the peer sent the sample.
+        sent: Latest records of the peer, a ring buffer: the record of tick i is at i modulo the
+            length.
+        link: Arrays of the link from the peer; the sample is stored in them.
+    """
+    n = peer.joints
+    m = peer.shared
+    first_sent = _first_sent(peer)
+    q_column = 0
+    qd_column = n
+    tau_x_column = 3 * n + 2 * m
+    if peer.task:
+        # x, xd and the wrench are the last vectors before the numbers that the law sends.
+        q_column = first_sent - 3 * m
+        qd_column = first_sent - 2 * m
+        tau_x_column = first_sent - m
+    # The length of the ring is a power of two, so a modulo is a mask of the lower bits.
+    ring_mask = sent.t_ns.shape[0] - 1
+    row = sent.rows[sample & ring_mask]
+    # Each slice starts at its vector and may be longer: `accept_sample` ignores the rest.
+    accept_sample(
+        k=k,
+        rate_hz=rate_hz,
+        tick=sample,
+        q=row[q_column:],
+        qd=row[qd_column:],
+        tau_x=row[tau_x_column:],
+        sent=row[first_sent:],
+        link=link,
+    )
+
+
+@leaf
+def _accept_prompt_records(
+    k: int,
+    t_ns: int,
+    rate_hz: int,
+    peer: SiteRow,
+    records: int,
+    next_sample: int,
+    sent: RecentRecords,
+    link: LinkArrays,
+) -> int:
+    """Accepts a peer's records with a stamp before time t, as if they arrived without delay.
+
+    A site is the process that runs one arm. The receiver is a site, and the peer another site
+    whose records it receives. A record contains the results of one tick, a period of the
+    control loop. Its stamp is the nominal time of this tick. Acceptance stores the record until
+    the simulated delay of the link has passed.
+
+    Args:
+        k: The tick of the receiver.
+        t_ns: Time t of this tick, ns since the epoch, the common start of the session.
+        rate_hz: Tick rate of the receiver, Hz.
+        peer: State of the peer.
+        records: The number of records that the peer has made.
+        next_sample: The first record that was not accepted yet, by its tick of the peer.
+        sent: The last records of the peer, in a ring buffer: record n is at n modulo its
+            length.
+        link: The link from the peer.
+
+    Returns:
+        The first record that is not accepted yet.
+    """
+    # The length of the ring is a power of two, so a modulo is a mask of the lower bits.
+    ring_mask = sent.t_ns.shape[0] - 1
+    while next_sample < records and sent.t_ns[next_sample & ring_mask] < t_ns:
+        _accept_record(
+            k=k, rate_hz=rate_hz, peer=peer, sample=next_sample, sent=sent, link=link
+        )
+        next_sample += 1
+    return next_sample
+
+
+@leaf
+def _apply_recorded_hand(
+    i: int, k: int, actors: TorqueSourceRows, feed: ReplayedInputs
+) -> None:
+    """Repeats what a person did with the arm of a site in a tick of a recorded run.
+
+    A live hand is a person or program that moves the arm during the run. A simulated spring
+    pulls the arm to the target of the hand. The grip, the target and the target one second
+    later are written into the row of the live hand. Nothing happens if the site has no live
+    hand, or after the end of the recorded run.
+
+    Args:
+        i: Index of the site.
+        k: The tick, a period of the site's control loop.
+        actors: Operators and environments of the site. The fields `a` and `b` of a live hand
+            are its target and its target one second later, m or rad.
+        feed: Inputs of the recorded run. `feed.hands` contains for each site and tick the grip,
+            0 to 1, the coordinates of the target, and those of the target one second later.
+    """
+    index = feed.hand_indices[i]
+    has_live_hand = index >= 0
+    if not has_live_hand or k >= feed.hands.shape[1]:
+        return
+    hand: Row = actors[index]
+    coordinates = (feed.hands.shape[2] - 1) // 2
+    first_target = 1
+    first_target_ahead = first_target + coordinates
+    hand.grip = feed.hands[i, k, 0]
+    for n in range(min(coordinates, hand.a.shape[0])):
+        hand.a[n] = feed.hands[i, k, first_target + n]
+        hand.b[n] = feed.hands[i, k, first_target_ahead + n]
+
+
+@leaf
+def _update_peaks(
+    row: Array,
+    t_ns: int,
+    settled_rad: float,
+    s: SiteRow,
+    progress: ProgressRow,
+    peaks: Array,
+    sums: SumsRow,
+) -> None:
+    """Updates the peaks of the present bucket by a record, and advances to the next bucket.
+
+    Args:
+        row: The floats of the record.
+        t_ns: Its nominal time, ns since the epoch.
+        settled_rad: Errors below this are settled, rad.
+        s: The row of the site.
+        progress: The progress of the site.
+        peaks: The peaks of the site, see `run_until`, shape (buckets, 3 n).
+        sums: The sums of the site.
+    """
+    largest_error = 0.0
+    bucket = progress.bucket
+    joints = peaks.shape[1] // 3
+    pose = _first_sent(s) - 3 * s.shared if s.task else 0
+    reference = 2 * s.joints
+    # A task may have fewer coordinates than the arm has joints, or more: the rest are zeros.
+    for i in range(joints):
+        e = 0.0
+        speed = 0.0
+        angle = 0.0
+        if i < s.shared:
+            e = row[pose + i] - row[reference + i]
+            if i >= POSITION and s.task:  # an orientation: differences of vectors are no error
+                e = s.e[i]
+        if i < s.joints:
+            speed = abs(row[s.joints + i])
+            angle = row[i]
+        sums.errors[i] += e * e
+        error = abs(e)
+        largest_error = max(largest_error, error)
+        peaks[bucket, i] = max(peaks[bucket, i], error)
+        peaks[bucket, joints + i] = max(peaks[bucket, joints + i], speed)
+        peaks[bucket, 2 * joints + i] = angle
+    if largest_error >= settled_rad:
+        progress.unsettled_ns = t_ns
+    progress.part += BUCKETS_PER_S
+    while progress.part >= progress.rate_hz:
+        progress.part -= progress.rate_hz
+        progress.bucket += 1
+
+
+@leaf
+def _put_gravity_torque(s: SiteRow, chain: RowArray | None, row: Array, torque: Array) -> None:
+    """Writes the gravity torque at the pose of a record, N m.
+
+    Args:
+        s: Row of the site.
+        chain: Rows of the chain, or None for the planar arm.
+        row: Floats of the record.
+        torque: Written, shape (n,).
+    """
+    if chain is None:
+        two_link_stages.put_gravity_torque(s, torque)
+    else:
+        chain_stages.put_gravity_torque(s, chain, row, torque)
+
+
+@leaf
+def _put_source_torque(
+    t_s: float,
+    s: SiteRow,
+    chain: RowArray | None,
+    row: Array,
+    actors: TorqueSourceRows,
+    table: TorqueTable,
+    sampled: int,
+    torque: Array,
+) -> None:
+    """Writes the torque of some actors at the state of a record, N m.
+
+    Args:
+        t_s: Time since the epoch, s.
+        s: Row of the site.
+        chain: Rows of the chain, or None for the planar arm.
+        row: Floats of the record.
+        actors: Operators and environments.
+        table: Their tables.
+        sampled: 1: the actors that are held over a tick; 0: the others.
+        torque: Written, shape (n,).
+    """
+    if chain is None:
+        two_link_stages.put_source_torque(
+            t_s=t_s, s=s, state=row, actors=actors, table=table, sampled=sampled, torque=torque
+        )
+    else:
+        chain_stages.put_source_torque(
+            t_s=t_s,
+            s=s,
+            chain=chain,
+            state=row,
+            actors=actors,
+            table=table,
+            sampled=sampled,
+            torque=torque,
+        )
+
+
+@leaf
+def _update_sums(
+    k: int,
+    t_ns: int,
+    s: SiteRow,
+    chain: RowArray | None,
+    actors: TorqueSourceRows,
+    table: TorqueTable,
+    row: Array,
+    sums: SumsRow,
+) -> None:
+    """Adds a record to the effort, and the period before it to the work of the environments.
+
+    The effort is the squared torque beyond gravity. The work over a period is the mean of the
+    present torque at both ends (trapezoid rule), plus the torque held over the period, times
+    the change of q.
+
+    Args:
+        k: The tick.
+        t_ns: Nominal time of the tick, ns since the epoch.
+        s: Row of the site.
+        chain: Rows of the chain, or None for the planar arm.
+        actors: Operators and environments, the operators first.
+        table: Their tables.
+        row: Floats of the record.
+        sums: Sums of the site.
+    """
+    n = s.joints
+    t_s = t_ns * 1e-9
+    first = sums.first_environment
+    _put_gravity_torque(s, chain, row, sums.G)
+    tau = 2 * (n + s.shared)
+    effort = 0.0
+    for i in range(n):
+        beyond_gravity = row[tau + i] - sums.G[i]
+        effort += beyond_gravity * beyond_gravity
+    sums.effort += effort
+    if first < 0:
+        return  # the site has no environment
+
+    for i in range(n):
+        sums.held[i] = s.held[i]
+        sums.now[i] = s.on_arm[i] - s.held[i]
+    # Rows of operators come first. With operators, s.held and s.on_arm contain their torque
+    # too.
+    if first > 0:
+        _put_source_torque(
+            t_s=t_s,
+            s=s,
+            chain=chain,
+            row=row,
+            actors=actors[first:],
+            table=table,
+            sampled=0,
+            torque=sums.now,
+        )
+        _put_source_torque(
+            t_s=t_s,
+            s=s,
+            chain=chain,
+            row=row,
+            actors=actors[first:],
+            table=table,
+            sampled=1,
+            torque=sums.held,
+        )
+    sums.force_peak_n = max(sums.force_peak_n, s.wall_n)
+    for i in range(n):
+        if k > 0:
+            mean = 0.5 * (sums.now_before[i] + sums.now[i]) + sums.held_before[i]
+            sums.environment_j += mean * (row[i] - sums.q[i])
+        sums.q[i] = row[i]
+        sums.now_before[i] = sums.now[i]
+        sums.held_before[i] = sums.held[i]
+
+
+class LawArrays(NamedTuple):
+    """Compiled control laws that users wrote, for all N sites of a simulation.
+
+    A site is a process that runs one arm.
+
+    Attributes:
+        addresses: Address of the machine code of each site's law, shape (N,), see
+            `CompiledLaw`. 0 if the law of the site is built in.
+        rows: Gains and memory of each law, one row per site, filled up to equal length.
+        sent: Numbers that each law sends to other sites, one row per site, filled up to equal
+            length.
+    """
+
+    addresses: IntArray
+    rows: Array
+    sent: Array
+
+
+@leaf
+def _compute_torque(
+    i: int,
+    progress: ProgressRow,
+    arrays: SiteArrays,
+    chain: RowArray | None,
+    laws: LawArrays | None,
+) -> None:
+    """Computes the torque of a site's control law, stage 6 of a tick (see `kernel`).
+
+    A law is built in, or a user wrote it. `torque_stage` computes the torque of built-in laws,
+    and does nothing for users' laws. `law_stage` calls a user's law that was compiled. The
+    driver of the simulation has called a user's law in plain Python before.
+
+    Args:
+        i: Index of the site, the process that runs one arm.
+        progress: Progress of the site, with the tick and its nominal time.
+        arrays: Arrays of all sites.
+        chain: Rows of the site's chain of joints, or None for the planar arm.
+        laws: The users' compiled laws. None if no site has one. The address of a law is 0 for a
+            site that has no compiled law.
+    """
+    if laws is None:
+        torque_stage(arrays.site[i], chain)
+        return
+    # The channel contains the numbers that other sites' laws send to this law. A site with a
+    # compiled law has one.
+    channel = channel_of(arrays.channel, i)
+    is_compiled = laws.addresses[i] != 0
+    if not is_compiled or channel is None:
+        torque_stage(arrays.site[i], chain)
+        return
+    law_stage(
+        k=progress.tick,
+        t_ns=progress.t_ns,
+        address=laws.addresses[i],
+        law=laws.rows[i],
+        site=arrays.site[i],
+        links=arrays.links[i],
+        chain=chain,
+        channel=channel,
+        sent=laws.sent[i],
+    )
+
+
+@leaf
+def _record_sent(s: SiteRow, i: int, row: Array, laws: LawArrays | None) -> None:
+    """Writes the numbers that the law of a site sends into its record.
+
+    Args:
+        s: Row of the site.
+        i: Index of the site.
+        row: Floats of the record; changed.
+        laws: The users' compiled laws, or None.
+    """
+    if laws is not None:
+        first = _first_sent(s)
+        for c in range(s.sent):
+            row[first + c] = laws.sent[i, c]
+
+
+@leaf
+def sense_site(
+    i: int,
+    progress: RowArray,
+    next_samples: IntArray,
+    sent: RecentRecords,
+    feed: ReplayedInputs,
+    arrays: SiteArrays,
+    chain: RowArray | None,
+) -> None:
+    """Computes the part of a site's next control period that comes before its control law.
+
+    A site is a process that runs one arm. This part accepts the samples (states) of its peers,
+    the other sites, and computes the reference, the errors and the parameter estimate. The
+    samples arrive as in the recorded run. Without a recorded run they arrive without delay.
+
+    Args:
+        i: Index of the site.
+        progress: State of the simulation, one row per site, see `ProgressRow`.
+        next_samples: Number of the next sample to accept, for each of N sites and P peers,
+            shape (N, P).
+        sent: Latest records of the sites, from which the samples are taken.
+        feed: Inputs of the recorded run.
+        arrays: Arrays of all sites.
+        chain: Data of the joints, one row per joint. None for the planar two-link arm.
+    """
+    site_progress: ProgressRow = progress[i]
+    k = site_progress.tick
+    t_ns = site_progress.t_ns
+    rate_hz = site_progress.rate_hz
+    links = arrays.links[i]
+    for p in range(links.shape[0]):
+        # The peers of a site are all other sites, in scenario order.
+        j = p if p < i else p + 1
+        link = LinkArrays(
+            state=links[p : p + 1],
+            models=arrays.models[i, p],
+            dues=arrays.dues[i, p],
+            calendar=arrays.calendars[i, p],
+            points=arrays.points,
+            channel=channel_of(channel_of(arrays.channel, i), p),
+        )
+        peer: SiteRow = arrays.site[j, 0]
+        peer_progress: ProgressRow = progress[j]
+        records = RecentRecords(sent.t_ns[j], sent.rows[j])
+        if k + 1 < feed.first.shape[2]:
+            for n in range(feed.first[i, p, k], feed.first[i, p, k + 1]):
+                _accept_record(
+                    k=k,
+                    rate_hz=rate_hz,
+                    peer=peer,
+                    sample=feed.samples[n],
+                    sent=records,
+                    link=link,
+                )
+        else:
+            next_samples[i, p] = _accept_prompt_records(
+                k=k,
+                t_ns=t_ns,
+                rate_hz=rate_hz,
+                peer=peer,
+                records=peer_progress.tick,
+                next_sample=next_samples[i, p],
+                sent=records,
+                link=link,
+            )
+        release_sample(k, rate_hz, link)
+    _apply_recorded_hand(i, k, arrays.actors[i], feed)
+    reference_stages(
+        k=k,
+        t_ns=t_ns,
+        site=arrays.site[i],
+        links=links,
+        ramps=arrays.ramps[i],
+        actors=arrays.actors[i],
+        table=arrays.table,
+        chain=chain,
+    )
+
+
+@leaf
+def finish_site(
+    i: int,
+    settled_rad: float,
+    progress: RowArray,
+    sent: RecentRecords,
+    peaks: Array,
+    sums: RowArray,
+    arrays: SiteArrays,
+    chain: RowArray | None,
+    laws: LawArrays | None,
+) -> int:
+    """Completes the control period of a site, whose first part `sense_site` computed.
+
+    The control law computes the torque, and the arm moves to the next period. The results of
+    the period are added to statistics of the run.
+
+    Args:
+        i: Index of the site, the process that runs one arm.
+        settled_rad: Position error below which the arm counts as settled, rad.
+        progress: State of the simulation, one row per site, see `ProgressRow`.
+        sent: Latest records of the sites; the new record is written.
+        peaks: Largest errors and speeds so far, see `run_until`; updated.
+        sums: Sums over the records, see `SumsRow`; updated.
+        arrays: Arrays of all sites; updated.
+        chain: Data of the joints, one row per joint. None for the planar two-link arm.
+        laws: Compiled control laws that users wrote. None if there are none.
+
+    Returns:
+        The mode of the site, a member of `Mode`.
+    """
+    site_progress: ProgressRow = progress[i]
+    k = site_progress.tick
+    t_ns = site_progress.t_ns
+    rate_hz = site_progress.rate_hz
+    site = arrays.site[i]
+    _compute_torque(i=i, progress=site_progress, arrays=arrays, chain=chain, laws=laws)
+    page = k & (sent.t_ns.shape[1] - 1)
+    sent.t_ns[i, page] = t_ns
+    record = sent.rows[i, page]
+    act_stages(
+        k=k,
+        t_ns=t_ns,
+        site=site,
+        actors=arrays.actors[i],
+        table=arrays.table,
+        chain=chain,
+        record=record,
+    )
+    _record_sent(site[0], i, record, laws)
+    site_sums: SumsRow = sums[i]  # one view for both: a view of a row costs time
+    _update_peaks(
+        row=record,
+        t_ns=t_ns,
+        settled_rad=settled_rad,
+        s=site[0],
+        progress=site_progress,
+        peaks=peaks[i],
+        sums=site_sums,
+    )
+    _update_sums(
+        k=k,
+        t_ns=t_ns,
+        s=site[0],
+        chain=chain,
+        actors=arrays.actors[i],
+        table=arrays.table,
+        row=record,
+        sums=site_sums,
+    )
+    site_progress.tick = k + 1
+    if k + 1 < site_progress.ticks:
+        site_progress.t_ns = tick_ns(k + 1, rate_hz)
+    else:
+        site_progress.t_ns = NEVER_NS
+    mode: int = site[0].mode
+    return mode
+
+
+@leaf
+def run_until(
+    last_ns: int,
+    settled_rad: float,
+    progress: RowArray,
+    next_samples: IntArray,
+    sent: RecentRecords,
+    feed: ReplayedInputs,
+    peaks: Array,
+    sums: RowArray,
+    arrays: SiteArrays,
+    chains: RowArray | None,
+    laws: LawArrays | None,
+) -> None:
+    """Steps all sites up to a time, or to the instant at which a site diverges.
+
+    Args:
+        last_ns: The last nominal time to step, ns since the epoch.
+        settled_rad: `unsettled_ns` is the last time of an |e| of this or more, rad.
+        progress: The progress of the sites, shape (N,), PROGRESS_DTYPE.
+        next_samples: The next sample of each peer to accept, shape (N, P).
+        sent: The last records of the sites.
+        feed: The inputs of a recorded run.
+        peaks: Per bucket the largest |e| of each joint, then the largest |qd| of each joint,
+            then the last q of each joint; -1 where there is no record; shape (N, buckets, 3 n).
+        sums: The sums of the sites, shape (N,), see `sums_dtype`.
+        arrays: The arrays of all sites, see `stack_site_arrays`.
+        chains: Its `chain` once more: as an argument that is None it keeps Numba from compiling
+            the leaves of chains.
+        laws: The users' compiled laws. None if there are none.
+    """
+    count = progress.shape[0]
+    while True:
+        t_ns = NEVER_NS
+        for i in range(count):
+            site_progress: ProgressRow = progress[i]
+            t_ns = min(t_ns, site_progress.t_ns)
+        if t_ns > last_ns or t_ns == NEVER_NS:
+            return
+        for i in range(count):
+            site_progress = progress[i]
+            if site_progress.t_ns != t_ns:
+                continue
+            # Two calls, because Numba needs one type of `chain` in each.
+            if chains is None:
+                sense_site(
+                    i=i,
+                    progress=progress,
+                    next_samples=next_samples,
+                    sent=sent,
+                    feed=feed,
+                    arrays=arrays,
+                    chain=None,
+                )
+                mode = finish_site(
+                    i=i,
+                    settled_rad=settled_rad,
+                    progress=progress,
+                    sent=sent,
+                    peaks=peaks,
+                    sums=sums,
+                    arrays=arrays,
+                    chain=None,
+                    laws=laws,
+                )
+            else:
+                chain = chains[i, : arrays.site[i, 0].joints]
+                sense_site(
+                    i=i,
+                    progress=progress,
+                    next_samples=next_samples,
+                    sent=sent,
+                    feed=feed,
+                    arrays=arrays,
+                    chain=chain,
+                )
+                mode = finish_site(
+                    i=i,
+                    settled_rad=settled_rad,
+                    progress=progress,
+                    sent=sent,
+                    peaks=peaks,
+                    sums=sums,
+                    arrays=arrays,
+                    chain=chain,
+                    laws=laws,
+                )
+            if mode == _DIVERGED:
+                site_progress.diverged_ns = t_ns
+                last_ns = t_ns

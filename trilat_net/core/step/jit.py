@@ -1,0 +1,628 @@
+# mypy: disallow-untyped-calls=False, disable-error-code="no-any-return"
+"""Compiles numerical functions with Numba, and stores their machine code on disk.
+
+The decorator `leaf` marks a function of numbers and arrays that is to be compiled. A marked
+function is called a leaf.
+
+Where the code is stored:
+    - The machine code is in the user's cache directory, in a folder named after a hash of all
+      source files of this package. Numba alone notices a change of the file that holds a
+      function, but not of the functions that it calls.
+    - A binary wheel contains the same kind of folder, with code for any processor of its
+      platform. This code is used if the cache directory has no code for the present processor.
+
+A leaf that is called from Python is stored as machine code. A leaf that is called by another
+leaf is called an inner leaf. It is stored as LLVM code before optimisation, because it is
+optimised together with its caller.
+
+Invariant:
+    - Floating-point operations are not reordered (no fastmath). Therefore compiled functions
+      and plain Python give the same bits.
+    - The compilation and the caches of other code in the process are not affected.
+"""
+
+import hashlib
+import os
+import pickle
+import sys
+import zlib
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, ParamSpec, TypeVar, cast
+
+import numba
+from llvmlite.binding import parse_bitcode
+from numba.core import event, types
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler, compile_result
+from numba.core.compiler_lock import global_compiler_lock
+from numba.core.registry import CPUDispatcher
+from numba.core.sigutils import normalize_signature
+
+from ...process import end_process_at_signals
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+# With little address space LLVM and OpenBLAS would retry for ever without reacting to signals,
+# or abort.
+with suppress(OSError, IndexError):  # only Linux has the file
+    _limits = Path("/proc/self/limits").read_text("utf-8")
+    _address_space = _limits.partition("Max address space")[2].split()[0]
+    if _address_space != "unlimited" and int(_address_space) < 1 << 30:
+        raise MemoryError
+
+
+def _cache_root() -> Path:
+    """Returns the user's cache directory, by the convention of the platform."""
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Caches"
+    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+
+
+def _core_digest() -> str:
+    """Returns a hash of all source files of the core and of Numba's version."""
+    digest = hashlib.sha256(numba.__version__.encode())
+    for source in sorted(Path(__file__).parent.rglob("*.py")):
+        digest.update(source.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _writable_cache() -> Path | None:
+    """Returns the directory for compiled leaves; None if it cannot be written.
+
+    Without a directory, compiled leaves are kept in memory only.
+    """
+    try:
+        directory = _cache_root() / "trilat-net" / _core_digest()
+        directory.mkdir(parents=True, exist_ok=True)
+    except (OSError, RuntimeError):  # RuntimeError: no home directory
+        return None
+    return directory if os.access(directory, os.W_OK) else None
+
+
+_config: Any = numba.config  # set from the environment at import; its stubs name no options
+_CACHE = None if _config.DISABLE_JIT else _writable_cache()
+_SHIPPED = Path(__file__).parent / "compiled" / _core_digest()
+_ships = _SHIPPED.is_dir()
+
+
+def is_core_cached() -> bool:
+    """Returns True if the simulation can start at once, because its code is compiled.
+
+    The stored code must be of the present version of the sources. Only the code of
+    `kernel.site_tick` is looked for. It is compiled last, so the other functions exist if it
+    does.
+    """
+    folders = [_CACHE, _SHIPPED if _ships else None]
+    for folder in folders:
+        if folder is None:
+            continue
+        files = folder.rglob("kernel.site_tick-*.nbc")
+        if any(files):
+            return True
+    return False
+
+
+COMPILING = (
+    "compiling, once for this machine and each number of joints: "
+    "half a minute, or minutes if the machine is busy ..."
+)
+
+
+class _CompilingNotice(event.Listener):
+    """Reports once that the core is compiled, which makes a first run take longer.
+
+    During a compilation signals end the process at once.
+
+    Attributes:
+        is_reported: True: the notice was reported, or must not be.
+        report: Writes the notice; by default to standard error.
+    """
+
+    def __init__(self) -> None:
+        self.is_reported = False
+        self.report: Callable[[str], None] = partial(print, file=sys.stderr, flush=True)
+        # Compilations may be nested: each one restores the handling of signals before it.
+        self._restorers: list[Callable[[], None]] = []
+
+    def on_start(self, event_data: Any) -> None:
+        """Reports the first compilation of a function of this package, because it takes long.
+
+        Numba calls this method at the start of each compilation. Until the end of the
+        compilation, signals such as Ctrl-C end the process at once.
+
+        Args:
+            event_data: Numba's description of the compilation.
+        """
+        self._restorers.append(end_process_at_signals())
+        module = event_data.data["dispatcher"].py_func.__module__
+        if not self.is_reported and module.startswith(__package__):
+            self.is_reported = True
+            self.report(COMPILING)
+
+    def on_end(self, _: Any) -> None:
+        """Restores the handling of signals."""
+        restore = self._restorers.pop()
+        restore()
+
+
+compiling_notice = _CompilingNotice()
+_register: Any = event.register
+_register("numba:compile", compiling_notice)
+
+
+def _mangle_record(record: types.Record) -> tuple[str, tuple[str]]:
+    """Returns the name that a record has in symbols of machine code, from a hash of its fields.
+
+    Numba itself numbers records in the order in which a process uses them. Leaves that two
+    processes compiled for two layouts would then have equal symbols, and a third process that
+    loads both from the cache would mix them up.
+    """
+    digest = hashlib.sha256(record.name.encode()).hexdigest()
+    return "Record", (f"r{digest[:16]}",)
+
+
+_record: Any = types.Record
+_record.mangling_args = property(_mangle_record)
+
+_OPTIONS: Any = {"_nrt": False}
+"""Options of leaves: no leaf allocates an array, so Numba need not count references, which
+would cost more than the arithmetic.
+"""
+_INNER = "within"
+"""Marks kept code as that of an inner leaf."""
+
+
+class _LeafLocator:
+    """Locates the machine code of a function, with the interface of Numba's cache locators.
+
+    Numba compares the source stamp, here a hash of the file, instead of the time of the file.
+    """
+
+    def __init__(self, function: Callable[..., Any], file: str) -> None:
+        self._line = function.__code__.co_firstlineno
+        self._py_file = Path(file)
+
+    from_function = classmethod(lambda cls, function, file: cls(function, file))
+
+    def get_cache_path(self) -> str:
+        root = _CACHE or _SHIPPED
+        return str(root / self._py_file.parent.name)
+
+    def get_source_stamp(self) -> str:
+        source = self._py_file.read_bytes()
+        return hashlib.sha256(source).hexdigest()
+
+    def get_disambiguator(self) -> str:
+        return str(self._line)
+
+    def ensure_cache_path(self) -> None:
+        Path(self.get_cache_path()).mkdir(parents=True, exist_ok=True)
+
+
+class _LeafCacheImpl(CompileResultCacheImpl):
+    """Converts compiled leaves to the content of cache files, and back.
+
+    An inner leaf is kept as LLVM code, other leaves as machine code.
+    """
+
+    _locator_classes = cast(Any, [_LeafLocator])
+
+    def rebuild(self, context: Any, kept: Any) -> Any:
+        """Converts the content of a cache file to a compiled function.
+
+        A leaf is a function with the decorator `leaf`. Numba itself loads the machine code of a
+        leaf. For the LLVM code of an inner leaf, which only other leaves call, this method
+        creates the objects that Numba has after a compilation. It uses private names of Numba,
+        because Numba has no interface for this.
+
+        Args:
+            context: Numba's description of the target processor.
+            kept: Content of the file, as `CompileResult._reduce` wrote it. The first entry is
+                what `_LeafLibrary.serialize_using_object_code` returned, and the others are
+                arguments of `compile_result` in a fixed order.
+
+        Returns:
+            Numba's description of the compiled function.
+        """
+        name, kind, code = kept[0]
+        is_inner = kind == _INNER
+        if not is_inner:
+            return super().rebuild(context, kept)
+
+        library = _LeafLibrary(context.codegen(), name)
+        library.is_inner = True
+        # No machine code is to be made: the library counts as complete with its LLVM code.
+        library._finalized = True
+        library._final_module = parse_bitcode(code)
+        # The order of `CompileResult._reduce`.
+        names = (
+            "fndesc",
+            "environment",
+            "signature",
+            "objectmode",
+            "lifted",
+            "type_annotation",
+            "reload_init",
+            "referenced_envs",
+        )
+        fields = dict(zip(names, kept[1:], strict=True))
+        result = compile_result(
+            library=library,
+            target_context=context,
+            typing_context=context.typing_context,
+            **fields,
+        )
+        return _as_inner(result)
+
+
+class _CompressedFiles(IndexDataCacheFile):
+    """The cache files of one function, compressed to a quarter.
+
+    Numba numbers the files. Therefore two processes may write different code into one file.
+    Here the name of a file contains a hash of its key.
+    """
+
+    def save(self, key: Any, code: Any) -> None:
+        """Writes compiled code to a file, and adds the file to the index of the cache.
+
+        The index contains the name of the file for each key. Numba numbers the files. Two
+        processes that compile at the same time may then choose the same number. A hash of the
+        key instead of a number makes the names differ.
+
+        Args:
+            key: Types of the arguments and the processor, for which the code was compiled.
+            code: The compiled code, as Numba serialises it.
+        """
+        names = self._load_index()
+        # Numba's name for file 0 is "FUNCTION.0.SUFFIX": the hash replaces the number.
+        prefix, _, suffix = self._data_name(0).rpartition(".0.")
+        digest = hashlib.sha256(repr(key).encode()).hexdigest()[:8]
+        name = f"{prefix}.{digest}.{suffix}"
+        names[key] = name
+        self._save_index(names)
+        self._save_data(name, code)
+
+    def _save_data(self, name: str, code: Any) -> None:
+        content = zlib.compress(self._dump(code), 1)
+        with self._open_for_write(self._data_path(name)) as file:
+            file.write(content)
+
+    def _load_data(self, name: str) -> Any:
+        path = Path(self._data_path(name))
+        content = zlib.decompress(path.read_bytes())
+        return pickle.loads(content)
+
+
+class _LeafCache(FunctionCache):
+    """Store of the machine code of a leaf.
+
+    Code is read from the user's folder, else from the wheel, and written into the user's
+    folder.
+    """
+
+    _impl_class = _LeafCacheImpl
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        base = self._impl.filename_base
+        stamp = self._cache_file._source_stamp
+        folder = Path(self._cache_path)
+        shipped_folder = _SHIPPED / folder.name
+        files = cast(Any, _CompressedFiles)
+        self._cache_file = files(str(folder), base, stamp)
+        self._shipped = files(str(shipped_folder), base, stamp)
+        self._inner = files(str(folder), f"{base}-within", stamp)
+
+    def load_overload(self, signature: Any, context: Any) -> Any:
+        """Loads the machine code of the function for given types of arguments.
+
+        The user's cache directory is searched first. The code in the installed wheel comes
+        second. In contrast to the method of Numba, this method does not prepare the compiler,
+        which would take far longer than loading.
+
+        Args:
+            signature: Types of the arguments.
+            context: Numba's description of the target processor.
+
+        Returns:
+            Numba's description of the compiled function. None if there is no stored code.
+        """
+        with self._guard_against_spurious_io_errors():
+            result = self._load_overload(signature, context)
+            if result is not None or not _ships:
+                return result
+            # The wheel's code is indexed by the platform and a processor named "generic".
+            triple = context.codegen().magic_tuple()[0]
+            generic = SimpleNamespace(magic_tuple=lambda: (triple, "generic", ""))
+            key = self._index_key(signature, generic)
+            kept = self._shipped.load(key)
+            return None if kept is None else self._impl.rebuild(context, kept)
+
+    def _save_overload(self, signature: Any, result: Any) -> None:
+        if _CACHE is not None:
+            super()._save_overload(signature, result)
+
+    def load_inner(self, argument_types: Any, context: Any) -> Any:
+        """Loads the LLVM code of a function that another compiled function calls.
+
+        Args:
+            argument_types: Numba's types of the arguments.
+            context: Numba's description of the target processor.
+
+        Returns:
+            Numba's description of the compiled function. None if the cache has no code for
+            these types.
+        """
+        key = self._index_key(argument_types, context.codegen())
+        kept = self._inner.load(key)
+        return None if kept is None else self._impl.rebuild(context, kept)
+
+    def save_inner(self, argument_types: Any, result: Any) -> None:
+        """Stores the LLVM code of an inner leaf, which only other compiled functions can call.
+
+        The code is kept in files of its own, besides those of the machine code that Python
+        calls. Nothing is stored if there is no cache directory in which files can be written.
+
+        Args:
+            argument_types: Numba's types of the arguments.
+            result: Numba's description of the compiled function.
+        """
+        has_cache = _CACHE is not None
+        if not has_cache:
+            return
+        self._impl.locator.ensure_cache_path()
+        key = self._index_key(argument_types, result.codegen)
+        content = self._impl.reduce(result)
+        self._inner.save(key, content)
+
+
+class _LeafLibrary(JITCodeLibrary):
+    """The code of a leaf; the code of an inner leaf is neither optimised nor made executable.
+
+    An inner leaf is optimised once, as a part of the outer leaf. Numba would also optimise each
+    inner leaf alone, and add a wrapper for calls from Python: half of the time of compilation.
+    """
+
+    is_inner = False
+
+    def serialize_using_object_code(self) -> tuple[str, str, Any]:
+        if not self.is_inner:
+            return super().serialize_using_object_code()
+        module = self._get_module_for_linking()
+        return self.name, _INNER, module.as_bitcode()
+
+    def _optimize_final_module(self) -> None:
+        if not self.is_inner:
+            super()._optimize_final_module()
+
+    def _finalize_final_module(self) -> None:
+        if self.is_inner:
+            self._finalized = True
+        else:
+            super()._finalize_final_module()
+
+
+def _as_inner(result: Any) -> Any:
+    """Returns a compiled inner leaf that other leaves can call.
+
+    Leaves find a function by its entry point. An inner leaf has no machine code. Therefore any
+    object serves.
+    """
+    result = result._replace(entry_point=object())
+    context = result.target_context
+    context.insert_user_function(result.entry_point, result.fndesc, [result.library])
+    return result
+
+
+class _LeafCompiler(Compiler):
+    """Compiles a leaf, as an inner leaf or for calls from Python.
+
+    Attributes:
+        depth: Number of leaves whose compilation is in progress.
+    """
+
+    depth = 0
+
+    def compile_extra(self, function: Any) -> Any:
+        """Compiles a leaf to machine code that Python can call, or to LLVM code.
+
+        A leaf is a function with the decorator `leaf`. While the compilation of another leaf is
+        in progress, this leaf is compiled because the other leaf calls it. It is then an inner
+        leaf. Only LLVM code is produced, which becomes a part of the other leaf. Numba calls
+        this method.
+
+        Args:
+            function: The Python function.
+
+        Returns:
+            Numba's description of the compiled function.
+        """
+        state = self.state
+        is_inner = _LeafCompiler.depth > 0
+        state.library = _LeafLibrary(state.targetctx.codegen(), function.__qualname__)
+        state.library.enable_object_caching()
+        state.library.is_inner = is_inner
+        if is_inner:
+            # No machine code, and no wrappers by which Python or C could call it.
+            state.flags.no_compile = True
+            state.flags.no_cpython_wrapper = True
+            state.flags.no_cfunc_wrapper = True
+
+        # A leaf that Numba compiles meanwhile is an inner leaf.
+        _LeafCompiler.depth += 1
+        try:
+            result = super().compile_extra(function)
+        finally:
+            _LeafCompiler.depth -= 1
+
+        if is_inner:
+            return _as_inner(result)
+        # Compiled code finds the global variables of a function in its environment. Usually the
+        # wrapper of a function sets it. The inner leaves that this leaf contains have no
+        # wrapper, so their environments are set now, when their code is executable.
+        for environment in result._find_referenced_environments():
+            result.library.codegen.set_env(environment.env_name, environment)
+        return result
+
+
+class _Leaf(CPUDispatcher):
+    """Numba's dispatcher of a leaf, which compiles the leaf for the types of its arguments.
+
+    An inner leaf, which was compiled as a part of another leaf, is compiled again for calls
+    from Python.
+    """
+
+    _cache: Any
+    _compiler: Any
+
+    def get_call_template(self, arguments: Any, keywords: Any) -> Any:
+        """Returns Numba's typing information for a call with given types of arguments.
+
+        A constant argument is treated like any other value of its type. Otherwise Numba would
+        compile the function again for each constant. Numba calls this method.
+
+        Args:
+            arguments: Types of the positional arguments.
+            keywords: Types of the keyword arguments, by name.
+        """
+        plain_arguments = tuple(map(types.unliteral, arguments))
+        plain_keywords = {name: types.unliteral(kind) for name, kind in keywords.items()}
+        return super().get_call_template(plain_arguments, plain_keywords)
+
+    def add_overload(self, result: Any) -> None:
+        """Stores a compiled form of the function, so that it need not be compiled again.
+
+        There are two forms. A leaf that Python calls is machine code. An inner leaf, which was
+        compiled because another leaf calls it, is LLVM code, which cannot be executed. Both are
+        entered into `overloads`, the table in which compiled callers look up a function by the
+        types of its arguments. Numba's own method also enters the machine code into the table
+        of functions that Python can call; an inner leaf must not get there. Numba calls this
+        method.
+
+        Args:
+            result: Numba's description of the compiled form.
+        """
+        # A library of Numba's own class, and not of `_LeafLibrary`, lacks the attribute.
+        is_inner = getattr(result.library, "is_inner", False)
+        if not is_inner:
+            super().add_overload(result)
+            return
+        argument_types = tuple(result.signature.args)
+        self.overloads[argument_types] = result
+
+    def compile(self, signature: Any) -> Any:
+        """Loads or compiles the function for given types of arguments.
+
+        If Python calls the function, machine code is produced. If another function that is
+        being compiled calls it, LLVM code is produced, which is then optimised together with
+        its caller. `overloads` contains the compiled forms of the function, machine code or
+        LLVM code, by the types of the arguments.
+
+        Args:
+            signature: Types of the arguments, in a form that Numba accepts.
+
+        Returns:
+            The compiled function. For LLVM code, an object that stands for it in Numba's
+            tables.
+        """
+        with global_compiler_lock:
+            argument_types, return_type = normalize_signature(signature)
+            known: Any = self.overloads.get(argument_types)
+            is_called_from_python = _LeafCompiler.depth == 0
+            if is_called_from_python:
+                if known is not None and getattr(known.library, "is_inner", False):
+                    # Python cannot call LLVM code. Without this entry, Numba compiles again.
+                    del self.overloads[argument_types]
+                return super().compile(signature)
+
+            # A compiled caller can use machine code and LLVM code alike.
+            if known is None:
+                known = self._cache.load_inner(argument_types, self.targetctx)
+                if known is None:
+                    # Report the compilation, as Numba's own method does.
+                    data = {"dispatcher": self, "args": argument_types}
+                    with event.trigger_event("numba:compile", data=data):
+                        known = self._compiler.compile(argument_types, return_type)
+                    self._cache.save_inner(argument_types, known)
+                self.add_overload(known)
+            return known.entry_point
+
+
+def bind_leaf(function: Callable[P, R], *arguments: P.args, **_: P.kwargs) -> Callable[P, R]:
+    """Compiles a function now, into a form that does not check the types of its arguments.
+
+    This form saves the time of the check in each call. It must only be called with arguments of
+    the same types as those given here. If Numba is disabled, the function itself is returned.
+
+    Args:
+        function: A function with the decorator `leaf`.
+        *arguments: Examples of the arguments.
+    """
+    if _config.DISABLE_JIT:
+        return function
+    dispatcher: Any = function
+    argument_types = tuple(map(numba.typeof, arguments))
+    return cast(Callable[P, R], dispatcher.compile(argument_types))
+
+
+def leaf(function: Callable[P, R]) -> Callable[P, R]:
+    """Marks a numerical function to be compiled by Numba at its first call (decorator).
+
+    In contrast to `numba.njit`, the compiled code is stored on disk and found again until a
+    source file of this package changes, and the function must not allocate arrays. The type of
+    the function is unchanged for readers and type checkers. If Numba is disabled, the function
+    itself is returned.
+    """
+    if _config.DISABLE_JIT:
+        return function
+    options = {"nopython": True, "boundscheck": None, **_OPTIONS}
+    dispatcher = cast(Any, _Leaf)(function, targetoptions=options, pipeline_class=_LeafCompiler)
+    dispatcher._cache = cast(Any, _LeafCache)(function)
+    return cast(Callable[P, R], dispatcher)
+
+
+class _NamedCache(_LeafCache):
+    """The machine code of a closure whose name identifies all that it is compiled from.
+
+    Numba's own key contains the values that a closure captured; the name replaces them.
+    """
+
+    def _index_key(self, signature: Any, codegen: Any) -> tuple[Any, Any]:
+        return signature, codegen.magic_tuple()
+
+
+def compile_named(
+    function: Callable[..., None], name: str, signature: Any, **options: Any
+) -> Any:
+    """Compiles a closure, and stores its machine code on disk under a name.
+
+    A closure is a function that uses variables of an outer function. If a closure with this
+    name was compiled before, its code is loaded. The caller therefore derives the name from all
+    that the code depends on. The name is part of the symbols of the machine code: no two such
+    functions may have the same name in any process.
+
+    Args:
+        function: The closure. Its qualified name is changed to `name`.
+        name: Name of the function.
+        signature: Signature of the function, as Numba has it.
+        **options: Options of `numba.njit`. The options that all leaves have in common, such as
+            no counting of references, take precedence.
+
+    Returns:
+        Numba's dispatcher of the compiled function.
+    """
+    function.__qualname__ = name
+    # The common options apply to new and to loaded code alike: neither counts references.
+    dispatcher = numba.njit(**{**options, **_OPTIONS})(function)
+    # Numba's own cache cannot store closures under a given name.
+    dispatcher._cache = cast(Any, _NamedCache)(function)
+    dispatcher.compile(signature)
+    return dispatcher

@@ -1,0 +1,655 @@
+"""Computes one period of the control loop of an arm, as compiled code.
+
+The process that runs one arm is called a site, and one period of its control loop a tick. A
+tick has eight stages, in this order:
+
+- 1 accept: store the samples (states) that arrived from other sites.
+- 2 release: take the newest sample of each site whose simulated delay has passed.
+- 3 reference: compute the position that the arm should follow.
+- 4 errors: compute the tracking errors.
+- 5 estimate: update the estimate of the arm's dynamic parameters.
+- 6 torque: compute the torque of the control law.
+- 7 emit: write the record, which contains the results of the tick.
+- 8 advance: simulate the arm until the next tick.
+
+The state of a site is a row of numbers, `SiteRow`, which the stages read and write. For an arm
+that is a chain of joints, `chain` contains the data of its joints. For the planar two-link arm
+it is None.
+
+Invariant:
+    - Live sites and the fused run, a simulation of all sites in one compiled loop, call the
+      same functions for the stages.
+    - Stage 8 integrates with the classical Runge-Kutta method of fourth order. The torque of
+      the motors is constant during the tick. The torques of operators and environments are
+      computed anew in each of the four evaluations, unless they are marked as sampled.
+"""
+
+from math import isfinite
+
+from ..arms import chain_stages, two_link_stages
+from ..arms.exogenous import TorqueSourceRows, TorqueTable
+from ..arms.task_space import POSE, update_orientation_reference
+from ..life.resting import add_rest_torque, advance_rest, limit_torque_rate, rests, rests_by_law
+from ..life.safeguards import is_torque_finite, limit_reference, return_to_law
+from ..life.session_life import is_law_returning, latch_mode, update_session_life
+from ..links.dominance import update_reference, update_stale_mode
+from ..links.link import ChannelArrays, LinkArrays, accept_sample, release_sample, release_tick
+from . import control
+from .jit import leaf
+from .row_fields import ArrivalRow, SiteRow
+from .site_arrays import SiteArrays, TickBuffers
+from .site_setup import Law, Scheme, StaleAction
+from .ticks import LifeReason, Mode, tick_ns
+from .vectors import Array, IntArray, Points, RowArray, Vector, put
+
+_DIVERGED = int(Mode.DIVERGED)
+_FAULT = int(Mode.FAULT)
+_NOT_FINITE = int(LifeReason.NOT_FINITE)
+_GLIDE = int(StaleAction.GLIDE)
+_DIGITAL = int(Scheme.DIGITAL)
+_ADAPTIVE = int(Law.ADAPTIVE)
+_USER = int(Law.USER)
+
+
+@leaf
+def _place_arm(
+    s: SiteRow, chain: RowArray | None, links: RowArray, updates_reference: bool
+) -> None:
+    """Computes the kinematics of a chain, and the orientation of its reference if requested.
+
+    The planar arm needs neither.
+
+    Args:
+        s: Row of the site.
+        chain: Rows of the chain, or None.
+        links: Rows of the site's links.
+        updates_reference: True in a tick; false if the reference was restored from a record.
+    """
+    if chain is None:
+        return
+    chain_stages.place_chain(s, chain)
+    if updates_reference and s.task and s.shared == POSE:
+        update_orientation_reference(s, links)
+
+
+@leaf
+def _update_errors(s: SiteRow, chain: RowArray | None) -> None:
+    """Runs stage 4: the errors, the filtered error r, and the dynamics that the law needs."""
+    if chain is None:
+        two_link_stages.update_errors(s)
+    else:
+        chain_stages.update_errors(s, chain)
+
+
+@leaf
+def _advance_estimate(s: SiteRow, chain: RowArray | None, gain_s: float, Yr: Vector) -> None:
+    """Advances the estimate of the arm's parameters to theta_hat - gain_s Gamma Yr, in its box.
+
+    Args:
+        s: Row of the site.
+        chain: Rows of the chain, or None.
+        gain_s: Duration of the step, s.
+        Yr: Y' r of Eq. (15), one number per parameter.
+    """
+    if chain is None:
+        two_link_stages.advance_estimate(s, gain_s, Yr)
+    else:
+        chain_stages.advance_estimate(s, gain_s, Yr)
+
+
+@leaf
+def _adapts(s: SiteRow) -> bool:
+    """Returns True if the estimate adapts in the present mode.
+
+    It does not adapt in DIVERGED, and at rest only while the law's own torque is in use.
+    """
+    return bool(s.mode != _DIVERGED and (rests_by_law(s) or not rests(s)))
+
+
+@leaf
+def _update_estimate(k: int, s: SiteRow, chain: RowArray | None) -> None:
+    """Updates the estimate of the arm's dynamic parameters by one tick, stage 5 of a tick.
+
+    The estimate theta follows Eq. (15) of the paper, dtheta/dt = -Gamma Y' r, where Gamma is
+    the matrix of the adaptation gains, Y the regressor and r the filtered error. The trapezoid
+    rule with the period h gives
+
+        theta_k = theta_{k-1} - h/2 Gamma (Y'r_{k-1} + Y'r_k)
+
+    The rule is explicit, because Y' r does not depend on the estimate. The scheme DIGITAL
+    advances the estimate by the Euler rule at the end of the tick instead, in stage 8.
+
+    Args:
+        k: The tick.
+        s: Row of the site. `Yr` is Y' r of tick k. `Yr_before` is that of tick k - 1, and is
+            overwritten with the sum of both; stage 8 sets it anew.
+        chain: Rows of the chain, or None.
+    """
+    # `_adapts` is evaluated last, because it is the costly condition.
+    if s.scheme == _DIGITAL or k == s.first or s.law != _ADAPTIVE or not _adapts(s):
+        return
+    for p in range(s.Yr.shape[0]):
+        s.Yr_before[p] += s.Yr[p]
+    sum_of_both_ticks = s.Yr_before
+    half_h_s = 0.5 / s.rate_hz
+    _advance_estimate(s, chain, half_h_s, sum_of_both_ticks)
+
+
+@leaf
+def torque_stage(site: RowArray, chain: RowArray | None) -> None:
+    """Computes the torque of a control law that is built in.
+
+    If the control law was written by a user, this function does nothing. `law_stage` computes
+    the torque of compiled user laws.
+
+    Args:
+        site: State of the site (the process that runs the arm), shape (1,). The torque is
+            written into it.
+        chain: Data of the joints, one row per joint. None for the planar two-link arm.
+    """
+    s: SiteRow = site[0]
+    if s.law == _USER:
+        return
+    if chain is None:
+        two_link_stages.update_torque(s)
+    else:
+        chain_stages.update_torque(s, chain)
+
+
+@leaf
+def _put_known_gravity(s: SiteRow, chain: RowArray | None, torque: Array) -> None:
+    """Writes the gravity torque for the parameters that the law knows or has estimated.
+
+    Args:
+        s: Row of the site.
+        chain: Rows of the chain, or None.
+        torque: Written, shape (n,), N m.
+    """
+    learns = s.law == _ADAPTIVE or (s.law == _USER and s.theta_known == 0)
+    theta = s.theta_hat if learns else s.known
+    if chain is None:
+        two_link_stages.put_gravity(s, theta, torque)
+    else:
+        chain_stages.put_gravity(s, chain, theta, torque)
+
+
+@leaf
+def _guard_torque(k: int, t_ns: int, s: SiteRow, chain: RowArray | None) -> None:
+    """Turns the torque of the control law into the torque that the motors get.
+
+    This is the last part of stage 6 of a tick, after the law has written the torque `tau`. The
+    rate of every torque is limited. Under the rule `glide`, by which an arm comes to rest while
+    a peer (another arm) is silent, the torque is first modified in these cases:
+
+    - The torque is not finite: the mode becomes FAULT, in which the arm comes to rest.
+    - The arm comes to rest or is at rest: damping and an integral term are added, see
+      `resting`. If the law cannot hold the arm, the gravity torque replaces that of the law.
+    - The arm has just left its rest: the torque blends from that at rest to that of the law.
+
+    Args:
+        k: Number of the tick, a period of the control loop.
+        t_ns: Nominal time of the tick, ns since the epoch, the common start of the session.
+        s: State of the site (the process that runs the arm); changed.
+        chain: Data of the joints, one row per joint. None for the planar two-link arm.
+    """
+    resting = False
+    if s.on_stale == _GLIDE:
+        # A site with the reason NOT_FINITE is in FAULT already, and does not enter it again.
+        if s.reason != _NOT_FINITE and s.mode != _DIVERGED and not is_torque_finite(s):
+            latch_mode(t_ns, s, _FAULT, _NOT_FINITE)
+        # The mode may have just become FAULT, in which the arm rests.
+        resting = rests(s)
+        if resting:
+            if not rests_by_law(s):
+                _put_known_gravity(s, chain, s.tau)
+            add_rest_torque(k, t_ns, s)
+        elif is_law_returning(t_ns, s):
+            return_to_law(t_ns, s)
+    limit_torque_rate(s)
+    if resting:
+        # The integral term must not grow while a limit cuts off the torque.
+        advance_rest(s)
+
+
+@leaf
+def _write_record(s: SiteRow, row: Array) -> None:
+    """Runs stage 7: writes the record's floats in the order of `Layout.columns`.
+
+    A number that is not finite becomes 0, and the site becomes DIVERGED.
+
+    Args:
+        s: Row of the site.
+        row: The record's floats; written.
+    """
+    n = s.joints
+    m = s.shared
+    P = s.parameters
+    first = 2 * n
+    for i in range(n):
+        row[i] = s.q[i]
+        row[n + i] = s.qd[i]
+    for i in range(m):
+        row[first + i] = s.q_des[i]
+        row[first + m + i] = s.qd_des[i]
+    first += 2 * m
+    for i in range(n):
+        row[first + i] = s.tau[i]
+        # A subtraction and not a negation: where nothing acts the record has 0.0, never -0.0.
+        row[first + n + i] = 0.0 - s.on_arm[i]
+    first += 2 * n
+    for p in range(P):
+        row[first + p] = s.theta_hat[p]
+    first += P
+    if s.task:
+        for i in range(m):
+            row[first + i] = s.x[i]
+            row[first + m + i] = s.xd[i]
+            row[first + 2 * m + i] = s.wrench[i]
+        first += 3 * m
+    for i in range(first):
+        if not isfinite(row[i]):
+            row[i] = 0.0
+            s.mode = _DIVERGED
+
+
+@leaf
+def _update_external_torque(
+    t_s: float, s: SiteRow, chain: RowArray | None, actors: TorqueSourceRows, table: TorqueTable
+) -> None:
+    """Writes the torque of operators and environments at time t_k, which stage 6 may use.
+
+    Args:
+        t_s: Time since the epoch, s.
+        s: Row of the site.
+        chain: Rows of the chain, or None.
+        actors: Operators and environments.
+        table: Their tables.
+    """
+    if chain is None:
+        two_link_stages.update_external_torque(t_s, s, actors, table)
+    else:
+        chain_stages.update_external_torque(
+            t_s=t_s, s=s, chain=chain, actors=actors, table=table
+        )
+
+
+@leaf
+def _advance_arm(
+    t_s: float,
+    h_s: float,
+    s: SiteRow,
+    chain: RowArray | None,
+    actors: TorqueSourceRows,
+    table: TorqueTable,
+) -> bool:
+    """Advances q and qd by one period.
+
+    Args:
+        t_s: Time at the beginning of the period, s since the epoch.
+        h_s: The period, s.
+        s: Row of the site.
+        chain: Rows of the chain, or None.
+        actors: Operators and environments.
+        table: Their tables.
+
+    Returns:
+        False, without a change, if the result is not finite.
+    """
+    if chain is None:
+        return two_link_stages.advance_arm(t_s=t_s, h_s=h_s, s=s, actors=actors, table=table)
+    return chain_stages.advance_arm(
+        t_s=t_s, h_s=h_s, s=s, chain=chain, actors=actors, table=table
+    )
+
+
+@leaf
+def _advance(
+    k: int,
+    t_ns: int,
+    s: SiteRow,
+    chain: RowArray | None,
+    actors: TorqueSourceRows,
+    table: TorqueTable,
+) -> None:
+    """Runs stage 8: advances the state from t_k to t_{k+1}, and keeps numbers for tick k+1.
+
+    The torque that is held over the period is that of its middle, extrapolated linearly:
+
+        u = 1.5 tau_k - 0.5 tau_{k-1}, within the limit
+
+    At the first tick, and under DIGITAL, u = tau_k.
+
+    Args:
+        k: The tick.
+        t_ns: Nominal time of the tick, ns since the epoch.
+        s: Row of the site.
+        chain: Rows of the chain, or None.
+        actors: Operators and environments.
+        table: Their tables.
+    """
+    h_s = 1.0 / s.rate_hz
+    # Evaluate this before the arm moves: whether an arm at rest is fast depends on its speed.
+    adapts = _adapts(s)
+    put(s.q_before, s.q)
+    if s.external == 0:
+        for i in range(s.u.shape[0]):
+            torque = s.tau[i]
+            if s.scheme != _DIGITAL and k > s.first:
+                extrapolated = 1.5 * s.tau[i] - 0.5 * s.tau_before[i]
+                torque = control.limit_torque(extrapolated, s.tau_limit[i])
+            s.u[i] = torque + s.held[i]
+        is_finite = _advance_arm(
+            t_s=t_ns * 1e-9, h_s=h_s, s=s, chain=chain, actors=actors, table=table
+        )
+        if not is_finite:
+            s.mode = _DIVERGED
+    if s.scheme == _DIGITAL and s.law == _ADAPTIVE and adapts and s.mode != _DIVERGED:
+        _advance_estimate(s, chain, h_s, s.Yr)
+    for i in range(s.tau.shape[0]):
+        s.tau_before[i] = s.tau[i]
+    for p in range(s.Yr.shape[0]):
+        s.Yr_before[p] = s.Yr[p] if adapts and s.mode != _DIVERGED else 0.0
+
+
+@leaf
+def channel_of(channel: ChannelArrays | None, peer: int) -> ChannelArrays | None:
+    """Selects the arrays for the numbers that the control law of one peer sends.
+
+    A peer is another site (process that runs one arm). Some control laws send numbers in
+    addition to the motion of the arm, for example energies.
+
+    Args:
+        channel: Arrays of all peers of a site, or of all sites of a simulation. None if the
+            control law of this site reads no such numbers.
+        peer: Index of the peer, or of the site.
+
+    Returns:
+        Views of the arrays of the peer or the site. None if `channel` is None.
+    """
+    if channel is None:
+        return None
+    return ChannelArrays(channel.waiting[peer], channel.received[peer], channel.columns[peer])
+
+
+@leaf
+def link_arrays(arrays: SiteArrays, peer: int) -> LinkArrays:
+    """Returns the arrays of the link from one peer, as views of the arrays of the site.
+
+    A site is the process that runs one arm, and a peer another site that sends its samples
+    (states). `LinkArrays` describes the arrays of a link. Nearly all of them are rows of the
+    site's arrays, one row per peer. `state` is a slice, because it must stay an array, of
+    shape (1,). `points` is the table of all links of the site, in which each link has rows of
+    its own.
+
+    Args:
+        arrays: Arrays of the site.
+        peer: Index of the peer, in scenario order.
+    """
+    return LinkArrays(
+        state=arrays.links[peer : peer + 1],
+        models=arrays.models[peer],
+        dues=arrays.dues[peer],
+        calendar=arrays.calendars[peer],
+        points=arrays.points,
+        channel=channel_of(arrays.channel, peer),
+    )
+
+
+@leaf
+def find_release(peer: int, tick: int, arrays: SiteArrays) -> int:
+    """Finds the period of the site's control loop in which a sample of a peer is used first.
+
+    A site is the process that runs one arm, and a peer is another site. A sample is the state
+    that the peer sends in one period of its own control loop.
+
+    Args:
+        peer: Index of the peer.
+        tick: Number of the period in which the peer sent the sample.
+        arrays: Arrays of the site.
+
+    Returns:
+        The number of the period if the sample arrives in time. LOST if the link loses the
+        sample, or if the sample is too old.
+    """
+    return release_tick(tick, arrays.site[0].rate_hz, link_arrays(arrays, peer))
+
+
+@leaf
+def accept_stage(k: int, count: int, arrays: SiteArrays, buffers: TickBuffers) -> None:
+    """Stores the samples that arrived, until their simulated delay has passed.
+
+    A sample is the state that another arm sends in one period of its control loop. Samples wait
+    in ring buffers, which are called calendars.
+
+    Args:
+        k: Number of the present control period.
+        count: Number of samples that arrived since the previous period.
+        arrays: Arrays of the site (the process that runs the arm); written.
+        buffers: Contains the samples.
+    """
+    rate_hz = arrays.site[0].rate_hz
+    for n in range(count):
+        arrival: ArrivalRow = buffers.arrivals[n]
+        accept_sample(
+            k=k,
+            rate_hz=rate_hz,
+            tick=arrival.tick,
+            q=arrival.q,
+            qd=arrival.qd,
+            tau_x=buffers.forces[n],
+            sent=buffers.sent[n],
+            link=link_arrays(arrays, arrival.peer),
+        )
+
+
+@leaf
+def reference_stages(
+    k: int,
+    t_ns: int,
+    site: RowArray,
+    links: RowArray,
+    ramps: Array,
+    actors: TorqueSourceRows,
+    table: TorqueTable,
+    chain: RowArray | None,
+) -> None:
+    """Computes reference, tracking errors and parameter estimate of a control period.
+
+    These are stages 3 to 5 of a tick. They use the newest samples (states) of the other arms
+    whose delay has passed. Finally, the external torque of operators and environments is
+    computed.
+
+    Args:
+        k: Number of the tick, a period of the control loop.
+        t_ns: Nominal time of the tick, ns since the start of the session.
+        site: State of the site (the process that runs the arm), shape (1,); written.
+        links: States of the links from the other sites, one row per link.
+        ramps: Planned changes of the weights with which the arm follows the other arms.
+        actors: Operators and environments, one row for each.
+        table: Numbers of all operators and environments.
+        chain: Data of the joints, one row per joint. None for the planar two-link arm.
+    """
+    s: SiteRow = site[0]
+    # 3 reference
+    update_reference(t_ns, s, links, ramps)
+    _place_arm(s, chain, links, True)
+    if s.on_stale == _GLIDE:
+        update_session_life(t_ns, s, links)
+    else:
+        update_stale_mode(t_ns, s, links)
+    if not rests(s):
+        limit_reference(k, s)
+    # 4 errors
+    _update_errors(s, chain)
+    # 5 estimate
+    _update_estimate(k, s, chain)
+    _update_external_torque(t_s=t_ns * 1e-9, s=s, chain=chain, actors=actors, table=table)
+
+
+@leaf
+def sense_stages(
+    k: int, t_ns: int, count: int, arrays: SiteArrays, buffers: TickBuffers
+) -> None:
+    """Computes the part of a tick that precedes the control law (stages 1 to 5).
+
+    A tick is one period of the control loop. A sample is the state that a peer, another arm's
+    process, sends in one of its ticks. The stages are:
+
+    - 1 accept: store the samples that arrived, until their simulated delay has passed.
+    - 2 release: put into use the newest sample of each peer whose delay has passed.
+    - 3 reference: compute the position that the arm should follow.
+    - 4 errors: compute the tracking errors.
+    - 5 estimate: update the estimate of the arm's dynamic parameters.
+
+    Finally, the torque of operators and environments on the arm is computed.
+
+    Args:
+        k: Number of the tick.
+        t_ns: Nominal time of the tick, ns since the epoch, the common start of the session.
+        count: Number of samples that arrived since the previous tick.
+        arrays: Arrays of the site (the process that runs the arm), see `SiteArrays`; written.
+        buffers: Contains the samples that arrived.
+    """
+    rate_hz = arrays.site[0].rate_hz
+    # Samples wait in a ring buffer with one page per tick. The pages of the ticks that the site
+    # has missed (because it was too slow) are emptied first. Otherwise a later tick with the
+    # same page would use their samples.
+    for missed in range(k - arrays.site[0].skipped, k):
+        for j in range(arrays.links.shape[0]):
+            release_sample(missed, rate_hz, link_arrays(arrays, j))
+    # 1 accept
+    accept_stage(k, count, arrays, buffers)
+    # 2 release
+    for j in range(arrays.links.shape[0]):
+        release_sample(k, rate_hz, link_arrays(arrays, j))
+    # 3 reference, 4 errors, 5 estimate
+    reference_stages(
+        k=k,
+        t_ns=t_ns,
+        site=arrays.site,
+        links=arrays.links,
+        ramps=arrays.ramps,
+        actors=arrays.actors,
+        table=arrays.table,
+        chain=arrays.chain,
+    )
+
+
+@leaf
+def act_stages(
+    k: int,
+    t_ns: int,
+    site: RowArray,
+    actors: TorqueSourceRows,
+    table: TorqueTable,
+    chain: RowArray | None,
+    record: Array,
+) -> None:
+    """Computes the part of a control period that follows the control law.
+
+    The torque is limited, the record is written, and the arm moves to the next period (stages 6
+    to 8). If a joint is faster than its limit, the site ends in the mode DIVERGED. Under the
+    rule `glide` the arm comes to rest instead, see `session_life`.
+
+    Args:
+        k: Number of the tick, a period of the control loop.
+        t_ns: Nominal time of the tick, ns since the start of the session.
+        site: State of the site (the process that runs the arm), shape (1,), with the torque of
+            the law; written.
+        actors: Operators and environments, one row for each.
+        table: Numbers of all operators and environments.
+        chain: Data of the joints, one row per joint. None for the planar two-link arm.
+        record: Receives the floating-point numbers of the record, the results of the tick.
+    """
+    s: SiteRow = site[0]
+    _guard_torque(k, t_ns, s, chain)
+    for i in range(s.joints):
+        if s.on_stale != _GLIDE and not abs(s.qd[i]) <= s.qd_limit[i]:
+            s.mode = _DIVERGED
+    # 7 emit
+    _write_record(s, record)
+    # 8 advance
+    if s.mode != _DIVERGED:
+        _advance(k=k, t_ns=t_ns, s=s, chain=chain, actors=actors, table=table)
+
+
+@leaf
+def site_tick(
+    k: int,
+    t_ns: int,
+    count: int,
+    site: RowArray,
+    links: RowArray,
+    models: RowArray,
+    dues: IntArray,
+    calendars: RowArray,
+    points: Points,
+    ramps: Array,
+    actors: TorqueSourceRows,
+    table: TorqueTable,
+    chain: RowArray | None,
+    channel: ChannelArrays | None,
+    arrivals: RowArray,
+    forces: Array,
+    sent: Array,
+    record: Array,
+) -> None:
+    """Computes one whole tick of a site, with a control law that is built in.
+
+    A site is the process that runs one arm, and a tick is one period of its control loop. The
+    number of the tick is k, and its nominal time t_ns is in ns since the start of the session.
+    Only the first `count` rows of `arrivals` are read; they are the samples that arrived.
+
+    All other arguments are the fields of `SiteArrays` and `TickBuffers`. They are passed one by
+    one, because passing the two tuples from Python takes a microsecond longer.
+    """
+    arrays = SiteArrays(
+        site=site,
+        links=links,
+        models=models,
+        dues=dues,
+        calendars=calendars,
+        points=points,
+        ramps=ramps,
+        actors=actors,
+        table=table,
+        chain=chain,
+        channel=channel,
+    )
+    sense_stages(
+        k=k,
+        t_ns=t_ns,
+        count=count,
+        arrays=arrays,
+        buffers=TickBuffers(arrivals, forces, sent, record),
+    )
+    # 6 torque
+    torque_stage(site, chain)
+    act_stages(
+        k=k, t_ns=t_ns, site=site, actors=actors, table=table, chain=chain, record=record
+    )
+
+
+@leaf
+def resume_stages(k: int, arrays: SiteArrays) -> None:
+    """Completes the state of a site that was restored from records, to continue the run.
+
+    A site is the process that runs one arm. Some numbers that tick k + 1 (the next period of
+    the control loop) needs are not in the records. They are computed here from the restored
+    state: the tracking errors, the external torques, and the state of the arm at tick k + 1.
+
+    Args:
+        k: The last tick that was recorded.
+        arrays: Arrays of the site, with the restored state; changed.
+    """
+    s: SiteRow = arrays.site[0]
+    t_ns = tick_ns(k, s.rate_hz)
+    _place_arm(s, arrays.chain, arrays.links, False)
+    _update_errors(s, arrays.chain)
+    _update_external_torque(
+        t_s=t_ns * 1e-9, s=s, chain=arrays.chain, actors=arrays.actors, table=arrays.table
+    )
+    if s.mode != _DIVERGED:
+        _advance(
+            k=k, t_ns=t_ns, s=s, chain=arrays.chain, actors=arrays.actors, table=arrays.table
+        )

@@ -1,0 +1,769 @@
+"""Creates the arrays that hold the state of a running arm, and enlarges them during a run.
+
+A site is a process that runs one arm and its control loop. Over network links it receives
+samples, the states of other sites. The arrays contain the state of the arm and its control law
+(`SiteRow`), and the state of each link (`LinkRow`) with its models of delay and loss. They also
+contain a ring buffer per link, called calendar, in which samples wait until their simulated
+delay has passed. Each entry of a calendar is called a page.
+
+Structured arrays are used because they are cheap to pass to compiled code, and because their
+fields can have the same names as the symbols in the equations.
+
+Invariant:
+    - The compiled code of a control period reads and writes nothing but these arrays and
+      `TickBuffers`.
+    - Two sites with equal setups have equal arrays.
+    - The links of a site take at most `MAX_LINKS_BYTES` of memory beyond what the delays in the
+      setup need.
+"""
+
+from collections.abc import Sequence
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arms.chain import build_chain
+from ..arms.exogenous import TorqueSourceRows, TorqueTable, torque_source_rows
+from ..links.channel import LOST
+from ..links.delay import LINK_MODEL_DTYPE, MAX_DELAY_US, LinkModel, max_delay_us
+from ..links.dominance import RAMP_COLUMNS, fold_ramps
+from ..links.link import (
+    AHEAD_LIMIT_NS,
+    ChannelArrays,
+    calendar_pages,
+    link_dtype,
+    sample_dtype,
+    span_ticks,
+)
+from .row_fields import FIELDS, field_shape, row_dtype
+from .site_setup import Gains, Law, Layout, LinkSetup, SiteSetup
+from .ticks import MAX_ARRIVALS, NS_PER_S, CoreChange, DominanceRamp, LifeOrder, Mode
+from .vectors import Array, IntArray, Points, Row, RowArray
+
+_OTHER_GAINS = ("law", "theta_hat0", "absolute")
+_GAINS = tuple(name for name in Gains._fields if name not in _OTHER_GAINS)
+"""Constant gains, named as the site's fields are; theta_hat0 becomes `theta_hat`."""
+
+
+@cache
+def site_dtype(layout: Layout) -> np.dtype[np.void]:
+    """Returns the NumPy data type of the row that stores a site, see `SiteRow`.
+
+    Args:
+        layout: Lengths of the site's vectors.
+    """
+    return row_dtype("site", layout.axes(), chain=layout.chain)
+
+
+@cache
+def arrival_dtype(shared: int) -> np.dtype[np.void]:
+    """Returns the NumPy data type of a sample as it arrives at a site, see `ArrivalRow`.
+
+    Args:
+        shared: Number of coordinates that sites share, the length of the sample's vectors.
+    """
+    return row_dtype("arrival", {"shared": shared})
+
+
+class SiteArrays(NamedTuple):
+    """The arrays of one site, or of several sites stacked along an additional first axis.
+
+    Attributes:
+        site: State and constants, shape (1,), see `site_dtype`.
+        links: One row per peer, shape (P,), see `link_dtype`.
+        models: The models of the links' channels, shape (P, M), LINK_MODEL_DTYPE.
+        dues: Due times of the links' newest samples, shape (P, D), ns; see `LinkArrays`.
+        calendars: The links' calendars, shape (P, pages), see `sample_dtype`.
+        points: Traces and outages, shape (n, 2); stacked sites share one table.
+        ramps: Changes of the dominance factors, shape (R, RAMP_COLUMNS + P).
+        actors: Operators and environments, shape (A,), see `torque_source_dtype`.
+        table: Recorded torques of the operators and environments, shape (rows, 1 + n); stacked
+            sites share one table.
+        chain: The joints of a chain, shape (n,), see `chain_dtype`. None for the planar
+            two-link arm.
+        channel: The numbers that the peers' laws send to a user's law, per peer. None if the
+            kernel computes the law.
+    """
+
+    site: RowArray
+    links: RowArray
+    models: RowArray
+    dues: IntArray
+    calendars: RowArray
+    points: Points
+    ramps: Array
+    actors: TorqueSourceRows
+    table: TorqueTable
+    chain: RowArray | None
+    channel: ChannelArrays | None
+
+
+class TickBuffers(NamedTuple):
+    """Input and output of one period of the control loop.
+
+    The input consists of samples, the states that other sites (processes that run one arm each)
+    sent. A sample has m coordinates.
+
+    Attributes:
+        arrivals: Samples that arrived since the previous period, shape (MAX_ARRIVALS,), see
+            `arrival_dtype`.
+        forces: External torques or forces on the arms of the senders, N m or N, shape
+            (MAX_ARRIVALS, m).
+        sent: Further numbers that the control laws of the senders sent, shape (MAX_ARRIVALS, C)
+            for at most C numbers per sample.
+        record: Receives the floating-point numbers of the record, see `Layout.columns`.
+    """
+
+    arrivals: RowArray
+    forces: Array
+    sent: Array
+    record: Array
+
+
+def build_tick_buffers(setup: SiteSetup) -> TickBuffers:
+    """Returns empty buffers for the arrivals and the record of one tick.
+
+    A site creates them once and uses them in all ticks.
+
+    Args:
+        setup: Setup of the site, which determines the lengths of vectors.
+    """
+    layout = setup.layout
+    largest_received = 0
+    if setup.law_factory is not None:
+        largest_received = max(link.channel.received_size for link in setup.links)
+    return TickBuffers(
+        arrivals=np.zeros(MAX_ARRIVALS, arrival_dtype(layout.shared)),
+        forces=np.zeros((MAX_ARRIVALS, layout.shared)),
+        sent=np.zeros((MAX_ARRIVALS, largest_received)),
+        record=np.zeros(layout.floats),
+    )
+
+
+def build_site_arrays(
+    setup: SiteSetup,
+    spare: tuple[int, int] = (0, 0),
+    pages: int = 0,
+    layout: Layout | None = None,
+    *,
+    plugged: bool = False,
+) -> SiteArrays:
+    """Creates the arrays of a site (the process of one arm) before its first control period.
+
+    Args:
+        setup: Setup of the site.
+        spare: Two numbers of free rows for changes during the run: for changes of each link's
+            delay model, and for changes of the weights with which the site follows the other
+            sites.
+        pages: Number of samples that can wait on each link, which is also the number of
+            delivery times that each link stores. 0 to derive both numbers from the setup.
+        layout: Lengths of the vectors in the arrays, if they are larger than this site needs.
+        plugged: True to include the arrays of a user's control law, even if this site has none.
+    """
+    links = setup.links
+    layout = layout or setup.layout
+    peers = len(links)
+    spare_models, spare_ramps = spare
+    kept_dues = pages or _count_kept_dues(setup)
+    pages = pages or needed_pages(setup)
+    calendars = np.zeros((peers, pages), sample_dtype(layout.shared))
+    calendars["tick"] = -1
+    rows, models, points = _build_links(links, spare_models, layout.shared)
+    axes = 3 if layout.chain else 2
+    actors, table = torque_source_rows(setup.actors, layout.joints, axes)
+    ramp_count = 1 + len(setup.ramps) + spare_ramps
+    ramps = np.zeros((ramp_count, RAMP_COLUMNS + peers))
+    ramps[0, RAMP_COLUMNS:] = [link.alpha for link in links]
+    chain = None
+    if setup.chain is not None:
+        chain = build_chain(setup.chain.joints, layout.joints)
+    has_channel = plugged or setup.law_factory is not None
+    arrays = SiteArrays(
+        site=_build_site(setup, layout),
+        links=rows,
+        models=models,
+        dues=np.full((peers, kept_dues), LOST, dtype=np.int64),
+        calendars=calendars,
+        points=points,
+        ramps=ramps,
+        actors=actors,
+        table=table,
+        chain=chain,
+        channel=_build_channel(setup, pages) if has_channel else None,
+    )
+    for ramp in setup.ramps:
+        add_ramp(arrays, ramp)
+    return arrays
+
+
+def needed_pages(setup: SiteSetup) -> int:
+    """Computes how many samples must be able to wait on each link of a site.
+
+    A site is a process that runs one arm. Its samples, the states of other sites, wait until
+    their simulated delay has passed. The result follows from the longest delay in the setup,
+    and from the time `_NEAR_NS` by which the clock of a sender may be ahead.
+
+    Args:
+        setup: Setup of the site.
+
+    Returns:
+        The number of entries of the ring buffer of a link, a power of two.
+    """
+    delays_us = [max_delay_us(link.models, link.traces) for link in setup.links]
+    longest_us = max(delays_us)
+    return calendar_pages(setup.rate_hz, longest_us, _NEAR_NS)
+
+
+def links_bytes(setup: SiteSetup, pages: int) -> int:
+    """Returns the memory that the links of a site take, bytes.
+
+    Args:
+        setup: Setup of the site.
+        pages: Number of pages of each calendar, in which samples wait until their delay has
+            passed.
+    """
+    numbers = 0
+    if setup.law_factory is not None:
+        numbers = sum(vector.length for vector in setup.received_vectors)
+    page_bytes = sample_dtype(setup.layout.shared).itemsize + 8 * numbers
+    dues_bytes = 8 * _count_kept_dues(setup)
+    link_bytes = pages * page_bytes + dues_bytes
+    return len(setup.links) * link_bytes
+
+
+def _count_kept_dues(setup: SiteSetup) -> int:
+    """Returns the number of due times that a link keeps.
+
+    The due times span the stamps from the latest possible sample to the sample farthest ahead.
+    """
+    peer_rates_hz = [link.rate_hz for link in setup.links]
+    fastest_hz = max(setup.rate_hz, *peer_rates_hz)
+    span_ns = MAX_DELAY_US * 1000 + AHEAD_LIMIT_NS
+    return span_ticks(span_ns, fastest_hz) + _SLACK
+
+
+def widen_calendars(arrays: SiteArrays, k: int, pages: int) -> SiteArrays:
+    """Enlarges the ring buffers in which samples wait until their simulated delay has passed.
+
+    A sample is the state that another arm's process sends. All waiting samples are kept.
+
+    Args:
+        arrays: Arrays of the site, the process that runs the arm.
+        k: The next control period of the site.
+        pages: New number of entries of each buffer, a power of two.
+
+    Returns:
+        New arrays with the larger buffers.
+    """
+    old_count = arrays.calendars.shape[1]
+    ticks = np.arange(k, k + old_count)
+    # A tick's page is its lowest bits, as the number of pages is a power of two.
+    old_pages = ticks & (old_count - 1)
+    new_pages = ticks & (pages - 1)
+    calendars = np.zeros((len(arrays.links), pages), arrays.calendars.dtype)
+    calendars["tick"] = -1
+    calendars[:, new_pages] = arrays.calendars[:, old_pages]
+    channel = arrays.channel
+    if channel is not None:
+        waiting = np.zeros((*calendars.shape, channel.waiting.shape[2]))
+        waiting[:, new_pages] = channel.waiting[:, old_pages]
+        channel = channel._replace(waiting=waiting)
+    return arrays._replace(calendars=calendars, channel=channel)
+
+
+class CalendarSizer:
+    """Enlarges the ring buffers of delayed samples when a sample arrives that does not fit.
+
+    A sample is the state of a peer, the process of another arm. It waits until its simulated
+    delay has passed. A buffer is too short if the delays have become longer, or if the clock of
+    the peer is far ahead. The buffers never take more memory than `MAX_LINKS_BYTES`, or than
+    the delays in the setup need. A sample that still does not fit is refused later.
+
+    Attributes:
+        newest: For each peer the number of the newest sample that is known to fit now and
+            later.
+        most_pages: Largest number of entries of a buffer.
+    """
+
+    def __init__(self, setup: SiteSetup) -> None:
+        self._rate_hz = setup.rate_hz
+        self._peer_hz = [link.rate_hz for link in setup.links]
+        self._delay_us = [max_delay_us(link.models, link.traces) for link in setup.links]
+        self.newest = [-1] * len(setup.links)
+        self.most_pages = needed_pages(setup)
+        limit = calendar_pages(setup.rate_hz)
+        while self.most_pages < limit:
+            if links_bytes(setup, 2 * self.most_pages) > MAX_LINKS_BYTES:
+                break
+            self.most_pages *= 2
+
+    def clear(self) -> None:
+        """Forgets which samples are known to fit into the buffers.
+
+        The next sample of each peer (another arm's process) is checked again.
+        """
+        self.newest = [-1] * len(self.newest)
+
+    def add_model(self, peer: int, model: LinkModel) -> None:
+        """Notes that the delays of a link will change, so that longer delays get room.
+
+        Args:
+            peer: Index of the sender at the other end of the link.
+            model: New model of the link's delays.
+        """
+        longest_us = max_delay_us([model], [None])
+        self._delay_us[peer] = max(self._delay_us[peer], longest_us)
+        self.newest[peer] = -1
+
+    def make_room(self, arrays: SiteArrays, k: int, peer: int, tick: int) -> SiteArrays:
+        """Makes sure that a sample fits into the ring buffer of its link.
+
+        A sample is the state that a peer (another arm's process) sends in one of its ticks, the
+        periods of its control loop. The sample waits in the buffer until its simulated delay
+        has passed. The buffer has one entry, called page, for each tick of the receiver from
+        the present one on. The sample fits if the last tick in which it may come into use has a
+        page. This tick is at most `ahead` + `longest_wait` ticks away: the sample was sent
+        `ahead` ticks after the present one (negative for an earlier sample), and then waits for
+        at most `longest_wait` ticks.
+
+        If the clock of the peer is too far ahead, the buffer is not enlarged, and the sample is
+        refused later. Otherwise `newest` is updated: it is the newest sample of the peer that
+        fits into the buffer as it is now. Samples up to this one need no call of this method.
+
+        Args:
+            arrays: Arrays of the site, the process that receives the sample.
+            k: Present tick of the site.
+            peer: Index of the peer.
+            tick: Tick of the peer in which it sent the sample.
+
+        Returns:
+            The same arrays if the sample fits, is to be refused, or if the buffers have their
+            largest size. Otherwise arrays with larger buffers.
+        """
+        rate_hz = self._rate_hz
+        peer_hz = self._peer_hz[peer]
+        longest_wait = span_ticks(self._delay_us[peer] * 1000, rate_hz) + _SLACK
+        sent_at_tick = tick * rate_hz // peer_hz  # in ticks of this site
+        ahead = sent_at_tick - k
+        if ahead > span_ticks(AHEAD_LIMIT_NS, rate_hz):
+            return arrays  # the sample will be refused
+
+        needed = ahead + longest_wait
+        pages = arrays.calendars.shape[1]
+        if needed > pages and pages < self.most_pages:
+            # The number of pages is a power of two, so that a modulo is a mask of bits.
+            next_power_of_two = 1 << needed.bit_length()
+            pages = min(next_power_of_two, self.most_pages)
+            # Samples of missed ticks still wait in the pages of those ticks.
+            first_waiting_tick = k - int(arrays.site["skipped"][0])
+            arrays = widen_calendars(arrays, first_waiting_tick, pages)
+        newest_fitting_tick = k + pages - longest_wait
+        self.newest[peer] = newest_fitting_tick * peer_hz // rate_hz
+        return arrays
+
+
+def add_ramp(arrays: SiteArrays, ramp: DominanceRamp) -> None:
+    """Adds a planned change of the weights with which an arm follows the other arms.
+
+    The table of changes is sorted by their start times.
+
+    Args:
+        arrays: Arrays of the site (the process that runs the arm). Their table must have a free
+            row.
+        ramp: The change, a ramp in time.
+    """
+    site: Row = arrays.site[0]
+    count = int(site.ramps)
+    ramps = arrays.ramps
+    starts_ns = ramps[1:count, 0]
+    index = 1 + int(np.searchsorted(starts_ns, ramp.start_ns, side="right"))
+    later_ramps = ramps[index:count].copy()
+    ramps[index + 1 : count + 1] = later_ramps
+    ramps[index] = (ramp.start_ns, ramp.end_ns, *ramp.alpha)
+    site.ramps = count + 1
+
+
+def add_model(arrays: SiteArrays, peer: int, model: LinkModel) -> None:
+    """Adds a planned change of a link's delay and loss to the table of changes.
+
+    The table is sorted by the time from which a change applies.
+
+    Args:
+        arrays: Arrays of the site (the process that runs the arm). Their table must have a free
+            row.
+        peer: Index of the site at the other end of the link.
+        model: Model of delay and loss, with the time from which it applies.
+    """
+    link: Row = arrays.links[peer]
+    models = arrays.models[peer]
+    count = int(link.models)
+    starts_ns = models["from_ns"][1:count]
+    index = 1 + int(np.searchsorted(starts_ns, model.from_ns, side="right"))
+    later_models = models[index:count].copy()
+    models[index + 1 : count + 1] = later_models
+    models[index] = model
+    link.models = count + 1
+    # The model in force moves down one row. Samples that are scheduled already keep their
+    # times.
+    if link.model >= index:
+        link.model += 1
+
+
+MAX_CHANGES = 4096
+"""Largest number of changes of one link besides those of the scenario."""
+MAX_RAMPS = 256
+"""Largest number of waiting changes of the dominance factors besides those of the scenario.
+
+A run may have any number of changes: those that have begun are folded, see `fold_ramps`.
+"""
+
+
+def apply_change(arrays: SiteArrays, change: CoreChange, t_ns: int) -> None:
+    """Applies a change from outside to a running site, the process that runs one arm.
+
+    There are four kinds of changes:
+
+    - The message that the site missed ticks, the periods of its control loop. Their number is
+      stored until the next tick.
+    - An order, for example to stop the arm. The next tick carries it out. If several orders
+      come before this tick, the one with the highest number counts, see `LifeOrder`.
+    - A new model of the delay and loss of a link. It is added to the table of the link's
+      models, and applies from its start time on.
+    - A ramp of the dominance factors, the weights with which the arm follows the other arms.
+      It is added to the table of ramps, from which old ramps are removed before.
+
+    Args:
+        arrays: Arrays of the site; changed.
+        change: The change.
+        t_ns: Present time in ns since the start of the session. The site computes no more
+            control periods before this time.
+
+    Raises:
+        ValueError: A table has no free row for the change.
+    """
+    s: Row = arrays.site[0]
+    if change.order is LifeOrder.OVERRUN:
+        s.skipped = change.skipped
+    elif change.order is not None:
+        s.order = max(s.order, change.order)
+    if change.model is not None:
+        link: Row = arrays.links[change.peer]
+        largest_count = arrays.models.shape[1]
+        if link.models >= largest_count:
+            raise ValueError(f"a run can have at most {MAX_CHANGES} changes to a link")
+        add_model(arrays, change.peer, change.model)
+    if change.ramp is not None:
+        # Remove the ramps that are over, to have room for the new one.
+        s.ramps = fold_ramps(t_ns, int(s.ramps), arrays.ramps)
+        if s.ramps >= len(arrays.ramps):
+            raise ValueError(
+                f"at most {MAX_RAMPS} changes to the shares of a site can be pending at once"
+            )
+        add_ramp(arrays, change.ramp)
+
+
+_NEAR_NS = NS_PER_S // 4
+"""Lead of senders over a receiver that is a little late: calendars have pages for it, ns."""
+MAX_LINKS_BYTES = 64 << 20
+"""Largest memory of a site's links beyond what their delays need, bytes."""
+_SLACK = 4
+"""Reserve, ticks: a sample is scheduled up to two ticks before it is filed."""
+_NEVER_SAMPLED = 2
+"""Marks an actor that only fills up a stack: it is evaluated neither per stage nor per tick."""
+
+
+def stack_site_arrays(
+    setups: Sequence[SiteSetup], spare: int = 0, longest_us: int = 0, late_ns: int = 0
+) -> SiteArrays:
+    """Creates the arrays for a simulation of several sites, stacked along a first axis.
+
+    A site is a process that runs one arm. If the arrays of a site are shorter than those of
+    another site, they are filled up with rows that are never read. The ring buffers for delayed
+    samples (states of other sites) are long enough for all delays.
+
+    Args:
+        setups: Setups of the sites.
+        spare: Number of changes during the run for which there is room, for each link and for
+            the weights with which each site follows the others.
+        longest_us: Longest delay that the changes can lead to, us.
+        late_ns: Longest time by which a sample may arrive after its delivery time, ns.
+    """
+    for setup in setups:
+        for link in setup.links:
+            longest_us = max(longest_us, max_delay_us(link.models, link.traces))
+    fastest_hz = max(setup.rate_hz for setup in setups)
+    margin_ns = late_ns + _SLACK * NS_PER_S // fastest_hz
+    pages = calendar_pages(fastest_hz, longest_us, margin_ns)
+    layouts = [setup.layout for setup in setups]
+    lengths_by_field = zip(*layouts, strict=True)
+    largest = Layout(*map(max, lengths_by_field))
+    plugged = any(setup.law_factory is not None for setup in setups)
+    sites = [
+        build_site_arrays(setup, (spare, spare), pages, largest, plugged=plugged)
+        for setup in setups
+    ]
+    _share_tables(sites)
+    actors = _stack_padded([site.actors for site in sites])
+    for row, site in zip(actors, sites, strict=True):
+        row["sampled"][len(site.actors) :] = _NEVER_SAMPLED
+    chains = [site.chain for site in sites if site.chain is not None]
+    channels = [site.channel for site in sites if site.channel is not None]
+    return SiteArrays(
+        site=_stack_padded([site.site for site in sites]),
+        links=_stack_padded([site.links for site in sites]),
+        models=_stack_padded([site.models for site in sites]),
+        dues=_stack_padded([site.dues for site in sites]),
+        calendars=_stack_padded([site.calendars for site in sites]),
+        points=np.concatenate([site.points for site in sites]),
+        ramps=_stack_padded([site.ramps for site in sites]),
+        actors=actors,
+        table=np.concatenate([site.table for site in sites]),
+        chain=_stack_padded(chains) if largest.chain else None,
+        channel=_stack_channels(setups, channels) if channels else None,
+    )
+
+
+def _share_tables(sites: Sequence[SiteArrays]) -> None:
+    """Shifts the indices of each site's points and torques to the rows of joined tables."""
+    first_point = 0
+    first_torque = 0
+    for site in sites:
+        site.models["trace_first"] += first_point
+        site.links["outage_first"] += first_point
+        site.actors["table_first"] += first_torque
+        first_point += len(site.points)
+        first_torque += len(site.table)
+
+
+def select_site(stacked: SiteArrays, i: int, layout: Layout) -> SiteArrays:
+    """Returns the arrays of one site of several stacked sites, as views.
+
+    The rows may be longer than the site's layout.
+
+    Args:
+        stacked: Arrays of all sites, see `stack_site_arrays`.
+        i: Index of the site.
+        layout: Layout of the site.
+    """
+    channel = stacked.channel
+    if channel is not None:
+        waiting = channel.waiting[i]
+        received = channel.received[i]
+        columns = channel.columns[i]
+        channel = ChannelArrays(waiting, received, columns)
+    chain = stacked.chain
+    if chain is not None:
+        chain = chain[i, : layout.joints]
+    return stacked._replace(
+        site=stacked.site[i],
+        links=stacked.links[i],
+        models=stacked.models[i],
+        dues=stacked.dues[i],
+        calendars=stacked.calendars[i],
+        ramps=stacked.ramps[i],
+        actors=stacked.actors[i],
+        chain=chain,
+        channel=channel,
+    )
+
+
+def _stack_channels(
+    setups: Sequence[SiteSetup], channels: Sequence[ChannelArrays]
+) -> ChannelArrays:
+    """Stacks the arrays for the numbers that control laws send, over several sites.
+
+    A site is the process that runs one arm, and its peers are the other sites. The law of a
+    peer sends A numbers to all sites, and E numbers to each of them. A single site receives
+    only the A + E numbers that are meant for it. In a simulation of all sites, it reads the
+    record of the peer, which contains the numbers for all of its receivers:
+
+        a single site:  A to all | E to this site
+        record:         A to all | E to receiver 0 | E to receiver 1 | ...
+
+    Therefore the column of a number to each site grows by E for each receiver before this site.
+
+    Args:
+        setups: Setups of the sites.
+        channels: Arrays of each site. `columns` contains for each peer the index of each number
+            that the law of the site reads, or -1. It is changed in place.
+
+    Returns:
+        The arrays with a first axis for the site, filled up to equal lengths.
+    """
+    for setup, channel in zip(setups, channels, strict=True):
+        for link, columns in zip(setup.links, channel.columns, strict=True):
+            to_all = link.channel.count_numbers(per_peer=False)
+            to_each = link.channel.count_numbers(per_peer=True)
+            are_to_this_site = columns >= to_all
+            columns[are_to_this_site] += link.index_at_peer * to_each
+
+    waiting = _stack_padded([channel.waiting for channel in channels])
+    received = _stack_padded([channel.received for channel in channels])
+    columns = _stack_padded([channel.columns for channel in channels])
+    for channel, padded in zip(channels, columns, strict=True):
+        # Padding with zeros would mean column 0: -1 stands for a number that is not sent.
+        count = channel.columns.shape[1]
+        padded[:, count:] = -1
+    return ChannelArrays(waiting, received, columns)
+
+
+def _stack_padded(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """Returns arrays stacked, each filled up with zeros to the longest along every axis."""
+    shapes = [array.shape for array in arrays]
+    shape = np.max(shapes, axis=0)
+    padded = []
+    for array in arrays:
+        missing = shape - array.shape
+        widths = [(0, count) for count in missing]
+        padded.append(np.pad(array, widths))
+    return np.stack(padded)
+
+
+def _build_site(setup: SiteSetup, layout: Layout) -> RowArray:
+    """Returns the row of a site before its first tick, shape (1,).
+
+    The layout may be larger than the site's: the numbers beyond stay zero.
+
+    Args:
+        setup: Setup of the site.
+        layout: Layout of the row.
+    """
+    site = np.zeros(1, site_dtype(layout))
+    s: Row = site[0]
+    gains = setup.gains
+    rule = setup.on_stale
+    site_layout = setup.layout
+    s.rate_hz = setup.rate_hz
+    s.scheme = setup.scheme
+    s.law = gains.law
+    s.mode = Mode.RUN
+    s.joints = site_layout.joints
+    s.shared = site_layout.shared
+    s.parameters = site_layout.parameters
+    s.task = site_layout.task
+    s.sent = site_layout.sent
+    s.external = int(setup.external)
+    s.ramps = 1
+    s.theta_known = setup.theta_known
+    s.on_stale = rule.action
+    s.stale_ns = rule.age_ns
+    s.return_ns = rule.return_ns
+    s.align_speed = rule.align_speed
+    s.align_limit = rule.align_limit
+    s.degrades = rule.degrades
+    s.bit = setup.bit
+    if setup.chain is None:
+        s.g = setup.g_m_s2
+        s.lengths = setup.lengths_m
+    else:
+        s.gravity = setup.chain.gravity_m_s2
+        s.tip = setup.chain.tip_m
+        s.tip_back = np.transpose(setup.chain.tip_rotation)
+    if setup.chain is not None and setup.chain.task is not None:
+        task = setup.chain.task
+        s.scale = task.scale
+        s.posture_rate = task.posture_rate
+        s.singular_value = task.singular_value
+        s.axes[: site_layout.shared] = task.axes
+        s.posture[: site_layout.joints] = task.posture or setup.q0
+    lengths = site_layout.axes()
+    for name, numbers in _list_vectors(setup).items():
+        field = FIELDS["site"][name]
+        (length,) = field_shape(field, lengths)
+        s[name][:length] = numbers
+    return site
+
+
+def _list_vectors(setup: SiteSetup) -> dict[str, Any]:
+    """Returns the vectors of a site's row before its first tick, by the name of the field.
+
+    A law of known gravity starts with its known parameters as estimate, other laws with their
+    first estimate.
+    """
+    gains = setup.gains
+    vectors: dict[str, Any] = {name: getattr(gains, name) for name in _GAINS}
+    vectors |= setup.limits._asdict()
+    vectors |= setup.rest.vectors()
+    vectors["tau_limit"] = setup.tau_limit_nm
+    vectors["qd_limit"] = setup.qd_limit_rad_s
+    vectors["theta"] = setup.theta
+    vectors["q"] = setup.q0
+    vectors["qd"] = setup.qd0
+    vectors["q_before"] = setup.q0
+    if gains.law is Law.USER and setup.theta_known:
+        vectors["known"] = setup.theta
+    has_known_gravity = gains.law is Law.KNOWN
+    vectors["theta_hat"] = gains.known if has_known_gravity else gains.theta_hat0
+    return vectors
+
+
+def _build_channel(setup: SiteSetup, pages: int) -> ChannelArrays:
+    """Returns the arrays of the numbers that the peers' laws send, before the first sample.
+
+    Args:
+        setup: Setup of the site.
+        pages: Number of pages of each calendar.
+    """
+    vectors = setup.received_vectors
+    peers = len(setup.links)
+    numbers = sum(vector.length for vector in vectors)
+    columns = [link.channel.find_columns(vectors) for link in setup.links]
+    shape = (peers, numbers)
+    return ChannelArrays(
+        waiting=np.zeros((peers, pages, numbers)),
+        received=np.zeros(shape),
+        columns=np.array(columns, dtype=np.int64).reshape(shape),
+    )
+
+
+def _build_links(
+    links: Sequence[LinkSetup], spare: int, shared: int
+) -> tuple[RowArray, RowArray, Points]:
+    """Returns the links' rows, their models, and the points of their traces and outages.
+
+    In the table of points all traces come first, then all outages.
+
+    Args:
+        links: Setups of the links.
+        spare: Free rows for later changes of each link's model.
+        shared: Number of coordinates of a sample.
+    """
+    most_models = max(len(link.models) for link in links)
+    model_rows = most_models + spare
+    rows = np.zeros(len(links), link_dtype(shared))
+    all_models = np.zeros((len(links), model_rows), LINK_MODEL_DTYPE)
+    trace_points: list[Any] = []
+    outages: list[Any] = []
+    for link in links:
+        for trace in link.traces:
+            if trace is not None:
+                trace_points.extend(trace)
+        outages.extend(link.outages)
+    all_points = np.array(trace_points + outages, dtype=np.int64)
+    points = all_points.reshape(-1, 2)
+
+    trace_first = 0
+    outage_first = len(trace_points)
+    row: Row
+    for row, models, link in zip(rows, all_models, links, strict=True):
+        row.alpha = link.alpha
+        row.rate_hz = link.rate_hz
+        row.key = link.key
+        row.bit = link.bit
+        row.followed = link.followed
+        row.dispensable = link.dispensable
+        row.used = -1
+        row.scheduled = -1
+        row.q[: len(link.q0)] = link.q0
+        row.outage_first = outage_first
+        row.outage_count = len(link.outages)
+        outage_first += len(link.outages)
+        row.models = len(link.models)
+        pairs = zip(link.models, link.traces, strict=True)
+        for n, (model, trace) in enumerate(pairs):
+            count = 0 if trace is None else len(trace)
+            models[n] = model._replace(trace_first=trace_first, trace_count=count)
+            trace_first += count
+    return rows, all_models, points

@@ -1,0 +1,547 @@
+"""Defines the setup of a site: all numbers and names that are needed to run one arm.
+
+A site is a process that runs one arm and its control loop. The setup is derived from a
+scenario, the file that describes an experiment. In contrast to the scenario, the setup has no
+missing values, and refers to other sites by index instead of name.
+
+Invariant:
+    - All numbers that a site computes depend only on its setup and on the inputs of its control
+      periods.
+"""
+
+import math
+from collections.abc import Sequence
+from enum import IntEnum
+from itertools import accumulate
+from typing import NamedTuple
+
+import numpy as np
+
+from ..arms.chain import LINK_PARAMETERS, ChainJoint, Matrix, Three
+from ..arms.exogenous import LIVE_KINDS, TorqueKind, TorqueSource
+from ..arms.two_link_arm import JOINTS, PARAMETERS
+from ..life.live_hand import count_hand_numbers
+from ..links.delay import LinkModel
+from ..plug.law_channel import LawChannel, SentVector, join_received
+from ..plug.user_law import LawContext, UserLawFactory
+from .ticks import DominanceRamp
+from .vectors import Array, Points, Vector
+
+
+class Scheme(IntEnum):
+    """How the continuous control law is converted to a discrete one.
+
+    SECOND_ORDER extrapolates the torque to the middle of the control period, and updates the
+    parameter estimate by the trapezoid rule. DIGITAL uses a zero-order hold and the forward
+    Euler rule, as a plain digital controller does.
+    """
+
+    SECOND_ORDER = 0
+    DIGITAL = 1
+
+
+class Law(IntEnum):
+    """Kind of control law of an arm.
+
+    ADAPTIVE estimates the dynamic parameters of the arm, optionally within bounds. KNOWN
+    compensates the known gravity torque:
+
+        tau = G(q) - K e - d qd - Kd ed + k_f felt
+
+    Here q and qd are the joint angles and velocities, G is the gravity torque, e and ed are the
+    errors of position and velocity, and felt is the external torque of the other arms. The
+    gains are the stiffness K, the damping d, the derivative gain Kd and the force gain k_f. The
+    gains decide whether this is P+d, PD+d or direct force reflection. USER is a law in Python,
+    either written by a user or from `trilat_net.laws`.
+    """
+
+    ADAPTIVE = 0
+    KNOWN = 1
+    USER = 2
+
+
+LEAST_STOP_S = 0.1
+"""Shortest time in which the reference of an arm comes to rest, s."""
+
+
+class StaleAction(IntEnum):
+    """What a site does while a peer is silent for too long.
+
+    A site is a process that runs one arm, and a peer is another site that it follows.
+
+    USE follows the last known state of the peer. HOLD keeps the last reference, the position
+    that the arm follows. BRAKE keeps the pose that the arm had when the peer fell silent.
+    GLIDE brings the arm smoothly to rest. With GLIDE, the arm also waits at the start until all
+    peers are heard, see `session_life`.
+    """
+
+    USE = 0
+    HOLD = 1
+    BRAKE = 2
+    GLIDE = 3
+
+
+class StaleRule(NamedTuple):
+    """Rule of a site for a stale peer, from which no new sample has come for too long.
+
+    A site is a process that runs one arm, and a peer is another site that it follows. A sample
+    is the state that a peer sends in each period of its control loop.
+
+    Attributes:
+        action: What the site does while a peer is stale.
+        age_ns: Largest age of the newest sample, ns. For GLIDE, the largest time since a new
+            sample could be used.
+        return_ns: Duration of the return to the reference of the peers, ns. Not used for GLIDE.
+        align_speed: For GLIDE: largest speed with which the arm returns to its peers, rad/s or
+            m/s.
+        align_limit: For GLIDE: longest distance of this return, rad or m.
+        degrades: For GLIDE: True if the site continues without a lost peer, see `lost_peers`.
+    """
+
+    action: StaleAction = StaleAction.USE
+    age_ns: int = 0
+    return_ns: int = 1
+    align_speed: float = 1.0
+    align_limit: float = math.inf
+    degrades: bool = False
+
+
+class MotionLimits(NamedTuple):
+    """Limits of an arm's angles, and of the rates of its reference and torque.
+
+    A limit is one number for all joints or coordinates, or one number per joint or coordinate.
+
+    Attributes:
+        q_min: Least joint angles, rad.
+        q_max: Largest joint angles, rad.
+        qd_des_limit: Largest speed of the reference, rad/s; in task space m/s.
+        tau_rate: Largest rate of the control torque, N m/s.
+    """
+
+    q_min: Vector = (-math.inf,)
+    q_max: Vector = (math.inf,)
+    qd_des_limit: Vector = (math.inf,)
+    tau_rate: Vector = (math.inf,)
+
+
+class RestGains(NamedTuple):
+    """Gains of the torque that brings an arm to rest, see `resting`.
+
+    Each vector has either a single number or a number per joint.
+
+    Attributes:
+        damping: Damping B of the joints, N m s/rad.
+        time_s: Time constant with which the damping alone stops a joint, s. It holds for the
+            inertia for which B was chosen.
+        deceleration: Deceleration of the reference, the motion that the joints follow while
+            they come to rest, rad/s^2.
+    """
+
+    damping: Vector = (0.0,)
+    time_s: float = 1.0
+    deceleration: Vector = (math.inf,)
+
+    def vectors(self) -> dict[str, Vector]:
+        """Returns the gains in the form in which the state arrays store them.
+
+        Returns:
+            By name: "damping", "integral" and "deceleration". The integral gain is the damping
+            divided by 4 `time_s`, in N m/rad.
+        """
+        integral = tuple(float(B) / (4.0 * self.time_s) for B in self.damping)
+        return {
+            "damping": self.damping,
+            "integral": integral,
+            "deceleration": self.deceleration,
+        }
+
+    def stop_s(self, qd: Array) -> Array:
+        """Computes how long it takes to bring an arm to rest from given joint velocities.
+
+        Args:
+            qd: Joint velocities of one or several arms, shape (..., n), rad/s.
+
+        Returns:
+            The time in s for each set of n velocities, shape (...). If nothing else slows down
+            the joints, their reference has stopped after this time.
+        """
+        slowest_s = (np.abs(qd) / self.deceleration).max(axis=-1)
+        duration_s: Array = np.maximum(LEAST_STOP_S, slowest_s)
+        return duration_s
+
+
+class LinkSetup(NamedTuple):
+    """Setup of the link, the directed connection, from one peer to a site.
+
+    Attributes:
+        peer: Name of the peer.
+        alpha: Its dominance factor, the weight of the peer in this site's reference, Eq. (6).
+        rate_hz: Tick rate of the peer, Hz.
+        q0: Start pose of the peer, rad, or of its end effector; in use until the first sample
+            is due (L7).
+        key: Key from which the random numbers of the link follow, see `link_key`.
+        models: Models of the delay in the order of their first stamps; the first one applies
+            from stamp 0.
+        traces: Per model the points of its trace, a table of delays by time, shape (n, 2), see
+            `Points`, or None.
+        outages: Interruptions of the link: pairs of first stamp and end, ns.
+        channel: Numbers that the peer's law sends besides its motion.
+        index_at_peer: Index of this site among the peers of the peer, in scenario order.
+        speed_limit: Largest speeds of the peer's joints, rad/s, beyond which its samples are
+            dropped; (): no limit.
+        bit: Bit of the peer in sets of sites, which are integers with a bit per site.
+        followed: Set of the sites that the peer follows.
+        dispensable: True: the site may go on without the peer if the peer is lost.
+    """
+
+    peer: str
+    alpha: float
+    rate_hz: int
+    q0: tuple[float, ...]
+    key: int = 0
+    models: tuple[LinkModel, ...] = (LinkModel(),)
+    traces: tuple[Points | None, ...] = (None,)
+    outages: tuple[tuple[int, int], ...] = ()
+    channel: LawChannel = LawChannel()
+    index_at_peer: int = 0
+    speed_limit: tuple[float, ...] = ()
+    bit: int = 0
+    followed: int = 0
+    dispensable: bool = False
+
+
+class Layout(NamedTuple):
+    """Lengths of the vectors that describe an arm and its control law.
+
+    Attributes:
+        joints: Number of joints of the arm.
+        shared: Number of coordinates that the arms send each other.
+        parameters: Number of dynamic parameters of the arm.
+        chain: True if the arm is a chain of joints. False for the planar two-link arm.
+        task: True if the coordinates are the pose of the end effector. False if they are joint
+            angles.
+        sent: Number of values that the control law sends to other arms in each period.
+        hand: Number of values that describe the person or program who moves the arm during the
+            run, see `live_hand`. 0 if there is none.
+        bodies: Number of values in the poses of other bodies in the scene, see
+            `TickRecord.bodies`.
+    """
+
+    joints: int = JOINTS
+    shared: int = JOINTS
+    parameters: int = PARAMETERS
+    chain: bool = False
+    task: bool = False
+    sent: int = 0
+    hand: int = 0
+    bodies: int = 0
+
+    @classmethod
+    def of_arm(
+        cls, chain: "ChainSetup | None", sent: int = 0, actors: Sequence[TorqueSource] = ()
+    ) -> "Layout":
+        """Computes the lengths of the vectors of an arm.
+
+        Args:
+            chain: The arm if it is a chain of joints. None for the planar two-link arm.
+            sent: Number of values that the control law sends to other arms in each period.
+            actors: Operators and environments of the arm. At most one of them is a person or
+                program that moves the arm during the run.
+        """
+        joints = JOINTS if chain is None else len(chain.joints)
+
+        live = next((actor.kind for actor in actors if actor.kind in LIVE_KINDS), None)
+        if live is None:
+            hand = 0
+        elif live is TorqueKind.LIVE_JOINT:
+            hand = count_hand_numbers(joints)
+        else:
+            hand = count_hand_numbers(2 if chain is None else 3)
+
+        if chain is None:
+            return cls(sent=sent, hand=hand)
+        task = chain.task
+        return cls(
+            joints=joints,
+            shared=joints if task is None else len(task.axes),
+            parameters=LINK_PARAMETERS * joints,
+            chain=True,
+            task=task is not None,
+            sent=sent,
+            hand=hand,
+        )
+
+    def axes(self) -> dict[str, int]:
+        """Returns the lengths of the named axes that fields of the state arrays have.
+
+        The names are "joints", "shared" and "parameters", see `row_fields`.
+        """
+        return {"joints": self.joints, "shared": self.shared, "parameters": self.parameters}
+
+    def lengths(self) -> dict[str, int]:
+        """Returns the lengths of the vectors of a record by name, in their order.
+
+        A record is the result of one tick. Vectors that the site does not have are left out.
+        """
+        n = self.joints
+        m = self.shared
+        lengths = {"q": n, "qd": n, "q_des": m, "qd_des": m, "tau": n, "tau_x": n}
+        lengths["theta_hat"] = self.parameters
+        if self.task:
+            lengths |= {"x": m, "xd": m, "wrench": m}
+        optional = {"ch": self.sent, "hand": self.hand, "bodies": self.bodies}
+        lengths |= {name: count for name, count in optional.items() if count}
+        return lengths
+
+    def columns(self) -> dict[str, slice]:
+        """Finds each vector of a record among the values that a control period computes.
+
+        Returns:
+            A slice for each vector, by name. Vectors that are inputs of the period are left
+            out.
+        """
+        lengths = self.lengths()
+        for name in ("hand", "bodies"):  # inputs of the tick
+            lengths.pop(name, None)
+        ends = accumulate(lengths.values())
+        return {
+            name: slice(end - length, end)
+            for (name, length), end in zip(lengths.items(), ends, strict=True)
+        }
+
+    def count_life_memory(self, peers: int, *, degrades: bool = False) -> int:
+        """Counts the values that the rule `glide` stores in the field `mem` of a record.
+
+        A site is the process that runs one arm. By the rule `glide`, its arm comes to rest
+        while another site is silent, see `session_life`. The values are the state of this rule,
+        from which a run can be continued. They come first in `mem`:
+
+        - the values that every such site stores, for example when each peer was heard last,
+        - in task space, the reference that brings the joints to rest (`rest_columns`),
+        - if the site continues without a lost site, a value for each peer: whether it is lost.
+
+        Args:
+            peers: Number of the other sites from which this site receives data.
+            degrades: True if the site continues without a lost site.
+        """
+        end_of_reference: int = self.rest_columns(peers).stop
+        lost_peer_values = peers * degrades  # none if it does not
+        return end_of_reference + lost_peer_values
+
+    def rest_columns(self, peers: int) -> slice:
+        """Finds the reference that brings the joints to rest, in the field `mem` of a record.
+
+        `mem` contains numbers from which a run can be continued. For a site (the process that
+        runs one arm) with n joints, m coordinates that the sites share, and P peers (the other
+        sites), it starts with the numbers that `Site` stores under the rule `glide`:
+
+            q_held (m), return_from_ns (1), qd_held (m), reason (1), used_ns (P), tau_held (n),
+            q_rest (n), qd_rest (n)                                       only in task space
+
+        `q_rest` and `qd_rest` are the positions and velocities of the reference, for each
+        joint. In joint space, `q_held` and `qd_held` contain them while the arm rests.
+
+        Args:
+            peers: Number P of the other sites from which this site receives data.
+
+        Returns:
+            The slice of `q_rest` and `qd_rest`. Empty in joint space.
+        """
+        held_and_start = self.shared + 1  # q_held and return_from_ns
+        rate_and_reason = self.shared + 1  # qd_held and reason
+        first = held_and_start + rate_and_reason + peers + self.joints
+        length = 2 * self.joints * self.task  # zero in joint space, where `task` is False
+        return slice(first, first + length)
+
+    def list_lost_peers(self, mem: Sequence[float], peers: Sequence[str]) -> list[str]:
+        """Returns the names of the peers without which a site goes on, from its record.
+
+        Args:
+            mem: Field `mem` of the record, the numbers that the site keeps from tick to tick.
+            peers: Names of the site's peers, in scenario order.
+        """
+        end = self.count_life_memory(len(peers), degrades=True)
+        all_gone = mem[end - len(peers) : end]
+        # A record of another rule has a shorter memory, and then no lost peers.
+        return [peer for peer, gone in zip(peers, all_gone, strict=False) if gone]
+
+    @property
+    def floats(self) -> int:
+        """Number of floating-point values in a record, without the values that are inputs.
+
+        A record contains the inputs and results of one period of the control loop.
+        """
+        shared_vectors = 5 if self.task else 2
+        return 4 * self.joints + shared_vectors * self.shared + self.parameters + self.sent
+
+
+class TaskSetup(NamedTuple):
+    """Setup of an arm whose end effector follows the end effectors of other arms.
+
+    Attributes:
+        axes: For each coordinate of the end effector 1 if it follows the other arms, otherwise
+            0. Three coordinates are a position, and six are a pose.
+        scale: Size of the common coordinates in relation to this arm: 2 means that 1 m of
+            motion of this arm counts as 2 m.
+        posture: Joint angles that the arm prefers if the end effector leaves it a choice, rad.
+        posture_rate: Rate with which the arm approaches these angles, 1/s.
+        singular_value: Near a singular pose, the Jacobian is damped if its least singular value
+            may be below this number, m/rad.
+    """
+
+    axes: tuple[float, ...]
+    scale: float = 1.0
+    posture: tuple[float, ...] = ()
+    posture_rate: float = 0.0
+    singular_value: float = 0.05
+
+
+class ChainSetup(NamedTuple):
+    """The setup of an arm that is a chain of joints.
+
+    Attributes:
+        joints: The joints, from the base on.
+        gravity_m_s2: Gravitational acceleration in the frame of the base, m/s^2.
+        tip_m: Position of the end effector in the frame of the last link, m.
+        tip_rotation: Orientation of the end effector in that frame.
+        task: The setup in task space. None if the arm follows joint by joint.
+    """
+
+    joints: tuple[ChainJoint, ...]
+    gravity_m_s2: Three = (0.0, 0.0, -9.81)
+    tip_m: Three = (0.0, 0.0, 0.0)
+    tip_rotation: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    task: TaskSetup | None = None
+
+
+class Gains(NamedTuple):
+    """A control law and its gains; gains of other laws have no effect.
+
+    Diagonal matrices are vectors. A vector of one number has this number for all its entries.
+
+    Attributes:
+        law: The law.
+        Lambda: Shape (n,), 1/s.
+        Kp: Shape (n,), N m s/rad.
+        Kd: Shape (n,), N m s/rad.
+        Gamma: Adaptation gain per parameter, shape (P,).
+        theta_hat0: The first estimate, shape (P,).
+        low: Lower bound of each estimate, shape (P,).
+        high: Upper bound, shape (P,).
+        known: The parameters that KNOWN assumes, shape (P,).
+        K: Stiffness of KNOWN, shape (n,), N m/rad.
+        d: Damping of KNOWN, shape (n,), N m s/rad.
+        k_f: Gain of the reflected force of KNOWN, shape (n,), dimensionless.
+        rho: Largest robust torque of ADAPTIVE, shape (n,), N m.
+        width: Speed r at which the robust torque is 0.71 rho, shape (n,), rad/s.
+        friction: Part of a chain's joint friction that ADAPTIVE compensates, shape (n,).
+        absolute: True: r of ADAPTIVE is qd + Lambda q, and Kp couples it to r of the peers;
+            only linear analysis uses this.
+    """
+
+    law: Law
+    Lambda: Vector = (1.0,)
+    Kp: Vector = (0.0,)
+    Kd: Vector = (0.0,)
+    Gamma: Vector = (0.0,)
+    theta_hat0: Vector = (0.0,)
+    low: Vector = (-math.inf,)
+    high: Vector = (math.inf,)
+    known: Vector = (0.0,)
+    K: Vector = (0.0,)
+    d: Vector = (0.0,)
+    k_f: Vector = (0.0,)
+    rho: Vector = (0.0,)
+    width: Vector = (1.0,)
+    friction: Vector = (1.0,)
+    absolute: bool = False
+
+
+class SiteSetup(NamedTuple):
+    """All numbers and names from which a site is built.
+
+    Attributes:
+        name: The site's name.
+        rate_hz: The tick rate, Hz.
+        scheme: The sampling of the law.
+        gains: The law and its gains.
+        theta: The true parameters of the arm, shape (P,).
+        g_m_s2: Gravitational acceleration, m/s^2; a chain has that of its setup instead.
+        lengths_m: Lengths of the two links, m; without effect for a chain.
+        tau_limit_nm: Largest control torque of a joint, N m; one number, or one per joint.
+        qd_limit_rad_s: Joint speed beyond which the run counts as diverged, rad/s.
+        q0: The start pose, rad.
+        qd0: The start velocity, rad/s.
+        actors: Operators and environments.
+        links: The links from the peers, in scenario order.
+        ramps: The scripted changes of the dominance factors, in the order of their starts.
+        on_stale: The rule for a stale peer.
+        external: True: the arm is outside of the program: it is measured, and not integrated.
+        law_factory: Creates the user's law. None if the kernel computes the law.
+        theta_known: False: `theta` does not describe the arm, which is external and not
+            identified.
+        chain: The arm if it is a chain. None for the planar two-link arm.
+        channel: The numbers that the site's law sends to its peers.
+        limits: Limits of the motion.
+        rest: The gains with which the arm comes to rest.
+        bit: The bit of the site in sets of sites.
+        bodies: The number of bodies of the plant whose poses are recorded.
+    """
+
+    name: str
+    rate_hz: int
+    scheme: Scheme
+    gains: Gains
+    theta: Array
+    g_m_s2: float
+    lengths_m: tuple[float, float]
+    tau_limit_nm: Vector
+    qd_limit_rad_s: Vector
+    q0: tuple[float, ...]
+    qd0: tuple[float, ...]
+    actors: tuple[TorqueSource, ...]
+    links: tuple[LinkSetup, ...]
+    ramps: tuple[DominanceRamp, ...] = ()
+    on_stale: StaleRule = StaleRule()
+    external: bool = False
+    law_factory: UserLawFactory | None = None
+    theta_known: bool = True
+    chain: ChainSetup | None = None
+    channel: LawChannel = LawChannel()
+    limits: MotionLimits = MotionLimits()
+    rest: RestGains = RestGains()
+    bit: int = 0
+    bodies: int = 0
+
+    @property
+    def layout(self) -> Layout:
+        """Lengths of the site's vectors."""
+        layout = Layout.of_arm(self.chain, self.channel.record_size, self.actors)
+        return layout._replace(bodies=7 * self.bodies)
+
+    @property
+    def received_vectors(self) -> tuple[SentVector, ...]:
+        """Vectors that the control law of this site reads from each of the other sites.
+
+        A site is the process that runs one arm. A control law may send vectors to other sites
+        besides the motion of its arm. A vector that another site does not send is zero.
+
+        Returns:
+            A description of each vector, in the order in which the law receives them.
+        """
+        channels = [link.channel for link in self.links]
+        return join_received([*channels, self.channel])
+
+    def law_context(self) -> LawContext:
+        """Returns the facts about the site that a user's law receives when it is created."""
+        return LawContext(
+            site=self.name,
+            rate_hz=self.rate_hz,
+            g_m_s2=self.g_m_s2,
+            lengths_m=self.lengths_m,
+            theta=tuple(map(float, self.theta)) if self.theta_known else (),
+            tau_limit_nm=self.tau_limit_nm,
+            joints=self.layout.joints,
+            coordinates=self.layout.shared,
+            peers=tuple(link.peer for link in self.links),
+        )

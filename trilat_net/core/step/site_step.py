@@ -1,0 +1,756 @@
+"""Runs the control loop of an arm, one period per call of `Site.step`.
+
+A site is a process that runs one arm and its control loop, and a tick is one period of the
+loop. In each tick, a site sends a sample with its state to its peers, the other sites.
+
+`Site.step` writes the samples that arrived into arrays, calls the compiled function
+`kernel.site_tick`, and converts the results to a record. If the control law was written by a
+user, the law is called between the two halves of the tick, which are compiled separately.
+
+Invariant:
+    - Live sessions, simulations and the verification of logs use `Site.step`. Only the fast
+      simulation of all sites (`fused_run`) does not, and it calls the same compiled functions.
+    - The result of `Site.step` depends only on the state of the site and on its argument. The
+      method reads no clock and no network connection, and draws no random number.
+    - Equal inputs give results that are equal to the last bit.
+"""
+
+import math
+import struct
+import zlib
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from ...errors import LawFailed
+from ..arms.exogenous import LIVE_KINDS
+from ..life.live_hand import HandInForce, empty_hand_vector
+from ..links.channel import LOST
+from ..links.delay import DelayKind
+from ..plug.compiled_law import plug_law
+from .jit import bind_leaf
+from .kernel import (
+    accept_stage,
+    act_stages,
+    find_release,
+    resume_stages,
+    sense_stages,
+    site_tick,
+)
+from .site_arrays import (
+    MAX_CHANGES,
+    MAX_RAMPS,
+    CalendarSizer,
+    SiteArrays,
+    apply_change,
+    build_site_arrays,
+    build_tick_buffers,
+)
+from .site_setup import SiteSetup, StaleAction
+from .ticks import (
+    MAX_ARRIVALS,
+    NS_PER_S,
+    Arrival,
+    CoreChange,
+    LifeReason,
+    LinkCounts,
+    Mode,
+    PlantState,
+    TickInput,
+    TickRecord,
+)
+from .vectors import Array, Row
+
+_MODES = {int(mode): mode for mode in Mode}
+_RUN = int(Mode.RUN)
+_DIVERGED = int(Mode.DIVERGED)
+_NO_SHARED: tuple[tuple[float, ...], ...] = ((), (), ())
+
+
+class Site:
+    """Manipulator with its controller and the receiving ends of its links.
+
+    The process of a site creates this object and calls `step` once per tick. The simulation
+    in virtual time does the same for each site.
+
+    Args:
+        setup: Setup of the site.
+
+    Attributes:
+        name: Name of the site.
+        rate_hz: Tick rate, Hz.
+        peers: Names of the peers, in scenario order.
+        layout: Lengths of the site's vectors.
+        law_failure: Last failure of a user's law under the rule `glide`; None if it never
+            failed.
+    """
+
+    def __init__(self, setup: SiteSetup) -> None:
+        self.name = setup.name
+        self.rate_hz = setup.rate_hz
+        self.peers = tuple(link.peer for link in setup.links)
+        self._start_poses = [link.q0 for link in setup.links]
+        self._sizer = CalendarSizer(setup)
+        self._external = setup.external
+        self._arrays = build_site_arrays(setup, (MAX_CHANGES, MAX_RAMPS))
+        self.layout = setup.layout
+        columns = self.layout.columns()
+        columns.pop("ch", None)
+        slices = tuple(columns.values())
+        self._state_columns = slices[:7]
+        self._shared_columns = slices[7:]
+        self._buffers = build_tick_buffers(setup)
+        arrival = struct.Struct(f"<qq{2 * self.layout.shared}d")
+        self._pack_arrival = arrival.pack_into
+        self._arrival_size = arrival.size
+        self._tick_arrays = (*self._arrays, *self._buffers)
+        self._tick: Callable[..., None] | None = None  # stays None with a user's law
+        self._site = self._arrays.site
+        self._links = self._arrays.links
+        self._mode = self._site["mode"]
+        self._used = self._links["used"]
+        self._arrival_bytes = self._buffers.arrivals.view(np.uint8).data
+        force_bytes = self._buffers.forces.view(np.uint8)
+        self._force_bytes = force_bytes.reshape(-1).data
+        sent_first = self.layout.floats - self.layout.sent
+        self._sent = self._buffers.record[sent_first:]
+        self._plug_law(setup)
+        live = [n for n, actor in enumerate(setup.actors) if actor.kind in LIVE_KINDS]
+        self._hand = self._find_hand(live[0]) if live else None
+        counts = [link.channel.received_size for link in setup.links]
+        receives = self._user_law is not None and any(counts)
+        self._received_counts = counts if receives else None
+        self._glides = setup.on_stale.action is StaleAction.GLIDE
+        self._degrades = setup.on_stale.degrades
+        self._law_memory: list[float] = []
+        if self._law is not None and self._glides:
+            self._law_memory = self._law.memory
+        self._remembers = self._glides or self._user_law is not None
+        # Looking up a field of a structured array takes longer than reading its numbers.
+        s = self._site
+        self._q_held = s["q_held"][0]
+        self._return_from_ns = s["return_from_ns"]
+        self._qd_held = s["qd_held"][0]
+        self._reason = s["reason"]
+        self._tau_held = s["tau_held"][0]
+        self._q_rest = s["q_rest"][0]
+        self._qd_rest = s["qd_rest"][0]
+        self._used_ns = self._links["used_ns"]
+        self._gone = self._links["gone"]
+        self._reflects = bool(np.any(setup.gains.k_f)) or self._user_law is not None
+        # A user's hand sees the forces that its site received.
+        self._keeps_forces = self._reflects or self._hand is not None
+
+    def _find_hand(self, index: int) -> tuple[Array, Array, Array]:
+        """Returns the numbers of the live hand, which change during the run.
+
+        A live hand is a person or program that moves the arm during the run. A simulated spring
+        pulls the arm to the target of the hand, with a force that is multiplied by the grip.
+
+        Args:
+            index: Index of the live hand among the operators and environments.
+
+        Returns:
+            The grip, shape (1,), the target, and the target one second later, as views: who
+            writes into them changes the row of the live hand.
+        """
+        actors = self._arrays.actors
+        # The field `hand` of a record has grip, number, source, target and rate of the target.
+        coordinates = (self.layout.hand - 3) // 2
+        # The field `a` of a live hand is its target, and `b` the target one second later.
+        grip = actors["grip"][index : index + 1]
+        target = actors["a"][index, :coordinates]
+        target_ahead = actors["b"][index, :coordinates]
+        return grip, target, target_ahead
+
+    def _plug_law(self, setup: SiteSetup) -> None:
+        """Creates the control law that a user wrote, and compiles the other stages of a tick.
+
+        A tick is a period of the control loop. A user's law is called between two compiled
+        functions: `_sense` computes the stages of a tick before the torque, and `_act` those
+        after it. Without such a law, nothing is compiled here.
+
+        `_user_law` is the user's object. `_law` calls it with the arrays of this site, and may
+        be a compiled form of it. Both are None without such a law.
+
+        Args:
+            setup: Setup of the site, which may contain a factory of the law.
+        """
+        self._user_law = None
+        if setup.law_factory is not None:
+            self._user_law = setup.law_factory(setup.law_context())
+        self._law = None
+        self.law_failure: LawFailed | None = None
+        if self._user_law is None:
+            return
+
+        arrays = self._arrays
+        buffers = self._buffers
+        self._law = plug_law(self._user_law, setup, arrays, self._sent)
+        # Compile now, and not within the time that the law has for a tick. The arguments serve
+        # for their types: the zeros stand for the tick, its time in ns, and the count of
+        # arrivals.
+        self._law.bind()
+        self._sense = bind_leaf(sense_stages, 0, 0, 0, arrays, buffers)
+        self._act = bind_leaf(
+            act_stages,
+            0,
+            0,
+            arrays.site,
+            arrays.actors,
+            arrays.table,
+            arrays.chain,
+            buffers.record,
+        )
+
+    def apply_change(self, command: CoreChange, t_ns: int) -> None:
+        """Applies a change to the running site, for example a new delay model of a link.
+
+        A change that starts later is added to the planned changes.
+
+        Args:
+            command: The change.
+            t_ns: Present time in ns since the start of the session. The site computes no more
+                control periods before this time.
+
+        Raises:
+            ValueError: There are too many planned changes.
+        """
+        apply_change(self._arrays, command, t_ns)
+        if command.model is not None:
+            self._sizer.add_model(command.peer, command.model)
+
+    def start_at(self, k: int) -> None:
+        """Makes tick `k` the first tick of a site that joins a running session.
+
+        The site must not have made a tick. Its arm stands at the start pose, no sample (state)
+        of a peer is in use or waits, and the links have the state of tick k - 1: the models of
+        delay and loss have processed all samples that the peers have sent by then.
+
+        Args:
+            k: The first tick.
+        """
+        links_may_be_ahead = k <= self._site["first"]
+        if links_may_be_ahead:
+            # The links may be ahead of tick k: start them anew.
+            self.restore_links(k, [None] * len(self.peers), ())
+        self._site["first"] = k
+        for n, link in enumerate(self._links):
+            peer_hz = int(link["rate_hz"])
+            last_sample = (k - 1) * peer_hz // self.rate_hz
+            if last_sample >= 0:
+                # Not for its result: it advances the random models of the link to this sample.
+                find_release(n, last_sample, self._arrays)
+        # Copies of samples that were sent before the site joined do not count.
+        self._links["copies"] = 0
+
+    def step(self, tick: TickInput) -> TickRecord:
+        """Computes one period of the control loop.
+
+        Args:
+            tick: Number of the period and its inputs. The number must follow that of the
+                previous call.
+
+        Returns:
+            The record of the period: its inputs and results.
+
+        Raises:
+            ValueError: There are more than MAX_ARRIVALS arrivals, or too many planned changes.
+            LawFailed: A user's control law failed. Under the rule `glide`, see `session_life`,
+                the site enters the mode FAULT instead.
+        """
+        t_ns = tick.k * NS_PER_S // self.rate_hz
+        count = len(tick.arrivals)
+        for command in tick.commands:
+            self.apply_change(command, t_ns)
+        packed_bytes = self._pack(tick.k, tick.arrivals)
+
+        bodies: Sequence[float] = ()
+        if tick.measured is not None and self._external:
+            bodies = tick.measured.bodies
+            self._write_measurement(tick.measured)
+        hand = self._apply_hand(tick.hand)
+        law_memory = self._compute_tick(tick.k, t_ns, count)
+
+        row = self._buffers.record.tolist()
+        mode = self._mode.item()
+        memory: list[float] = []
+        if self._remembers or mode not in (_RUN, _DIVERGED):
+            memory = self._held_memory() + law_memory
+        q, qd, q_des, qd_des, tau, tau_x, theta_hat = [
+            row[column] for column in self._state_columns
+        ]
+        x, xd, wrench = [row[column] for column in self._shared_columns] or _NO_SHARED
+        # Positional: a call that names the twenty fields takes 3 microseconds longer.
+        return TickRecord(
+            tick.k,
+            t_ns,
+            _MODES[mode],
+            q,
+            qd,
+            q_des,
+            qd_des,
+            tau,
+            tau_x,
+            theta_hat,
+            self._used.tolist(),
+            self._compute_crc(packed_bytes, count),
+            [command.text for command in tick.commands],
+            memory,
+            x,
+            xd,
+            wrench,
+            self._sent.tolist() or (),
+            hand,
+            bodies,
+        )
+
+    def _compute_tick(self, k: int, t_ns: int, count: int) -> list[float]:
+        """Runs the eight stages of a tick (see `kernel`) on the buffers.
+
+        Without a user's law, one compiled function runs all stages. A user's law is called
+        between two compiled functions, of the stages before the torque and after it.
+
+        Args:
+            k: The tick.
+            t_ns: Nominal time of the tick, ns since the epoch.
+            count: Number of arrivals in the buffers.
+
+        Returns:
+            The memory of the user's law. Empty without such a law.
+        """
+        if self._law is None:
+            if self._tick is None:
+                # Compile at the first tick, for arguments with the types of three integers.
+                self._tick = bind_leaf(site_tick, 0, 0, 0, *self._tick_arrays)
+            self._tick(k, t_ns, count, *self._tick_arrays)
+            return []
+
+        arrays = self._arrays
+        # Stages 1 to 5: accept, release, reference, errors, estimate.
+        self._sense(k, t_ns, count, arrays, self._buffers)
+        # Stage 6: torque.
+        memory = self._compute_law(k, t_ns)
+        # Stages 7 and 8: emit, advance. The limits of the torque come first.
+        self._act(
+            k,
+            t_ns,
+            arrays.site,
+            arrays.actors,
+            arrays.table,
+            arrays.chain,
+            self._buffers.record,
+        )
+        return memory
+
+    def _write_measurement(self, measured: PlantState) -> None:
+        """Writes the state and the external torque of a measured arm into the site's row."""
+        s: Row = self._site[0]
+        s.q = measured.q
+        s.qd = measured.qd
+        # The record has the sign of Eq. (8); the row has the torque ON the arm.
+        s.sensed = [-torque for torque in measured.tau_x] or 0.0
+
+    def _compute_law(self, k: int, t_ns: int) -> list[float]:
+        """Computes the torque by the user's law (stage 6 of a tick), and returns its memory.
+
+        The law writes the torque into the row of the site. Its memory are the numbers that it
+        keeps from tick to tick.
+
+        The rule `glide` brings the arm to rest when something fails. Under this rule, a law
+        that fails gives NaN as torque. `act_stages` then enters the mode FAULT with the reason
+        NOT_FINITE. The law is not called again until the fault is reset, and then continues
+        from the memory that it had before the failure.
+
+        Args:
+            k: The tick.
+            t_ns: Nominal time of the tick, ns since the epoch.
+
+        Raises:
+            LawFailed: The law failed, and the site is not under the rule `glide`.
+        """
+        assert self._law is not None
+        s: Row = self._site[0]
+        if not self._glides:
+            return self._law.compute(k, t_ns)
+
+        has_failed_before = s.mode == Mode.FAULT and s.reason == LifeReason.NOT_FINITE
+        if has_failed_before:
+            s.tau = math.nan
+            return self._law_memory
+
+        try:
+            self._law_memory = self._law.compute(k, t_ns)
+        except LawFailed as failure:
+            self.law_failure = failure
+            self._law.restore(self._law_memory)
+            s.tau = math.nan
+        return self._law_memory
+
+    @property
+    def speed_limits(self) -> list[float]:
+        """Largest speed of each joint, rad/s."""
+        limits: list[float] = self._site[0]["qd_limit"].tolist()
+        return limits
+
+    @property
+    def mode(self) -> Mode:
+        """Mode of the site after the last tick, for example RUN while it follows others."""
+        return _MODES[self._mode.item()]
+
+    @property
+    def life_reason(self) -> LifeReason:
+        """Why the site last changed its mode under the rule `glide`, see `session_life`."""
+        return LifeReason(self._reason.item())
+
+    @property
+    def arrays(self) -> SiteArrays:
+        """Arrays with the present state of the site. They must not be changed."""
+        return self._arrays
+
+    @property
+    def q(self) -> list[float]:
+        """Joint angles at the next tick, rad."""
+        joints = self.layout.joints
+        angles: list[float] = self._site[0]["q"][:joints].tolist()
+        return angles
+
+    def _apply_hand(self, vector: Sequence[float]) -> Sequence[float]:
+        """Writes the action of a live hand into its row, and returns the `hand` of the record.
+
+        A live hand is a person or program that moves the arm during the run.
+
+        Args:
+            vector: The action in the form of `HandInForce`: how firmly the arm is gripped, to
+                which target it is pulled, and the velocity of the target. Empty if nobody
+                holds the arm.
+
+        Returns:
+            The action in force. Empty if the site has no live hand.
+        """
+        if self._hand is None:
+            return ()
+        # Views of the row: the assignments change its numbers.
+        grip, target, target_ahead = self._hand
+        action = list(vector) or empty_hand_vector(len(target))
+        hand = HandInForce.read(action)
+        grip[0] = hand.grip
+        target[:] = hand.target
+        # The target one second later: its position plus its velocity times 1 s.
+        motion = zip(hand.target, hand.rate, strict=True)
+        target_ahead[:] = [position + velocity for position, velocity in motion]
+        return action
+
+    def _compute_crc(self, packed_bytes: int, arrivals: int) -> int:
+        """Returns the checksum of the arrivals in the buffers, `TickRecord.rx_crc`.
+
+        An arrival is a sample (the state of a peer) that came since the last tick. Only what
+        the site uses is part of the checksum: peer, tick and motion of each arrival, then the
+        forces if the site reflects forces, then the numbers that the peers' laws send if the
+        law of this site reads such numbers.
+
+        Args:
+            packed_bytes: Number of bytes of the packed arrivals: peers, ticks and motions.
+            arrivals: Number of arrivals.
+        """
+        crc = zlib.crc32(self._arrival_bytes[:packed_bytes])
+        if self._reflects:
+            bytes_per_float = 8
+            force_bytes = arrivals * bytes_per_float * self.layout.shared
+            crc = zlib.crc32(self._force_bytes[:force_bytes], crc)
+        if self._received_counts:
+            peers = self._buffers.arrivals["peer"][:arrivals].tolist()
+            # Row n of `sent` belongs to arrival n. The rows are longer than what a peer sends.
+            for n, peer in enumerate(peers):
+                count = self._received_counts[peer]
+                sent = self._buffers.sent[n, :count]
+                crc = zlib.crc32(sent.data, crc)
+        return crc
+
+    def _held_memory(self) -> list[float]:
+        """Returns the part of `TickRecord.mem` that belongs to the site and not to its law.
+
+        A run can be continued from the records of a tick. These are the numbers of the site
+        that the next tick needs and that no other field of the record contains. A site that is
+        not under the rule `glide`, which brings arms to rest, has only the first two items:
+
+        - `q_held`: the reference (position that the arm follows) that is held, or the start
+          value of an offset that falls to zero,
+        - `return_from_ns`: the time at which the present rest, return or run began, ns,
+        - `qd_held`: the rate of `q_held`,
+        - `reason`: why the mode changed last, a `LifeReason`,
+        - `used_ns`: for each peer the time at which its last sample came into use, ns,
+        - `tau_held`: the torque of each joint that carries a constant load at rest, N m,
+        - `q_rest`, `qd_rest`: the reference that brings the joints to rest, only in task space,
+        - `gone`: the state of each peer, only if the site continues without lost peers.
+
+        `restore_state` reads the same numbers in the same order.
+        """
+        return_from_ns = float(self._return_from_ns.item())
+        memory = [*self._q_held.tolist(), return_from_ns]
+        if not self._glides:
+            return memory
+
+        memory += self._qd_held.tolist()
+        memory.append(float(self._reason.item()))
+        memory += map(float, self._used_ns.tolist())
+        memory += self._tau_held.tolist()
+        if self.layout.task:
+            memory += self._q_rest.tolist()
+            memory += self._qd_rest.tolist()
+        if self._degrades:
+            memory += self._gone.tolist()
+        return memory
+
+    def counts(self) -> tuple[LinkCounts, ...]:
+        """Returns counts of the samples that arrived, came late or were lost, for each link.
+
+        The links are in scenario order. `LinkCounts` explains the counts.
+        """
+        counts = []
+        for link in self._links:
+            numbers = [int(link[field]) for field in LinkCounts._fields]
+            counts.append(LinkCounts(*numbers))
+        return tuple(counts)
+
+    def release_tick(self, peer: int, tick: int) -> int | None:
+        """Finds the control period of this site in which a sample of a peer is used first.
+
+        A peer is another site (process that runs one arm). A sample is the state that it sends
+        in one period of its own control loop.
+
+        Args:
+            peer: Index of the peer.
+            tick: Number of the period in which the peer sent the sample.
+
+        Returns:
+            The number of this site's period if the sample arrives in time. None if the link
+            loses the sample, or if the sample is so old that its delivery time is no longer
+            stored.
+        """
+        release = int(find_release(peer, tick, self._arrays))
+        return None if release == LOST else release
+
+    def is_measured(self, peer: int) -> bool:
+        """Returns True if the real network alone delays the samples of a link.
+
+        Args:
+            peer: Index of the sender at the other end of the link.
+        """
+        link: Row = self._links[peer]
+        model: Row = self._arrays.models[peer, link.model]
+        return bool(model["kind"] == DelayKind.MEASURED)
+
+    def peer_rate_hz(self, peer: int) -> int:
+        """Returns the tick rate of a peer, Hz.
+
+        Args:
+            peer: Index of the peer.
+        """
+        return int(self._links[peer]["rate_hz"])
+
+    def restore_state(self, before: TickRecord, last: TickRecord) -> None:
+        """Restores the state of the arm and its control law from the records of a run.
+
+        After a further call of `restore_links`, `step` continues the run.
+
+        The field `mem` of a record contains the numbers of the site and its law that no other
+        field contains. For m coordinates that the sites share, these are
+
+        - the reference that is held (m numbers) and the time from which it is held, ns,
+        - under the rule `glide`, by which an arm comes to rest while a peer (another arm) is
+          silent, the further numbers that `_restore_life` reads,
+        - the numbers that the user's law remembers, if there is one.
+
+        `mem` is empty if nothing is to be remembered.
+
+        Args:
+            before: Record of the control period before `last`. If `last` is the first record,
+                any record can be given.
+            last: Last record of the part that is not computed again.
+        """
+        s: Row = self._site[0]
+        shared = self.layout.shared
+        s.mode = int(last.mode)
+        s.q = last.q
+        s.qd = last.qd
+        s.theta_hat = last.theta_hat
+        s.q_des = last.q_des
+        s.qd_des = last.qd_des
+        s.tau = last.tau
+        # `resume_stages` extrapolates the torque during the period of `last` from both torques.
+        s.tau_before = before.tau
+        if last.mem:
+            s.q_held = last.mem[:shared]
+            s.return_from_ns = int(last.mem[shared])
+        law_memory = last.mem[shared + 1 :]
+        if self._glides and law_memory:
+            law_memory = self._restore_life(law_memory)
+        self._sent[:] = last.ch or 0.0  # `ch` is empty if the law sends no numbers
+        self._apply_hand(last.hand)
+        if self._law is not None:
+            self._law.restore(law_memory)
+            self._law_memory = list(law_memory)
+        # Compute what is in no record: errors, external torques, and the motion after `last`.
+        resume_stages(last.tick, self._arrays)
+
+    def _restore_life(self, memory: list[float]) -> list[float]:
+        """Restores the memory of the rule `glide` from the field `mem` of a record.
+
+        By this rule, an arm comes to rest while a peer (another arm) is silent, see
+        `session_life`. The numbers are read in the order in which `_held_memory` writes them:
+
+        - `qd_held`: the rate of the held reference, one number per shared coordinate,
+        - `reason`: why the mode changed last, a `LifeReason`,
+        - `used_ns`: the time at which the last sample of a peer came into use, per peer, ns,
+        - `tau_held`: the torque that carries a constant load at rest, per joint, N m,
+        - only in task space `q_rest` and `qd_rest`: the reference that brings the joints to
+          rest, two numbers per joint,
+        - only if the site continues without lost peers `gone`: the state of each peer.
+
+        Args:
+            memory: Numbers of the record, after the held reference and the time from which it
+                is held.
+
+        Returns:
+            The remaining numbers, which belong to the user's law.
+        """
+        s: Row = self._site[0]
+        shared = self.layout.shared
+        peers = len(self.peers)
+        joints = self.layout.joints
+        s.qd_held = memory[:shared]
+        s.reason = int(memory[shared])
+        remaining = memory[shared + 1 :]
+
+        # Each number is removed from `remaining` once it is restored.
+        self._links["used_ns"] = remaining[:peers]
+        remaining = remaining[peers:]
+        s.tau_held = remaining[:joints]
+        remaining = remaining[joints:]
+        if self.layout.task:
+            s.q_rest = remaining[:joints]
+            s.qd_rest = remaining[joints : 2 * joints]
+            remaining = remaining[2 * joints :]
+        if self._degrades:
+            self._links["gone"] = remaining[:peers]
+            remaining = remaining[peers:]
+        # Orders and missed ticks are inputs of the tick that applies them: none is waiting.
+        s.order = 0
+        s.skipped = 0
+        return remaining
+
+    def restore_links(
+        self, k: int, in_use: Sequence[Arrival | None], waiting: Sequence[Arrival]
+    ) -> None:
+        """Restores the state of the network links, to continue a recorded run at tick k.
+
+        A site is a process that runs one arm, its peers are the other sites, and a tick is one
+        period of the control loop. A peer sends a sample, its state, in each tick. The state of
+        random models of delay and loss is not recorded. It is computed again from the start of
+        the run, which gives the same numbers.
+
+        Args:
+            k: The next tick.
+            in_use: For each peer the newest sample that has been used. None if there was no
+                sample.
+            waiting: Samples that have arrived, but whose simulated delay has not passed.
+
+        Raises:
+            ValueError: More than MAX_ARRIVALS samples wait.
+        """
+        self._arrays.calendars["tick"] = -1
+        self._sizer.clear()
+        link: Row
+        for n, (link, start_pose, sample) in enumerate(
+            zip(self._links, self._start_poses, in_use, strict=True)
+        ):
+            link.scheduled = -1
+            link.model = 0
+            link.due_before = 0
+            if sample is None:
+                link.used = -1
+                link.q = start_pose
+                link.qd = 0.0
+                link.tau_x = 0.0
+            else:
+                link.used = sample.tick
+                link.q = sample.q
+                link.qd = sample.qd
+                link.tau_x = sample.tau_x or 0.0
+            self._restore_received(n, sample)
+
+        self._pack(k, waiting)
+        accept_stage(k, len(waiting), self._arrays, self._buffers)
+
+    def _restore_received(self, peer: int, sample: Arrival | None) -> None:
+        """Restores the numbers that the control law of a peer sent with the sample in use.
+
+        Control laws that users wrote can send numbers to each other, besides the motion of the
+        arms. They travel in the field `ch` of a sample, the state that a peer (another arm's
+        process) sends. The law of this site reads them in an order of its own. The array
+        `columns` contains for each number that it reads the index in `ch`, or -1 if the law of
+        the peer does not send this number. Such a number is 0.
+
+        Args:
+            peer: Index of the peer.
+            sample: The sample in use. None before the first sample.
+        """
+        channel = self._arrays.channel
+        if channel is None:
+            return  # the law of this site is built in, and reads no such numbers
+        if sample is None or not len(sample.ch):
+            channel.received[peer] = 0.0
+            return
+        # The index -1 selects the last number, the appended zero.
+        sent_and_zero = np.append(sample.ch, 0.0)
+        channel.received[peer] = sent_and_zero[channel.columns[peer]]
+
+    def _pack(self, k: int, arrivals: Sequence[Arrival]) -> int:
+        """Writes the samples that arrived before a tick into the input buffers of the tick.
+
+        A tick is a period of the control loop. A sample is the state that a peer (another arm's
+        process) sends. The buffers have three parts:
+
+        - `arrivals`: peer, tick and motion of each sample,
+        - `forces`: the external torques of the senders, if this site uses them,
+        - `sent`: the numbers that the laws of the senders sent, if the law of this site reads
+          such numbers.
+
+        Later the tick moves the samples to the calendars, the ring buffers in which they wait
+        until their simulated delay has passed. If a sample does not fit there, the calendars
+        are replaced by larger ones.
+
+        Args:
+            k: Number of the tick.
+            arrivals: Samples that arrived since the previous tick.
+
+        Returns:
+            The number of bytes written into `arrivals`.
+
+        Raises:
+            ValueError: There are more than MAX_ARRIVALS arrivals.
+        """
+        if len(arrivals) > MAX_ARRIVALS:
+            raise ValueError(
+                f"a tick can process at most {MAX_ARRIVALS} arrivals, but has {len(arrivals)}"
+            )
+        packed_bytes = 0
+        # For each peer the newest sample that is known to fit; `make_room` updates the list.
+        newest_fitting = self._sizer.newest
+        for peer, tick, q, qd, *_ in arrivals:
+            if tick > newest_fitting[peer]:
+                self._arrays = self._sizer.make_room(self._arrays, k, peer, tick)
+                # The arguments of the compiled tick contain the calendars.
+                self._tick_arrays = (*self._arrays, *self._buffers)
+            self._pack_arrival(self._arrival_bytes, packed_bytes, peer, tick, *q, *qd)
+            packed_bytes += self._arrival_size
+        # A sample without forces or numbers has an empty vector, which counts as zeros.
+        if self._keeps_forces:
+            for n, arrival in enumerate(arrivals):
+                self._buffers.forces[n] = arrival.tau_x or 0.0
+        if self._received_counts:
+            for n, arrival in enumerate(arrivals):
+                count = self._received_counts[arrival.peer]
+                self._buffers.sent[n, :count] = arrival.ch or 0.0
+        return packed_bytes

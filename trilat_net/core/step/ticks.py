@@ -1,0 +1,537 @@
+"""Defines the inputs, the results and the times of the control periods of an arm.
+
+A site is a process that runs one arm, and a tick is one period of its control loop. The inputs
+of a tick are the samples (states) that arrived from other sites, and commands. Its record is
+the stored result. This module also defines the modes in which a site can be.
+
+Invariant (laws L1 and L3 of docs/design.md):
+    - The nominal time of tick k is `k * 10^9 // rate_hz` nanoseconds after the start of the
+      session, where `rate_hz` is the rate of the loop. It is computed from k anew in each tick,
+      so that rounding errors do not add up.
+    - The record of a tick contains all inputs of the tick.
+"""
+
+from collections.abc import Sequence
+from enum import IntEnum
+from typing import NamedTuple
+
+from ..links.delay import LinkModel
+from .jit import leaf
+
+NS_PER_S = 1_000_000_000
+BUCKETS_PER_S = 20
+"""Equal parts of a second for which a run that is reduced to peaks keeps the peaks."""
+
+
+@leaf
+def tick_ns(tick: int, rate_hz: int) -> int:
+    """Returns the nominal time of a tick, ns since the epoch, the common start of the session.
+
+    Args:
+        tick: The tick.
+        rate_hz: Tick rate, Hz.
+    """
+    return tick * 1_000_000_000 // rate_hz
+
+
+@leaf
+def first_tick_at(due_ns: int, rate_hz: int) -> int:
+    """Returns the first tick whose nominal time is at or after a due time.
+
+    It is the smallest k with k / rate_hz >= due_ns / 10^9. The result is exact:
+    floor(k 10^9 / rate) >= due if and only if k 10^9 >= due rate. The division of the negative
+    number rounds up.
+
+    Args:
+        due_ns: The due time, ns since the epoch, the common start of the session.
+        rate_hz: Tick rate, Hz.
+    """
+    return -(-due_ns * rate_hz // 1_000_000_000)
+
+
+MAX_ARRIVALS = 4096
+"""Largest number of arrivals of one tick; a driver keeps further ones for the next tick."""
+
+
+class Mode(IntEnum):
+    """What a site, the process that runs one arm, does in a period of its control loop.
+
+    RUN: the arm follows the other arms. If no samples (states) come from one of them, the mode
+    becomes HOLD (the arm keeps its last reference) or BRAKE (the arm keeps its pose). When
+    samples come again, it becomes RETURN (the arm moves smoothly back to the others), and then
+    RUN. DIVERGED: a joint was too fast, or a number was not finite. This mode is final.
+
+    Under the rule `glide`, explained in `session_life`, there are further modes, and the arm is
+    at rest in all of them. WAITING: not all other arms are heard yet. FAULT: a limit was
+    exceeded; it replaces DIVERGED. STOPPED: the arm was stopped by order.
+    """
+
+    RUN = 1
+    DIVERGED = 2
+    HOLD = 3
+    BRAKE = 4
+    RETURN = 5
+    WAITING = 6
+    FAULT = 7
+    STOPPED = 8
+
+
+class LifeReason(IntEnum):
+    """Why a site last changed its mode, or what last happened to it.
+
+    A site is the process that runs one arm. The reasons only exist under the rule `glide`, by
+    which an arm waits for the other arms and comes to rest while one of them is silent.
+    `session_life` explains this rule.
+    """
+
+    START = 0
+    PEERS_HERE = 1
+    ALIGNED = 2
+    PEER_SILENT = 3
+    PEERS_BACK = 4
+    ALIGN_LIMIT = 5
+    LIMIT_Q = 6
+    LIMIT_QD = 7
+    NOT_FINITE = 8
+    STOP = 9
+    ENABLE = 10
+    RESET = 11
+    OVERRUN = 12
+    ARM_SILENT = 13
+    ARM_BACK = 14
+    RELEASED = 15
+    HELD = 16
+    DROPPED = 17
+    RESTORED = 18
+    RESUMED = 19
+
+
+class LifeOrder(IntEnum):
+    """Order to a site, the process that runs one arm.
+
+    Orders only exist under the rule `glide`, which `session_life` explains. Users give these
+    orders:
+
+    - STOP: bring the arm to rest, in the mode STOPPED.
+    - ENABLE: leave the mode STOPPED.
+    - RESET: leave the mode FAULT.
+
+    The site gives the other orders itself. Most of them concern a real arm:
+
+    - ARM_SILENT: the arm has not sent its position for a short time.
+    - ARM_LOST: the arm has not sent its position for a long time.
+    - ARM_BACK: the arm sends its position again.
+    - RELEASED: nobody holds the dead-man switch.
+    - HELD: somebody holds the dead-man switch again.
+    - OVERRUN: the site was too slow and missed control periods.
+
+    If several orders come in the same period, the order with the highest number counts. OVERRUN
+    is applied in addition.
+    """
+
+    ENABLE = 1
+    RESET = 2
+    HELD = 3
+    ARM_BACK = 4
+    ARM_SILENT = 5
+    RELEASED = 6
+    STOP = 7
+    ARM_LOST = 8
+    OVERRUN = 9
+
+
+class Arrival(NamedTuple):
+    """Sample that arrived at a site from one of its peers.
+
+    A site is a process that runs one arm, and its peers are the other sites. A sample is the
+    state that a peer sends in each period of its control loop.
+
+    Attributes:
+        peer: Index of the peer.
+        tick: Number of the peer's control period in which it sent the sample.
+        q: Joint angles of the peer, rad.
+        qd: Joint velocities of the peer, rad/s.
+        latency_us: Measured latency of the network, us. It is only recorded, and has no effect.
+        tau_x: External torque of the peer, N m, for control laws that reflect force. The torque
+            ON its arm is the negative.
+        ch: Further numbers that the control law of the peer sent, see
+            `LawChannel.select_for_peer`.
+    """
+
+    peer: int
+    tick: int
+    q: Sequence[float]
+    qd: Sequence[float]
+    latency_us: int = 0
+    tau_x: Sequence[float] = ()
+    ch: Sequence[float] = ()
+
+
+class DominanceRamp(NamedTuple):
+    """Linear change over time of a site's dominance factors, the weights of its peers.
+
+    Attributes:
+        start_ns: Start of the change, ns since the epoch.
+        end_ns: End of the change, ns since the epoch, not before `start_ns`.
+        alpha: Factors at the end, per peer in scenario order.
+    """
+
+    start_ns: int
+    end_ns: int
+    alpha: tuple[float, ...]
+
+
+class CoreChange(NamedTuple):
+    """Change of a running site by a command from outside.
+
+    A command changes the model of a link or the dominance factors, or gives an order.
+
+    Attributes:
+        text: Text in the record, from which all readers derive the same change.
+        peer: Index of the peer whose link changes; -1 for other changes.
+        model: New model of the link.
+        ramp: Change of the dominance factors.
+        order: Order to the site.
+        skipped: With OVERRUN, the number of ticks before this one that the site missed.
+    """
+
+    text: str
+    peer: int = -1
+    model: LinkModel | None = None
+    ramp: DominanceRamp | None = None
+    order: LifeOrder | None = None
+    skipped: int = 0
+
+
+class PlantState(NamedTuple):
+    """Measured state of an arm that the program does not simulate, for example of a real arm.
+
+    Attributes:
+        q: Joint angles, rad.
+        qd: Joint velocities, rad/s.
+        tau_x: Negative of the torque with which operator and environment act ON the arm, N m.
+            Empty if the arm does not measure this torque.
+        bodies: Poses of the other bodies of the scene, as in `TickRecord.bodies`.
+    """
+
+    q: Sequence[float]
+    qd: Sequence[float]
+    tau_x: Sequence[float] = ()
+    bodies: Sequence[float] = ()
+
+
+class TickInput(NamedTuple):
+    """Input of one period of the control loop, for `Site.step`.
+
+    Attributes:
+        k: Number of the period.
+        arrivals: Samples (states of other arms) that arrived since the previous period, in
+            order.
+        commands: Changes of the settings that were ordered since the previous period.
+        measured: Measured state of a real or otherwise external arm. None if there is no new
+            measurement.
+        hand: What a person or program does with the arm in this period, see `live_hand`. Empty
+            if nobody holds the arm.
+    """
+
+    k: int
+    arrivals: Sequence[Arrival] = ()
+    commands: Sequence[CoreChange] = ()
+    measured: PlantState | None = None
+    hand: Sequence[float] = ()
+
+
+class TickRecord(NamedTuple):
+    """The record of one tick: the state AT t_k and its consequences, never the advanced state.
+
+    Attributes:
+        tick: k.
+        t_ns: Nominal time, ns since the epoch.
+        mode: The site's mode.
+        q: Joint angles, rad.
+        qd: Joint velocities, rad/s.
+        q_des: Reference q_id, Eq. (6), rad.
+        qd_des: Its derivative, rad/s.
+        tau: Control torque, Eq. (13), N m.
+        tau_x: Exogenous torque in the sign of Eq. (8), N m; the torque ON the arm is its
+            negative.
+        theta_hat: Estimate of the parameters.
+        used: Tick of the sample in use, per peer in scenario order; -1 before the first.
+        rx_crc: CRC-32 of the arrivals of this tick as the step received them, so that a changed
+            input shows at its own tick. Each arrival is little-endian (peer i64, tick i64, q
+            f64s, qd f64s), followed by its tau_x if the law reflects force.
+        cmd: Texts of the changes that this tick applied.
+        mem: The memory of the site that no other field holds. In RUN and DIVERGED it is empty;
+            otherwise it is the held pose, rad, and the time at which the return began, ns since
+            the epoch (0 before). A site with a user's law always has these numbers, followed
+            by the memory of the law. Under the rule `glide` a site always has the memory of
+            `session_life` instead, see `Layout.count_life_memory`.
+        x: in task space the shared pose of the end effector: position, m, and orientation;
+            otherwise empty.
+        xd: Derivative of x, m/s and rad/s.
+        wrench: tau_x expressed at the end effector, N and N m.
+        ch: The numbers that the site's law sends, see `LawChannel`.
+        hand: The action of a live hand in this tick, see `live_hand`; empty without a hand.
+        bodies: Poses of the bodies of the plant, seven numbers each: x, y, z in the arm's base
+            frame, m, and the unit quaternion w, x, y, z; empty without bodies.
+    """
+
+    tick: int
+    t_ns: int
+    mode: Mode
+    q: list[float]
+    qd: list[float]
+    q_des: list[float]
+    qd_des: list[float]
+    tau: list[float]
+    tau_x: list[float]
+    theta_hat: list[float]
+    used: list[int]
+    rx_crc: int
+    cmd: list[str]
+    mem: list[float]
+    x: Sequence[float] = ()
+    xd: Sequence[float] = ()
+    wrench: Sequence[float] = ()
+    ch: Sequence[float] = ()
+    hand: Sequence[float] = ()
+    bodies: Sequence[float] = ()
+
+    def shared(self) -> tuple[Sequence[float], Sequence[float], Sequence[float]]:
+        """Returns the part of the record that peers receive: their view of this site's arm.
+
+        In task space it refers to the end effector, otherwise to the joints.
+
+        Returns:
+            The position, the velocity and the exogenous torque, a number per coordinate each.
+        """
+        if self.x:
+            return self.x, self.xd, self.wrench
+        return self.q, self.qd, self.tau_x
+
+
+class LinkCounts(NamedTuple):
+    """Counts of the samples of one link since the start of the site.
+
+    A link is the directed connection from a peer, and a sample the state that the peer
+    published in one tick.
+
+    Attributes:
+        accepted: Samples that arrived.
+        late: Of those, samples that arrived after they were due.
+        duplicate: Of those, samples that had arrived before.
+        refused: Of those, samples whose stamp was out of range.
+        lost: Of those, samples that the link's model of losses dropped.
+        superseded: Samples that were never used, because a newer sample was released before
+            them or in the same tick.
+        copies: Duplicates that the link's model produced.
+    """
+
+    accepted: int
+    late: int
+    duplicate: int
+    refused: int
+    lost: int
+    superseded: int
+    copies: int
+
+
+_REASONS = {
+    LifeReason.PEER_SILENT: "a peer is silent",
+    LifeReason.ALIGN_LIMIT: "its peers are farther away than align_limit_rad",
+    LifeReason.LIMIT_Q: "a joint is beyond q_min_rad or q_max_rad",
+    LifeReason.LIMIT_QD: "a joint is faster than qd_limit_rad_s",
+    LifeReason.NOT_FINITE: "a number is no longer finite",
+    LifeReason.STOP: "it was ordered to stop",
+    LifeReason.ENABLE: "it was enabled",
+    LifeReason.RESET: "its fault was reset",
+    LifeReason.OVERRUN: "it missed ticks",
+    LifeReason.ARM_SILENT: "its arm is silent",
+    LifeReason.RELEASED: "its dead-man switch is not held",
+    LifeReason.HELD: "its dead-man switch is held",
+    LifeReason.DROPPED: "a lost peer has no share any more",
+    LifeReason.RESTORED: "a peer that was lost has its share again",
+}
+
+
+def find_life_reason(output: TickRecord) -> LifeReason:
+    """Returns the reason for the last change of mode of a site, from its record.
+
+    The site must be under the rule `glide`, by which an arm comes to rest while a peer is
+    silent. Only then does a record contain the reason.
+
+    Args:
+        output: Record of the site, the result of one tick.
+    """
+    shared = len(output.q_des)
+    return LifeReason(int(output.mem[2 * shared + 1]))
+
+
+class LifeAlarm(NamedTuple):
+    """Alarm that tells people why a site does not follow its peers, and what they can do.
+
+    `find_alarm` creates it. Pages and terminals show it as long as the site is in this mode.
+
+    Attributes:
+        word: The mode, in capitals.
+        reason: Reason for the mode.
+        advice: Remedy, for a user at a terminal.
+        order: Order that ends the alarm, "enable" or "reset", for which a page has a button.
+            Empty if no order ends the alarm.
+        before: Remedy that has to precede the order, a clause that ends in ", then". Empty if
+            no remedy is needed.
+    """
+
+    word: str
+    reason: str
+    advice: str
+    order: str = ""
+    before: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.word}: {self.reason}; {self.advice}"
+
+
+_REMEDIES = {
+    LifeReason.LIMIT_Q: "bring the joint back within its limits, then",
+    LifeReason.ARM_SILENT: "let the program of the arm send again, then",
+}
+_ORDERS = {"fault": "reset", "stopped": "enable"}
+"""The order that ends a mode."""
+_ALARM_MODES = ("fault", "stopped", "hold")
+_ADVICE = {
+    ("stopped", LifeReason.RELEASED): "hold the switch",
+    ("fault", LifeReason.RELEASED): "hold the switch",
+    ("hold", LifeReason.RELEASED): "hold the switch",
+    ("hold", LifeReason.ARM_SILENT): "it goes on by itself once its arm is heard",
+    ("hold", LifeReason.ALIGN_LIMIT): "bring the arms closer together",
+    ("waiting", LifeReason.ALIGN_LIMIT): "bring the arms closer together",
+}
+_DEFAULT_ADVICE = "it goes on by itself once all its peers are heard"
+
+
+def find_alarm(
+    session: str,
+    site: str,
+    mode: str,
+    mem: Sequence[float],
+    shared: int,
+    lost: Sequence[str] = (),
+) -> LifeAlarm | None:
+    """Returns the alarm that tells people why a site does not follow its peers.
+
+    Only a site under the rule `glide` has alarms. By this rule an arm comes to rest while a
+    peer is silent, and follows again after a person's order. All facts come from the site's
+    record, the stored result of one tick.
+
+    Args:
+        session: Name of the session, which the advice of the alarm quotes.
+        site: Name of the site, which the advice quotes.
+        mode: Mode of the site, as the record names it.
+        mem: Numbers that the site keeps from tick to tick, the field `mem` of the record. They
+            contain the reason for the mode.
+        shared: Number of coordinates that sites share, by which `mem` is divided.
+        lost: Names of the peers without which the site goes on.
+
+    Returns:
+        The alarm. None if the site needs no attention, or if the record is not from a site
+        under this rule.
+    """
+    try:
+        reason = LifeReason(int(mem[2 * shared + 1]))
+    except (IndexError, ValueError, OverflowError):  # another rule, or a record of a stranger
+        return None
+    is_too_far = (mode, reason) == ("waiting", LifeReason.ALIGN_LIMIT)
+    if mode not in _ALARM_MODES and not is_too_far:
+        return _find_lost_alarm(lost)
+
+    # The dead-man switch ends a release, and no order does.
+    order = "" if reason is LifeReason.RELEASED else _ORDERS.get(mode, "")
+    before = _REMEDIES.get(reason, "") if mode == "fault" else ""
+    advice = _DEFAULT_ADVICE
+    if order:
+        advice = f"{before} trilat {order} --session {session} {site}".lstrip()
+    advice = _ADVICE.get((mode, reason), advice)
+    text = _REASONS.get(reason, reason.name.lower().replace("_", " "))
+    return LifeAlarm(word=mode.upper(), reason=text, advice=advice, order=order, before=before)
+
+
+def _find_lost_alarm(lost: Sequence[str]) -> LifeAlarm | None:
+    """Returns the alarm of a site that goes on without lost peers, or None."""
+    if not lost:
+        return None
+    names = ", ".join(lost)
+    return LifeAlarm(
+        word=f"WITHOUT {names}",
+        reason="the others have its share",
+        advice=f"the share comes back by itself once {names} is there again",
+    )
+
+
+_ACTIVITIES = {
+    Mode.RUN: "follows its peers",
+    Mode.HOLD: "holds its reference",
+    Mode.BRAKE: "holds its pose",
+    Mode.RETURN: "returns to its peers",
+    Mode.WAITING: "waits for its peers",
+    Mode.FAULT: "is in FAULT",
+    Mode.STOPPED: "is STOPPED",
+}
+
+
+def describe_mode(
+    site: str, output: TickRecord, *, glides: bool = False, law_failure: Exception | None = None
+) -> str:
+    """Writes the sentence with which a site reports a change of its mode in the log.
+
+    A site is the process that runs one arm, and its peers are the other sites. The sentence
+    states what the arm does, from which time on, and why, for example "s holds its reference
+    from t = 1.250 s: a peer is stale". A peer is stale if nothing has come from it for too
+    long.
+
+    No reason is given for what happens as soon as the peers are heard: that the arm returns to
+    them (RETURN) and follows them (RUN). An exception is a return because a peer was dropped or
+    restored.
+
+    Args:
+        site: Name of the site.
+        output: Record of the first tick (period of the control loop) in the mode.
+        glides: True: the site is under the rule `glide`, by which an arm comes to rest while a
+            peer is silent. Its record contains the reason for the mode. Without this rule, the
+            mode can only change because of a stale peer.
+        law_failure: Error with which the user's control law failed last, or None. It is given
+            as the reason if the mode is due to this failure. It is only used under the rule
+            `glide`.
+
+    Returns:
+        The sentence.
+    """
+    if glides:
+        reason = find_life_reason(output)
+        text = _REASONS.get(reason, "")
+    else:
+        reason = None
+        text = "a peer is stale"
+    # The error of the law says more than the reason that a number is not finite.
+    if law_failure is not None and find_life_reason(output) is LifeReason.NOT_FINITE:
+        text = str(law_failure)
+
+    is_regrouped = reason in (LifeReason.DROPPED, LifeReason.RESTORED)
+    is_usual_return = output.mode is Mode.RETURN and not is_regrouped
+    needs_no_reason = is_usual_return or output.mode is Mode.RUN
+    if needs_no_reason:
+        text = ""
+    event = f"{site} {_ACTIVITIES[output.mode]} from t = {output.t_ns * 1e-9:.3f} s"
+    return f"{event}: {text}" if text else event
+
+
+def describe_divergence(site: str, output: TickRecord) -> str:
+    """Writes the sentence that a log contains if an arm moved faster than its limit.
+
+    Args:
+        site: Name of the process that runs the arm.
+        output: Record of the control period in which this happened.
+    """
+    speed = max(abs(v) for v in output.qd)
+    t_s = output.t_ns * 1e-9
+    return f"{site} diverged at t = {t_s:.3f} s: a joint moves at {speed:.4g} rad/s"

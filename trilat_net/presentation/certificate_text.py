@@ -1,0 +1,383 @@
+"""Composes the text of a stability certificate, for the terminal and for the page of a report.
+
+A certificate judges from its log whether a run was stable, and gives the reasons. V is the
+energy function of the stability proof: it must not rise, except by energy that is accounted
+for. `describe_certificate` returns the sentences, which the terminal and the page share. The
+terminal adds tables of the premises, which are conditions of the stability theorem, and of the
+energies that changed V.
+
+Invariant:
+    - The terminal and the page have the same sentences.
+    - The verdict comes first.
+    - The listed energies add up: V at the end is V at the start plus all other entries, up to
+      entries that are too small to be listed.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..analysis.certificate.energy_balance import ZERO_ENERGY_J, EnergyBalance
+from ..analysis.certificate.observed_energy import NEGATIVE_ENERGY_MEANING, ObservedFinding
+from ..analysis.certificate.premises import Premise
+from ..analysis.certificate.stability_certificate import Certificate, StabilityFinding
+from ..analysis.run_end import Stability
+from ..analysis.stability_decision import LoopRoots
+from ..analysis.twins.envelope_trend import EnvelopeTrend
+from ..analysis.twins.twin_growth import PushedTwins, TwinGrowth
+from ..core.step.vectors import Array
+from ..errors import count_nouns
+from .result_text import MARKS, Block, MarkedText, TextTable
+
+MIN_ENERGY_SHARE = 1e-6
+"""Smallest listed energy, as a share of the largest energy."""
+MAX_LISTED_LINKS = 6
+"""Largest number of links that are listed. The energies of more links are summed."""
+_SOURCE_NAMES = {
+    "rule": "rule for stale peers",
+    "shares": "change of shares",
+    "estimates": "box, or wrong estimates",
+}
+"""Texts of the sources of energy other than links, by their names in a balance."""
+
+_SAME_RATE = 0.2
+"""Largest relative difference of two rates that needs no explanation."""
+_HOLDS = {True: "holds", False: "fails", None: "undecided"}
+
+
+def compose_certificate(certificate: Certificate) -> Iterator[Block]:
+    """Yields the text of a stability certificate.
+
+    The judgement and its reasons come first. Tables of the premises (the conditions of the
+    stability theorem) and of the energies follow.
+
+    Args:
+        certificate: Judgement whether a run was stable, with its reasons.
+    """
+    for line in describe_certificate(certificate):
+        yield MarkedText(MARKS[line.mark], line.text)
+
+    observed = certificate.observed
+    premises = select_premises(certificate)
+    if premises:
+        yield ""
+        yield _tabulate_premises(premises)
+
+    if observed is not None and observed.least:
+        rows = []
+        for name, amount_j, at_s in observed.least:
+            rows.append((name, f"{amount_j:.4g}", f"{at_s:.4g}"))
+        headers = ("energy of the laws", "least J", "at s")
+        yield ""
+        yield TextTable(headers, rows, align="lrr")
+
+    if certificate.balance is not None:
+        energies = list_energies(certificate.balance)
+        cells = [(name, f"{energy_j:.4g}") for name, energy_j in energies]
+        yield ""
+        yield TextTable(("energy", "J"), cells, align="lr")
+
+
+def select_premises(certificate: Certificate) -> list[Premise]:
+    """Returns the premises that apply to the control laws of a run.
+
+    The premises of the stability theorem concern its energy function V. They are left out for
+    laws for which V does not exist; only the walls, and the law's own premises, remain.
+
+    Args:
+        certificate: Judgement whether a run was stable, with its reasons.
+    """
+    premises = list(certificate.premises)
+    if not certificate.has_functional:
+        premises = [premise for premise in premises if premise.name == "walls"]
+    if certificate.observed is not None:
+        premises += certificate.observed.premises
+    return premises
+
+
+def _tabulate_premises(premises: Sequence[Premise]) -> TextTable:
+    """Returns a table with a row per premise: whether it holds, and why."""
+    rows = [(premise.name, _HOLDS[premise.holds], premise.text) for premise in premises]
+    styles = {"holds": "green", "fails": "yellow"}
+    return TextTable(("premise", "", "finding"), rows, styles=styles)
+
+
+def compose_twins(twins: PushedTwins) -> Iterator[Block]:
+    """Yields the text about the pushed twins of a run.
+
+    A push is a small disturbance of a twin, a second execution of the run. It shows whether
+    disturbances grow. The text states up to which size a push has a proportional effect, and
+    has a line about each push.
+
+    Args:
+        twins: The run and its twins.
+    """
+    if twins.linear is not None or not twins.growth.pushes:
+        yield twins.headline()
+    yield from map(twins.describe, twins.growth.pushes)
+    if not twins.growth.same_platform:
+        cause = "another platform, or version"
+        yield f"note: executed again, its last bits are not those of the records: {cause}"
+
+
+class CertificateLine(NamedTuple):
+    """A sentence of a stability certificate, marked with what it says about stability.
+
+    Attributes:
+        mark: "ok" if the sentence supports that the run was stable, "FAIL" if it speaks against
+            it, "open" if it leaves the question open, and "note" for other sentences.
+        text: The sentence.
+    """
+
+    mark: str
+    text: str
+
+
+def describe_certificate(certificate: Certificate) -> list[CertificateLine]:
+    """Returns the judgement of a certificate, and then its reasons, each as a marked sentence.
+
+    The reasons are: the energy function V of the stability proof; the end of the run; the
+    energy balance; the energies that control laws declare; the characteristic roots; the twins,
+    which are repeated runs with a small push; and the log itself. Reasons that do not exist for
+    a run are left out.
+
+    Args:
+        certificate: Judgement whether a run was stable, with its reasons.
+    """
+    lines = _describe_verdict(certificate)
+    if certificate.balance is not None:
+        mark = _BALANCE_MARKS.get(certificate.verdict.finding, "ok")
+        balance = describe_balance(certificate.balance)
+        lines.append(CertificateLine(mark, f"energy balance: {balance}"))
+    observed = certificate.observed
+    if observed is not None:
+        lines.append(CertificateLine(_OBSERVED_MARKS[observed.finding], observed.text))
+        if observed.finding is ObservedFinding.NEGATIVE:
+            lines.append(CertificateLine("note", NEGATIVE_ENERGY_MEANING))
+    roots = certificate.roots
+    if roots is not None:
+        # Roots of an approximation cannot show stability.
+        is_doubtful = roots.verdict == "stable" and not roots.exact
+        mark = "note" if is_doubtful else _ROOT_MARKS.get(roots.verdict, "note")
+        lines.append(CertificateLine(mark, roots.text))
+    twins = certificate.twins
+    if twins is not None:
+        lines.append(CertificateLine(_mark_twins(twins), twins.text))
+        lines += _compare_rates(roots, twins)
+    lines.append(_describe_evidence(certificate))
+    paper_note = _describe_paper_weights(certificate)
+    if paper_note:
+        lines.append(CertificateLine("note", paper_note))
+    return lines
+
+
+def _describe_verdict(certificate: Certificate) -> list[CertificateLine]:
+    """Returns the judgement, the verdict about V, and the end of the run."""
+    stability_mark = _JUDGEMENT_MARKS[certificate.stability]
+    verdict_mark = "ok" if certificate.bounded_by_v else "open"
+    if certificate.verdict.finding is StabilityFinding.DID_NOT_RISE:
+        verdict_mark = "note"  # a theorem that does not apply has neither held nor failed
+    if certificate.verdict.finding is StabilityFinding.BROKEN:
+        stability_mark = "FAIL"
+        verdict_mark = "FAIL"
+    lines = [CertificateLine(stability_mark, describe_judgement(certificate))]
+    if certificate.has_functional:
+        lines.append(CertificateLine(verdict_mark, certificate.verdict.text))
+    lines += [CertificateLine("note", text) for text in certificate.law_conditions]
+    end_mark = _JUDGEMENT_MARKS[certificate.end.stability]
+    lines.append(CertificateLine(end_mark, f"e and qd: {certificate.end.text}"))
+    return lines
+
+
+def describe_theorem(certificate: Certificate) -> list[str]:
+    """Returns a line that says what the paper's stability theorem says about a run.
+
+    Args:
+        certificate: Judgement whether a run was stable, with its reasons.
+
+    Returns:
+        The line. Empty if the theorem is about another control law, and has nothing to say.
+    """
+    if not certificate.has_functional:
+        return []
+    text = certificate.verdict.text
+    return [f"stability theorem of the paper (V: its energy function): {text}"]
+
+
+def _compare_rates(roots: LoopRoots | None, twins: TwinGrowth) -> list[CertificateLine]:
+    """Returns why the rate of the pushes is not that of the roots, if the rates differ.
+
+    Both are rates of amplitudes. The roots are about small motions near one pose, whereas
+    pushes follow the motion of the run for a limited time.
+
+    Args:
+        roots: Characteristic roots of the loop at its final pose. None if there are none.
+        twins: Growth of the pushes.
+
+    Returns:
+        A remark. Empty if the rates agree, or if one of them is unknown.
+    """
+    worst = twins.worst
+    if roots is None or roots.rate_per_s is None or worst is None:
+        return []
+    if twins.departure is not None or worst.factor == 0.0 or math.isnan(worst.rate_per_s):
+        return []  # the text about the pushes states no rate of a push
+    difference = abs(roots.rate_per_s - worst.rate_per_s)
+    if difference <= _SAME_RATE * max(abs(roots.rate_per_s), abs(worst.rate_per_s)):
+        return []
+    text = (
+        "the two rates are both of amplitudes, exp(rate t), yet not of one motion: the roots "
+        "are about small motions near the final pose, in the long run; pushes were followed "
+        f"along this run, from {twins.from_s:.4g} to {twins.to_s:.4g} s"
+    )
+    return [CertificateLine("note", text)]
+
+
+def _describe_evidence(certificate: Certificate) -> CertificateLine:
+    """Returns the line that says whether the log is complete and intact."""
+    evidence = certificate.evidence
+    mark = "open" if evidence.reasons else "ok"
+    if not evidence.integrity.passed:
+        mark = "FAIL"
+    return CertificateLine(mark, f"log: {evidence.text}")
+
+
+def _describe_paper_weights(certificate: Certificate) -> str:
+    """Returns how much V would have risen with the weights of the sites that the paper uses.
+
+    Returns:
+        A sentence. Empty if the paper's weights are right for this run.
+    """
+    balance = certificate.paper_balance
+    rise = certificate.paper_weights_rise
+    if balance is None or rise is None:
+        return ""
+    largest_j = balance.V.max()
+    sentence = f"V would have risen by {rise.amount:.3g} J of {largest_j:.4g} J"
+    return f"with the paper's weights, ones, {sentence} (docs/errata-proof.md, 6)"
+
+
+def describe_judgement(certificate: Certificate) -> str:
+    """Returns the judgement whether a run was stable, in one line.
+
+    If the judgement is open, the line states the reasons.
+
+    Args:
+        certificate: Judgement whether a run was stable, with its reasons.
+    """
+    return "; ".join([certificate.headline(), *certificate.reasons])
+
+
+_JUDGEMENT_MARKS = {
+    Stability.STABLE: "ok",
+    Stability.SETTLED: "ok",
+    Stability.NOT_STABLE: "FAIL",
+    Stability.OPEN: "open",
+}
+_BALANCE_MARKS = {
+    StabilityFinding.BROKEN: "FAIL",
+    StabilityFinding.NOT_JUDGED: "open",
+}
+_OBSERVED_MARKS = {
+    ObservedFinding.PASSIVE: "ok",
+    ObservedFinding.NEGATIVE: "open",
+    ObservedFinding.BROKEN: "FAIL",
+    ObservedFinding.NOT_JUDGED: "open",
+}
+_ROOT_MARKS = {"stable": "ok", "unstable": "open"}
+
+
+def _mark_twins(twins: TwinGrowth) -> str:
+    """Returns the mark of the sentence about twins, see `CertificateLine`."""
+    if not twins.pushes:
+        return "note"
+    if twins.grows or twins.departure is not None:
+        return "FAIL"
+    decays = twins.trend in (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY)
+    return "ok" if decays else "open"
+
+
+def describe_balance(balance: EnergyBalance) -> str:
+    """Returns a sentence about how well the energy balance of a run closes.
+
+    V is the energy function of the stability proof, in J. Its change should equal the work that
+    was done on the arms less the dissipated energy. The difference is the residual. One cause
+    is that the controller acts only once per tick (period of the control loop), while the proof
+    assumes continuous time. The work of this sampling is computed. The sentence therefore also
+    says how small the residual is without it.
+
+    Args:
+        balance: The energy balance of the run.
+    """
+    scale_j = balance.scale
+    if scale_j <= ZERO_ENERGY_J:
+        return "there is no energy in this run"
+    residual_j = float(np.abs(balance.residual).max())
+    unexplained_j = float(np.abs(balance.unexplained).max())
+    text = f"closes to {residual_j / scale_j:.1e} of the largest energy, {scale_j:.4g} J"
+    if unexplained_j >= residual_j:
+        return text
+    share = unexplained_j / scale_j
+    return f"{text}; to {share:.1e} once the controller's sampling is booked"
+
+
+def list_energies(balance: EnergyBalance) -> list[tuple[str, float]]:
+    """Lists the energies of the balance of V, the energy function of the stability proof.
+
+    They are V at the start, the energies that changed V, and V at the end, in J. Energies below
+    `MIN_ENERGY_SHARE` of the largest energy are left out. If there are more than
+    `MAX_LISTED_LINKS` links, their energies are summed.
+
+    Args:
+        balance: The energy balance.
+
+    Returns:
+        Name and energy of each entry.
+    """
+    links: dict[str, Array] = {}
+    sources: dict[str, Array] = {}
+    for name, work in balance.work.items():
+        group = links if "->" in name else sources
+        group[name] = work
+    if len(links) > MAX_LISTED_LINKS:
+        total = np.sum(list(links.values()), axis=0)
+        links = {count_nouns(len(links), "link"): total}
+
+    entries = {}
+    for name, energy in balance.dissipation.items():
+        entries[f"dissipated: {name}"] = -energy
+    for name, energy in (sources | links).items():
+        entries[f"supplied: {_SOURCE_NAMES.get(name, name)}"] = energy
+    entries["supplied: sampling of the controller"] = balance.sampling
+    entries["transferred, not cancelled by beta"] = -balance.transfer
+    has_no_gaps = balance.judged.all()
+    rest_name = "unexplained" if has_no_gaps else "in gaps, or unexplained"
+    entries[rest_name] = _compute_rest(balance)
+
+    least_j = MIN_ENERGY_SHARE * balance.scale + ZERO_ENERGY_J
+    listed = [_describe_v(balance, 0)]
+    for name, energy in entries.items():
+        if np.abs(energy).max() > least_j:
+            listed.append((name, float(energy[-1])))
+    return [*listed, _describe_v(balance, -1)]
+
+
+def _compute_rest(balance: EnergyBalance) -> Array:
+    """Returns the change of V that no listed energy explains, shape (T,), in J."""
+    gained = sum(balance.work.values())
+    lost = sum(balance.dissipation.values())
+    explained = gained - lost + balance.sampling - balance.transfer
+    rest: Array = balance.V - balance.V[0] - explained
+    return rest
+
+
+def _describe_v(balance: EnergyBalance, index: int) -> tuple[str, float]:
+    """Returns an entry for V at a tick: its name, and its value in J.
+
+    A V that is smaller than rounding errors counts as 0.
+    """
+    energy_j = float(balance.V[index])
+    shown_j = energy_j if energy_j > ZERO_ENERGY_J else 0.0
+    return f"V at {balance.t_s[index]:.4g} s", shown_j

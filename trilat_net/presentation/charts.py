@@ -1,0 +1,770 @@
+"""Computes the data of the interactive charts on the page of a report.
+
+A report is a web page about a recorded run. Scripts in the page draw its charts. For this they
+need the signals of the run, such as joint angles and torques. A log, the file with the results
+of the run, has a value per tick (period of the control loop) of 1 ms, which is far too much for
+a page. `ChartBuilder` therefore decimates each signal: it divides the ticks into buckets, and
+keeps the least and the largest value of each bucket.
+
+The result consists of tables of columns, and of charts whose lines refer to these columns by
+index. `page_data` defines the types of the data.
+
+Invariant:
+    - Every spike of the log is on the page, because decimation keeps the least and the largest
+      value of a bucket.
+    - Every line of a chart has a value to draw. A chart without any line is left out, and
+      `PageCharts.missing` names it, so that the page can say so.
+    - Numbers are base64 text of little-endian int32 and float32. This is a third of their
+      length as decimal text.
+"""
+
+import base64
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..analysis import site_signals
+from ..analysis.arm_rows import joint_positions_m
+from ..analysis.site_signals import decimate
+from ..analysis.timeline import (
+    find_mode_intervals,
+    list_changes,
+    list_stated_models,
+    recorded_end_s,
+)
+from ..core.step.vectors import Array
+from ..log.log_reader import Log
+from ..log.record_columns import Ints
+from ..log.site_log import SiteLog
+from . import style
+from .appearance import DARK_SITE_COLOURS, list_site_colours
+from .figures import age_and_lateness, arm_poses
+from .page_data import (
+    ChainArm,
+    Chart,
+    ColumnTable,
+    DistributionChart,
+    DistributionSeries,
+    HistogramChart,
+    HistogramSeries,
+    MarkedChange,
+    ModeSpan,
+    PageData,
+    Palettes,
+    PlanarArm,
+    StatedLine,
+    TableSeries,
+    TimeChart,
+)
+from .page_leaders import caption_site, list_lead_bars, trace_leads
+
+Values = NDArray[Any]
+"""Numbers of any type."""
+
+BUCKET_BUDGET = 48_000
+"""Number of buckets of all columns together. It keeps a page near 1 MB for any number of sites.
+"""
+_MIN_BUCKETS = 100
+"""Smallest number of buckets of a column, whatever the budget."""
+_MAX_BUCKETS = 1200
+"""Largest number of buckets of a column."""
+_BOX_INSTANTS = 60
+"""Number of instants at which the box around the motion of the arms is measured."""
+_CHAIN_INSTANTS = 400
+"""Largest number of instants for which the page has the joint positions of a chain."""
+_MAXIMA = 400
+"""Number of intervals of a line of maxima."""
+_LEAST_DRAWN = 1e-6
+"""Smallest drawn maximum, at which smaller ones are drawn. A logarithmic axis has no zero."""
+PICTURE_SIDE = 4.0
+"""Longer side of a picture of a chain, in the unit of the line widths of the page."""
+
+
+class PageCharts(NamedTuple):
+    """The charts of a report's page, as `ChartBuilder.build` returns them.
+
+    Attributes:
+        data: Data that the scripts of the page draw.
+        missing: Titles of the charts that are left out because the log has no value for them,
+            by section of the page.
+    """
+
+    data: PageData
+    missing: dict[str, list[str]]
+
+
+class ChartBuilder:
+    """Computes the charts of the page that reports a run, from the run's log.
+
+    Args:
+        log: Log of the run.
+        twin: Log of the same run without operators, the people or programs that move the arms.
+            None if there is no such log. Then the chart of the motion due to operators is left
+            out.
+
+    Attributes:
+        bounds_m: Left, right, bottom and top of a box around the motion of all arms, in m.
+        units_per_m: Scale of the pictures of the arms, in units of the picture per m. It is 1
+            for planar arms. Pictures with a chain are scaled to the size `PICTURE_SIDE`.
+        leads: Who leads each slave over time.
+    """
+
+    def __init__(self, log: Log, twin: Log | None) -> None:
+        self._log = log
+        self._twin = twin
+        self._changes = list_changes(log)
+        self._end_s = recorded_end_s(log)
+        self._tables: list[ColumnTable] = []
+        self._has_values: list[list[bool]] = []  # by table and column
+        self.leads = trace_leads(log)
+
+        times_s = np.linspace(0.0, self._end_s, _BOX_INSTANTS)
+        poses = [arm_poses.find_pose(log, site, t_s) for site in log.sites for t_s in times_s]
+        self.bounds_m = arm_poses.compute_pose_box_m(poses)
+        self.units_per_m = 1.0
+        arms = log.scenario.arms.values()
+        if any(arm.chain is not None for arm in arms):
+            left, right, bottom, top = self.bounds_m
+            longer_side_m = max(right - left, top - bottom)
+            self.units_per_m = PICTURE_SIDE / longer_side_m
+
+        self._joint_titles = []
+        for title in style.name_joints(log):
+            self._joint_titles.append(f"joint {title.removeprefix('joint ')}")
+
+        counts = max(arm.counts for arm in arms)
+        # Each bucket of a table keeps the rows with the extremes of all its columns. Therefore
+        # one table with many columns is larger than many tables with one column.
+        self._has_table_per_column = counts.joints > 2
+        # Nine signals have a column per joint. The ages of samples have a column per peer.
+        columns_per_site = 9 * counts.joints + counts.parameters + len(log.sites)
+        buckets = BUCKET_BUDGET // (columns_per_site * len(log.sites))
+        self._buckets = max(_MIN_BUCKETS, min(_MAX_BUCKETS, buckets))
+
+    def build(self) -> PageCharts:
+        """Computes all charts of the page.
+
+        Returns:
+            The data of the page, and the titles of the charts that are left out.
+        """
+        log = self._log
+        charts: list[Chart] = []
+        missing: dict[str, list[str]] = {}
+        candidates = [
+            *self._build_overview_charts(),
+            *self._build_motion_charts(),
+            *self._build_timing_charts(),
+        ]
+        for chart in candidates:
+            if chart.series:
+                charts.append(chart)
+            else:
+                missing.setdefault(chart.section, []).append(chart.title)
+
+        arms = []
+        spans = {}
+        for index, site in enumerate(log.sites):
+            if len(log[site]):
+                arms.append(self._build_arm(index, site))
+            intervals = find_mode_intervals(log[site])
+            spans[site] = [ModeSpan(index, *interval) for interval in intervals]
+
+        changes = []
+        for number, applied in enumerate(self._changes, 1):
+            change = applied.change
+            changes.append(MarkedChange(number, change.at_s, applied.site, change.link))
+
+        light = list_site_colours(log.scenario)
+        dark = list_site_colours(log.scenario, DARK_SITE_COLOURS)
+        data = PageData(
+            end_s=self._end_s,
+            colours=Palettes(light, dark),
+            arms=arms,
+            leads=list_lead_bars(self.leads),
+            tables=self._tables,
+            charts=charts,
+            changes=changes,
+            spans=spans,
+            bounds_m=[self.units_per_m * bound for bound in self.bounds_m],
+        )
+        return PageCharts(data, missing)
+
+    def _build_overview_charts(self) -> Iterator[TimeChart]:
+        """Yields the two charts of the first screen: the error and the delay of each site.
+
+        A site has a single line in each: the largest error of its joints, and the age of the
+        oldest sample that its controller used.
+        """
+        log = self._log
+        limit = self._draw_limit(site_signals.SETTLED_ERROR_RAD)
+        stated = [line for site in log.sites for line in self._list_stated_delays(site)]
+        has_one_delay = len({line.value for line in stated}) == 1
+        yield self._make_chart(
+            section="overview",
+            title=f"Largest error |e| by site{self._note_floor()}; dashed: {limit.value:g}",
+            unit=site_signals.shared_unit(log),
+            series=self._add_maxima(lambda site: np.abs(site_signals.joint_errors(log[site]))),
+            lines=[limit],
+            log=True,
+        )
+        yield self._make_chart(
+            section="overview",
+            title=f"Delay that each controller experienced{'; dashed: stated' * has_one_delay}",
+            unit="ms",
+            series=self._add_maxima(lambda site: site_signals.sample_ages_ms(log, site)),
+            lines=[self._draw_limit(stated[0].value)] if has_one_delay else [],
+            zero=True,
+            margin=0.05,
+        )
+
+    def _note_floor(self) -> str:
+        """Returns a remark with the smallest drawn error, at which smaller ones are drawn.
+
+        Returns:
+            The remark. Empty if no site has such small errors.
+        """
+        for site in self._log.sites:
+            largest = site_signals.largest_magnitude(site_signals.joint_errors(self._log[site]))
+            if (largest < _LEAST_DRAWN).any():
+                return f" (smaller ones at {_LEAST_DRAWN:g})"
+        return ""
+
+    def _add_maxima(self, read_values: Callable[[str], Array]) -> list[TableSeries]:
+        """Adds a line per site with the largest values of a signal in short intervals.
+
+        Within an interval, the line is constant. A line of the values themselves would be a
+        broad band wherever they oscillate.
+
+        Args:
+            read_values: Function that returns the values of a site, given its name, with a row
+                for each record.
+        """
+        series = []
+        for site in self._log.sites:
+            values = read_values(site)
+            known = np.where(np.isnan(values), -np.inf, values)
+            largest = known.max(axis=1, initial=-np.inf)
+            records = self._log[site]
+            interval = np.floor(records.t_s * (_MAXIMA / self._end_s)).astype(np.int64)
+            starts = np.flatnonzero(np.diff(interval, prepend=-1))
+            maxima = largest
+            if len(starts):
+                lengths = np.diff(np.append(starts, len(interval)))
+                maxima = np.repeat(np.maximum.reduceat(largest, starts), lengths)
+            drawn = np.where(np.isfinite(maxima), np.maximum(maxima, _LEAST_DRAWN), np.nan)
+            series.append(self._make_series(site, self._add_records(site, drawn[:, None]), 0))
+        return series
+
+    def _build_motion_charts(self) -> Iterator[TimeChart]:
+        """Yields the charts of torques, positions, errors, estimates and displacements.
+
+        Some of them are yielded only if the run has the quantity, such as the operator's
+        torque.
+        """
+        log = self._log
+        operated = site_signals.sites_with_operator(log)
+        if operated:
+            series = self._add_signal(site_signals.external_torques, operated)
+            title = "operator torque on the arm"
+            yield from self._chart_joints("torques", title, "N m", series)
+        yield from self._chart_positions()
+
+        errors = self._add_signal(site_signals.joint_errors)
+        axes = self._joint_titles
+        if site_signals.follows_in_task_space(log):
+            axes = style.name_shared(log)
+        yield from self._chart_joints(
+            section="errors",
+            title="tracking error",
+            unit=site_signals.shared_unit(log),
+            series_by_site=errors,
+            titles=axes,
+        )
+        yield from self._chart_estimates()
+
+        if self._twin is not None:
+            series = {}
+            for site in log.sites:
+                tick, t_s, moved = site_signals.operator_displacement(log, self._twin, site)
+                series[site] = self._add_columns(site, tick, t_s, moved)
+            yield from self._chart_joints("moved", "moved by the operators", "rad", series)
+
+        torques = self._add_signal(site_signals.controller_torques)
+        yield from self._chart_joints("control", "control torque", "N m", torques)
+
+    def _build_timing_charts(self) -> Iterator[Chart]:
+        """Yields the charts of sample ages, delays, lateness of ticks and computing time.
+
+        Charts of delays need a delay that varies, and charts of the loop need a run in real
+        time.
+        """
+        log = self._log
+        yield from self._chart_ages()
+        if age_and_lateness.has_varying_delay(log):
+            yield from self._chart_distributions()
+        if not age_and_lateness.explain_missing_loop_times(log):
+            lateness = self._add_signal(_lateness_ms)
+            yield self._make_chart(
+                section="timing",
+                title="wake-up after the deadline",
+                unit="ms",
+                series=[columns[0] for columns in lateness.values()],
+                zero=True,
+            )
+            yield from self._chart_histograms()
+
+    def _add_table(self, site: str, tick: Ints, values: Values) -> int:
+        """Adds a table of values to the page.
+
+        Args:
+            site: Name of the site, whose tick rate converts ticks to times.
+            tick: Ticks of the values, shape (P,).
+            values: The values, shape (P, C), a column per quantity.
+
+        Returns:
+            The index of the table.
+        """
+        columns = [_encode(column, "<f4") for column in values.T]
+        rate_hz = self._log.scenario.sites[site].rate_hz
+        table = ColumnTable(rate_hz=rate_hz, tick=_encode(tick, "<i4"), columns=columns)
+        self._tables.append(table)
+        has_values = [bool(np.isfinite(column).any()) for column in values.T]
+        self._has_values.append(has_values)
+        return len(self._tables) - 1
+
+    def _add_decimated(self, site: str, tick: Ints, t_s: Array, values: Values) -> int:
+        """Decimates values, and adds them to the page as a table.
+
+        Args:
+            site: Name of the site.
+            tick: Ticks of the values, shape (K,).
+            t_s: Times of the values, in s, shape (K,).
+            values: The values, shape (K, C).
+
+        Returns:
+            The index of the table.
+        """
+        trace = decimate(tick, t_s, values, self._buckets)
+        return self._add_table(site, trace.tick, trace.values)
+
+    def _add_records(self, site: str, values: Values) -> int:
+        """Decimates values that belong to the records of a site, and adds them as a table.
+
+        Args:
+            site: Name of the site.
+            values: A row of values for each record of the site, shape (K, C).
+
+        Returns:
+            The index of the table.
+        """
+        records = self._log[site]
+        return self._add_decimated(site, records.tick, records.t_s, values)
+
+    def _add_signal(
+        self, signal: Callable[[SiteLog], Values], sites: Sequence[str] = ()
+    ) -> dict[str, list[TableSeries]]:
+        """Adds the tables of a signal of several sites.
+
+        Args:
+            signal: Function that computes the values of the signal, shape (K, C), from the K
+                records of a site.
+            sites: Names of the sites. Empty for all sites.
+
+        Returns:
+            The lines of each site, one line per column of the signal.
+        """
+        series = {}
+        for site in sites or self._log.sites:
+            records = self._log[site]
+            values = signal(records)
+            series[site] = self._add_columns(site, records.tick, records.t_s, values)
+        return series
+
+    def _add_columns(
+        self, site: str, tick: Ints, t_s: Array, values: Values
+    ) -> list[TableSeries]:
+        """Decimates the values of one site, and adds them to the page.
+
+        All columns share one table if there are few of them. Otherwise each column has its own
+        table, which is smaller in total, see `__init__`.
+
+        Args:
+            site: Name of the site.
+            tick: Ticks of the values, shape (K,).
+            t_s: Times of the values, in s, shape (K,).
+            values: The values, shape (K, C).
+
+        Returns:
+            A line per column.
+        """
+        if self._has_table_per_column:
+            tables = [
+                self._add_decimated(site, tick, t_s, column[:, np.newaxis])
+                for column in values.T
+            ]
+            return [self._make_series(site, table, column=0) for table in tables]
+        table = self._add_decimated(site, tick, t_s, values)
+        columns = range(values.shape[1])
+        return [self._make_series(site, table, column) for column in columns]
+
+    def _make_series(self, site: str, table: int, column: int, label: str = "") -> TableSeries:
+        """Returns a line in the colour of a site.
+
+        Args:
+            site: Name of the site.
+            table: Index of the table with the values of the line.
+            column: Index of the column in this table.
+            label: Text in the legend. Empty for the name of the site.
+        """
+        colour = self._log.sites.index(site)
+        return TableSeries(label=label or site, colour=colour, table=table, column=column)
+
+    def _make_chart(
+        self,
+        section: str,
+        title: str,
+        unit: str,
+        series: Sequence[TableSeries],
+        sites: Sequence[str] = (),
+        **options: Any,
+    ) -> TimeChart:
+        """Returns a chart over time, without the lines that have no value to draw.
+
+        Args:
+            section: Key of the section of the page, as in `report.toml`.
+            title: Title of the chart.
+            unit: Unit of the values.
+            series: The lines.
+            sites: Names of the sites whose changes and modes are marked in the chart. Empty for
+                all sites.
+            **options: Further fields of `TimeChart`.
+        """
+        drawable = [line for line in series if self._has_values[line.table][line.column]]
+        return TimeChart(
+            section=section,
+            title=title,
+            unit=unit,
+            series=drawable,
+            sites=list(sites or self._log.sites),
+            **options,
+        )
+
+    def _chart_joints(
+        self,
+        section: str,
+        title: str,
+        unit: str,
+        series_by_site: dict[str, list[TableSeries]],
+        titles: Sequence[str] = (),
+    ) -> Iterator[TimeChart]:
+        """Yields a chart per joint, each with a line per site.
+
+        Args:
+            section: Key of the section of the page, as in `report.toml`.
+            title: Name of the quantity.
+            unit: Unit of the quantity.
+            series_by_site: For each site, a line per joint. Sites may have different numbers of
+                joints.
+            titles: Names of the joints, or of the axes of the task. Empty for the joints'
+                names.
+        """
+        for joint, name in enumerate(titles or self._joint_titles):
+            series = [lines[joint] for lines in series_by_site.values() if joint < len(lines)]
+            yield self._make_chart(section, f"{title}, {name}", unit, series)
+
+    def _chart_positions(self) -> Iterator[TimeChart]:
+        """Yields a chart per site and joint, with the actual and the desired angle."""
+        for site in self._log.sites:
+            records = self._log[site]
+            actual = site_signals.joint_angles(records)
+            desired = site_signals.reference_angles(records)
+            for joint, name in enumerate(self._joint_titles[: actual.shape[1]]):
+                angles = np.stack([actual[:, joint], desired[:, joint]], axis=1)
+                table = self._add_records(site, angles)
+                actual_line = self._make_series(site, table, column=0)
+                desired_line = TableSeries(
+                    label="desired", colour="limit", table=table, column=1, dash=True
+                )
+                yield self._make_chart(
+                    section="positions",
+                    title=f"{site}, {name}",
+                    unit="rad",
+                    series=[actual_line, desired_line],
+                    sites=[site],
+                )
+
+    def _chart_estimates(self) -> Iterator[TimeChart]:
+        """Yields a chart per inertial parameter of the arms.
+
+        Adaptive control laws estimate the inertial parameters of their arm while it moves. Each
+        chart has a line per site, and dashed lines at the true values of the scenario.
+        """
+        log = self._log
+        estimates = self._add_signal(site_signals.parameter_estimates)
+        arms = log.scenario.arms
+        largest_arm = max(arms.values(), key=lambda arm: arm.counts)
+        thetas = [arms[site].theta for site in log.sites]
+        for index, (name, unit) in enumerate(largest_arm.parameters):
+            series = [lines[index] for lines in estimates.values() if index < len(lines)]
+            truths = [float(theta[index]) for theta in thetas if index < len(theta)]
+            title = name if largest_arm.chain else f"estimate of θ{'₁₂₃₄₅'[index]}"
+            yield self._make_chart(
+                section="estimates",
+                title=title,
+                unit=style.typeset_unit(unit),
+                series=series,
+                lines=self._draw_truths(truths),
+            )
+
+    def _draw_truths(self, truths: Sequence[float]) -> list[StatedLine]:
+        """Returns lines at the true values of a parameter over the whole run.
+
+        Args:
+            truths: The true value for each site.
+
+        Returns:
+            A line per site in its colour. If all values are equal, a single line in a neutral
+            colour.
+        """
+        if len(set(truths)) == 1:
+            return [self._draw_limit(truths[0])]
+        lines = []
+        for colour, truth in enumerate(truths):
+            lines.append(StatedLine(value=truth, colour=colour, from_s=0.0, to_s=self._end_s))
+        return lines
+
+    def _draw_limit(self, value: float) -> StatedLine:
+        """Returns a line at a value over the whole run, in a neutral colour."""
+        return StatedLine(value=value, colour="limit", from_s=0.0, to_s=self._end_s)
+
+    def _chart_ages(self) -> Iterator[TimeChart]:
+        """Yields a chart per site with the age of the samples that it uses.
+
+        A sample is the state that a peer, another site, publishes in one tick. Its age is the
+        time since it was sent. Lines at the delays that the scenario states serve for
+        comparison.
+        """
+        log = self._log
+        for site in log.sites:
+            ages_ms = site_signals.sample_ages_ms(log, site)
+            table = self._add_records(site, ages_ms)
+            series = [
+                self._make_series(peer, table, column, label=f"{peer} → {site}")
+                for column, peer in enumerate(log[site].peers)
+            ]
+            lines = self._list_stated_delays(site)
+            stated_ms = [line.value for line in lines]
+            shown_ms = np.concatenate([ages_ms.ravel(), stated_ms])
+            yield self._make_chart(
+                section="ages",
+                title=f"age of the samples that {site} uses",
+                unit="ms",
+                series=series,
+                sites=[site],
+                lines=lines,
+                links=True,
+                log=age_and_lateness.needs_log_axis(shown_ms),
+                margin=0.025,
+            )
+
+    def _list_stated_delays(self, site: str) -> list[StatedLine]:
+        """Returns lines at the mean delays that the scenario states for the links to a site.
+
+        Args:
+            site: Name of the receiving site.
+
+        Returns:
+            A line per peer and link model, from the start to the end of the model. If all
+            delays are equal, a single line in a neutral colour.
+        """
+        log = self._log
+        lines: list[StatedLine] = []
+        for peer in log[site].peers:
+            colour = log.sites.index(peer)
+            states = list_stated_models(log, f"{peer}->{site}", self._changes)
+            t_s, mean_ms = age_and_lateness.trace_stated_delay(log, states)
+            # The trace has three points per model: its start, its end, and a gap.
+            models = zip(t_s[::3], t_s[1::3], mean_ms[::3], strict=True)
+            for start_s, end_s, delay_ms in models:
+                if np.isfinite(delay_ms):
+                    line = StatedLine(
+                        value=float(delay_ms),
+                        colour=colour,
+                        from_s=float(start_s),
+                        to_s=float(end_s),
+                    )
+                    lines.append(line)
+        delays_ms = {line.value for line in lines}
+        if len(delays_ms) == 1:
+            return [self._draw_limit(lines[0].value)]
+        return lines
+
+    def _chart_distributions(self) -> Iterator[DistributionChart]:
+        """Yields a chart per receiving site with the distributions of ages and delays.
+
+        A curve at x shows the percentage of ages, or of delays, that are at most x ms.
+        """
+        measured = age_and_lateness.measure_delay_distributions(self._log)
+        x_ms = age_and_lateness.choose_delay_axis_ms(measured)
+        for site in self._log.sites:
+            series = []
+            for link in measured:
+                if link.site != site:
+                    continue
+                colour = self._log.sites.index(link.peer)
+                curves = (("age", link.age_ms, False), ("delay", link.delay_ms, True))
+                for quantity, values_ms, dash in curves:
+                    percent = age_and_lateness.compute_cumulative_percent(values_ms, x_ms)
+                    if not np.isfinite(percent).any():
+                        continue
+                    curve = DistributionSeries(
+                        label=f"{quantity}, {link.peer}",
+                        colour=colour,
+                        dash=dash,
+                        values=_encode(percent, "<f4"),
+                    )
+                    series.append(curve)
+            yield DistributionChart(
+                section="delays",
+                title=f"delay and age on the way to {site}",
+                unit="ms",
+                series=series,
+                x=_encode(x_ms, "<f4"),
+                log=bool(x_ms[0] > 0.0),
+            )
+
+    def _chart_histograms(self) -> Iterator[HistogramChart]:
+        """Yields the histograms of the lateness of ticks and of their computing time."""
+        log = self._log
+        edges_us = age_and_lateness.choose_bin_edges_us(log)
+        rates_hz = {log.scenario.sites[site].rate_hz for site in log.sites}
+        periods_us = sorted(1e6 / rate_hz for rate_hz in rates_hz)
+        titles = {
+            "late_us": "wake-up after the deadline",
+            "busy_us": "computing time of a tick",
+        }
+        for field, title in titles.items():
+            series = []
+            for colour, site in enumerate(log.sites):
+                if len(log[site]):
+                    times_us = getattr(log[site], field)
+                    counts = age_and_lateness.bin_loop_times(times_us, edges_us)
+                    series.append(HistogramSeries(site, colour, counts.tolist()))
+            yield HistogramChart(
+                section="timing",
+                title=f"{title}, histogram",
+                unit="µs",
+                series=series,
+                edges=edges_us.tolist(),
+                periods=periods_us,
+            )
+
+    def _build_arm(self, index: int, site: str) -> PlanarArm | ChainArm:
+        """Adds the motion of a site's arm and of the bodies that it touches.
+
+        The script of the page draws planar arms from their joint angles and link lengths. Other
+        arms, called chains, are handled by `_build_chain`.
+
+        Args:
+            index: Index of the site, which is also that of its colour.
+            site: Name of the site, which must have at least one record.
+
+        Returns:
+            Description of the arm, which refers to the table of its motion.
+        """
+        arm = self._log.scenario.arms[site]
+        if arm.chain is not None:
+            return self._build_chain(index, site)
+        records = self._log[site]
+        actual = site_signals.joint_angles(records)
+        desired = site_signals.reference_angles(records)
+        bodies = self._trace_bodies(site, np.arange(len(records)))
+        table = self._add_records(site, np.hstack([actual, desired, *bodies]))
+        return PlanarArm(
+            site=site,
+            caption=caption_site(self._log.scenario, site),
+            colour=index,
+            table=table,
+            bodies=len(bodies),
+            links_m=list(arm.lengths_m),
+        )
+
+    def _build_chain(self, index: int, site: str) -> ChainArm:
+        """Adds the motion of a chain, an arm of any number of joints in space.
+
+        The page cannot compute the forward kinematics of chains. Its table therefore contains
+        the joint positions in the picture, of the actual arm, of the reference and of the arm's
+        shadow on the floor, at up to `_CHAIN_INSTANTS` records.
+
+        Args:
+            index: Index of the site, which is also that of its colour.
+            site: Name of the site, which must have at least one record.
+
+        Returns:
+            Description of the chain, which refers to the table of its motion.
+        """
+        records = self._log[site]
+        arm = self._log.scenario.arms[site]
+        last = len(records) - 1
+        instants = np.linspace(0, last, _CHAIN_INSTANTS).astype(np.int64)
+        rows = np.unique(instants)  # short logs have fewer records than instants
+
+        desired_q = site_signals.reference_angles(records)
+        actual_m = joint_positions_m(arm, records.q[rows])
+        desired_m = joint_positions_m(arm, desired_q[rows])
+        pictures = (
+            arm_poses.project_arm_m(arm, actual_m),
+            arm_poses.project_arm_m(arm, desired_m),
+            arm_poses.project_arm_m(arm, actual_m, onto_floor=True),
+        )
+        # The first point is the base, which does not move.
+        moving_points_m = [picture[:, 1:] for picture in pictures]
+        points = np.stack(moving_points_m, axis=1) * self.units_per_m
+        bodies = self._trace_bodies(site, rows)
+        values = np.hstack([points.reshape(len(rows), -1), *bodies])
+        table = self._add_table(site, records.tick[rows], values)
+        return ChainArm(
+            site=site,
+            caption=caption_site(self._log.scenario, site),
+            colour=index,
+            table=table,
+            bodies=len(bodies),
+            points=points.shape[2],
+        )
+
+    def _trace_bodies(self, site: str, rows: NDArray[np.int64]) -> list[NDArray[np.float64]]:
+        """Returns the edges of each body that a site's arm can touch, in the picture.
+
+        Args:
+            site: Name of the site.
+            rows: Indices of K records.
+
+        Returns:
+            For each body the coordinates of its P corners along all edges, shape (K, 2 P), in
+            units of the picture. Empty if the site has no bodies.
+        """
+        sizes_m = self._log.scenario.bodies_m(site).values()
+        if not sizes_m:
+            return []
+        arm = self._log.scenario.arms[site]
+        poses = self._log[site].bodies[rows]
+        paths_m = arm_poses.trace_bodies_m(arm, sizes_m, poses)
+        return [self.units_per_m * path.reshape(len(rows), -1) for path in paths_m]
+
+
+def _lateness_ms(records: SiteLog) -> Values:
+    """Returns the lateness of each tick, ms, shape (K, 1)."""
+    return records.late_us[:, np.newaxis] * 1e-3
+
+
+def _encode(column: Values, kind: str) -> str:
+    """Returns numbers as base64 text.
+
+    Args:
+        column: The numbers, shape (P,).
+        kind: NumPy type of each number, such as "<f4" for little-endian float32.
+    """
+    numbers = np.ascontiguousarray(column.astype(kind))
+    return base64.b64encode(numbers.tobytes()).decode()

@@ -1,0 +1,424 @@
+"""Draws columns of a log over time: the figures of the method `Log.plot`.
+
+A log is the MCAP file with the results of a run. A site is a process that controls one arm, and
+a column is one number of the site's records, such as the angle of the first joint. Columns are
+selected by name. A name is one of
+
+- a quantity, such as "q", which selects all columns of the quantity,
+- a column without its unit, such as "q1",
+- a column, such as "q1_rad".
+
+Invariant:
+    - Names are those of the tables of the log (`Log.table`), and "e", the error.
+    - Each column has a panel. The panel contains a line for each selected site that has the
+      column.
+    - An unknown name is an error that states which names exist.
+"""
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from ..analysis.timeline import recorded_end_s
+from ..core.step.vectors import Array
+from ..errors import UnknownName, UsageError, suggest_nearest
+from ..log.data_tables import UNIT_SUFFIXES, Column
+from ..log.log_reader import Log
+from ..log.record_columns import Ints
+from ..log.ros2.ros2_messages import NUMBERS_BY_MODE_WORD
+from ..scenario.arms import TASK_AXES
+from . import style
+from .appearance import REPORT_SIZE
+from .figures.registry import FIGURES
+from .figures.run_overview import draw_overview
+
+DEFAULT_QUANTITIES = ("q", "e", "tau")
+"""Quantities of a plot for which sites, joints or times are selected, but no columns."""
+_JOINT_QUANTITIES = ("q", "qd", "q_des", "qd_des", "tau", "tau_x", "e")
+"""Quantities that have a column per joint, named after the number of the joint."""
+_QUANTITIES_BY_SOURCE = {"ch.": "ch", "used.": "used", "t_ns, used.": "age"}
+"""Quantities with a column per peer or per vector, by the beginning of a column's source."""
+_MARGIN_IN = 0.7
+"""Height of the time axis and the legend, in inches."""
+_ROW_IN = 1.25
+"""Height of a row of panels, in inches."""
+
+Joints = int | str | Sequence[int | str] | None
+"""Joints by number, counted from 1, or by name. None for all joints."""
+
+
+class _Line(NamedTuple):
+    """The values of one column at one site.
+
+    Attributes:
+        site: Name of the site.
+        tick: Numbers of the ticks, shape (K,).
+        t_s: Times of the ticks, shape (K,), in s.
+        column: The column, with K rows.
+    """
+
+    site: str
+    tick: Ints
+    t_s: Array
+    column: Column
+
+
+_Panels = dict[str, list[_Line]]
+"""The lines of each panel, by the name of the column."""
+
+
+def plot_log(
+    log: Log,
+    names: Sequence[str] = (),
+    *,
+    sites: str | Iterable[str] | None = None,
+    joints: Joints = None,
+    from_s: float | None = None,
+    until_s: float | None = None,
+) -> Figure:
+    """Draws columns of a log over time, with a panel per column and a line per site.
+
+    If nothing is selected, the figure is the overview of the run.
+
+    Args:
+        log: The log.
+        names: Names of quantities or columns. Each name gets its own rows of panels.
+        sites: Names of the sites. None for all sites.
+        joints: Joints that are drawn of quantities with a column per joint.
+        from_s: First time that is drawn, in s. None for the start of the run.
+        until_s: Last time that is drawn, in s. None for the end of the run.
+
+    Raises:
+        UnknownName: There is no such column, site or joint.
+        UsageError: The interval of time contains no records.
+        LogError: The records cannot be read.
+    """
+    is_restricted = not (
+        sites is None and joints is None and from_s is None and until_s is None
+    )
+    if not names and not is_restricted:
+        return draw_overview(log)
+
+    site_names = _select_sites(log, sites)
+    interval_s = _check_interval(log, from_s, until_s)
+    _check_joints(log, site_names, joints)
+    columns = {site: _list_columns(log, site) for site in site_names}
+    groups = []
+    for name in names or DEFAULT_QUANTITIES:
+        group = _find_lines(log, columns, name)
+        groups.append(_filter_joints(log, name, group, joints))
+    return _draw_groups(log, groups, site_names, interval_s)
+
+
+def _select_sites(log: Log, sites: str | Iterable[str] | None) -> list[str]:
+    """Returns the selected sites in the order of the scenario.
+
+    Raises:
+        UnknownName: There is no such site.
+        UsageError: No site is selected.
+    """
+    if sites is None:
+        return list(log.sites)
+    selected = [sites] if isinstance(sites, str) else list(sites)
+    if not selected:
+        raise UsageError(f"sites is empty; the sites are {', '.join(log.sites)}")
+    for site in selected:
+        log[site]  # raises if there is no such site
+    return [site for site in log.sites if site in selected]
+
+
+def _check_interval(
+    log: Log, from_s: float | None, until_s: float | None
+) -> tuple[float, float]:
+    """Returns the first and the last time to draw, in s.
+
+    Raises:
+        UsageError: The first time is not before the last one, or the log ends before.
+    """
+    end_s = recorded_end_s(log)
+    first_s = 0.0 if from_s is None else float(from_s)
+    last_s = end_s if until_s is None else float(until_s)
+    if not first_s < last_s:
+        raise UsageError(
+            f"from_s must be less than until_s, but from_s is {first_s:g} and until_s "
+            f"{last_s:g}; the log ends at {end_s:g} s"
+        )
+    if first_s >= end_s or last_s <= 0.0:
+        raise UsageError(
+            f"there are no records from {first_s:g} s until {last_s:g} s; the log has records "
+            f"from 0 s until {end_s:g} s"
+        )
+    return first_s, last_s
+
+
+def _list_columns(log: Log, site: str) -> list[Column]:
+    """Returns the columns of a site's records, and those of the error."""
+    columns = [*log.table(site).columns]
+    arm = log.scenario.arms[site]
+    if arm.shares_pose:
+        units = ["m" if axis in "xyz" else "rad" for axis in TASK_AXES[: arm.counts.shared]]
+        stems = [f"e_{axis}" for axis in TASK_AXES[: arm.counts.shared]]
+    else:
+        units = arm.joint_units("rad")
+        stems = [f"e{number}" for number in range(1, len(units) + 1)]
+    errors = log[site].e
+    for index, (stem, unit) in enumerate(zip(stems, units, strict=True)):
+        column = Column(
+            name=f"{stem}_{UNIT_SUFFIXES[unit]}",
+            values=errors[:, index],
+            unit=unit,
+            meaning="error that the control law acts on",
+            source=f"e[{index}]",
+        )
+        columns.append(column)
+    return columns
+
+
+def _get_quantity(column: Column) -> str:
+    """Returns the name of the quantity to which a column belongs, such as "q" for "q1_rad".
+
+    A column that is a quantity by itself returns its name without the unit.
+    """
+    for start, quantity in _QUANTITIES_BY_SOURCE.items():
+        if column.source.startswith(start):
+            return quantity
+    field, bracket, _ = column.source.partition("[")
+    return field if bracket else _get_stem(column)
+
+
+def _get_stem(column: Column) -> str:
+    """Returns the name of a column without its unit."""
+    suffix = UNIT_SUFFIXES.get(column.unit, "")
+    return column.name.removesuffix(f"_{suffix}") if suffix else column.name
+
+
+def _find_lines(log: Log, columns: Mapping[str, Sequence[Column]], name: str) -> _Panels:
+    """Returns the lines of the columns that a name selects.
+
+    Args:
+        log: The log.
+        columns: All columns, by site.
+        name: Name of a quantity or of a column, with or without its unit.
+
+    Raises:
+        UnknownName: The name selects no column.
+    """
+    panels: _Panels = {}
+    for site, site_columns in columns.items():
+        for column in site_columns:
+            if name in (column.name, _get_stem(column), _get_quantity(column)):
+                line = _Line(site, log[site].tick, log[site].t_s, column)
+                panels.setdefault(column.name, []).append(line)
+    if not panels:
+        raise UnknownName(_explain_unknown_name(columns, name))
+    return panels
+
+
+def _explain_unknown_name(columns: Mapping[str, Sequence[Column]], name: str) -> str:
+    """Returns the text of the error that a name selects no column."""
+    if name in FIGURES:
+        return (
+            f"{name!r} is a figure and no column of the log; "
+            f"trilat_net.figure(log, {name!r}) draws it"
+        )
+    quantities: dict[str, None] = {}
+    column_names: dict[str, None] = {}
+    for site_columns in columns.values():
+        for column in site_columns:
+            quantities[_get_quantity(column)] = None
+            column_names[column.name] = None
+    hint = suggest_nearest(name, [*quantities, *column_names])
+    return (
+        f"there is no column {name!r}{hint}; the quantities are {', '.join(quantities)}, and "
+        f"the columns of a quantity have names such as {next(iter(column_names))}"
+    )
+
+
+def _number_joints(log: Log, site: str, joints: Joints) -> list[int]:
+    """Returns the numbers of the selected joints that a site's arm has, counted from 1.
+
+    Args:
+        log: The log.
+        site: Name of the site.
+        joints: The selected joints.
+    """
+    names = log.scenario.arms[site].joint_names
+    numbers = list(range(1, len(names) + 1))
+    if joints is None:
+        return numbers
+    selected = [joints] if isinstance(joints, int | str) else list(joints)
+    return [
+        number
+        for number, name in zip(numbers, names, strict=True)
+        if number in selected or name in selected
+    ]
+
+
+def _check_joints(log: Log, sites: Sequence[str], joints: Joints) -> None:
+    """Checks that each selected joint is a joint of at least one selected site.
+
+    Raises:
+        UnknownName: There is no such joint.
+    """
+    if joints is None:
+        return
+    selected = [joints] if isinstance(joints, int | str) else list(joints)
+    if not selected:
+        raise UsageError("joints is empty; joints are numbers from 1 or names")
+    for joint in selected:
+        if not any(_number_joints(log, site, joint) for site in sites):
+            names = log.scenario.arms[sites[0]].joint_names
+            raise UnknownName(
+                f"there is no joint {joint!r}; the joints of {sites[0]} are 1 to {len(names)}, "
+                f"or {', '.join(names)}"
+            )
+
+
+def _filter_joints(log: Log, name: str, panels: _Panels, joints: Joints) -> _Panels:
+    """Removes the columns of joints that are not selected.
+
+    Columns that belong to no joint, such as the age of a sample, are kept.
+
+    Args:
+        log: The log.
+        name: Name that selected the columns, for the error.
+        panels: The lines by the name of the column.
+        joints: The selected joints.
+
+    Raises:
+        UsageError: No column is left.
+    """
+    if joints is None:
+        return panels
+    kept: _Panels = {}
+    for column_name, lines in panels.items():
+        kept_lines = []
+        for line in lines:
+            number = _get_joint_number(line.column)
+            if number is None or number in _number_joints(log, line.site, joints):
+                kept_lines.append(line)
+        if kept_lines:
+            kept[column_name] = kept_lines
+    if not kept:
+        raise UsageError(f"{name} has no column of the joints {joints!r}")
+    return kept
+
+
+def _get_joint_number(column: Column) -> int | None:
+    """Returns the number of the joint to which a column belongs. None if it belongs to none."""
+    quantity = _get_quantity(column)
+    if quantity not in _JOINT_QUANTITIES:
+        return None
+    digits = re.match(r"\d+", column.name.removeprefix(quantity))
+    return int(digits.group()) if digits else None
+
+
+def _draw_groups(
+    log: Log,
+    groups: Sequence[_Panels],
+    sites: Sequence[str],
+    interval_s: tuple[float, float],
+) -> Figure:
+    """Draws groups of columns. A group begins in a new row.
+
+    Args:
+        log: The log.
+        groups: The lines of each group.
+        sites: Names of all selected sites.
+        interval_s: First and last time to draw, in s.
+    """
+    most = max(len(group) for group in groups)
+    column_count = len(style.arrange_joints(most, narrow=False)[0]) if most > 1 else 1
+    cells: list[str] = []
+    for group in groups:
+        cells += group
+        cells += [""] * (-len(cells) % column_count)
+    row_count = len(cells) // column_count
+    height_in = _MARGIN_IN + _ROW_IN * row_count
+
+    lines = {name: group_lines for group in groups for name, group_lines in group.items()}
+    with style.time_figure(log, REPORT_SIZE, height_in, interval_s) as plot:
+        grid = style.add_panels(plot.figure, row_count, column_count, sharex=True)
+        # The lowest panel of each column, which has the time axis. Rows below may be empty.
+        lowest: dict[int, Axes] = {}
+        for index, name in enumerate(cells):
+            row, column = divmod(index, column_count)
+            axes: Axes = grid[row, column]
+            if name:
+                _draw_panel(plot, axes, lines[name], interval_s)
+                lowest[column] = axes
+            else:
+                axes.remove()
+        for axes in lowest.values():
+            axes.tick_params(labelbottom=True)
+        drawn_sites = {line.site for panel in lines.values() for line in panel}
+        entries = [site for site in sites if site in drawn_sites]
+        plot.finish(list(lowest.values()), style.site_legend_entries(log, entries))
+    return plot.figure
+
+
+def _draw_panel(
+    plot: style.TimeFigure,
+    axes: Axes,
+    lines: Sequence[_Line],
+    interval_s: tuple[float, float],
+) -> None:
+    """Draws a column of several sites in a panel.
+
+    Args:
+        plot: The figure.
+        axes: The panel.
+        lines: The lines.
+        interval_s: First and last time to draw, in s.
+    """
+    first_s, last_s = interval_s
+    column = lines[0].column
+    unit = f" ({style.typeset_unit(column.unit)})" if column.unit else ""
+    axes.set_title(f"{_get_stem(column)}{unit}")
+    words = _list_words(lines)
+    for line in lines:
+        options = style.site_line(plot.log, line.site)
+        if words:
+            options["drawstyle"] = "steps-post"
+        visible = (line.t_s >= first_s) & (line.t_s <= last_s)
+        values = _read_numbers(line.column, words)
+        style.plot_decimated(
+            axes, line.tick[visible], line.t_s[visible], values[visible], **options
+        )
+    if words:
+        axes.set_yticks(range(len(words)), words)
+    plot.mark(axes, [line.site for line in lines])
+    style.flatten_rounding(axes)
+
+
+def _list_words(lines: Sequence[_Line]) -> list[str]:
+    """Returns the different texts of a column of texts, for the ticks of the value axis.
+
+    The list is empty for a column of numbers. Modes have the order of their
+    numbers in messages for viewers.
+    """
+    words: set[str] = set()
+    for line in lines:
+        if line.column.is_text:
+            words |= {str(word) for word in line.column.values}
+    numbers = NUMBERS_BY_MODE_WORD
+    return sorted(words, key=lambda word: (numbers.get(word, len(numbers) + 1), word))
+
+
+def _read_numbers(column: Column, words: Sequence[str]) -> NDArray[np.float64]:
+    """Returns the values of a column as numbers, shape (K,). NaN stands for no value.
+
+    Args:
+        column: The column.
+        words: The texts of the column. Each text becomes its index. Empty for numbers.
+    """
+    if not words:
+        return np.asarray(column.numbers(), dtype=np.float64)
+    indices = {word: index for index, word in enumerate(words)}
+    numbers = [indices[str(word)] for word in column.values]
+    return np.array(numbers, dtype=np.float64)

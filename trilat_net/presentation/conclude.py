@@ -1,0 +1,254 @@
+"""Concludes a finished run: checks its log, and writes its page and its summary.
+
+A run is executed by sites, processes that each control one robot arm. A record is the stored
+result of one period of a site's control loop. `conclude` does the work of `trilat report`. The
+check computes the control loops again from the received data in the log, and compares the
+results with the records, bit for bit. The result is a `Conclusion`, whose text the commands
+print after a run.
+
+Invariant:
+    - Every claim rests on a new execution of the log, made for this conclusion.
+    - The execution runs in another process while the page is written, so that two processor
+      cores are used.
+"""
+
+from collections.abc import Iterator
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..analysis.judge import certify_run
+from ..analysis.site_signals import shared_unit
+from ..errors import CodeWithheld, LawFailed, RunFailed, ScenarioError
+from ..execution.log_checks import check_log_files
+from ..execution.virtual_comparison import simulate_without_operators
+from ..log.accounting import MIN_COVERAGE
+from ..log.findings import CheckReport, Finding
+from ..log.log_reader import Log
+from ..log.mcap_reader import Progress
+from ..log.site_log import SiteLog
+from ..process import worker_pool
+from ..scenario.code_consent import may_run_user_laws
+from ..scenario.imported_code import allowed_code
+from .certificate_text import CertificateLine, describe_certificate, describe_theorem
+from .result_text import MARKS, Block, MarkedText, TextTable
+from .summary_text import format_run_lines
+
+
+@dataclass(frozen=True, repr=False)
+class Conclusion(CheckReport):
+    """Everything that a user wants to know about a finished run, with the written files.
+
+    `conclude` creates this object after a run was recorded.
+
+    Attributes:
+        verdict: Judgement whether the run was stable.
+        table: Table with a row for each arm.
+        notes: Lines about notable facts of the run, such as changed settings or messages of a
+            user's control law, and about the proof of stability.
+        findings: Results of the checks of the log, one per check.
+        paths: Files of the log, and files that were written.
+    """
+
+    verdict: CertificateLine
+    table: TextTable
+    notes: list[str]
+    findings: list[Finding]
+    paths: list[Path]
+
+    def blocks(self) -> Iterator[Block]:
+        """Yields the parts of the text that `trilat report` prints.
+
+        They are the judgement about stability, the checks of the log, the table of sites, the
+        notes, and the paths of the files.
+        """
+        yield MarkedText(MARKS[self.verdict.mark], f"stability: {self.verdict.text}")
+        for finding in self.findings:
+            failed = "FAIL" if finding.judged else "open"
+            mark = "ok" if finding.passed else failed
+            yield MarkedText(MARKS[mark], f"{finding.check}: {finding.text}")
+        yield self.table
+        yield from self.notes
+        yield from (f"  {path}" for path in self.paths if path != self.page)
+        yield f"open first: {self.page}"
+
+    @property
+    def page(self) -> Path:
+        """Path of the HTML report of the run.
+
+        If no report was written, it is the path of the first log file.
+        """
+        pages = [path for path in self.paths if path.suffix == ".html"]
+        return pages[0] if pages else self.paths[0]
+
+    def headline(self) -> str:
+        """Returns a line that says whether the log passed its checks, with the report's path.
+
+        Some checks may be incomplete, because they need the code of a user's control law that
+        may not run. The line then says that not all was judged.
+        """
+        results = {0: "passed", CodeWithheld.exit_code: "not all was judged"}
+        result = results.get(self.exit_code, "FAILED")
+        return f"{result}; {self.page}"
+
+    def to_rows(self) -> list[dict[str, str]]:
+        """Returns the table of sites as dictionaries of texts, one per site."""
+        headers = self.table.headers
+        return [dict(zip(headers, row, strict=False)) for row in self.table.rows]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Converts the result to plain values, as `trilat report --json` prints them."""
+        return {
+            "passed": self.passed,
+            "verdict": self.verdict.text,
+            "notes": self.notes,
+            "checks": [finding.to_row() for finding in self.findings],
+            "paths": [path.as_posix() for path in self.paths],
+        }
+
+
+def conclude(
+    log: Log,
+    folder: Path,
+    progress: Progress | None = None,
+    *,
+    min_coverage: float = MIN_COVERAGE,
+    png: bool = False,
+) -> Conclusion:
+    """Checks the log of a finished run, and writes its page and summary into a folder.
+
+    Args:
+        log: Log that was opened from files.
+        folder: Existing folder.
+        progress: Function that is called with the number of drawn figures and of all figures.
+        min_coverage: Smallest fraction of the ticks (control periods) of each site that must be
+            recorded and checked for a judgement.
+        png: True to write the figures as PNG files too.
+
+    Returns:
+        The judgement, the checks and the written files.
+
+    Raises:
+        LogError: A record cannot be read.
+        RunFailed: The process that executes the log was terminated.
+    """
+    # Importing Matplotlib takes a second, which `trilat verify` need not wait for.
+    from .figures.age_and_lateness import explain_missing_loop_times
+    from .figures.registry import write_report_figures
+    from .page import write_report
+
+    findings: list[Finding] = []
+    # Two processor cores are used: the log is executed while its figures are drawn.
+    with worker_pool(1) as pool:
+        allowed = dict(allowed_code)
+        check = pool.submit(check_log_files, log.sources, min_coverage, allowed)
+        twin = _run_without_operators(log)
+        own_laws = may_run_user_laws(log.scenario)
+        certificate = certify_run(log, min_coverage=min_coverage, own_laws=own_laws)
+        # A record that cannot be read raises here, before anything is written.
+        run_lines = format_run_lines(log)
+        figures: list[Path] = []
+        if png:
+            figures = write_report_figures(
+                log=log,
+                folder=folder,
+                twin=twin,
+                progress=progress,
+                pushed=certificate.twins,
+            )
+
+        def wait_for_findings() -> Iterator[Finding]:
+            """Yields the result of each check of the log, once the checks have finished.
+
+            The checks run in another process, which executes the log again. `check` is the
+            future of their results. This generator waits for them only when the first result is
+            requested, so that the report can be prepared meanwhile. The results are also stored
+            in the list `findings`, which is empty until then.
+
+            Raises:
+                RunFailed: The other process was terminated.
+            """
+            try:
+                results = check.result()
+                findings.extend(results)
+            except BrokenProcessPool:
+                raise RunFailed(
+                    "the process that reruns the log ended unexpectedly; try again"
+                ) from None
+            yield from findings
+
+        report = write_report(
+            log,
+            folder,
+            twin=twin,
+            certificate=certificate,
+            verdicts=wait_for_findings(),
+        )
+    untimed = explain_missing_loop_times(log)
+    timing_lines = [untimed] if untimed else []
+    return Conclusion(
+        verdict=describe_certificate(certificate)[0],
+        table=_tabulate_sites(log, is_timed=not untimed),
+        notes=[*timing_lines, *run_lines, *describe_theorem(certificate)],
+        findings=findings,
+        paths=[*map(Path, log.sources), *report, *figures],
+    )
+
+
+def _run_without_operators(log: Log) -> Log | None:
+    """Simulates the run of a log without the people or programs that moved the arms.
+
+    Returns:
+        The log of the simulation. None if it would not differ from the run, or cannot run.
+    """
+    # A run that failed would fail again, or hang. External arms cannot be simulated.
+    has_failed = any(event.kind == "failed" for event in log.events)
+    has_operators = any(site.hands for site in log.scenario.sites.values())
+    if has_failed or log.scenario.external or not has_operators:
+        return None
+    try:
+        return simulate_without_operators(log)
+    except (ScenarioError, LawFailed):
+        # The control law of a user fails or may not run. The check of the log reports this.
+        return None
+
+
+_HEADERS = ("site", "records", "missing")
+_TIMING_HEADERS = ("late p50 us", "p99", "max", "busy p50 us", "p99")
+
+
+def _tabulate_sites(log: Log, *, is_timed: bool) -> TextTable:
+    """Returns a table with a row per site: records, timing of the loop, and last error.
+
+    Args:
+        log: Log of the run.
+        is_timed: False to leave out the timing. Loops in virtual time are never late.
+    """
+    timing = _TIMING_HEADERS if is_timed else ()
+    headers = (*_HEADERS, *timing, f"max|e| end {shared_unit(log)}")
+    rows = []
+    for site in log.sites:
+        records = log[site]
+        if not len(records):
+            empty = [""] * (len(headers) - 2)
+            rows.append([site, "0", *empty])
+            continue
+        ticks = max(log.last_ticks[site], records.last_tick) + 1
+        missing = ticks - len(records) - log.absent_ticks(site)
+        times = _list_timing_cells(records) if is_timed else []
+        last_error = np.abs(records.e[-1]).max()
+        rows.append([site, str(len(records)), str(missing), *times, f"{last_error:.2e}"])
+    return TextTable(headers, rows, align="lr")
+
+
+def _list_timing_cells(records: SiteLog) -> list[str]:
+    """Returns the percentiles of the lateness and of the computing time of a site's ticks."""
+    late_us = np.percentile(records.late_us, (50, 99, 100))
+    busy_us = np.zeros(2)
+    # A record has the computing time of the previous tick, so that the first record has none.
+    if len(records) > 1:
+        busy_us = np.percentile(records.busy_us, (50, 99))
+    return [f"{time_us:.0f}" for time_us in (*late_us, *busy_us)]

@@ -1,0 +1,271 @@
+"""Exports a log as a ROS 2 bag: standard messages in an MCAP file of the profile `ros2`.
+
+A bag can be played with `ros2 bag play`, or read by tools for ROS. Its messages are those that
+the live bridge to ROS 2 would have published during the run.
+
+Invariant:
+    - A bag has every record, the stored result of one tick (period) of an arm's control loop,
+      exactly once, with its numbers and times. Nothing is decimated.
+    - The names and types of the topics are those of the live bridge
+      (`trilat_net.log.ros2.published`).
+    - The stamp of a header is the nominal time of its tick. The publish time of a message is
+      the time of sending, and its log time is the time of arrival.
+"""
+
+import heapq
+from collections.abc import Callable, Iterator
+from operator import itemgetter
+from pathlib import Path
+
+import numpy as np
+
+from ...analysis.dominance_history import trace_dominance
+from ...core.step.ticks import NS_PER_S
+from ...log.log_layout import SCENARIO, collect_provenance
+from ...log.log_reader import Log
+from ...log.mcap_writer import McapWriter
+from ...log.ros2 import cdr, ros2_messages
+from ...log.ros2.published import SiteMessages, list_full_topics, pack_session_diagnostics
+from ...log.ros2.topic_names import (
+    DIAGNOSTICS,
+    FRAMES,
+    NAMINGS,
+    TopicTable,
+    make_session_name,
+    read_topic_table,
+)
+from ..export import ExportFormat, Written
+
+SOURCE_METADATA = "trilat.source"
+"""Name of the metadata record that describes the exported session."""
+_QOS_FILE = cdr.DEFINITIONS / "qos.yaml"
+_QOS = _QOS_FILE.read_text(encoding="utf-8")
+"""Template of a quality of service, as rosbag2 writes it: reliable."""
+_VOLATILE = {"DEPTH": "10", "DURABILITY": "2"}
+"""Values for `_QOS`: the last ten messages, for present subscribers."""
+_LATCHED = {"DEPTH": "1", "DURABILITY": "1"}
+"""Values for `_QOS`: the last message, for late subscribers as well (transient local)."""
+_RECORDS_PER_REPORT = 1000
+"""Number of records between two reports of progress."""
+
+TopicMessages = list[tuple[str, bytes]]
+"""Encoded messages, each with its topic."""
+TimedMessages = tuple[int, int, TopicMessages]
+"""Log time in ns, publish time in ns, and the topic and data of each message with these times.
+"""
+
+
+def export_ros2(
+    log: Log,
+    path: Path,
+    written: Written = lambda _: None,
+    *,
+    names: str = NAMINGS[0],
+) -> None:
+    """Writes a log as a file that `ros2 bag` and other players of ROS 2 bags can read.
+
+    Topics of sites are `/<session>/<site>/joint_states` and others. Topics of the session are
+    `/<session>/events`, `/<session>/log`, `/tf` and `/diagnostics`. The metadata of the
+    channels have units, names and representations of orientations. An existing file is
+    replaced.
+
+    Args:
+        log: Log of the run that is exported.
+        path: File of the bag.
+        written: Function that is called with the number of records written since its last call.
+        names: Names of the topics: "crisp", "crtk", or a file of names as for
+            `trilat ros2 --names`.
+
+    Raises:
+        LogError: A message of the log cannot be read.
+        UsageError: The names cannot be read.
+        OSError: The disk refused the data.
+    """
+    table = read_topic_table(names)
+    log_session = log.session.get("session", "") or log.scenario.name
+    session = make_session_name(log_session)
+    with path.open("wb") as stream:
+        provenance = collect_provenance()
+        version = provenance["version_trilat-net"]
+        file = McapWriter(stream, f"trilat-net {version}", profile="ros2")
+        source = {"source": log.source, **log.session}
+        file.add_metadata(SOURCE_METADATA, source)
+        file.add_attachment(
+            create_time=0,
+            log_time=0,
+            name=SCENARIO,
+            media_type="application/toml",
+            data=log.scenario_text.encode(),
+        )
+        channels = {}
+        topics = list_full_topics(log.scenario, session, table)
+        for topic, channel in topics.items():
+            channels[topic] = _add_quality(channel)
+        channel_numbers = ros2_messages.StandardChannels(file, channels)
+
+        streams: list[Iterator[TimedMessages]] = []
+        for site in log.sites:
+            site_bag = _SiteBag(
+                log=log,
+                site=site,
+                session=session,
+                table=table,
+                progress=written,
+            )
+            streams.append(site_bag.iterate_records())
+            streams.append(site_bag.iterate_statistics())
+        streams.append(_iterate_events(log, session))
+        streams.append(_iterate_diagnostics(log, session))
+
+        # Each stream is in the order of log times. Merging them keeps this order.
+        merged_streams = heapq.merge(*streams, key=itemgetter(0))
+        for log_ns, publish_ns, messages in merged_streams:
+            for topic, data in messages:
+                channel_number = channel_numbers[f"/{topic}"]
+                file.add_message(channel_number, log_ns, data, publish_ns)
+        file.finish()
+
+
+def _add_quality(channel: ros2_messages.Ros2Channel) -> ros2_messages.Ros2Channel:
+    """Adds the quality of service to the metadata of a channel, as rosbag2 writes it."""
+    text = _QOS
+    values = _LATCHED if channel.latched else _VOLATILE
+    for placeholder, value in values.items():
+        text = text.replace(placeholder, value)
+    metadata = {"offered_qos_profiles": text, **channel.about}
+    return channel._replace(about=metadata)
+
+
+class _SiteBag:
+    """Converts the messages of one site for a bag.
+
+    Args:
+        log: Log of the run that is exported.
+        site: Name of the site.
+        session: Name of the session in topics.
+        table: Names of the topics.
+        progress: Function that is called with the number of records since its last call.
+    """
+
+    def __init__(
+        self,
+        log: Log,
+        site: str,
+        session: str,
+        table: TopicTable,
+        progress: Callable[[int], None],
+    ) -> None:
+        self._log = log
+        self._site = site
+        self._session = session
+        self._table = table
+        self._progress = progress
+        epoch_unix_ns = _find_epoch_ns(log)
+        self._messages = SiteMessages(log.scenario, site, epoch_unix_ns)
+
+    def _find_topic(self, topic: str) -> str:
+        """Returns the full name of a topic of the site."""
+        return self._table.find(self._session, self._site, topic)
+
+    def _name_messages(self, messages: ros2_messages.NamedMessages) -> TopicMessages:
+        """Returns messages with the full names of their topics."""
+        topic_messages: TopicMessages = []
+        for name, data in messages:
+            topic = self._find_topic(name)
+            topic_messages.append((topic, data))
+        return topic_messages
+
+    def iterate_records(self) -> Iterator[TimedMessages]:
+        """Yields the ROS messages that describe the motion of the site.
+
+        The messages are in the order of their arrival. The first ones also contain the
+        description of the robot.
+        """
+        records = self._log[self._site]
+        dominance = trace_dominance(self._log, self._site, records.t_s)
+        shares = dominance.alpha.tolist()
+        log_ns = records.log_time_ns.tolist()
+        publish_ns = records.publish_time_ns.tolist()
+        order = np.argsort(records.log_time_ns, kind="stable")
+        for count, row in enumerate(order.tolist(), 1):
+            record = records.states[row]
+            packed = self._messages.pack_record(record, shares[row])
+            messages = self._name_messages(packed)
+            if count == 1:
+                topic = self._find_topic("robot_description")
+                description = (topic, self._messages.description)
+                messages.insert(0, description)
+            for data in self._messages.pack_frames(record):
+                messages.append((FRAMES, data))
+            yield log_ns[row], publish_ns[row], messages
+            is_last = count == len(records)
+            if is_last or count % _RECORDS_PER_REPORT == 0:
+                # The last report can have fewer records than the others.
+                new_records = (count - 1) % _RECORDS_PER_REPORT + 1
+                self._progress(new_records)
+
+    def iterate_statistics(self) -> Iterator[TimedMessages]:
+        """Yields the ROS messages about the delays and losses of the links to the site.
+
+        The messages are in the order of their arrival.
+        """
+        timed = self._log.timed_link_stats(self._site)
+        log_times_ns = timed.log_ns.tolist()
+        publish_times_ns = timed.publish_ns.tolist()
+        rows = zip(log_times_ns, publish_times_ns, timed.messages, strict=True)
+        ordered_rows = sorted(rows, key=itemgetter(0))
+        for log_ns, publish_ns, stats in ordered_rows:
+            packed = self._messages.pack_statistics(stats)
+            messages = self._name_messages(packed)
+            yield log_ns, publish_ns, messages
+
+
+def _find_epoch_ns(log: Log) -> int:
+    """Returns the Unix time of a session's common start, in ns. It is 0 in virtual time."""
+    epoch_text = log.session.get("epoch_unix_ns", "0")
+    return int(epoch_text)
+
+
+def _iterate_events(log: Log, session: str) -> Iterator[TimedMessages]:
+    """Yields the messages about the events of a session."""
+    timed = log.timed_events()
+    log_times_ns = timed.log_ns.tolist()
+    publish_times_ns = timed.publish_ns.tolist()
+    rows = zip(log_times_ns, publish_times_ns, timed.messages, strict=True)
+    for log_ns, publish_ns, event in rows:
+        packed = ros2_messages.pack_event(event, publish_ns)
+        messages = [(f"{session}/{topic}", data) for topic, data in packed]
+        yield log_ns, publish_ns, messages
+
+
+def _iterate_diagnostics(log: Log, session: str) -> Iterator[TimedMessages]:
+    """Yields a message per second about the newest records of all sites.
+
+    The times of a message are the latest times of these records, and never earlier than those
+    of the previous message.
+    """
+    parts = [log[site] for site in log.sites if len(log[site])]
+    end_times_ns = [int(part.t_ns.max()) for part in parts]
+    end_ns = max(end_times_ns, default=-1)
+    log_ns = 0
+    publish_ns = 0
+    for second in range(end_ns // NS_PER_S + 1):
+        t_ns = second * NS_PER_S
+        records = []
+        for part in parts:
+            next_row = int(np.searchsorted(part.t_ns, t_ns, side="right"))
+            row = next_row - 1
+            if row < 0:
+                continue
+            records.append(part.record(row))
+            record_log_ns = int(part.log_time_ns[row])
+            log_ns = max(log_ns, record_log_ns)
+            record_publish_ns = int(part.publish_time_ns[row])
+            publish_ns = max(publish_ns, record_publish_ns)
+        if records:
+            epoch_unix_ns = _find_epoch_ns(log)
+            data = pack_session_diagnostics(session, epoch_unix_ns, records)
+            yield log_ns, publish_ns, [(DIAGNOSTICS, data)]
+
+
+FORMAT = ExportFormat(export_ros2, "-ros2.mcap")

@@ -1,0 +1,445 @@
+"""Draws figures of communication and timing: ages and delays of samples, and timing of loops.
+
+A site is a process that controls one arm, and a tick is one period of its control loop. A
+sample is the state of the arm that the site publishes in a tick. A link is the directed
+connection between two sites. The delay of a sample is the time that it needs on its link. The
+age is the time since the sample that a receiver uses in a tick was sent: it grows until a newer
+sample arrives. The lateness is the time by which a tick started after it was due.
+
+Invariant:
+    - If the delays of a link follow a measured series, the figure has no line for the delay
+      that the scenario states.
+    - A run whose links all have one constant delay has no figure of distributions, because
+      these would be vertical lines.
+    - A run in virtual time reads no clock. The figure of its loops gives this reason instead of
+      showing zeros.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ...analysis.link_summary import (
+    count_sent,
+    has_one_constant_delay,
+    predict_delivery,
+    read_arrivals,
+    sample_ages_ns,
+)
+from ...analysis.site_signals import sample_ages_ms
+from ...analysis.timeline import StatedModel, list_changes, list_stated_models, recorded_end_s
+from ...core.step.vectors import Array
+from ...log.log_reader import Log
+from ...log.record_columns import Ints
+from .. import style
+from ..appearance import REPORT_SIZE, FigureSize
+from .figure_entry import draws, unless
+
+_POINTS = 400
+"""Number of points of a distribution."""
+_RARE_RATIO = 6.0
+"""An axis is logarithmic if the largest value exceeds the 95th percentile by this factor."""
+_STEP_MS = 1.5
+"""An age that falls by more than this from one tick to the next counts as a fluctuation.
+
+If two samples arrive in the same tick of 1 ms, the age falls by about 1 ms, which is normal.
+"""
+NO_LOOP_CLOCK = "virtual time: no clock was read, so no loop was late and no tick was timed"
+NO_LOOP_TIMES = "no lateness and no computing time in this log"
+_BINS_PER_DECADE = 20
+"""Number of bins of a histogram between 1 us and 10 us, and so on."""
+
+
+class DelayDistribution(NamedTuple):
+    """Delays and ages of the samples on one link.
+
+    Attributes:
+        peer: Name of the sender.
+        site: Name of the receiver.
+        delay_ms: Delays of the samples, shape (S,). They follow from the link's model if the
+            scenario has one, and were measured otherwise.
+        age_ms: Age of the sample in use at each tick of the receiver, shape (K,).
+    """
+
+    peer: str
+    site: str
+    delay_ms: Array
+    age_ms: Array
+
+
+@draws("sample_age", "age of the samples in use, per link", in_report=True)
+def draw_sample_age(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+    """Draws the age of the sample in use on every link over time, in ms.
+
+    The age of a sample of a peer's state is the time from its sending until its use. The figure
+    has a row per receiver. An age that fluctuates is drawn as a band with its median, because a
+    line would fill the area between its extremes.
+
+    Args:
+        log: Log of the run.
+        form: Width, type sizes and resolution of the figure.
+    """
+    ages_ms = _read_ages_ms(log)
+    stated = {
+        link: trace_stated_delay(log, models) for link, models in _list_link_models(log).items()
+    }
+    has_bands = False
+    with style.time_figure(log, form, 0.6 + 1.05 * len(log.sites)) as plot:
+        grid, panels = _add_link_panels(plot.figure, log)
+        for (peer, site), axes in panels.items():
+            age_ms = ages_ms[peer, site]
+            line = style.site_line(log, peer, 1.4)
+            plot.mark(axes, [site], f"{peer}->{site}")
+            if is_unsteady(age_ms):
+                has_bands = True
+                style.plot_spread(axes, log[site].t_s, age_ms, **line)
+            else:
+                plot.trace(axes, site, age_ms, **line)
+            axes.plot(*stated[f"{peer}->{site}"], **style.LIMIT_LINE)
+            if not np.any(np.isfinite(age_ms)):
+                style.annotate_empty_panel(axes, "no sample in use")
+        for axes in grid[:, 0]:
+            axes.set_ylabel("age (ms)")
+
+        stated_ms = np.concatenate([delay_ms for _, delay_ms in stated.values()])
+        _scale_age_axis(grid[0, 0], np.concatenate([*ages_ms.values(), stated_ms]))
+        entries = _list_sender_entries(log)
+        if np.any(np.isfinite(stated_ms)):
+            entries.append(("mean delay as stated", style.LIMIT_LINE))
+        if has_bands:
+            entries.append(("least to largest, with median", style.SPREAD))
+        plot.finish(grid[-1], entries, links=True)
+    return plot.figure
+
+
+def _read_ages_ms(log: Log) -> dict[tuple[str, str], Array]:
+    """Returns the age of the sample in use, shape (K,), in ms, by sender and receiver."""
+    ages_ms = {}
+    for site in log.sites:
+        columns = sample_ages_ms(log, site).T
+        for peer, age_ms in zip(log[site].peers, columns, strict=True):
+            ages_ms[peer, site] = age_ms
+    return ages_ms
+
+
+def _add_link_panels(
+    figure: Figure, log: Log
+) -> tuple[style.AxesGrid, dict[tuple[str, str], Axes]]:
+    """Adds a panel per link to a figure, with a row per receiver.
+
+    Returns:
+        The grid of panels, and the panels by sender and receiver.
+    """
+    count = len(log.sites)
+    grid = style.add_panels(figure, count, count - 1, sharex=True, sharey=True)
+    panels = {}
+    for site, row in zip(log.sites, grid, strict=True):
+        for peer, axes in zip(log[site].peers, row, strict=True):
+            axes.set_title(f"{peer} → {site}", loc="left", pad=2.0)
+            panels[peer, site] = axes
+    return grid, panels
+
+
+def has_varying_delay(log: Log) -> bool:
+    """Tells whether the delays of a run vary, so that their distribution is of interest.
+
+    Args:
+        log: Log of the run.
+
+    Returns:
+        True if at least one link has more than one constant delay.
+    """
+    return not all(map(has_one_constant_delay, _list_link_models(log).values()))
+
+
+@draws(
+    "delay_distributions",
+    "distributions of delays and ages",
+    unless(has_varying_delay, "every link is stated as one constant delay"),
+    in_report=True,
+)
+def draw_delay_distributions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+    """Draws the distributions of the delay and of the age of samples on every link.
+
+    The delay of a sample is the time until its arrival, its age the time until its use. A curve
+    at x shows the percentage of samples with a delay of at most x ms, or of ticks with an age
+    of at most x ms. The figure has a row per receiver.
+
+    Args:
+        log: Log of the run.
+        form: Width, type sizes and resolution of the figure.
+    """
+    links = measure_delay_distributions(log)
+    x_ms = choose_delay_axis_ms(links)
+    with style.styled_figure(form, 0.6 + 1.05 * len(log.sites)) as figure:
+        grid, panels = _add_link_panels(figure, log)
+        for link in links:
+            axes = panels[link.peer, link.site]
+            age_percent = compute_cumulative_percent(link.age_ms, x_ms)
+            delay_percent = compute_cumulative_percent(link.delay_ms, x_ms)
+            axes.plot(x_ms, age_percent, **style.site_line(log, link.peer, 1.8))
+            axes.plot(x_ms, delay_percent, **style.LIMIT_LINE)
+        for axes in grid[:, 0]:
+            axes.set_ylabel("cumulative (%)")
+        for axes in grid[-1]:
+            axes.set_xlabel("delay or age (ms)")
+
+        first = grid[0, 0]
+        first.set(ylim=(0.0, 104.0), xlim=(x_ms[0], x_ms[-1]))
+        is_logarithmic = x_ms[0] > 0.0
+        if is_logarithmic:
+            first.set_xscale("log")
+            style.set_plain_log_axis(first.xaxis, (1.0,) if form.narrow else (1.0, 2.0, 5.0))
+        entries = [(f"age, {text}", line) for text, line in _list_sender_entries(log)]
+        style.add_legend(figure, [*entries, ("delay of the samples", style.LIMIT_LINE)])
+    return figure
+
+
+def _list_link_models(log: Log) -> dict[str, list[StatedModel]]:
+    """Returns the models of every link: the first one, and one after every change."""
+    changes = list_changes(log)
+    return {link: list_stated_models(log, link, changes) for link in log.scenario.links}
+
+
+def measure_delay_distributions(log: Log) -> list[DelayDistribution]:
+    """Collects the delays and ages of the samples on every link of a run.
+
+    Args:
+        log: Log of the run.
+
+    Returns:
+        An entry per link, ordered by receiver and then by sender.
+    """
+    distributions = []
+    for site in log.sites:
+        for peer, arrivals in read_arrivals(log, site).items():
+            newest = int(arrivals.sample.max(initial=-1))
+            sent_count = count_sent(log, peer, newest)
+            delay_ms = predict_delivery(log, peer, site, sent_count).drawn_ms
+            # A link without a model has only measured delays, and only in a live session.
+            if not len(delay_ms) and log.driver == "live":
+                delay_ms = arrivals.delay_us / 1e3
+            age_ms = sample_ages_ns(log, peer, site) / 1e6
+            distributions.append(DelayDistribution(peer, site, delay_ms, age_ms))
+    return distributions
+
+
+def choose_delay_axis_ms(links: list[DelayDistribution]) -> Array:
+    """Chooses the delays at which the curves of the distributions have points.
+
+    The delays reach up to the longest delay or age. Their steps are equal, or equal on a
+    logarithmic axis if only few values are long.
+
+    Args:
+        links: Delays and ages of all links that share the axis.
+
+    Returns:
+        The delays, in ms, shape (P,). The first one is 0 unless the axis is logarithmic.
+    """
+    parts: list[Array] = [np.zeros(0)]
+    for link in links:
+        parts += [link.delay_ms, link.age_ms]
+    values = np.concatenate(parts)
+    known = values[np.isfinite(values)]
+    end_ms = 1.05 * max(float(known.max(initial=0.0)), 1.0)
+    if not needs_log_axis(known):
+        return np.linspace(0.0, end_ms, _POINTS)
+    shortest_ms = float(np.percentile(known, 1.0))
+    return np.geomspace(max(0.5 * shortest_ms, 0.1), end_ms, _POINTS)
+
+
+def compute_cumulative_percent(values: Array, limits: Array) -> Array:
+    """Returns the percentage of values that do not exceed each limit.
+
+    Args:
+        values: The values to count, shape (K,).
+        limits: The limits, shape (P,).
+
+    Returns:
+        Percentages, shape (P,). All are NaN if there are no values.
+    """
+    if not len(values):
+        return np.full(len(limits), np.nan)
+    counts = np.searchsorted(np.sort(values), limits, side="right")
+    return 100.0 * counts / len(values)
+
+
+def trace_stated_delay(log: Log, models: list[StatedModel]) -> tuple[Array, Array]:
+    """Returns the mean delay that the scenario states for a link, as the points of a line.
+
+    Args:
+        log: Log of the run.
+        models: Models of the link in order of time, at least one.
+
+    Returns:
+        Times in s, and mean delays in ms, each of shape (3 M,) for M models. Each model has a
+        point at its start, a point at its end, and a NaN that interrupts the line.
+    """
+    starts_s = [model.from_s for model in models]
+    last_s = max(recorded_end_s(log), starts_s[-1])
+    ends_s = [*starts_s[1:], last_s]
+    times_s: list[float] = []
+    means_ms: list[float] = []
+    for model, end_s in zip(models, ends_s, strict=True):
+        mean_ms = model.link.moments().mean_ms
+        times_s += [model.from_s, end_s, end_s]
+        means_ms += [mean_ms, mean_ms, np.nan]
+    return np.array(times_s), np.array(means_ms)
+
+
+def needs_log_axis(ages_ms: Array) -> bool:
+    """Returns True if a few ages are so long that a linear axis would hide the others.
+
+    This happens after an outage of a link, for example.
+
+    Args:
+        ages_ms: Ages, shape (K,). NaN values are ignored.
+    """
+    known = ages_ms[np.isfinite(ages_ms)]
+    if not len(known):
+        return False
+    return bool(known.max() > _RARE_RATIO * np.percentile(known, 95.0))
+
+
+def is_unsteady(ages_ms: Array) -> bool:
+    """Tells whether ages fluctuate so often that a line would look like a filled area.
+
+    Args:
+        ages_ms: Ages over time, shape (K,), in ms.
+
+    Returns:
+        True if the ages fall often, which happens whenever a newer sample is used.
+    """
+    falls = np.flatnonzero(np.diff(ages_ms) < -_STEP_MS)
+    return len(falls) > style.SPREAD_BUCKETS
+
+
+def _scale_age_axis(axes: Axes, values_ms: Array) -> None:
+    """Scales the value axis of ages to all values, shape (K,). NaN values are ignored."""
+    known = values_ms[np.isfinite(values_ms)]
+    if needs_log_axis(known):
+        least_ms = float(known[known > 0.0].min())
+        axes.set(yscale="log", ylim=(0.7 * least_ms, 2.0 * float(known.max())))
+        style.set_plain_log_axis(axes.yaxis, (1.0, 3.0))
+    else:
+        axes.set_ylim(0.0, 1.25 * max(float(known.max(initial=0.0)), 1.0))
+
+
+def _list_sender_entries(log: Log) -> list[tuple[str, dict[str, Any]]]:
+    """Returns the legend entries of the senders of samples."""
+    return [
+        (f"from {style.site_title(log, site)}", style.site_line(log, site, 1.8))
+        for site in log.sites
+    ]
+
+
+def explain_missing_loop_times(log: Log) -> str:
+    """Explains why a log has no figures of lateness and computing times of the control loop.
+
+    Only live sites measure how late a tick began and how long it took.
+
+    Args:
+        log: Log of the run.
+
+    Returns:
+        The reason. Empty if at least one site has such times.
+    """
+    if any(np.any(log[site].late_us) or np.any(log[site].busy_us) for site in log.sites):
+        return ""
+    return NO_LOOP_CLOCK if log.driver == "virtual" else NO_LOOP_TIMES
+
+
+def choose_bin_edges_us(log: Log) -> Array:
+    """Chooses the bins of the histograms of lateness and computing times.
+
+    The bins have equal widths on a logarithmic axis, from 1 us to above the longest time of the
+    log.
+
+    Args:
+        log: Log of the run.
+
+    Returns:
+        Edges of the bins in us, shape (B + 1,).
+    """
+    largest_us = 0
+    for site in log.sites:
+        for times_us in (log[site].late_us, log[site].busy_us):
+            largest_us = max(largest_us, int(times_us.max(initial=0)))
+    decades = np.log10(max(largest_us, 10) * 1.1)
+    count = int(np.ceil(decades * _BINS_PER_DECADE))
+    return np.power(10.0, np.arange(count + 1) / _BINS_PER_DECADE)
+
+
+def bin_loop_times(times_us: Ints, edges_us: Array) -> Ints:
+    """Counts how many times lie in each bin of a histogram.
+
+    Times below 1 us count in the first bin.
+
+    Args:
+        times_us: Times in us, shape (K,).
+        edges_us: Edges of the bins in us, shape (B + 1,).
+
+    Returns:
+        Number of times in each bin, shape (B,).
+    """
+    counts, _ = np.histogram(np.maximum(times_us, 1), edges_us)
+    return counts.astype(np.int64)
+
+
+@draws(
+    "loop_timing",
+    "lateness and computing time of the loops",
+    explain_missing_loop_times,
+    in_report=True,
+)
+def draw_loop_timing(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+    """Draws histograms of the timing of each site's control loop, in us.
+
+    They show the lateness, by which a tick began after its planned time, and the time that its
+    computation took.
+
+    Args:
+        log: Log of the run.
+        form: Width, type sizes and resolution of the figure.
+    """
+    edges_us = choose_bin_edges_us(log)
+    labels = ("wake-up after the deadline", "computing time of a tick")
+    if form.narrow:
+        labels = ("lateness", "computing time")
+    row_in = 1.3 if form.narrow else 1.05
+    with style.styled_figure(form, 0.6 + row_in * len(log.sites)) as figure:
+        grid = style.add_panels(figure, len(log.sites), 2, sharex=True, sharey=True)
+        for site, (late, busy) in zip(log.sites, grid, strict=True):
+            records = log[site]
+            for axes, times_us in ((late, records.late_us), (busy, records.busy_us)):
+                colour = style.site_colour(log, site)
+                _draw_histogram(axes, times_us, edges_us, colour)
+                axes.axvline(1e6 / log.scenario.sites[site].rate_hz, **style.LIMIT_LINE)
+                _title_histogram(axes, site, times_us, form)
+            late.set_ylabel("ticks (count)")
+        grid[0, 0].set_ylim(bottom=0.7)
+        for axes, label in zip(grid[-1], labels, strict=True):
+            axes.set_xlabel(f"{label} (µs)")
+        style.add_legend(figure, [("one period", style.LIMIT_LINE)])
+    return figure
+
+
+def _draw_histogram(axes: Axes, times_us: Ints, edges_us: Array, colour: str) -> None:
+    """Draws the histogram of times on logarithmic axes."""
+    axes.set(xscale="log", yscale="log")
+    counts = bin_loop_times(times_us, edges_us)
+    axes.stairs(counts, edges_us, baseline=0.5, fill=True, color=colour)
+
+
+def _title_histogram(axes: Axes, site: str, times_us: Ints, form: FigureSize) -> None:
+    """Writes the site and the percentiles of its times, shape (K,), above a histogram."""
+    if not len(times_us):
+        style.annotate_empty_panel(axes, f"no times of {site}")
+        return
+    percentiles = np.percentile(times_us, (50.0, 99.0, 100.0))
+    p50, p99, largest = (f"{value_us:.0f}" for value_us in percentiles)
+    separator = "\n" if form.narrow else " "
+    title = f"{site}: p50 {p50}, p99 {p99},{separator}max {largest} µs"
+    axes.set_title(title, loc="left", pad=2.0)

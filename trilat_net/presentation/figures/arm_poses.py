@@ -1,0 +1,408 @@
+"""Draws the poses of the arms at a few times of a run, for a figure and for a page.
+
+A planar arm is drawn in its plane. An arm in space, called a chain, is drawn as seen from one
+fixed direction, in parallel projection. Up in the picture is opposite to gravity.
+
+`draw_arms` returns a Matplotlib figure, and `render_arms_svg` returns SVG for the page. Both
+draw the same poses, which `find_pose` computes.
+
+Invariant:
+    - The positions of the joints are those of the simulation kernel's forward kinematics.
+    - The reference pose of each arm, which its control law aims at, is drawn with dashed lines.
+"""
+
+from collections.abc import Iterable, Sequence
+from html import escape
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ...analysis import site_signals
+from ...analysis.arm_rows import joint_positions_m, upright_axes
+from ...analysis.site_signals import reference_angles
+from ...analysis.timeline import recorded_end_s
+from ...core.step.vectors import Array
+from ...log.log_reader import Log
+from ...scenario.arms import ArmModel
+from .. import style
+from ..appearance import REPORT_SIZE, FigureSize
+from .figure_entry import draws
+
+INSTANTS = 6
+"""Number of times at which the arms are drawn."""
+_NARROW_INSTANTS = 3
+"""The same in a figure that is as wide as one column of a paper."""
+_PATH_POINTS = 400
+"""Largest number of points of the path of an end effector."""
+_AZIMUTH = np.deg2rad(-50.0)
+"""Direction of view of chains: angle about the vertical, from the x axis of the base, in rad.
+"""
+_ELEVATION = np.deg2rad(22.0)
+"""Direction of view of chains: angle above the floor, in rad."""
+_SHADOW: dict[str, Any] = {
+    "color": "#c9c9c9",
+    "linewidth": 1.6,
+    "solid_capstyle": "round",
+    "zorder": 1.0,
+}
+_DESIRED: dict[str, Any] = {
+    "color": style.REFERENCE,
+    "linestyle": (0, (3, 1.5)),
+    "linewidth": 0.8,
+}
+PictureBox = tuple[float, float, float, float]
+"""Left, right, bottom and top of a picture."""
+_CORNERS_ON_PATH = np.array([0, 1, 3, 2, 0, 4, 5, 1, 5, 7, 3, 7, 6, 2, 6, 4])
+"""Numbers of a box's corners along a path that visits all of its edges.
+
+The bits of a number tell on which side of the box the corner lies, along x, y and z.
+"""
+_BOX_PATH = 0.5 - (_CORNERS_ON_PATH[:, np.newaxis] >> np.arange(3) & 1)
+"""The path as points of a box with sides of length 1 around the origin, shape (16, 3)."""
+_BASE: dict[str, Any] = {
+    "linestyle": "none",
+    "marker": "s",
+    "markersize": 4.5,
+    "color": style.REFERENCE,
+}
+
+
+class ArmPose(NamedTuple):
+    """The pose of a site's arm at some time, as points in the plane of a picture.
+
+    Attributes:
+        actual: Base, joints and end effector, shape (L, 2), in m.
+        desired: The same points for the reference pose, shape (L, 2), in m.
+        path: Path of the end effector from the start of the run, shape (P, 2), in m.
+        shadow: Shadow of a chain on a floor at its base, with light from straight above, shape
+            (L, 2), in m. Planar arms have no shadow: shape (0, 2).
+        bodies: For each body that the arm can touch, its edges as a path, shape (16, 2), in m.
+    """
+
+    actual: Array
+    desired: Array
+    path: Array
+    shadow: Array
+    bodies: Sequence[Array] = ()
+
+    def scale(self, factor: float) -> "ArmPose":
+        """Returns the pose with all points multiplied by a factor.
+
+        This converts a pose in m to the units of a picture.
+
+        Args:
+            factor: The factor.
+        """
+        return ArmPose(
+            actual=factor * self.actual,
+            desired=factor * self.desired,
+            path=factor * self.path,
+            shadow=factor * self.shadow,
+            bodies=[factor * path for path in self.bodies],
+        )
+
+    def list_points(self) -> Array:
+        """Returns all points that are drawn for this pose, to find the bounds of the picture.
+
+        Returns:
+            The points of the arms, of their paths and of the touched bodies, shape (K, 2), in
+            m.
+        """
+        parts = [self.actual, self.desired, self.path, self.shadow, *self.bodies]
+        return np.concatenate(parts)
+
+
+def trace_bodies_m(
+    arm: ArmModel, sizes_m: Iterable[Sequence[float]], poses: Array
+) -> list[Array]:
+    """Returns the edges of box-shaped bodies as paths in the plane of a picture.
+
+    A path visits all edges of a box, so that one line draws the box.
+
+    Args:
+        arm: Arm of the site, which determines the projection.
+        sizes_m: Size of each of the b bodies along its own axes, in m.
+        poses: Poses of the bodies in K records, shape (K, 7 b): for each body the position in
+            m, and the unit quaternion of its orientation with w first.
+
+    Returns:
+        A path per body, shape (K, 16, 2), in m.
+    """
+    paths = []
+    body_count = poses.shape[1] // 7
+    for size, pose in zip(sizes_m, np.split(poses, body_count, axis=1), strict=True):
+        position = pose[:, np.newaxis, :3]
+        w = pose[:, np.newaxis, 3:4]
+        v = pose[:, np.newaxis, 4:]
+        box = _BOX_PATH * np.asarray(size)
+        corners = np.broadcast_to(box, (len(pose), *box.shape))
+        # Rotation of a point p by the quaternion (w, v): p + 2 v x (v x p + w p).
+        rotated = corners + 2.0 * np.cross(v, np.cross(v, corners) + w * corners)
+        edges = rotated + position
+        paths.append(edges[..., :2] if arm.chain is None else project_arm_m(arm, edges))
+    return paths
+
+
+def project_arm_m(arm: ArmModel, points: Array, *, onto_floor: bool = False) -> Array:
+    """Projects points of an arm to the plane of a picture.
+
+    Args:
+        arm: Model of the arm.
+        points: Points in the frame of the base, in m, shape (..., 3). Those of a planar arm
+            have the shape (..., 2), and are returned unchanged.
+        onto_floor: True to return the shadows of the points on a floor at the base.
+
+    Returns:
+        Points in the picture, shape (..., 2), in m.
+    """
+    if arm.chain is None:
+        return points
+    x, y, z = np.moveaxis(points @ upright_axes(arm.chain).T, -1, 0)
+    across = y * np.cos(_AZIMUTH) - x * np.sin(_AZIMUTH)
+    towards = x * np.cos(_AZIMUTH) + y * np.sin(_AZIMUTH)
+    height = np.zeros_like(z) if onto_floor else z
+    up = height * np.cos(_ELEVATION) - towards * np.sin(_ELEVATION)
+    return np.stack([across, up], axis=-1)
+
+
+def choose_instants_s(log: Log, count: int = INSTANTS) -> list[float]:
+    """Chooses the times at which to draw the arms, including the first and the last time.
+
+    Equal steps of time would mostly show arms at rest. Therefore the times are equally spaced
+    in a measure of progress to which time and motion contribute one half each.
+
+    Args:
+        log: Log of the run.
+        count: Largest number of times. There may be fewer, because the times are rounded.
+
+    Returns:
+        The times in increasing order, in s.
+    """
+    end_s = recorded_end_s(log)
+    grid_s = np.linspace(0.0, end_s, 1001)
+    moved_rad = np.zeros_like(grid_s)
+    for site in log.sites:
+        part = log[site]
+        if len(part):
+            angles = site_signals.joint_angles(part)
+            steps = np.abs(np.diff(angles, axis=0, prepend=part.q[:1])).sum(axis=1)
+            moved_rad += np.interp(grid_s, part.t_s, np.cumsum(steps))
+
+    progress = grid_s / end_s
+    if moved_rad[-1] > 0.0:
+        progress += moved_rad / moved_rad[-1]
+    chosen_s = np.interp(np.linspace(0.0, progress[-1], count), progress, grid_s)
+
+    # The times are rounded to two or three digits, for short titles.
+    step_s = 10.0 ** np.floor(np.log10(end_s / 50.0))
+    times_s = {0.0, end_s}
+    for time_s in chosen_s[1:-1]:
+        rounded_s = float(np.round(time_s / step_s) * step_s)
+        if rounded_s < end_s:
+            times_s.add(round(rounded_s, 6))
+    return sorted(times_s)
+
+
+def find_pose(log: Log, site: str, t_s: float) -> ArmPose | None:
+    """Returns the pose of a site in its last record until a time.
+
+    Args:
+        log: Log of the run.
+        site: Name of the site.
+        t_s: The time, in s.
+
+    Returns:
+        The pose. None if the site has no record until then.
+    """
+    part = log[site]
+    arm = log.scenario.arms[site]
+    last = int(np.searchsorted(part.t_s, t_s + 1e-9, side="right")) - 1
+    if last < 0:
+        return None
+
+    # The path of the end effector until then. Its last point belongs to the last record.
+    rows = np.unique(np.linspace(0, last, _PATH_POINTS).astype(np.int64))
+    positions = joint_positions_m(arm, part.q[rows])
+    actual = project_arm_m(arm, positions)
+    reference = reference_angles(part)[last : last + 1]
+    desired = project_arm_m(arm, joint_positions_m(arm, reference)[0])
+
+    shadow: Array = np.zeros((0, 2))
+    if arm.chain is not None:
+        shadow = project_arm_m(arm, positions[-1:], onto_floor=True)[0]
+
+    bodies: list[Array] = []
+    sizes_m = log.scenario.bodies_m(site).values()
+    if sizes_m:
+        paths = trace_bodies_m(arm, sizes_m, part.bodies[last : last + 1])
+        bodies = [path[0] for path in paths]
+    return ArmPose(
+        actual=actual[-1], desired=desired, path=actual[:, -1], shadow=shadow, bodies=bodies
+    )
+
+
+def compute_pose_box_m(poses: Sequence[ArmPose | None]) -> PictureBox:
+    """Returns a box around poses and the base, with a margin.
+
+    Before the margin is added, the box is made at least 70 % as wide as it is high, and at
+    least 70 % as high as it is wide, so that pictures are never narrow strips.
+
+    Args:
+        poses: The poses. None entries are ignored.
+
+    Returns:
+        Left, right, bottom and top of the box, in m.
+    """
+    parts = [pose.list_points() for pose in poses if pose is not None]
+    base = np.zeros((1, 2))
+    points = np.concatenate([*parts, base])
+    low = points.min(axis=0)
+    high = points.max(axis=0)
+    centre = (low + high) / 2.0
+    extent = max(float((high - low).max()), 0.1)
+    half = np.maximum((high - low) / 2.0, 0.35 * extent) + 0.08 * extent
+
+    left, bottom = (centre - half).tolist()
+    right, top = (centre + half).tolist()
+    return left, right, bottom, top
+
+
+@draws("arms", "the arms at a few instants", in_report=True)
+def draw_arms(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+    """Draws the poses of all arms at a few times, with a row per site and a column per time.
+
+    Args:
+        log: Log of the run.
+        form: Width, type sizes and resolution of the figure.
+    """
+    times_s = choose_instants_s(log, _NARROW_INSTANTS if form.narrow else INSTANTS)
+    poses = {site: [find_pose(log, site, t_s) for t_s in times_s] for site in log.sites}
+    all_poses = [pose for row in poses.values() for pose in row]
+    left, right, bottom, top = compute_pose_box_m(all_poses)
+    is_planar = all(arm.chain is None for arm in log.scenario.arms.values())
+
+    width_in = (form.width_in - 0.6) / len(times_s)
+    row_in = width_in * (top - bottom) / (right - left) + 0.08
+    with style.styled_figure(form, 0.75 + len(log.sites) * row_in) as figure:
+        grid = style.add_panels(figure, len(log.sites), len(times_s), sharex=True, sharey=True)
+        for site, row in zip(log.sites, grid, strict=True):
+            for axes, pose in zip(row, poses[site], strict=True):
+                _draw_pose(axes, pose, style.site_colour(log, site))
+            row[0].set_ylabel(f"{site}: y (m)" if is_planar else f"{site}: up (m)")
+        for axes, t_s in zip(grid[0], times_s, strict=True):
+            axes.set_title(f"t = {t_s:.4g} s")
+        for axes in grid[-1]:
+            axes.set_xlabel("x (m)" if is_planar else "across (m)")
+        grid[0, 0].set(xlim=(left, right), ylim=(bottom, top))
+
+        entries: list[tuple[str, dict[str, Any]]] = []
+        for site in log.sites:
+            line = {"color": style.site_colour(log, site), "linewidth": 2.0}
+            entries.append((style.site_title(log, site), line))
+        entries += [("desired", _DESIRED), ("base", _BASE)]
+        if not is_planar:
+            entries.append(("shadow", _SHADOW))
+        style.add_legend(figure, entries)
+    return figure
+
+
+def _draw_pose(axes: Axes, pose: ArmPose | None, colour: str) -> None:
+    """Draws a pose into a panel, or a note if `pose` is None because there is no record yet."""
+    axes.set_aspect("equal")
+    if pose is None:
+        style.annotate_empty_panel(axes, "no record")
+        return
+    if len(pose.shadow):
+        axes.plot(*pose.shadow.T, **_SHADOW)
+    for path in pose.bodies:
+        axes.plot(*path.T, color=style.REFERENCE, linewidth=0.8)
+    axes.plot(*pose.path.T, color=colour, linewidth=0.6, alpha=0.55)
+    axes.plot(*pose.desired.T, **_DESIRED)
+    axes.plot(
+        *pose.actual.T,
+        color=colour,
+        linewidth=2.0,
+        solid_capstyle="round",
+        solid_joinstyle="round",
+    )
+    joints = pose.actual[1:]
+    axes.plot(*joints.T, linestyle="none", marker="o", markersize=2.6, color=colour)
+    axes.plot(0.0, 0.0, **_BASE)
+
+
+def render_arms_svg(log: Log, bounds_m: PictureBox, factor: float) -> str:
+    """Draws the poses of all arms at a few times, as pictures in HTML.
+
+    There is a row per site and a column per time. Sites without records are left out.
+
+    Args:
+        log: Log of the run.
+        bounds_m: Left, right, bottom and top of every picture, in m.
+        factor: Scale of the pictures, in units of the picture per m.
+
+    Returns:
+        HTML with the pictures.
+    """
+    left_m, right_m, bottom_m, top_m = bounds_m
+    bounds = (factor * left_m, factor * right_m, factor * bottom_m, factor * top_m)
+    times_s = choose_instants_s(log)
+    cells = ["<span></span>"]
+    cells += [f'<span class="head">t = {t_s:.4g} s</span>' for t_s in times_s]
+    for index, site in enumerate(log.sites):
+        if not len(log[site]):
+            continue
+        cells.append(f'<span class="head">{escape(site)}</span>')
+        for t_s in times_s:
+            pose = find_pose(log, site, t_s)
+            scaled = None if pose is None else pose.scale(factor)
+            label = f"{site} at {t_s:.4g} s"
+            cells.append(_render_picture(scaled, index, bounds, label))
+    columns = f"grid-template-columns: max-content repeat({len(times_s)}, 1fr)"
+    html = f'<div class="strip" style="{columns}">{"".join(cells)}</div>'
+    if any(arm.chain for arm in log.scenario.arms.values()):
+        html += (
+            '<p class="note">Gray: the shadow on a floor at the base. '
+            "Up is opposite to gravity.</p>"
+        )
+    return html
+
+
+def _render_picture(pose: ArmPose | None, index: int, bounds: PictureBox, label: str) -> str:
+    """Returns a picture of a pose as SVG.
+
+    Args:
+        pose: The pose in units of the picture. None for a picture without an arm.
+        index: Index of the site, on which its colour depends.
+        bounds: Left, right, bottom and top of the picture.
+        label: Description of the picture for screen readers.
+    """
+    left, right, bottom, top = bounds
+    ground = f'<line class="ground" x1="{left:.3f}" x2="{right:.3f}" y1="0" y2="0"/>'
+    base = '<rect class="base" x="-.06" y="-.06" width=".12" height=".12"/>'
+    drawing = ""
+    if pose is not None:
+        paths = [
+            (f"path site-{index}", pose.path),
+            ("desired", pose.desired),
+            (f"arm site-{index}", pose.actual),
+        ]
+        paths += [("body", path) for path in pose.bodies]
+        if len(pose.shadow):
+            ground = ""
+            paths.insert(0, ("shadow", pose.shadow))
+        for kind, path in paths:
+            drawing += f'<polyline class="{kind}" points="{_format_points(path)}"/>'
+        for x, y in pose.actual[1:]:
+            drawing += f'<circle class="fill-{index}" cx="{x:.3f}" cy="{-y:.3f}" r=".055"/>'
+    box = f"{left:.3f} {-top:.3f} {right - left:.3f} {top - bottom:.3f}"
+    return (
+        f'<svg viewBox="{box}" role="img" aria-label="{escape(label)}">'
+        f"{ground}{drawing}{base}</svg>"
+    )
+
+
+def _format_points(points: Array) -> str:
+    """Returns points, shape (K, 2), as text for SVG, whose y axis points downwards."""
+    return " ".join(f"{x:.3f},{-y:.3f}" for x, y in points)

@@ -1,0 +1,305 @@
+"""Draws the energies that show whether a run was stable, in J over time.
+
+V is the energy function with which the stability of the coupled arms is proved. It contains the
+energy of motion, of position errors, of errors of the parameter estimates, and of delayed
+signals (docs/certificate-energy.md). A site is a process that runs one arm. There are two
+figures:
+
+- `draw_functional` draws V, its parts, and the contribution of each site. It also draws the
+  energy that was dissipated, the work that was done on the arms, and the residual: the change
+  of V that dissipation and work do not explain.
+- `draw_observed_energy` is for control laws that prove their passivity by bookkeeping: they
+  record how much energy they have received and supplied. The figure draws these energies.
+
+Invariant:
+    - Times for which V is unknown, because records are missing, are shaded.
+    - The largest rise of V is marked, because V must not rise in a stable run.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ...analysis.certificate.energy_balance import EnergyBalance
+from ...analysis.certificate.observed_energy import ObservedEnergy, observe_energies
+from ...analysis.certificate.premises import explain_no_functional, find_unjudged_spans
+from ...analysis.certificate.stability_certificate import Certificate, certify
+from ...core.step.vectors import Array
+from ...log.log_reader import Log
+from ...scenario.code_consent import may_run_user_laws
+from .. import style
+from ..appearance import REPORT_SIZE, FigureSize
+from .figure_entry import draws, unless
+
+_PART_LABELS = {
+    "kinetic": "r'Mr / 2",
+    "parameter": "parameter error",
+    "position": "e'ΛKd e / 2",
+    "delay": "under way",
+}
+_DISSIPATION_LABELS = {
+    "damping": "taken: r'Kp r",
+    "disagreement": "taken: disagreement",
+}
+_WORK_COLOURS = ("#117733", "#aa4499", "#999933", "#882255", "#44aa99", "#661100")
+_TOTAL: dict[str, Any] = {"color": style.REFERENCE, "linewidth": 1.6}
+_PAPER_TOTAL: dict[str, Any] = {
+    "color": style.REFERENCE,
+    "linewidth": 0.9,
+    "linestyle": (0, (4, 2)),
+}
+_RISE: dict[str, Any] = {"color": "#cc3311", "alpha": 0.25, "linewidth": 0.0, "zorder": 0.4}
+_UNJUDGED: dict[str, Any] = {
+    "color": style.FAINT,
+    "alpha": 0.3,
+    "linewidth": 0.0,
+    "zorder": 0.3,
+}
+_DISSIPATED: dict[str, Any] = {"color": style.REFERENCE, "linestyle": style.DASHES[1]}
+_HEIGHTS = (1.5, 1.2, 1.3, 1.0)
+"""Relative heights of the panels of V."""
+_OBSERVED_PANELS = {
+    "line": "in the lines (J)",
+    "known": "known of them (J)",
+    "store": "stored (J)",
+    "given": "given, taken (J)",
+}
+"""Label of the panel of each kind of declared energy.
+
+The panel "given" also shows the kind "taken", the energy that a law dissipated.
+"""
+
+
+def draw_functional(
+    log: Log, certificate: Certificate, form: FigureSize = REPORT_SIZE
+) -> Figure:
+    """Draws the energy function V of the stability proof and its balance, in J over time.
+
+    V decreases if the controllers dissipate more than the operators put in. The panels are,
+    from the top: V and the contribution of each site; the parts of V; dissipation and work; and
+    the residual of the balance, the part of V that they do not explain. Without a balance the
+    figure shows the reason.
+
+    Args:
+        log: Log of the run.
+        certificate: Judgement whether the run was stable, which contains the balance.
+        form: Width, type sizes and resolution of the figure.
+    """
+    balance = certificate.balance
+    if balance is None:
+        return style.empty_figure(certificate.verdict.text, form)
+
+    height_in = 7.2 if form.narrow else 6.4
+    with style.time_figure(log, form, height_in) as plot:
+        panels = style.add_panels(plot.figure, 4, 1, sharex=True, height_ratios=_HEIGHTS)
+        total, parts, work, residual = panels[:, 0]
+        _draw_total(total, log, certificate, balance)
+        _draw_parts(parts, balance, form)
+        _draw_work(work, balance, form)
+        _draw_residual(residual, balance, form)
+        for axes in (total, parts, work, residual):
+            # The lower panels have a legend where the numbers of the changes would be.
+            plot.mark(axes, log.sites, numbered=axes is total)
+            for from_s, to_s in find_unjudged_spans(balance):
+                axes.axvspan(from_s, to_s, **_UNJUDGED)
+        rise = certificate.verdict.rise
+        if rise is not None:
+            total.axvspan(rise.from_s, rise.at_s, **_RISE)
+            total.axvline(rise.at_s, color=_RISE["color"], linewidth=0.8)
+
+        entries = [*style.site_legend_entries(log, log.sites), ("V", _TOTAL)]
+        if certificate.paper_balance is not None:
+            entries.append(("V with the paper's ones", _PAPER_TOTAL))
+        plot.finish([residual], entries)
+    return plot.figure
+
+
+@draws(
+    "certificate",
+    "V, its parts, who changed it, the energy balance",
+    lambda log: explain_no_functional(log.scenario),
+    in_report=True,
+)
+def _draw_certificate(log: Log, form: FigureSize) -> Figure:
+    """Draws the energy function V of the stability proof over the course of a log.
+
+    This function is called through the registry of figures.
+    """
+    own_laws = may_run_user_laws(log.scenario)
+    return draw_functional(log, certify(log, own_laws=own_laws), form)
+
+
+def draw_observed_energy(
+    log: Log, observed: ObservedEnergy, form: FigureSize = REPORT_SIZE
+) -> Figure:
+    """Draws the energies that the control laws keep account of and record, in J over time.
+
+    Some laws ensure stability by not returning more energy than they received. There is a panel
+    for each kind that the laws declare: the energy in the lines between sites; the part of this
+    energy that is known to the receivers; stored energy; and energy that the arms gave to the
+    laws or that the laws dissipated. A line between sites has the colour of its receiver.
+
+    Args:
+        log: Log of the run.
+        observed: The declared energies, at least one.
+        form: Width, type sizes and resolution of the figure.
+    """
+    kinds = {curve.kind for curve in observed.curves}
+    panel_kinds = [kind for kind in _OBSERVED_PANELS if kind in kinds]
+    panel_in = 1.6 if form.narrow else 1.4
+    height_in = panel_in * len(panel_kinds) + 0.8
+    with style.time_figure(log, form, height_in) as plot:
+        rows = style.add_panels(plot.figure, len(panel_kinds), 1, sharex=True)[:, 0]
+        panels = dict(zip(panel_kinds, rows, strict=True))
+        for curve in observed.curves:
+            panel_kind = curve.kind
+            line = style.site_line(log, curve.site)
+            if curve.kind == "taken":
+                panel_kind = "given"
+                line["linestyle"] = _DISSIPATED["linestyle"]
+            axes = panels[panel_kind]
+            ticks = np.arange(len(curve.t_s))
+            style.plot_decimated(axes, ticks, curve.t_s, curve.energy_j, **line)
+        for kind, axes in panels.items():
+            axes.set_ylabel(_OBSERVED_PANELS[kind])
+            plot.mark(axes, log.sites, numbered=axes is rows[0])
+        entries = style.site_legend_entries(log, log.sites)
+        plot.finish([rows[-1]], [*entries, ("taken by the law", _DISSIPATED)])
+    return plot.figure
+
+
+def _has_declared_energies(log: Log) -> bool:
+    """Returns True if at least one control law of the run declares energies."""
+    observed = observe_energies(log, own_laws=may_run_user_laws(log.scenario))
+    return observed is not None and bool(observed.curves)
+
+
+@draws(
+    "observed_energy",
+    "energies that the control laws declare: lines, observers, tanks",
+    unless(_has_declared_energies, "the laws of this run declare no energies"),
+    in_report=True,
+)
+def _draw_observed(log: Log, form: FigureSize) -> Figure:
+    """Draws the declared energies of a log's control laws, for the registry of figures."""
+    observed = observe_energies(log, own_laws=may_run_user_laws(log.scenario))
+    assert observed is not None
+    return draw_observed_energy(log, observed, form)
+
+
+def _draw_line(balance: EnergyBalance, axes: Axes, values: Array, **options: Any) -> None:
+    """Draws values at the ticks of a balance, shape (T,)."""
+    ticks = np.arange(len(balance.t_s))
+    style.plot_decimated(axes, ticks, balance.t_s, values, **options)
+
+
+def _add_panel_legend(axes: Axes, form: FigureSize) -> None:
+    """Adds a legend inside a panel, and extends the value axis to make room for it."""
+    handles, _ = axes.get_legend_handles_labels()
+    columns = 2 if form.narrow else 4
+    rows = math.ceil(len(handles) / columns)
+    room = 0.25 * rows if form.narrow else 0.35
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, high + room * (high - low))
+    axes.legend(loc="upper left", ncols=columns, fontsize=_choose_legend_pt(form))
+
+
+def _choose_legend_pt(form: FigureSize) -> float:
+    """Returns the type size of a legend inside a panel, in pt."""
+    is_uniform = form.small_pt == form.tick_pt
+    return form.small_pt if is_uniform else form.small_pt + 0.5
+
+
+def _draw_total(axes: Axes, log: Log, certificate: Certificate, balance: EnergyBalance) -> None:
+    """Draws V and the contribution of each site to V.
+
+    If the weights of the sites that the paper states do not apply, V with these weights is
+    drawn as a dashed line for comparison.
+    """
+    _draw_line(balance, axes, balance.V, **_TOTAL)
+    paper_balance = certificate.paper_balance
+    if paper_balance is not None:
+        _draw_line(paper_balance, axes, paper_balance.V, **_PAPER_TOTAL)
+    for site, values in balance.sites.items():
+        _draw_line(balance, axes, values, **style.site_line(log, site, 1.0))
+    axes.set_ylim(bottom=0.0)
+    axes.set_ylabel(r"V and its $\beta_i V_i$ (J)")
+
+
+def _draw_parts(axes: Axes, balance: EnergyBalance, form: FigureSize) -> None:
+    """Draws the parts of V: kinetic, parameter error, position error, and under way."""
+    for (name, values), dashes in zip(balance.parts.items(), style.DASHES, strict=True):
+        _draw_line(
+            balance,
+            axes,
+            values,
+            label=_PART_LABELS[name],
+            color=style.REFERENCE,
+            linestyle=dashes,
+        )
+    axes.set_ylabel("parts of V (J)")
+    _add_panel_legend(axes, form)
+
+
+def _draw_work(axes: Axes, balance: EnergyBalance, form: FigureSize) -> None:
+    """Draws the dissipated energy by kind, and the work of every source.
+
+    The work of all links is drawn as one line. Sources whose work is negligible are left out.
+    """
+    for (name, values), dashes in zip(balance.dissipation.items(), style.DASHES, strict=False):
+        label = _DISSIPATION_LABELS.get(name, f"taken: {name}")
+        _draw_line(balance, axes, values, label=label, color=style.REFERENCE, linestyle=dashes)
+
+    link_works = [work for name, work in balance.work.items() if "->" in name]
+    other_works = {name: work for name, work in balance.work.items() if "->" not in name}
+    works = {
+        "hands": other_works.pop("hands"),
+        "walls": other_works.pop("walls"),
+        "links": np.sum(link_works, axis=0),
+        **other_works,
+        "sampling": balance.sampling,
+    }
+    least = 1e-4 * balance.scale
+    for (name, values), colour in zip(works.items(), 2 * _WORK_COLOURS, strict=False):
+        if np.abs(values).max() > least:
+            _draw_line(balance, axes, values, label=f"given: {name}", color=colour)
+    _add_panel_legend(axes, form)
+    axes.set_ylabel("taken and given (J)")
+
+
+def _draw_residual(axes: Axes, balance: EnergyBalance, form: FigureSize) -> None:
+    """Draws the residual of the energy balance, which shows whether the log fits the model.
+
+    The solid line is the residual: the change of the energy function V that neither dissipation
+    ("taken") nor the work on the arms ("given") explains. Some of it arises because the control
+    law is executed in ticks ("sampling"). The dotted line is what remains without this part.
+    The value axis is logarithmic, so that the residual can be compared with the largest energy.
+
+    Args:
+        axes: Panel of the figure, as Matplotlib axes.
+        balance: V and all energies that change it, in J over time.
+        form: Width, type sizes and resolution of the figure.
+    """
+    largest_energy = balance.scale or 1.0
+    floor = 1e-9 * largest_energy  # smaller magnitudes are drawn at this height
+    solid = "-"
+    dotted = (0, (1, 1))
+    residuals = (
+        ("V - V(0) + taken - given", balance.residual, solid),
+        ("with sampling booked", balance.unexplained, dotted),
+    )
+    for label, values, dashes in residuals:
+        magnitude = np.maximum(np.abs(values), floor)
+        _draw_line(
+            balance, axes, magnitude, label=label, color=style.REFERENCE, linestyle=dashes
+        )
+    axes.axhline(largest_energy, color=style.FAINT, linewidth=0.9, label="largest energy")
+    # The legend is above the lines. In a narrow figure it is higher, and needs 12 decades of
+    # the axis instead of 4.
+    room = 1e12 if form.narrow else 1e4
+    axes.set(yscale="log", ylabel="residual (J)", ylim=(floor, room * largest_energy))
+    columns = 1 if form.narrow else 3
+    axes.legend(loc="upper left", ncols=columns, fontsize=_choose_legend_pt(form))

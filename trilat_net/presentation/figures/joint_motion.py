@@ -1,0 +1,779 @@
+"""Draws the signals of the arms, such as torques, angles, errors and contact forces.
+
+A site is a process that runs one arm, and an operator is the person or program that moves an
+arm. Each function with the decorator `draws` is one figure. Most signals are read from the
+records of the run. Some are computed:
+
+- Weights with which an arm follows the other arms (dominance factors) are computed from the
+  scenario, the description of the experiment, and its recorded changes.
+- Contact forces are computed from the walls of the scenario and the recorded motion, by
+  `analysis.torque_sources`.
+- The settling time, after which an error stays small, is computed by `analysis.site_signals`.
+
+Invariant:
+    - Torques of operators are drawn as they act on the arm. The records contain the opposite
+      sign, the torque that the arm exerts on the operator.
+"""
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ...analysis import site_signals
+from ...analysis.arm_rows import build_arm_rows
+from ...analysis.dominance_history import trace_dominance
+from ...analysis.site_signals import SETTLED_ERROR_RAD
+from ...analysis.timeline import list_changes
+from ...analysis.torque_sources import list_walls, wall_depth, wall_force
+from ...core.arms.chain import LINK_PARAMETERS
+from ...core.step.vectors import Array
+from ...execution.virtual_comparison import simulate_without_operators
+from ...log.log_reader import Log
+from ...scenario.code_consent import find_user_laws
+from .. import style
+from ..appearance import REPORT_SIZE, FigureSize
+from .figure_entry import draws, unless
+
+_ROW_IN = 1.2
+"""Height of every further row of panels, in inches."""
+_TRANSPOSED = {"col": "row", "none": "none"}
+"""Which panels share their value axis after rows and columns have been exchanged."""
+_LEAST_RAD = 1e-3 * SETTLED_ERROR_RAD
+"""Smallest lower end of the axis of errors, in rad."""
+_PLANES = ((0, 1), (0, 2), (1, 2))
+"""Horizontal and vertical axis of each plane in which paths are drawn."""
+_LOOP_PT = 0.8
+"""Width of a line that crosses itself, in pt."""
+_PATH_STEP = 0.01
+"""Distance between two points of a thinned path, as a share of the extent of the path."""
+_LINK_PANEL_PT = 5.5
+"""Type size of titles and time labels in the figure of link parameters, in pt."""
+NO_OPERATOR = "no site has an operator in this run"
+
+explain_absent_operator = unless(site_signals.sites_with_operator, NO_OPERATOR)
+"""Returns the reason why a log has no torque of an operator. Empty if it has one."""
+
+
+@draws(
+    "operator_torques",
+    "torque of operators and walls on the arms (Fig. 3 of the paper)",
+    explain_absent_operator,
+    in_report=True,
+)
+def draw_operator_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+    """Draws the torques of the operators on the arms over time, as Fig. 3 of the paper.
+
+    An operator is the person or program that moves an arm. The torques are in N m.
+
+    Args:
+        log: Log of the run.
+        form: Width, type sizes and resolution of the figure.
+    """
+    return _draw_joints(
+        log=log,
+        form=form,
+        sites=site_signals.sites_with_operator(log),
+        signal=style.site_records(log, site_signals.external_torques),
+        label="torque on the arm (N m)",
+    )
+
+
+def _explain_absent_displacement(log: Log) -> str:
+    """Returns the reason why a run cannot be repeated without its operators.
+
+    Returns:
+        The reason: there are no operators, or the code of a user's control law may not run
+        here. Empty if the run can be repeated.
+    """
+    if not any(site.hands for site in log.scenario.sites.values()):
+        return NO_OPERATOR
+    for law in find_user_laws(log.scenario):
+        if not law.allowed:
+            return str(law)
+    return ""
+
+
+@draws(
+    "hands_moved",
+    "the log minus the same run without operators",
+    _explain_absent_displacement,
+    in_report=True,
+)
+def draw_operator_displacement(
+    log: Log, form: FigureSize = REPORT_SIZE, *, twin: Log | None = None
+) -> Figure:
+    """Draws how far the operators moved every arm, in rad.
+
+    The displacement is the difference between the log and the same run without operators.
+
+    Args:
+        log: Log of the run.
+        form: Width, type sizes and resolution of the figure.
+        twin: The run without operators. None to simulate it.
+    """
+    other = simulate_without_operators(log) if twin is None else twin
+    return _draw_joints(
+        log=log,
+        form=form,
+        sites=log.sites,
+        signal=partial(site_signals.operator_displacement, log, other),
+        label="moved by operators (rad)",
+    )
+
+
+@draws("control_torques", "torque of the controllers")
+def draw_control_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+    """Draws the torques that the controllers command at the joints of all arms, in N m.
+
+    They do not include the torques of operators and walls. If a controller reached its torque
+    limit, the limit is drawn too.
+
+    Args:
+        log: Log of the run.
+        form: Width, type sizes and resolution of the figure.
+    """
+    limits = list[Array]()
+    for site in log.sites:
+        torques = site_signals.controller_torques(log[site])
+        largest = np.abs(torques).max(axis=0, initial=0.0)
+        limit_nm = log.scenario.sites[site].limits.tau_limit_nm
+        limit = np.broadcast_to(limit_nm, largest.shape)
+        if (largest >= limit).any():
+            limits.append(limit)
+    return _draw_joints(
+        log=log,
+        form=form,
+        sites=log.sites,
+        signal=style.site_records(log, site_signals.controller_torques),
+        label="control torque (N m)",
+        limits=limits,
+    )
+
+
+def _draw_joints(
+    log: Log,
+    form: FigureSize,
+    sites: Sequence[str],
+    signal: style.SiteSignal,
+    label: str,
+    limits: Sequence[Array] = (),
+) -> Figure:
+    """Draws a signal over time, with a panel per joint and a line per site.
+
+    Args:
+        log: Log of the run.
+        form: Width, type sizes and resolution of the figure.
+        sites: Names of the sites that have the signal.
+        signal: Function that returns the signal of a site.
+        label: Label of the value axis.
+        limits: Limits of the signal, shape (n,) each. They are drawn with both signs.
+    """
+    count = len(style.name_joints(log))
+    rows = len(style.arrange_joints(count, form.narrow))
+    with style.time_figure(log, form, 2.2 + _ROW_IN * (rows - 1)) as plot:
+        panels = style.add_joint_panels(plot.figure, count, form)
+        style.title_joints(log, panels.joints)
+        plot.joint_row(panels.joints, sites, signal)
+        for joint, axes in enumerate(panels.joints):
+            joint_limits = {float(limit[joint]) for limit in limits if joint < len(limit)}
+            for value in sorted(joint_limits):
+                axes.axhline(value, **style.LIMIT_LINE)
+                axes.axhline(-value, **style.LIMIT_LINE)
+        first = panels.joints[0]
+        if rows == 1:
+            first.set_ylabel(label)
+        else:
+            plot.figure.supylabel(label, fontsize=first.yaxis.label.get_fontsize())
+        entries = style.site_legend_entries(log, sites)
+        if limits:
+            entries.append(("limit", style.LIMIT_LINE))
+        plot.finish(panels.lowest, entries)
+    return plot.figure
+
+
+def _add_joint_rows(
+    plot: style.TimeFigure,
+    form: FigureSize,
+    heads: Sequence[str],
+    labels: Sequence[str],
+    sharey: str,
+) -> tuple[list[list[Axes]], list[Axes]]:
+    """Adds a panel per quantity and joint to a figure.
+
+    Arms with two joints have a column per joint and a row per quantity. Arms with more joints
+    have a row per joint and a column per quantity, because a row of many joints would not fit.
+
+    Args:
+        plot: The figure.
+        form: Width, type sizes and resolution of the figure.
+        heads: Title of each quantity, used above a column.
+        labels: Label of each quantity, used beside a row.
+        sharey: "col" if the quantities of a joint share their value axis, otherwise "none".
+
+    Returns:
+        The panels, by quantity and then by joint, and the lowest panel of each column.
+    """
+    titles = style.name_joints(plot.log)
+    if len(titles) == 2:
+        grid = style.add_panels(plot.figure, len(labels), 2, sharex=True, sharey=sharey)
+        style.title_joints(plot.log, grid[0])
+        for row, label in zip(grid, labels, strict=True):
+            row[0].set_ylabel(label)
+        return [list(row) for row in grid], list(grid[-1])
+
+    grid = style.add_panels(
+        plot.figure, len(titles), len(heads), sharex=True, sharey=_TRANSPOSED[sharey]
+    )
+    for row, title in zip(grid, titles, strict=True):
+        style.label_row(row[0], title, form)
+    for axes, head in zip(grid[0], heads, strict=True):
+        axes.set_title(head)
+    return [list(column) for column in grid.T], list(grid[-1])
+
+
+@draws("operation", "torque on the arms above their angles", explain_absent_operator)
+def draw_operation(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+    """Draws what the operators did and how the arms moved.
+
+    The torques of the operators on the arms, in N m, are above the joint angles, in rad, or
+    beside them if the arms have more than two joints.
+
+    Args:
+        log: Log of the run.
+        form: Width, type sizes and resolution of the figure.
+    """
+    heads = ("torque on the arm (N m)", "joint angle (rad)")
+    if form.narrow:
+        heads = ("torque (N m)", "angle (rad)")
+    height_in = _choose_height_in(log, 2.9 if form.narrow else 3.4)
+    with style.time_figure(log, form, height_in) as plot:
+        (torques, angles), lowest = _add_joint_rows(
+            plot=plot, form=form, heads=heads, labels=heads, sharey="none"
+        )
+        if len(torques) == 2:
+            torques[1].sharey(torques[0])
+            torques[1].tick_params(labelleft=False)
+        operated_sites = site_signals.sites_with_operator(log)
+        torque_signal = style.site_records(log, site_signals.external_torques)
+        angle_signal = style.site_records(log, site_signals.joint_angles)
+        plot.joint_row(torques, operated_sites, torque_signal)
+        plot.joint_row(angles, log.sites, angle_signal)
+        plot.finish(lowest, style.site_legend_entries(log, log.sites))
+    return plot.figure
+
+
+def _choose_height_in(log: Log, two_joints_in: float) -> float:
+    """Returns the height of a figure that has a row per joint if there are more than two.
+
+    Args:
+        log: Log of the run.
+        two_joints_in: Height of the figure of arms with two joints, in inches.
+
+    Returns:
+        The height, in inches.
+    """
+    count = len(style.name_joints(log))
+    return two_joints_in if count == 2 else 0.8 + 0.9 * count
+
+
+@draws("positions", "actual and desired angles (Fig. 4 of the paper)", in_report=True)
+def draw_positions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+    """Draws the desired and the actual joint angles over time, as Fig. 4 of the paper.
+
+    The desired angles of a site are the average of its peers, weighted with the dominance
+    factors. The angles are in rad.
+
+    Args:
+        log: Log of the run.
+        form: Width, type sizes and resolution of the figure.
+    """
+    heads = [f"{site}: q (rad)" for site in log.sites]
+    labels = heads if form.narrow else [f"angle of {site} (rad)" for site in log.sites]
+    row_in = 0.95 if form.narrow else 1.25
+    height_in = _choose_height_in(log, 0.7 + row_in * len(log.sites))
+    with style.time_figure(log, form, height_in) as plot:
+        grid, lowest = _add_joint_rows(
+            plot=plot, form=form, heads=heads, labels=labels, sharey="col"
+        )
+        for site, row in zip(log.sites, grid, strict=True):
+            actual = site_signals.joint_angles(log[site])
+            desired = site_signals.reference_angles(log[site])
+            joints = actual.shape[1]
+            for joint, axes in enumerate(row[:joints]):
+                plot.trace(axes, site, actual[:, joint], 1.6)
+                plot.trace(axes, site, desired[:, joint], **style.LIMIT_LINE)
+                plot.mark(axes, [site])
+                if not len(log[site]):
+                    style.annotate_empty_panel(axes, f"no records of {site}")
+        entries = []
+        for site in log.sites:
+            label = f"{style.site_title(log, site)}, actual"
+            entries.append((label, style.site_line(log, site, 1.6)))
+        entries.append(("desired", style.LIMIT_LINE))
+        plot.finish(lowest, entries)
+    return plot.figure
+
+
+@draws(
+    "tracking_errors",
+    "errors, and the largest one still to come (Fig. 5 of the paper)",
+    in_report=True,
+)
+def draw_tracking_errors(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+    """Draws the tracking errors of every site over time, as Fig. 5 of the paper.
+
+    The error is e = q - q_des, the actual minus the desired joint angles. The panel below
+    shows, at each time, the largest error of any joint from then on. The settling time is
+    reached when this line falls below the dashed limit.
+
+    Args:
+        log: Log of the run.
+        form: Width, type sizes and resolution of the figure.
+    """
+    titles = style.name_shared(log)
+    unit = site_signals.shared_unit(log)
+    rows = len(style.arrange_joints(len(titles), form.narrow))
+    with style.time_figure(log, form, 3.6 + _ROW_IN * (rows - 1)) as plot:
+        panels = style.add_joint_panels(plot.figure, len(titles), form, below="all")
+        settling = panels.below
+        assert settling is not None
+        style.title_joints(log, panels.joints, titles)
+        error_signal = style.site_records(log, site_signals.joint_errors)
+        plot.joint_row(panels.joints, log.sites, error_signal)
+        first_in_rows = panels.joints[:: panels.columns]
+        for axes in first_in_rows:
+            axes.set_ylabel(f"tracking error ({unit})")
+
+        low = SETTLED_ERROR_RAD
+        high = SETTLED_ERROR_RAD
+        for site in log.sites:
+            remaining = style.positive(site_signals.largest_remaining_error(log[site]))
+            plot.trace(settling, site, remaining)
+            low = np.nanmin(remaining, initial=low)
+            high = np.nanmax(remaining, initial=high)
+        settling.axhline(SETTLED_ERROR_RAD, **style.LIMIT_LINE)
+        settling.set(
+            yscale="log",
+            ylim=(0.5 * low, 2.0 * high),
+            ylabel=f"largest error\nstill to come ({unit})",
+        )
+        plot.mark(settling, log.sites)
+        entries = style.site_legend_entries(log, log.sites)
+        entries.append((f"settling limit: {SETTLED_ERROR_RAD:g} {unit}", style.LIMIT_LINE))
+        plot.finish([*panels.lowest, settling], entries)
+    return plot.figure
+
+
+@draws("settling", "size of the errors on a log axis, settling times")
+def draw_settling(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+    """Draws the largest error of any joint of every site over time, on a logarithmic axis.
+
+    A triangle marks the time at which a site settles, and the legend states this time.
+
+    Args:
+        log: Log of the run.
+        form: Width, type sizes and resolution of the figure.
+    """
+    unit = site_signals.shared_unit(log)
+    entries = []
+    with style.time_figure(log, form, 2.4) as plot:
+        axes = style.add_panels(plot.figure, 1, 1)[0, 0]
+        low = SETTLED_ERROR_RAD
+        high = SETTLED_ERROR_RAD
+        for site in log.sites:
+            errors = site_signals.largest_magnitude(site_signals.joint_errors(log[site]))
+            drawn = style.positive(errors)
+            plot.trace(axes, site, drawn)
+            if errors.any():
+                # The 2nd percentile excludes the dips at zero crossings, which would stretch
+                # the logarithmic axis.
+                site_low, site_high = np.nanpercentile(drawn, (2.0, 100.0)).tolist()
+                low = min(low, site_low)
+                high = max(high, site_high)
+
+            line = style.site_line(log, site)
+            settled_s = site_signals.settling_time_s(log[site])
+            if settled_s is None:
+                entries.append((f"{site}: no settling time", line))
+            else:
+                axes.plot(
+                    settled_s,
+                    SETTLED_ERROR_RAD,
+                    marker="v",
+                    markersize=6.0,
+                    color=line["color"],
+                    clip_on=False,
+                )
+                entries.append((f"{site}: settling time {settled_s:.1f} s", line))
+        axes.axhline(SETTLED_ERROR_RAD, **style.LIMIT_LINE)
+        axes.set(
+            yscale="log",
+            ylim=(max(0.5 * low, _LEAST_RAD), 2.0 * high),
+            ylabel=f"largest error ({unit})",
+        )
+        plot.mark(axes, log.sites)
+        entries.append((f"limit {SETTLED_ERROR_RAD:g} {unit}", style.LIMIT_LINE))
+        plot.finish([axes], entries)
+    return plot.figure
+
+
+def _has_changing_estimates(log: Log) -> bool:
+    """Returns True if an estimate of at least one site changes during the run."""
+    for site in log.sites:
+        records = log[site]
+        if len(records) and np.ptp(records.theta_hat, axis=0).any():
+            return True
+    return False
+
+
+@draws(
+    "parameter_estimates",
+    "estimates and true values (Fig. 6 of the paper)",
+    unless(_has_changing_estimates, "no estimate changed in this run"),
+    in_report=True,
+)
+def draw_parameter_estimates(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+    """Draws the estimates of the arms' inertial parameters over time, with the true values.
+
+    Adaptive control laws estimate these parameters while the arm moves. The figure has the
+    estimates of all sites, whereas Fig. 6 of the paper has those of master 1. An arm in space
+    (a chain) has a row of panels per link, or two rows per link in a narrow figure.
+
+    Args:
+        log: Log of the run.
+        form: Width, type sizes and resolution of the figure.
+    """
+    arm = log.scenario.arms[log.sites[0]]
+    if arm.chain is not None:
+        return _draw_link_estimates(log, form)
+    # a panel per parameter, numbered from 1
+    mosaic = ["12", "34", "55"] if form.narrow else ["112233", "444555"]
+    with style.time_figure(log, form, 4.4 if form.narrow else 3.6) as plot:
+        panels = plot.figure.subplot_mosaic([[*row] for row in mosaic])
+        for index, (_, unit) in enumerate(arm.parameters):
+            axes = panels[str(index + 1)]
+            _draw_estimate(plot, log.sites, index, axes)
+            symbol = rf"$\theta_{index + 1}$ ({style.typeset_unit(unit)})"
+            axes.set_ylabel(symbol if form.narrow else f"estimate of {symbol}")
+            plot.mark(axes, log.sites)
+        plot.finish(list(panels.values()), _list_estimate_entries(log))
+    return plot.figure
+
+
+def _draw_link_estimates(log: Log, form: FigureSize) -> Figure:
+    """Draws the estimates of the inertial parameters of arms in space, over time.
+
+    A link has `LINK_PARAMETERS` parameters, such as its mass, and each has a panel. The panels
+    of a link fill one row, or two rows of a narrow figure. A panel has the estimates of all
+    sites whose arms have that link.
+
+    Args:
+        log: Log of the run.
+        form: Width, type sizes and resolution of the figure.
+    """
+    arms = log.scenario.arms
+    longest_arm = max((arms[site] for site in log.sites), key=lambda arm: arm.counts.joints)
+    columns = LINK_PARAMETERS // 2 if form.narrow else LINK_PARAMETERS
+    rows = len(longest_arm.theta) // columns  # theta are the parameters of all links
+    height_in = 0.8 + 0.74 * rows
+    with style.time_figure(log, form, height_in) as plot:
+        grid = style.add_panels(plot.figure, rows, columns, sharex=True)
+        panels: list[Axes] = [*grid.flat]
+        panel_parameters = zip(panels, longest_arm.parameters, strict=True)
+        for index, (axes, parameter) in enumerate(panel_parameters):
+            name, unit = parameter  # a name such as "upper.m", the mass of the link "upper"
+            link, _, symbol = name.rpartition(".")
+            sites = [site for site in log.sites if index < len(arms[site].theta)]
+            _draw_estimate(plot=plot, sites=sites, index=index, axes=axes, width=0.9)
+            plot.mark(axes, log.sites, numbered=False)
+
+            # The panels are small. Therefore titles, ticks and labels are small too.
+            title = f"{style.typeset_symbol(symbol)} ({style.typeset_unit(unit)})"
+            axes.set_title(title, fontsize=_LINK_PANEL_PT, pad=3.5)
+            axes.tick_params(labelsize=5.0, length=1.5, pad=1.0)
+            axes.locator_params(axis="y", nbins=2)
+            style.flatten_rounding(axes)
+
+            is_first_panel_of_link = index % LINK_PARAMETERS == 0
+            if is_first_panel_of_link:
+                link_number = 1 + index // LINK_PARAMETERS
+                style.label_row(axes, f"{link_number}: {link}", form)
+
+        bottom_panels = grid[-1]
+        plot.finish(list(bottom_panels), _list_estimate_entries(log))
+        for axes in bottom_panels:
+            axes.set_xlabel("t (s)", fontsize=_LINK_PANEL_PT, labelpad=1.0)
+    return plot.figure
+
+
+def _list_estimate_entries(log: Log) -> list[tuple[str, dict[str, Any]]]:
+    """Returns the legend entries of the figures of estimates."""
+    entries = style.site_legend_entries(log, log.sites)
+    return [*entries, ("true value", style.LIMIT_LINE)]
+
+
+def _draw_estimate(
+    plot: style.TimeFigure,
+    sites: Sequence[str],
+    index: int,
+    axes: Axes,
+    width: float | None = None,
+) -> None:
+    """Draws the estimates of one parameter and its true value.
+
+    The true value is drawn once if it is equal for all sites, otherwise in the colour of each
+    site.
+
+    Args:
+        plot: The figure.
+        sites: Names of the sites that have the parameter.
+        index: Index of the parameter.
+        axes: Panel of the figure, as Matplotlib axes.
+        width: Width of the lines, see `style.site_line`.
+    """
+    true_values = {}
+    for site in sites:
+        true_values[site] = float(plot.log.scenario.arms[site].theta[index])
+        estimates = site_signals.parameter_estimates(plot.log[site])
+        plot.trace(axes, site, estimates[:, index], width)
+
+    all_are_equal = len(set(true_values.values())) == 1
+    if all_are_equal:
+        axes.axhline(true_values[sites[0]], **style.LIMIT_LINE)
+        return
+    for site, true_value in true_values.items():
+        line = {**style.LIMIT_LINE, "color": style.site_colour(plot.log, site)}
+        axes.axhline(true_value, **line)
+
+
+@draws("phase", "errors against their rates")
+def draw_phase_portrait(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+    """Draws the phase portrait of the tracking errors, with a panel per joint.
+
+    The vertical axis has the velocity error qd - qd_des, and the horizontal axis the error q -
+    q_des, where q is the angle of the joint, qd its velocity, and "des" stands for desired. A
+    ring marks the start of a site, and a disc its end.
+
+    Args:
+        log: Log of the run.
+        form: Width, type sizes and resolution of the figure.
+    """
+    titles = style.name_shared(log)
+    unit = site_signals.shared_unit(log)
+    rate_unit = f"{unit.replace(',', '/s,')}/s"
+    mosaic = style.arrange_joints(len(titles), form.narrow)
+    columns = len(mosaic[0])
+    row_in = 0.72 * form.width_in / columns
+    with style.styled_figure(form, 1.0 + len(mosaic) * row_in) as figure:
+        panels = list(figure.subplot_mosaic([[*row] for row in mosaic]).values())
+        for site in log.sites:
+            records = log[site]
+            if not len(records):
+                continue
+            line = style.site_line(log, site, _LOOP_PT)
+            errors = site_signals.joint_errors(records)
+            rates = site_signals.joint_error_rates(records)
+            joints = errors.shape[1]
+            for joint, axes in enumerate(panels[:joints]):
+                path = np.stack([errors[:, joint], rates[:, joint]], axis=1)
+                _draw_path(axes, path, line)
+        style.title_joints(log, panels, titles)
+        for axes in panels:
+            axes.set_xlabel(f"error ({unit})")
+            if form.narrow:
+                axes.locator_params(axis="x", nbins=3)
+        for axes in panels[::columns]:
+            axes.set_ylabel(f"its rate ({rate_unit})")
+        style.add_legend(figure, style.site_legend_entries(log, log.sites))
+    return figure
+
+
+def _has_only_chains(log: Log) -> bool:
+    """Returns True if no arm of a run is planar."""
+    return all(arm.chain for arm in log.scenario.arms.values())
+
+
+@draws(
+    "paths",
+    "paths of the end effectors in three planes",
+    unless(_has_only_chains, "its arms are planar"),
+    in_report=True,
+)
+def draw_end_effector_paths(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+    """Draws the paths of the end effectors of arms in space in three planes, in m.
+
+    The planes are those of the frame that all sites share. If the sites exchange poses of their
+    end effectors (task space), the paths are scaled to the task. A ring marks the start of a
+    site, and a disc its end.
+
+    Args:
+        log: Log of the run.
+        form: Width, type sizes and resolution of the figure.
+    """
+    mosaic = style.arrange_joints(len(_PLANES), form.narrow)
+    row_in = 0.9 * form.width_in / len(mosaic[0])
+    with style.styled_figure(form, 0.4 + len(mosaic) * row_in) as figure:
+        panels = list(figure.subplot_mosaic([[*row] for row in mosaic]).values())
+        for site in log.sites:
+            records = log[site]
+            if not len(records):
+                continue
+            arm_rows = build_arm_rows(log.scenario, site)
+            end_effector = arm_rows.place_end_effector(records.q, records.qd)
+            positions = end_effector.position * log.scenario.sites[site].task.scale
+            for axes, plane in zip(panels, _PLANES, strict=True):
+                _draw_path(axes, positions[:, plane], style.site_line(log, site))
+        for axes, (across, up) in zip(panels, _PLANES, strict=True):
+            axes.set_aspect("equal", adjustable="datalim")
+            axes.set(xlabel=f"{'xyz'[across]} (m)", ylabel=f"{'xyz'[up]} (m)")
+            axes.locator_params(nbins=4)
+        style.add_legend(figure, style.site_legend_entries(log, log.sites))
+    return figure
+
+
+def _draw_path(axes: Axes, path: Array, line: dict[str, Any]) -> None:
+    """Draws a path with a ring at its start and a disc at its end.
+
+    Args:
+        axes: Panel of the figure, as Matplotlib axes.
+        path: Points of the path, shape (K, 2), K > 0.
+        line: Options of the line.
+    """
+    path = thin_path(path)
+    axes.plot(*path.T, **line)
+    disc = {"linestyle": "none", "marker": "o", "markersize": 4.0, "color": line["color"]}
+    ring = {**disc, "markerfacecolor": "white"}
+    axes.plot(*path[0], **ring, zorder=3)
+    axes.plot(*path[-1], **disc, zorder=3)
+
+
+def thin_path(path: Array) -> Array:
+    """Returns points of a path at about equal distances along it, including both ends.
+
+    The path is thinned by its length and not by time, so that its fast parts keep as many
+    points as its slow ones.
+
+    Args:
+        path: Points of the path, shape (K, 2), K > 0. Each axis is scaled to its own extent.
+
+    Returns:
+        Some of the points, shape (P, 2).
+    """
+    extent = np.ptp(path, axis=0)
+    scaled = path / np.where(extent > 0.0, extent, 1.0)
+    steps = np.diff(scaled, axis=0, prepend=scaled[:1])
+    length = np.cumsum(np.hypot(*steps.T))
+    _, first_in_step = np.unique(np.floor(length / _PATH_STEP), return_index=True)
+    rows = np.union1d(first_in_step, [0, len(path) - 1])
+    thinned: Array = path[rows]
+    return thinned
+
+
+def list_sites_with_changing_dominance(log: Log) -> list[str]:
+    """Lists the sites whose dominance factors change during the run, in scenario order.
+
+    A dominance factor is the weight with which a site follows another one.
+
+    Args:
+        log: Log of the run.
+    """
+    changed_sites = {changed.change.dominance for changed in list_changes(log)}
+    return [site for site in log.sites if site in changed_sites]
+
+
+@draws(
+    "authority",
+    "shares that change, and the motion of the arms",
+    unless(list_sites_with_changing_dominance, "the shares of all sites are constant"),
+)
+def draw_authority(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+    """Draws the dominance factors that change during the run, and the motion of all arms.
+
+    The dominance factor of a peer is the weight with which a site follows this peer. The motion
+    of an arm is its displacement from the start of the run, in rad.
+
+    Args:
+        log: Log of the run.
+        form: Width, type sizes and resolution of the figure.
+    """
+    owners = list_sites_with_changing_dominance(log)
+    titles = style.name_joints(log)
+    rows = len(owners) + len(titles)
+    has_low_rows = len(titles) > 2
+    row_in = 0.8 if has_low_rows else 1.05
+    with style.time_figure(log, form, 0.8 + row_in * rows) as plot:
+        panels = style.add_panels(plot.figure, rows, 1, sharex=True)[:, 0]
+        share_panels = panels[: len(owners)]
+        joint_panels = panels[len(owners) :]
+        for site, axes in zip(owners, share_panels, strict=True):
+            alpha = trace_dominance(log, site, log[site].t_s).alpha
+            for peer, share in zip(log.scenario.peers(site), alpha.T, strict=True):
+                plot.trace(axes, site, share, **style.site_line(log, peer))
+            axes.set(ylim=(-0.05, 1.05), ylabel=f"share in {site} (1)")
+            plot.mark(axes, [site])
+        for site in log.sites:
+            start = np.array(log.scenario.sites[site].q0_rad)
+            moved = site_signals.joint_angles(log[site]) - start
+            for axes, values in zip(joint_panels, moved.T, strict=False):
+                plot.trace(axes, site, values)
+        for title, axes in zip(titles, joint_panels, strict=True):
+            if has_low_rows:
+                style.label_row(axes, title, form)
+            else:
+                axes.set_ylabel(f"{title} (rad)")
+            plot.mark(axes, log.sites)
+        plot.finish([panels[-1]], style.site_legend_entries(log, log.sites))
+    return plot.figure
+
+
+def list_sites_with_walls(log: Log) -> list[str]:
+    """Lists the names of those sites whose arm can touch a wall.
+
+    A site is a process that runs one arm. The sites have the order of the scenario, the
+    description of the experiment.
+
+    Args:
+        log: Log of the run.
+    """
+    return [site for site in log.sites if list_walls(log.scenario.sites[site])]
+
+
+@draws(
+    "contact",
+    "force of the walls, and depth in them",
+    unless(list_sites_with_walls, "no site has a wall in this run"),
+)
+def draw_contact(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+    """Draws the contact of the arms with walls over time.
+
+    The panels have the normal force of every wall, in N, and the depth of the end effector in
+    it, in mm.
+
+    Args:
+        log: Log of the run.
+        form: Width, type sizes and resolution of the figure.
+    """
+    sites = list_sites_with_walls(log)
+    with style.time_figure(log, form, 2.9) as plot:
+        force_panel, depth_panel = style.add_panels(plot.figure, 2, 1, sharex=True)[:, 0]
+        for site in sites:
+            records = log[site]
+            arm_rows = build_arm_rows(log.scenario, site)
+            end_effector = arm_rows.place_end_effector(records.q, records.qd)
+            for number, wall in enumerate(list_walls(log.scenario.sites[site])):
+                dashes = style.DASHES[number % len(style.DASHES)]
+                force = wall_force(wall, records.t_s, end_effector)
+                depth_mm = 1e3 * np.maximum(wall_depth(wall, end_effector), 0.0)
+                plot.trace(force_panel, site, force, 1.1, linestyle=dashes)
+                plot.trace(depth_panel, site, depth_mm, 1.1, linestyle=dashes)
+        force_panel.set_ylabel("force of wall (N)")
+        depth_panel.set_ylabel("depth in it (mm)")
+        for axes in (force_panel, depth_panel):
+            axes.set_ylim(bottom=0.0)
+            plot.mark(axes, sites)
+        plot.finish([depth_panel], style.site_legend_entries(log, sites))
+    return plot.figure

@@ -1,0 +1,531 @@
+"""Draws figures of computed results, which need no recorded run.
+
+A linear model describes small motions of the coupled arms around a pose of rest. A site is a
+process that runs one arm, and an operator is the person or program that moves it. An operator
+and an arm exchange force and velocity at a port, such as a joint.
+
+- `draw_port_impedance` draws the impedance that operators feel at their ports, and
+  `draw_port_passivity` whether the arms could supply energy to operators.
+- `draw_root_map` draws the characteristic roots of the linear model, in continuous time and as
+  executed in ticks (periods of the control loop). A root with a positive real part means that
+  the arms are unstable.
+- `draw_network_delays` draws the measured one-way delays of a network.
+- `draw_arm_gains` draws the largest stable stiffness of an arm for different delays.
+
+Invariant:
+    - Each line of a port has the colour of the site whose arm the operator holds. It is solid
+      if the other arm can move freely, and dashed if the other arm is clamped.
+    - Frequencies at which a criterion of passivity or stability fails are shaded.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import MultipleLocator
+
+from ...analysis.theory.characteristic_roots import Spectrum
+from ...analysis.theory.delay_margin import MAX_COMMON_DELAY_S
+from ...analysis.theory.frequency_search import Minima
+from ...analysis.theory.linear_analysis import LinearAnalysis
+from ...analysis.theory.port_analysis import PortAnalysis
+from ...analysis.theory.port_response import Transparency
+from ...core.step.vectors import Array
+from .. import style
+from ..appearance import COLUMN_IN, REPORT_SIZE, SITE_COLOURS, FigureSize, list_site_colours
+
+_CLAMPED: tuple[int, tuple[float, float]] = (0, (4.0, 1.6))
+_FAILS: dict[str, Any] = {"color": "#cc3311", "alpha": 0.12, "linewidth": 0.0, "zorder": 0.3}
+_BAND: dict[str, Any] = {"color": style.FAINT, "alpha": 0.12, "linewidth": 0.0, "zorder": 0.2}
+_ALL: dict[str, Any] = {"color": SITE_COLOURS[0], "linewidth": 1.6}
+_PROOF: dict[str, Any] = {
+    "color": style.REFERENCE,
+    "linewidth": 1.0,
+    "linestyle": (0, (5, 1.5, 1, 1.5)),
+}
+_MAX_SHOWN_PARAMETER = 2.5
+"""Upper end of the axis of Llewellyn's parameter. All values far above 1 mean the same."""
+_CROWDED_TICKS_HZ = (0.1, 1.0, 10.0)
+"""Ticks of a narrow panel. Labels at its ends would overlap those of the next panel."""
+
+
+def draw_port_impedance(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> Figure:
+    """Draws the impedance that operators feel along every joint over frequency.
+
+    The impedance is the ratio of force to velocity. A joint has a panel of the magnitude above
+    a panel of the phase. The panels of many joints are arranged in several rows.
+
+    Args:
+        ports: Analysis of the ports, the places at which operators hold the arms.
+        size: Width, type sizes and resolution of the figure.
+    """
+    if "unstable" in (ports.verdict, ports.clamped_verdict):
+        return style.empty_figure("The loop is unstable: it has no impedance.", size)
+
+    joints = sorted({response.joint for response in ports.transparency})
+    rows = style.arrange_joints(len(joints), size.narrow)
+    columns = min(len(rows[0]), len(joints))
+    is_crowded = size.narrow or columns > 2
+    with style.styled_figure(size, 3.8 * len(rows)) as figure:
+        grid = style.add_panels(figure, 2 * len(rows), columns, sharex=True, sharey="row")
+        for index, joint in enumerate(joints):
+            row, column = divmod(index, columns)
+            magnitude = grid[2 * row, column]
+            phase = grid[2 * row + 1, column]
+            responses = [response for response in ports.transparency if response.joint == joint]
+            _plot_impedance(ports, responses, magnitude, phase)
+
+            title = ports.name_port(joint)
+            if is_crowded:
+                phase.set_xticks(_CROWDED_TICKS_HZ)
+            else:
+                title += _describe_ratios(responses)
+            magnitude.set_title(title)
+            is_lowest_in_column = index + columns >= len(joints)
+            if is_lowest_in_column:
+                phase.set_xlabel("frequency (Hz)")
+                phase.xaxis.set_tick_params(labelbottom=True)
+            if column == 0:
+                magnitude.set_ylabel(f"|Z| ({ports.impedance_unit(joint)})")
+                phase.set_ylabel("phase (degrees)")
+                phase.yaxis.set_major_locator(MultipleLocator(45.0))
+
+        # The last row can have fewer joints than columns.
+        joints_in_last_row = len(joints) - columns * (len(rows) - 1)
+        unused: list[Axes] = [*grid[-2:, joints_in_last_row:].flat]
+        for axes in unused:
+            axes.set_visible(False)
+        style.add_legend(figure, _list_impedance_entries(ports))
+    return figure
+
+
+def _list_impedance_entries(ports: PortAnalysis) -> list[tuple[str, dict[str, Any]]]:
+    """Returns the legend entries of the figure of impedances."""
+    operator_sites = dict.fromkeys(response.operator_site for response in ports.transparency)
+    entries: list[tuple[str, dict[str, Any]]] = [
+        (f"felt at {site}", {"color": _site_colour(ports, site)}) for site in operator_sites
+    ]
+    other_site = ports.transparency[0].other_site
+    clamped = {"color": style.REFERENCE, "linestyle": _CLAMPED}
+    entries.append((f"{other_site} free", {"color": style.REFERENCE}))
+    entries.append((f"{other_site} clamped", clamped))
+    entries.append(("band of the ratio", {**_BAND, "alpha": 0.4, "linewidth": 6.0}))
+    return entries
+
+
+def _plot_impedance(
+    ports: PortAnalysis, responses: Sequence[Transparency], magnitude: Axes, phase: Axes
+) -> None:
+    """Draws the impedances along one joint at the sites of the operators.
+
+    Each site has two lines: the impedance while the other site is free, and while it is
+    clamped.
+
+    Args:
+        ports: Analysis of the ports, the places at which operators hold the arms.
+        responses: Impedances of the joint, at least one.
+        magnitude: Panel of the magnitude.
+        phase: Panel of the phase.
+    """
+    for index, response in enumerate(responses):
+        hz = _convert_to_hz(response.w_rad_s)
+        width = 1.1
+        if len(responses) > 1:
+            # Later lines are thinner, so that lines that coincide all stay visible.
+            width = 2.0 - 1.2 * index / (len(responses) - 1)
+        for impedance, dashes in ((response.free, "-"), (response.clamped, _CLAMPED)):
+            line: dict[str, Any] = {
+                "color": _site_colour(ports, response.operator_site),
+                "linestyle": dashes,
+                "linewidth": width,
+            }
+            magnitude.loglog(hz, np.abs(impedance), **line)
+            # The phase is continuous, and starts between -180 and 180 degrees.
+            angle_rad = np.unwrap(np.angle(impedance))
+            phase.semilogx(hz, np.rad2deg(angle_rad), **line)
+    for axes in (magnitude, phase):
+        axes.axvspan(*responses[0].band_hz, **_BAND)
+        axes.set_xlim(hz[0], hz[-1])
+
+
+def _describe_ratios(responses: Sequence[Transparency]) -> str:
+    """Returns a line of a title with each site's ratio of clamped to free impedance, in dB."""
+    ratios = [f"{response.operator_site} {response.ratio_db:+.1f} dB" for response in responses]
+    text = f"\nclamped / free {', '.join(ratios)}"
+    return text.replace("-", "\N{MINUS SIGN}")
+
+
+def _site_colour(ports: PortAnalysis, site: str) -> str:
+    """Returns the colour of a site."""
+    index = ports.sites.index(site) % len(SITE_COLOURS)
+    return list_site_colours(ports.scenario)[index]
+
+
+def _convert_to_hz(w_rad_s: Array) -> Array:
+    """Converts angular frequencies from rad/s to Hz."""
+    return w_rad_s / (2.0 * np.pi)
+
+
+def draw_port_passivity(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> Figure:
+    """Draws over frequency whether the loop is passive, and stable with any passive operators.
+
+    The upper panel has the smallest eigenvalue of Y + Y^H, divided by its bound 2 norm(Y),
+    where Y is the admittance matrix of the ports: velocities over forces. A negative value
+    means that the loop can generate energy. With the value -1 it returns all energy that an
+    operator puts in.
+
+    The lower panel has the criterion for stability with any passive operators: for two sites
+    Llewellyn's parameter of each joint, which must be at least 1; for more sites the margin
+    under the best weights, which must be positive.
+
+    Args:
+        ports: Analysis of the ports, the places at which operators hold the arms.
+        size: Width, type sizes and resolution of the figure.
+    """
+    if ports.verdict == "unstable":
+        return style.empty_figure(
+            "The loop without operators is unstable: it cannot be passive.", size
+        )
+    with style.styled_figure(size, 3.9) as figure:
+        above, below = style.add_panels(figure, 2, 1, sharex=True)[:, 0]
+        _plot_eigenvalues(ports, above)
+        if len(ports.sites) == 2:
+            _plot_parameters(ports, below)
+        else:
+            _plot_margin(ports, below)
+        below.set(xlim=ports.band_hz, xlabel="frequency (Hz)")
+        figure.align_ylabels()
+        style.add_legend(figure, _list_passivity_entries(ports))
+    return figure
+
+
+def _list_passivity_entries(ports: PortAnalysis) -> list[tuple[str, dict[str, Any]]]:
+    """Returns the legend entries of the figure of passivity."""
+    noun = "axes" if ports.axes else "joints"
+    entries = [(f"all {noun}", _ALL)]
+    entries += [
+        (f"{ports.name_port(joint)} alone", _style_joint(joint)) for joint in ports.joints
+    ]
+    if ports.proof is not None:
+        entries.append((f"all {noun}, in r (weighted)", _PROOF))
+    entries.append(("fails", {**_FAILS, "linewidth": 6.0}))
+    return entries
+
+
+def _style_joint(joint: int) -> dict[str, Any]:
+    """Returns the options of the line of a joint."""
+    return {
+        "color": SITE_COLOURS[joint % len(SITE_COLOURS)],
+        "linestyle": style.DASHES[joint % len(style.DASHES)],
+        "linewidth": 1.0,
+    }
+
+
+def _plot_over_hz(axes: Axes, minima: Minima, values: Array, **options: Any) -> None:
+    """Draws values, shape (F,), over the frequencies of `minima`."""
+    axes.semilogx(_convert_to_hz(minima.w_rad_s), values, **options)
+
+
+def _shade_failures(axes: Axes, minima: Minima) -> None:
+    """Shades the bands of frequency in which a curve lies below its limit."""
+    for band in minima.below:
+        axes.axvspan(*band, **_FAILS)
+
+
+def _plot_eigenvalues(ports: PortAnalysis, axes: Axes) -> None:
+    """Draws the smallest eigenvalues of Y + Y^H over their bound, per joint and in all."""
+    curves = [(passivity, _style_joint(joint)) for joint, passivity in ports.joints.items()]
+    if ports.proof is not None:
+        curves.append((ports.proof, _PROOF))
+    curves.append((ports.velocity, _ALL))
+    for passivity, line in curves:
+        relative = passivity.minima.values / (2.0 * passivity.size)
+        _plot_over_hz(axes, passivity.minima, relative, **line)
+    _shade_failures(axes, ports.velocity.minima)
+    axes.axhline(0.0, **style.LIMIT_LINE)
+    axes.set(ylim=(-1.08, 1.08), ylabel=r"$\lambda_{\min}(Y+Y^{\mathrm{H}})\,/\,2\|Y\|$")
+
+
+def _plot_parameters(ports: PortAnalysis, axes: Axes) -> None:
+    """Draws Llewellyn's parameter of every joint, with the limit 1."""
+    for two_port in ports.two_ports:
+        line = _style_joint(two_port.joint)
+        _plot_over_hz(axes, two_port.minima, two_port.minima.values, **line)
+        _shade_failures(axes, two_port.minima)
+    axes.axhline(1.0, **style.LIMIT_LINE)
+    axes.set(ylim=(-1.2, _MAX_SHOWN_PARAMETER), ylabel="Llewellyn's parameter")
+
+
+def _plot_margin(ports: PortAnalysis, axes: Axes) -> None:
+    """Draws the smallest eigenvalue under the best weights, with the limit 0."""
+    _plot_over_hz(axes, ports.absolute, ports.absolute.values, **_ALL)
+    _shade_failures(axes, ports.absolute)
+    axes.axhline(0.0, **style.LIMIT_LINE)
+    axes.set_ylabel("margin, best weights")
+
+
+_SIZE = REPORT_SIZE._replace(width_in=COLUMN_IN)
+_HEIGHT_IN = 3.2
+_UNSTABLE: Any = {"color": "#cc3311", "alpha": 0.08, "linewidth": 0.0, "zorder": 0.3}
+
+
+def draw_root_map(analysis: LinearAnalysis) -> Figure:
+    """Draws the characteristic roots of the linearised loop in the complex plane.
+
+    The roots of the continuous and of the sampled loop have different marks. The half-plane of
+    unstable roots, whose motions grow, is shaded.
+
+    Args:
+        analysis: The linear analysis.
+    """
+    with style.styled_figure(_SIZE, _HEIGHT_IN) as figure:
+        axes = figure.add_subplot()
+        _plot_roots(
+            axes=axes,
+            spectrum=analysis.continuous,
+            mark="o",
+            colour=SITE_COLOURS[0],
+            label="continuous",
+        )
+        if analysis.sampled is not None:
+            _plot_roots(
+                axes=axes,
+                spectrum=analysis.sampled,
+                mark="x",
+                colour=SITE_COLOURS[1],
+                label="as computed",
+            )
+        zeros = analysis.decisive.zeros
+        if zeros:
+            axes.plot(
+                [0.0],
+                [0.0],
+                "s",
+                markersize=9.0,
+                fillstyle="none",
+                color=style.FAINT,
+                label=f"zero by structure ({zeros})",
+            )
+
+        # The unstable half is visible even if all roots are stable.
+        low, high = axes.get_xlim()
+        high = max(high, 0.06 * (high - low), 0.0)
+        axes.axvline(0.0, **style.LIMIT_LINE)
+        axes.axvspan(0.0, high, **_UNSTABLE)
+        axes.set(xlim=(low, high), xlabel="real part (1/s)", ylabel="imaginary part (rad/s)")
+        figure.legend(loc="outside upper center", ncols=3, handlelength=1.0, columnspacing=1.0)
+    return figure
+
+
+def _plot_roots(axes: Axes, spectrum: Spectrum, mark: str, colour: str, label: str) -> None:
+    """Draws the roots of a spectrum and their complex conjugates.
+
+    Args:
+        axes: Panel of the figure, as Matplotlib axes.
+        spectrum: The roots, of which each complex pair is listed once.
+        mark: Marker of Matplotlib.
+        colour: Colour of the markers.
+        label: Text in the legend.
+    """
+    roots = [root.s for root in spectrum.roots]
+    conjugates = [root.conjugate() for root in roots if root.imag]
+    points = np.array([*roots, *conjugates])
+    axes.plot(
+        points.real,
+        points.imag,
+        mark,
+        markersize=4.5,
+        fillstyle="none",
+        color=colour,
+        label=label,
+    )
+
+
+_MARKS = ("o", "s", "^", "v")
+_LOST: Any = {"marker": "x", "color": "#cc3311", "linestyle": "none", "markersize": 5.0}
+_TRANSPORT_STEP = 0.22
+"""Distance between the transports of one case, in distances between cases."""
+
+
+def draw_network_delays(facts: Mapping[str, Any]) -> Figure:
+    """Draws the measured one-way delays of a network, in ms, for several loads.
+
+    A load is a size of messages in bytes, and a number of messages per second. The load that
+    the benchmarked experiment needs is shaded.
+
+    Args:
+        facts: Results of the network benchmark, from `NetworkBenchmark.to_dict`.
+    """
+    rows = facts["rows"]
+    needs = facts["needs"]
+    cases = list(dict.fromkeys((row["bytes"], row["rate_hz"]) for row in rows))
+    transports = list(dict.fromkeys(row["transport"] for row in rows))
+    middle = (len(transports) - 1) / 2
+    with style.styled_figure(REPORT_SIZE, _HEIGHT_IN) as figure:
+        axes = figure.add_subplot()
+        for row in rows:
+            transport = transports.index(row["transport"])
+            case = cases.index((row["bytes"], row["rate_hz"]))
+            x = case + _TRANSPORT_STEP * (transport - middle)
+            _plot_case(axes, x, row, transport)
+        _plot_bounds(axes, facts)
+        axes.set_yscale("log")
+
+        labels = [f"{size} B\n{rate:g} Hz" for size, rate in cases]
+        needed = cases.index((needs["sample_bytes"], needs["rate_hz"]))
+        labels[needed] += f"\n{facts['scenario']}"
+        axes.axvspan(
+            needed - 0.45,
+            needed + 0.45,
+            color=style.FAINT,
+            alpha=0.15,
+            linewidth=0.0,
+            zorder=0.3,
+        )
+        axes.set_xticks(range(len(cases)), labels)
+        axes.set(xlim=(-0.5, len(cases) - 0.5), ylabel="one way: p50, p99, largest (ms)")
+        axes.grid(visible=False, axis="x")
+        style.place_legend(figure, _list_network_handles(rows, transports))
+    return figure
+
+
+def _list_network_handles(
+    rows: Sequence[Mapping[str, Any]], transports: Sequence[str]
+) -> list[Line2D]:
+    """Returns the Matplotlib objects for the legend of network delays."""
+    handles = []
+    for number, name in enumerate(transports):
+        handles.append(
+            Line2D(
+                [],
+                [],
+                label=name,
+                color=SITE_COLOURS[number],
+                marker=_MARKS[number % len(_MARKS)],
+                linewidth=1.1,
+            )
+        )
+    if any(row["lost"] for row in rows):
+        handles.append(Line2D([], [], label="some lost", **_LOST))
+    return handles
+
+
+def _plot_case(axes: Axes, x: float, row: Mapping[str, Any], transport: int) -> None:
+    """Draws the delays of one transport in one case, and a cross if messages were lost.
+
+    A mark is the median. A thick line leads from there to the 99th percentile, and a thin line
+    to the largest delay.
+
+    Args:
+        axes: Panel of the figure, as Matplotlib axes.
+        x: Position along the axis of cases.
+        row: Row of the benchmark.
+        transport: Number of the transport, on which its colour and its mark depend.
+    """
+    times_us = row["one_way_us"]
+    if times_us is not None:
+        p50_ms = times_us["p50"] / 1e3
+        p99_ms = times_us["p99"] / 1e3
+        largest_ms = times_us["max"] / 1e3
+        colour = SITE_COLOURS[transport % len(SITE_COLOURS)]
+        mark = _MARKS[transport % len(_MARKS)]
+        axes.plot([x, x], [p50_ms, largest_ms], color=colour, linewidth=0.8)
+        axes.plot([x, x], [p50_ms, p99_ms], color=colour, linewidth=2.6, solid_capstyle="butt")
+        axes.plot([x], [p50_ms], marker=mark, color=colour, markersize=4.5)
+        axes.plot([x], [largest_ms], marker="_", color=colour, markersize=6.0)
+    if row["lost"]:
+        axes.plot([x], [0.04], transform=axes.get_xaxis_transform(), **_LOST)
+
+
+def _plot_bounds(axes: Axes, facts: Mapping[str, Any]) -> None:
+    """Draws horizontal lines at the times with which the delays are to be compared, in ms.
+
+    These are the tick period of the scenario, the time for which its links hold samples, and
+    the ends of intervals of stable delays: of the first interval, and of those that contain a
+    measured age.
+    """
+    needs = facts["needs"]
+    stable_ms = needs["stable_ms"] or []
+    ages_ms = [
+        transport["age_ms"]
+        for transport in facts["transports"]
+        if transport["age_ms"] is not None
+    ]
+    bounds = [
+        ("one period", 1e3 / needs["rate_hz"], "center"),
+        ("held by links", needs["held_ms"], "top"),
+    ]
+    for interval in stable_ms:
+        low_ms, high_ms = interval
+        has_age = any(low_ms <= age_ms <= high_ms for age_ms in ages_ms)
+        if not has_age and interval != stable_ms[0]:
+            continue
+        bounds.append((f"stable from {low_ms:.4g} ms", low_ms, "top"))
+        # An interval that ends where the search ended has no upper edge.
+        if high_ms < 1e3 * MAX_COMMON_DELAY_S:
+            bounds.append((f"stable up to {high_ms:.4g} ms", high_ms, "bottom"))
+
+    for label, time_ms, alignment in bounds:
+        if time_ms:  # a logarithmic axis has no zero
+            axes.axhline(time_ms, **style.LIMIT_LINE)
+            axes.annotate(
+                label,
+                (1.01, time_ms),
+                xycoords=("axes fraction", "data"),
+                va=alignment,
+                fontsize=REPORT_SIZE.tick_pt,
+            )
+
+
+_RUN_MARKS = {
+    True: ("o", "run decays"),
+    False: ("x", "run grows"),
+    None: ("s", "run undecided"),
+}
+"""Mark and label of a run by `stable`."""
+
+
+def draw_arm_gains(facts: Mapping[str, Any]) -> Figure:
+    """Draws the largest stable stiffness of an arm that follows another arm over a delay.
+
+    The horizontal axis is the delay. The vertical axis is the stiffness K of a joint divided by
+    its inertia, in 1/s^2. Marks show the gains that were chosen, and the simulated runs that
+    checked the largest stable stiffness.
+
+    Args:
+        facts: Results of the search for gains, from `ArmGains.to_dict`.
+    """
+    edge = facts["edge"]
+    margin = facts["margin"]
+    curve = np.array(facts["curve"])
+    delay_ms = 1e3 * curve[:, 0]
+    k = curve[:, 1]
+    used_k = edge["used_per_s2"] / margin
+    marks = [(used_k, "D", f"the gains, margin {margin:g}")]
+    for run in facts["runs"]:
+        if run["share"]:
+            mark, label = _RUN_MARKS[run["stable"]]
+            marks.append((run["share"] * edge["k_per_s2"], mark, label))
+
+    with style.styled_figure(_SIZE, _HEIGHT_IN) as figure:
+        axes = figure.add_subplot()
+        axes.loglog(
+            delay_ms, k, color=SITE_COLOURS[0], linewidth=1.4, label="edge, constant delay"
+        )
+        axes.fill_between(delay_ms, k, 10.0 * k.max(), **_UNSTABLE)
+        for marked_k, mark, label in marks:
+            axes.plot(
+                facts["age_ms"],
+                marked_k,
+                mark,
+                color=SITE_COLOURS[1],
+                markersize=4.5,
+                label=label,
+            )
+        axes.set(xlim=(delay_ms[0], delay_ms[-1]), ylim=(0.3 * k.min(), 3.0 * k.max()))
+        axes.set(xlabel="delay of each link (ms)", ylabel=r"K / inertia (1/s$^2$)")
+        figure.legend(loc="outside upper center", ncols=2, handlelength=1.2, columnspacing=1.0)
+    return figure

@@ -1,0 +1,254 @@
+"""Draws the figures of a log by name, and writes them to files for a paper or for a report.
+
+    trilat_net.figure(log, "settling").savefig("settling.pdf")
+
+A log is the MCAP file with the results of a run. The modules of this folder register their
+figures with the decorator `figure_entry.draws`. This module imports all of them, so that
+`FIGURES` is complete.
+
+Invariant:
+    - A figure depends only on a log and a figure size.
+    - Equal logs give files with equal bytes.
+    - Every figure drawn by a module of this folder is in the registry.
+"""
+
+import pkgutil
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from ...analysis.twins.twin_growth import PushedTwins, TwinGrowth
+from ...errors import UsageError, suggest_nearest
+from ...files import make_folder, refuse_existing
+from ...log.log_reader import Log, open_log
+from ...log.mcap_reader import Progress
+from ..appearance import COLUMN_IN, REPORT_SIZE, FigureSize, make_print_size
+from ..style import FIGURE_FORMATS, write_figure
+from .figure_entry import FigureEntry, list_figures
+from .joint_motion import draw_operator_displacement
+from .run_overview import draw_overlay
+from .twin_differences import draw_twins
+
+# The modules of this folder register their figures when they are imported.
+for _module in pkgutil.iter_modules(import_module(__package__).__path__):
+    import_module(f"{__package__}.{_module.name}")
+
+FIGURES = list_figures()
+"""All figures by name, in the order in which a paper has them."""
+
+
+def figure(
+    log: str | Path | Log, name: str = "positions", width_in: float = COLUMN_IN
+) -> Figure:
+    """Returns a figure of a log for a paper, with type of 8 pt.
+
+    A notebook displays the figure as a picture. The command line has `trilat figure` for this.
+
+    >>> drawn = tn.figure(tn.simulate("two_sites", duration_s=0.1), "positions")
+    >>> drawn.savefig("positions.pdf")
+
+    Args:
+        log: The log, or its path.
+        name: Name of the figure, one of `FIGURES`.
+        width_in: Width of the figure: 3.5 in for one column of a paper, or 7 in for two.
+
+    Raises:
+        UsageError: The figure or the width does not exist, or the log has nothing to show in
+            the figure.
+    """
+    form = make_print_size(width_in)
+    opened = log if isinstance(log, Log) else open_log(log)
+    return _find_figure(opened, name).draw(opened, form)
+
+
+def list_drawable_figures(log: Log) -> list[str]:
+    """Lists the names of the figures for which a log has something to show.
+
+    Args:
+        log: Log of the run.
+    """
+    return [name for name, entry in FIGURES.items() if not entry.absent(log)]
+
+
+def write_figures(
+    log: Log,
+    folder: Path,
+    names: Sequence[str] = (),
+    *,
+    width_in: float = COLUMN_IN,
+    formats: Sequence[str] = FIGURE_FORMATS[:2],
+    force: bool = False,
+    progress: Progress | None = None,
+) -> list[Path]:
+    """Writes figures of a log to files, as for a paper.
+
+    Args:
+        log: Log of the run.
+        folder: Folder of the files. It is created if it does not exist.
+        names: Names of figures. Empty for all figures for which the log has something to show.
+        width_in: Width of the figures, 3.5 or 7 in.
+        formats: Formats of the files, of `FIGURE_FORMATS`.
+        force: True to overwrite existing files.
+        progress: Function that is called with the number of drawn figures and of all figures.
+
+    Returns:
+        The paths of the files.
+
+    Raises:
+        UsageError: A figure, the width or a format does not exist, the log has nothing to show
+            in a figure, or a file exists.
+    """
+    form = make_print_size(width_in)
+    unique_names = list(dict.fromkeys(names))
+    drawings: dict[str, Callable[[], Figure]] = {}
+    for name in unique_names or list_drawable_figures(log):
+        drawings[name] = partial(_find_figure(log, name).draw, log, form)
+    return _write(
+        drawings=drawings,
+        folder=folder,
+        form=form,
+        formats=formats,
+        progress=progress,
+        force=force,
+    )
+
+
+def write_overlay(
+    logs: Mapping[str, Log],
+    folder: Path,
+    *,
+    width_in: float = COLUMN_IN,
+    formats: Sequence[str] = FIGURE_FORMATS[:2],
+    force: bool = False,
+) -> list[Path]:
+    """Writes a figure that compares several runs, as overlay.pdf and in other formats.
+
+    Args:
+        logs: The logs, by their names in the legend.
+        folder: Folder of the files. It is created if it does not exist.
+        width_in: Width of the figure, 3.5 or 7 in.
+        formats: Formats of the files, of `FIGURE_FORMATS`.
+        force: True to overwrite existing files.
+
+    Returns:
+        The paths of the files.
+
+    Raises:
+        UsageError: The width or a format does not exist, the errors of the logs have different
+            units, or a file exists.
+    """
+    form = make_print_size(width_in)
+    drawings = {"overlay": partial(draw_overlay, logs, form)}
+    return _write(drawings, folder, form, formats, force=force)
+
+
+def write_report_figures(
+    log: Log,
+    folder: Path,
+    twin: Log | None,
+    progress: Progress | None = None,
+    pushed: TwinGrowth | None = None,
+) -> list[Path]:
+    """Writes the figures of a run's report as PNG files.
+
+    Figures for which the log has nothing to show are left out. Earlier files in the folder are
+    replaced. An operator is a person or program that moves an arm.
+
+    Args:
+        log: Log of the run.
+        folder: Folder of the files. It is created if it does not exist.
+        twin: Log of the same run, repeated without operators. None to leave out the figure that
+            shows how far operators moved the arms.
+        progress: Function that is called with the number of drawn figures and of all figures.
+        pushed: How small pushes grow in repetitions of the run. None to compute this here.
+
+    Returns:
+        The paths of the files.
+    """
+    drawings: dict[str, Callable[[], Figure]] = {}
+    for name in list_drawable_figures(log):
+        entry = FIGURES[name]
+        if entry.in_report:
+            drawings[name] = partial(entry.draw, log, REPORT_SIZE)
+
+    # These two figures need further runs, which the caller may have executed already.
+    if twin is None:
+        drawings.pop("hands_moved", None)
+    else:
+        drawings["hands_moved"] = partial(draw_operator_displacement, log, twin=twin)
+    if pushed is not None and "twins" in drawings:
+        drawings["twins"] = partial(draw_twins, PushedTwins(log, 0.0, pushed))
+    return _write(
+        drawings=drawings, folder=folder, form=REPORT_SIZE, formats=["png"], progress=progress
+    )
+
+
+def _write(
+    drawings: Mapping[str, Callable[[], Figure]],
+    folder: Path,
+    form: FigureSize,
+    formats: Sequence[str],
+    progress: Progress | None = None,
+    *,
+    force: bool = True,
+) -> list[Path]:
+    """Draws figures, and writes each of them in all formats.
+
+    All formats and file names are checked before the first figure is drawn, so that an error
+    does not leave half of the files behind.
+
+    Args:
+        drawings: Functions that draw the figures, by the names of the files.
+        folder: Folder of the files. It is created if it does not exist.
+        form: Size of the figures.
+        formats: Formats of the files, of `FIGURE_FORMATS`.
+        progress: Function that is called with the number of drawn figures and of all figures.
+        force: True to overwrite existing files.
+
+    Returns:
+        The paths of the files.
+
+    Raises:
+        UsageError: A format does not exist, or a file exists.
+    """
+    kinds = list(dict.fromkeys(formats))
+    for kind in kinds:
+        if kind not in FIGURE_FORMATS:
+            known = ", ".join(FIGURE_FORMATS)
+            raise UsageError(f"a figure can be written as {known}, not as {kind!r}")
+    for name in drawings:
+        for kind in kinds:
+            refuse_existing(folder / f"{name}.{kind}", force=force)
+
+    paths = []
+    for drawn_count, (name, draw) in enumerate(drawings.items()):
+        if progress is not None:
+            progress(drawn_count, len(drawings))
+        drawn = draw()
+        make_folder(folder)
+        for kind in kinds:
+            path = folder / f"{name}.{kind}"
+            paths.append(path)
+            write_figure(drawn, path, form.dpi)
+    return paths
+
+
+def _find_figure(log: Log, name: str) -> FigureEntry:
+    """Returns the registered figure of a name.
+
+    Raises:
+        UsageError: There is no such figure, or the log has nothing to show in it.
+    """
+    if name not in FIGURES:
+        hint = suggest_nearest(name, list(FIGURES))
+        if not hint:
+            hint = f"; the figures are {', '.join(FIGURES)}"
+        raise UsageError(f"there is no figure {name!r}{hint}")
+    entry = FIGURES[name]
+    reason = entry.absent(log)
+    if reason:
+        raise UsageError(f"{name}: nothing to show: {reason}")
+    return entry

@@ -1,0 +1,377 @@
+"""Draws the differences between a run and its twins over time.
+
+A twin is a second execution of the same run that received a small push at some time. Twins show
+whether small disturbances grow or decay. The upper panel has the differences of the joint
+velocities on a logarithmic axis, on which exponential growth is a straight line. A dashed line
+beside them has the growth rate that the headline states, as its slope. The lower panel has the
+joint speeds of the run itself.
+
+Invariant:
+    - The differences are drawn as they were measured.
+    - The dashed line covers the times to which its rate was fitted.
+    - If a twin was pushed again, because its difference had decayed to rounding errors, its
+      line is interrupted there.
+"""
+
+import textwrap
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
+
+from ...analysis.run_end import classify_log_end
+from ...analysis.twins.envelope_trend import EnvelopeTrend
+from ...analysis.twins.twin_growth import (
+    MOST_LOG,
+    PushedTwins,
+    PushGrowth,
+    measure_amplitude,
+    measure_twins,
+)
+from ...core.step.ticks import BUCKETS_PER_S
+from ...core.step.vectors import Array
+from ...execution.fused import explain_not_repeatable
+from ...execution.twins import SMALLEST, TwinPath, Twins
+from ...log.log_reader import Log
+from ...scenario.code_consent import may_run_user_laws
+from .. import style
+from ..appearance import REPORT_SIZE, FigureSize
+from .figure_entry import draws
+
+_POINTS = 150
+"""Approximate number of points of a line. Each is the largest value around its time."""
+_SEVERAL_JOINTS_COLOUR = "#7a7a7a"
+"""Colour of pushes that move several joints."""
+_ESTIMATES_COLOUR = "#999933"
+"""Colour of pushes that change parameter estimates instead of velocities."""
+_ROUNDING: dict[str, Any] = {
+    "color": style.FAINT,
+    "alpha": 0.18,
+    "linewidth": 0.0,
+    "zorder": 0.3,
+}
+_PAPER = {
+    "boxstyle": "square,pad=0.1",
+    "facecolor": "white",
+    "edgecolor": "none",
+    "alpha": 0.75,
+}
+_NOTE: dict[str, Any] = {
+    "textcoords": "offset points",
+    "color": style.REFERENCE,
+    "bbox": _PAPER,
+}
+
+
+class _DifferenceLine(NamedTuple):
+    """A line of the upper panel, which shows how the difference between two runs develops.
+
+    Attributes:
+        label: Text of the line in the legend.
+        path: Difference between a twin and its run.
+        joints: Indices of the joints that the drawn amplitude covers.
+        options: Colour, width and dashes of the line.
+    """
+
+    label: str
+    path: TwinPath
+    joints: list[int]
+    options: dict[str, Any]
+
+
+def draw_twins(pushed: PushedTwins, form: FigureSize = REPORT_SIZE) -> Figure:
+    """Draws how small pushes grow or decay in repetitions of a run.
+
+    Each repetition, called a twin, equals the run except for a small push. The upper panel
+    shows the differences between the joint velocities of the twins and of the run, in rad/s. It
+    has a line for each push, or a line for each joint if there was a single push. The lower
+    panel shows the joint speeds of the run. If there are no twins, the figure shows the reason.
+    The title is a sentence on how the pushes develop.
+
+    Args:
+        pushed: The run and its twins.
+        form: Width, type sizes and resolution of the figure.
+    """
+    growth = pushed.growth
+    if growth.twins is None or growth.worst is None:
+        return style.empty_figure(growth.text, form)
+
+    height_in = 5.4 if form.narrow else 4.4
+    title_width = 62 if form.narrow else 110  # characters per line
+    with style.time_figure(pushed.log, form, height_in) as plot:
+        panels = style.add_panels(plot.figure, 2, 1, sharex=True, height_ratios=(4.0, 1.0))
+        upper_panel, lower_panel = panels[:, 0]
+        lines = list(_list_lines(pushed, growth.twins))
+        # The growth rate is drawn for the push that the title is about. If pushes of several
+        # sizes were tried, the title is about all of them, and the first push is chosen.
+        has_several_sizes = pushed.linear is not None
+        rated_push = growth.pushes[0] if has_several_sizes else growth.worst
+        _draw_differences(upper_panel, pushed, lines, rated_push)
+        _limit_differences(upper_panel, form)
+        _mark_push(upper_panel, pushed.at_s, form)
+
+        # The time axis begins a little before the push, so that its line is visible.
+        margin_s = 0.08 * (growth.to_s - pushed.at_s)
+        from_s = max(0.0, pushed.at_s - margin_s)
+        _draw_speeds(lower_panel, pushed.log, growth.twins, from_s)
+
+        plot.mark(upper_panel, pushed.log.sites)
+        legend_entries = [(line.label, line.options) for line in lines]
+        title = textwrap.fill(pushed.headline(), title_width)
+        plot.finish([lower_panel], legend_entries, title=style.typeset(title))
+        lower_panel.set_xlim(from_s, growth.to_s)
+    return plot.figure
+
+
+def _explain_absent_twins(log: Log) -> str:
+    """Explains why a log has no twins. Empty if it has, as with laws that a user permitted."""
+    return explain_not_repeatable(log, own_laws=may_run_user_laws(log.scenario))
+
+
+@draws("twins", "growth or decay of small pushes", _explain_absent_twins, in_report=True)
+def _draw_log_twins(log: Log, form: FigureSize) -> Figure:
+    """Draws the differences of twins that are pushed at the start of a log's run."""
+    own_laws = may_run_user_laws(log.scenario)
+    growth = measure_twins(log, classify_log_end(log), own_laws=own_laws)
+    return draw_twins(PushedTwins(log, 0.0, growth), form)
+
+
+def _list_lines(pushed: PushedTwins, twins: Twins) -> Iterator[_DifferenceLine]:
+    """Yields the lines of the panel that shows the differences between twins and their run.
+
+    - If pushes of several sizes were tried, to find those that act linearly, each size has a
+      line, from light to dark.
+    - Several pushes have a line each. The push of one joint has the style of that joint.
+    - A single push has a line per joint that it moved.
+
+    Args:
+        pushed: The run and its pushed twins.
+        twins: The twins of `pushed`, each with its push and the course of its difference.
+    """
+    all_joints = list(range(len(twins.joints)))
+    joint_styles = _style_joints(pushed.log, twins.joints)
+    shades = colormaps["viridis"](np.linspace(0.9, 0.0, len(twins.paths)))
+    has_several_sizes = pushed.linear is not None
+    for number, path in enumerate(twins.paths):
+        # The name of a push is for example "1e-06 rad at m1 joint 1", "1e-06 rad at all joints"
+        # or "1e-06 of all estimates". Only a push of joints has a target after "at".
+        size, _, pushed_joints = path.push.name.partition(" at ")
+        if has_several_sizes:
+            shade = {"color": tuple(shades[number]), "linewidth": 1.3}
+            yield _DifferenceLine(size, path, all_joints, shade)
+        elif len(twins.paths) > 1:
+            style_without_joint = {
+                "color": _SEVERAL_JOINTS_COLOUR if pushed_joints else _ESTIMATES_COLOUR,
+                "linewidth": 1.0,
+                "linestyle": style.DASHES[number % len(style.DASHES)],
+            }
+            options = joint_styles.get(pushed_joints, style_without_joint)
+            yield _DifferenceLine(path.push.name, path, all_joints, options)
+        else:
+            for joint, name in enumerate(twins.joints):
+                # The logarithm of the difference is -inf while the joint has not moved.
+                has_moved = np.isfinite(path.largest[:, joint]).any()
+                if has_moved:
+                    yield _DifferenceLine(name, path, [joint], joint_styles[name])
+
+
+def _style_joints(log: Log, joints: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Returns the line style of each joint.
+
+    The colour is that of the joint's site. The dash pattern is chosen by the joint's number.
+
+    Args:
+        log: Log with the sites.
+        joints: Names of joints such as "m1 joint 2".
+    """
+    styles = {}
+    for name in joints:
+        site, _, number = name.partition(" joint ")
+        dashes = style.DASHES[(int(number) - 1) % len(style.DASHES)]
+        styles[name] = {**style.site_line(log, site), "linestyle": dashes}
+    return styles
+
+
+def _draw_differences(
+    axes: Axes, pushed: PushedTwins, lines: Sequence[_DifferenceLine], rated: PushGrowth
+) -> None:
+    """Draws the lines of all differences, and the growth rate of one push beside its lines.
+
+    Args:
+        axes: Panel of the figure, as Matplotlib axes.
+        pushed: A run and its pushed twins.
+        lines: Lines of the differences.
+        rated: Growth of the push whose rate is drawn. At least one line belongs to this push.
+    """
+    growth = pushed.growth
+    drawn_s = growth.to_s - pushed.at_s
+    # A twin has `BUCKETS_PER_S` values a second. So many of them become one point of a line
+    # that a line has about `_POINTS` points.
+    intervals_per_point = max(1, int(drawn_s * BUCKETS_PER_S / _POINTS))
+    axes.set_yscale("log")
+    rated_traces = []  # times and values of the lines of the rated push
+    for line in lines:
+        t_s, values = _trace_amplitude(line, growth.to_s, intervals_per_point)
+        axes.plot(t_s, values, **line.options)
+        belongs_to_rated_push = line.path.push is rated.push
+        if belongs_to_rated_push:
+            rated_traces.append((t_s, values))
+
+    # A push has one line, or one per joint. All of them belong to one twin, and therefore have
+    # the same times.
+    rated_t_s, _ = rated_traces[0]
+    envelope = np.fmax.reduce([values for _, values in rated_traces])
+    _draw_rate(axes, pushed, rated, rated_t_s, envelope)
+
+
+def _trace_amplitude(line: _DifferenceLine, to_s: float, step: int) -> tuple[Array, Array]:
+    """Computes the points of a line, each as the largest difference around its time.
+
+    The difference between a twin and its run is known in intervals of 50 ms. A difference that
+    has decayed to rounding errors is pushed again. The intervals from one push to the next are
+    called a leg. The line is interrupted between two legs.
+
+    The computation uses logarithms, because the difference of a run in which disturbances grow
+    exponentially may exceed the range of floating-point numbers.
+
+    Args:
+        line: The line.
+        to_s: End of the line, in s.
+        step: Number of intervals that a point covers.
+
+    Returns:
+        Times in s and amplitudes in rad/s, each of shape (K,). Each leg ends with a point of
+        the amplitude NaN, at which the line is interrupted. So is it where the difference is 0.
+    """
+    path = line.path
+    log_amplitude = measure_amplitude(path, line.joints)
+    end = int(np.searchsorted(path.t_s, to_s))
+    end = max(end, path.pushed[-1] + 1)  # the last leg has at least one interval
+    t_s = np.zeros(0)
+    log_peaks = np.zeros(0)
+    for leg_start, leg_end in pairwise([*path.pushed, end]):
+        # Groups of `step` intervals, each with its first and its middle interval.
+        starts = np.arange(leg_start, leg_end, step)
+        middles = np.minimum(starts + step // 2, leg_end - 1)
+        group_peaks = np.maximum.reduceat(log_amplitude[:leg_end], starts)
+        t_s = np.r_[t_s, path.t_s[middles], np.nan]
+        log_peaks = np.r_[log_peaks, group_peaks, -np.inf]
+    # Larger logarithms would overflow.
+    amplitudes = np.exp(np.minimum(log_peaks, MOST_LOG))
+    return t_s, np.where(np.isfinite(log_peaks), amplitudes, np.nan)
+
+
+def _draw_rate(
+    axes: Axes, pushed: PushedTwins, rated: PushGrowth, t_s: Array, values: Array
+) -> None:
+    """Draws a dashed line with the growth rate of a push, just above the differences.
+
+    The number of the rate is written beside the line. Nothing is drawn if the push has no rate
+    or no clear trend.
+
+    Args:
+        axes: Panel of the figure, as Matplotlib axes.
+        pushed: A run and its pushed twins.
+        rated: Growth of the push.
+        t_s: Times of the differences, in s, shape (K,).
+        values: Largest differences of all joints, in rad/s, shape (K,).
+    """
+    if not np.isfinite(rated.rate_per_s) or rated.trend is EnvelopeTrend.UNDECIDED:
+        return
+    from_s = pushed.growth.from_s
+    to_s = pushed.growth.to_s
+    if rated.ended_s is not None:
+        # The rate of a twin that ended early was fitted to the second half of its time.
+        from_s = 0.5 * (pushed.at_s + rated.ended_s)
+        to_s = rated.ended_s
+    rows = (t_s >= from_s) & (t_s <= to_s) & (values > 0.0)
+    if not rows.any():
+        return
+
+    line_t_s = t_s[rows]
+    # The lowest line with this slope that stays 15 % above all values.
+    heights = np.log(1.15 * values[rows]) - rated.rate_per_s * line_t_s
+    level = float(np.max(heights))
+    line = np.exp(np.minimum(level + rated.rate_per_s * line_t_s, MOST_LOG))
+    options = {**style.LIMIT_LINE, "linewidth": 1.0, "zorder": 4.0}
+    axes.plot(line_t_s, line, **options)
+
+    label = f"{rated.rate_per_s:+.3g} /s".replace("-", "\N{MINUS SIGN}")
+    middle = len(line_t_s) // 2
+    falls = rated.rate_per_s < 0.0
+    axes.annotate(
+        label,
+        xy=(line_t_s[middle], line[middle]),
+        xytext=(0.0, 3.0),
+        ha="left" if falls else "right",
+        **_NOTE,
+    )
+
+
+def _limit_differences(axes: Axes, form: FigureSize) -> None:
+    """Labels and limits the logarithmic axis of the differences.
+
+    Differences below `SMALLEST` consist of rounding errors. If any difference comes near this
+    value, the axis begins a decade below it, and this decade is shaded. The axis spans at least
+    a factor of 30, so that slow growth does not look fast.
+
+    Args:
+        axes: Panel of the figure, as Matplotlib axes, in which the lines are already drawn.
+        form: Width, type sizes and resolution of the figure.
+    """
+    axes.set_ylabel("difference of velocities (rad/s)")
+    low, high = axes.get_ylim()
+    is_near_rounding = low < 10.0 * SMALLEST
+    if is_near_rounding:
+        low = SMALLEST / 10.0
+        axes.axhspan(low, SMALLEST, **_ROUNDING)
+        axes.annotate(
+            "rounding",
+            xy=(0.0, SMALLEST),
+            xycoords=axes.get_yaxis_transform(),
+            xytext=(3.0, -9.0),  # in points: inside the shaded decade, at its left end
+            fontsize=form.small_pt,
+            **_NOTE,
+        )
+    axes.set_ylim(min(low, high / 30.0), high)
+    axes.yaxis.set_minor_formatter(NullFormatter())
+
+
+def _mark_push(axes: Axes, at_s: float, form: FigureSize) -> None:
+    """Marks the time of the pushes with a vertical line."""
+    axes.axvline(at_s, color=style.REFERENCE, linewidth=0.8)
+    axes.annotate(
+        "push",
+        xy=(at_s, 1.0),
+        xycoords=axes.get_xaxis_transform(),
+        xytext=(3.0, -8.0),
+        fontsize=form.small_pt,
+        **_NOTE,
+    )
+
+
+def _draw_speeds(axes: Axes, log: Log, twins: Twins, from_s: float) -> None:
+    """Draws the speed of the fastest joint of every site of the run, in rad/s.
+
+    Args:
+        axes: Panel of the figure, as Matplotlib axes.
+        log: Log of the run.
+        twins: Twins of the run, which also contain the speeds of the run.
+        from_s: Start of the time axis, in s.
+    """
+    t_s = twins.paths[0].t_s
+    first = 0
+    for site in log.sites:
+        # The columns of the speeds are the joints of all sites, one site after the other.
+        end = first + log.scenario.layout(site).joints
+        speed = twins.speed[:, first:end].max(axis=1)
+        axes.plot(t_s, speed, **{**style.site_line(log, site, 0.9), "alpha": 0.6})
+        first = end
+    largest = float(twins.speed[t_s >= from_s].max(initial=0.0))
+    axes.set_ylim(0.0, 1.1 * largest or 1.0)
+    axes.set_ylabel("run (rad/s)")

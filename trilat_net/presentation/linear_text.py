@@ -1,0 +1,472 @@
+"""Composes the text of a linear analysis, as the command `trilat linear` prints it.
+
+A linear analysis linearises the coupled arms at a pose of rest, and computes whether small
+motions decay. Operators are the people or programs that move the arms, and the key of a
+scenario is a value such as a gain or a delay. The text has the equilibrium, the delays, a table
+of the rightmost roots of the characteristic equation, the verdict, the largest stable delay,
+the ports at which operators hold the arms, and the values of scenario keys at which stability
+changes.
+
+Invariant:
+    - Every number has its unit.
+    - Roots that are zero by the structure of the system, whatever its parameters are, are
+      counted and not listed, because they say nothing about stability.
+"""
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from ..analysis.theory.frequency_search import FrequencyBand
+from ..analysis.theory.linear_analysis import LinearAnalysis
+from ..analysis.theory.linear_edge import EdgeScan
+from ..analysis.theory.port_analysis import PortAnalysis, TwoPort
+from ..analysis.theory.port_passivity import Passivity
+from ..analysis.theory.port_response import QUOTED_AT_HZ, Transparency
+from ..core.step.vectors import Array
+from ..errors import count_nouns
+from .result_text import Block, MarkedText, TextTable
+
+_COLOURS = {"stable": "green", "unstable": "red", "at the edge": "yellow"}
+
+
+def compose_linear(analysis: LinearAnalysis) -> Iterator[Block]:
+    """Yields the text about the linear analysis of a scenario.
+
+    The analysis linearises the loop of arms, controllers and delays at an equilibrium. The text
+    contains, in order, the equilibrium, the delays, the characteristic roots, the verdict about
+    stability, the margin, notes, the ports at which operators hold the arms, and scans.
+
+    Args:
+        analysis: The analysis.
+    """
+    yield from describe_equilibrium(analysis)
+    yield from describe_effective_delays(analysis)
+    yield ""
+    yield tabulate_roots(analysis)
+    yield describe_zero_roots(analysis)
+    verdict, _, rest = describe_linear_verdict(analysis).partition(": ")
+    yield MarkedText(f"[{_COLOURS[verdict]}]{verdict}[/]:", rest)
+    margin = analysis.margin.description
+    yield f"delay margin, continuous loop, one delay on all links: {margin}"
+    yield from (f"note: {note}" for note in analysis.notes)
+    if analysis.ports is not None:
+        yield from describe_ports(analysis.ports)
+    yield from (_describe_scan(scan, analysis.scenario.name) for scan in analysis.scans)
+
+
+def _describe_scan(scan: EdgeScan, name: str) -> str:
+    """Returns a line with the values of a scenario key at which the stability changes.
+
+    Args:
+        scan: Result of a scan of the key's values.
+        name: Name of the scenario.
+    """
+    edges = []
+    for edge in scan.edges:
+        state = "stable" if edge.stable_above else "unstable"
+        edges.append(f"{state} from {edge.value:.6g} on ({edge.omega_rad_s:.4g} rad/s)")
+    result = ", ".join(edges) or f"stability of {name} does not change"
+    return f"{scan.key} from {scan.low:g} to {scan.high:g}: {result}"
+
+
+def describe_equilibrium(analysis: LinearAnalysis) -> Iterator[str]:
+    """Yields lines about the equilibrium at which the loop was linearised.
+
+    They state how the equilibrium was computed, its residual, and the pose of each site. If all
+    sites have the same joint angles, a single line has them.
+
+    Args:
+        analysis: The analysis.
+    """
+    rest = analysis.rest
+    yield f"rest: {rest.how}; residual {rest.residual:.1g}"
+    sites = analysis.conditions.sites
+    angles = [q[: site.layout.joints] for site, q in zip(sites, rest.q, strict=True)]
+    is_joint_space = not sites[0].layout.task
+    # The limit is half a unit of the last digit that is printed.
+    if is_joint_space and float(np.ptp(rest.q, axis=0).max()) < 5e-5:
+        yield f"  all sites at ({_list_numbers(angles[0])}) rad"
+        return
+    for site, q, pose in zip(sites, angles, analysis.end_effectors, strict=True):
+        text = f"  {site.name} at ({_list_numbers(q)}) rad"
+        if len(pose):
+            units = "m and rad" if len(pose) > 3 else "m"
+            text += f", its end effector at ({_list_numbers(pose)}) {units}"
+        yield text
+
+
+def _list_numbers(values: Array) -> str:
+    """Returns numbers with four decimals, separated by commas."""
+    return ", ".join(f"{value:.4f}" for value in values)
+
+
+def describe_effective_delays(analysis: LinearAnalysis) -> Iterator[str]:
+    """Yields lines for the user about the delays with which arms follow each other.
+
+    There is a line for each link (one-way connection between two arms), or a single line if all
+    delays are equal. If a delay varies during a run, its mean is stated.
+
+    Args:
+        analysis: Result of the linear stability analysis.
+    """
+    names = analysis.scenario.names
+    age_s = analysis.conditions.age_s
+    quantity = "mean delay in use" if analysis.conditions.varying else "delay in use"
+    links = list(zip(*np.nonzero(analysis.conditions.alpha), strict=True))
+    values = {float(age_s[i, j]) for i, j in links}
+    if len(values) == 1:
+        yield f"{quantity} on every link: {1e3 * values.pop():.4g} ms"
+        return
+    for i, j in links:
+        yield f"{quantity} on {names[j]}->{names[i]}: {1e3 * age_s[i, j]:.4g} ms"
+
+
+def tabulate_roots(analysis: LinearAnalysis) -> TextTable:
+    """Returns a table of the rightmost characteristic roots, which determine stability.
+
+    A motion with the root s changes as exp(s t), and grows if the real part of s is positive.
+    The table describes the motion of each root.
+
+    The roots are those of the continuous loop, whose controllers compute all the time. If a
+    root of the sampled loop, whose controllers compute once per tick, differs, two further
+    columns have the roots of the sampled loop. If the delays differ from tick to tick, the
+    table has only the roots of the sampled loop over a span of ticks, because the continuous
+    loop has only mean delays.
+
+    Args:
+        analysis: The analysis.
+
+    Returns:
+        The table with a row per root: real part in 1/s, imaginary part in rad/s, frequency in
+        Hz, damping ratio, number of equal roots ("modes"), and what moves.
+    """
+    ticks_differ = analysis.decisive.span_s is not None
+    roots = analysis.decisive.roots if ticks_differ else analysis.continuous.roots
+    # For each root, the one of the sampled loop if it is to be shown beside it.
+    sampled_roots = [
+        None if ticks_differ else analysis.find_sampled_root(root) for root in roots
+    ]
+    has_sampled_columns = any(sampled is not None for sampled in sampled_roots)
+    rows = []
+    for root, sampled in zip(roots, sampled_roots, strict=True):
+        # The imaginary part of a real root may be -0.0, which would be printed as "-0".
+        row = [
+            f"{root.s.real:.4g}",
+            f"{root.s.imag:.4g}" if root.s.imag else "0",
+            f"{root.s.imag / (2.0 * math.pi):.4g}" if root.s.imag else "0",
+            f"{root.damping:.4g}",
+            str(root.multiplicity),
+        ]
+        if has_sampled_columns and sampled is None:
+            row += ["same", "same"]
+        elif sampled is not None:
+            row += [f"{sampled.s.real:.4g}", f"{sampled.s.imag:.4g}"]
+        rows.append([*row, root.description])
+    heads = ["re 1/s", "im rad/s", "Hz", "damping", "modes"]
+    if has_sampled_columns:
+        heads += ["re as computed", "im as computed"]
+    heads.append("what moves")
+    return TextTable(heads, rows, align="r" * (len(heads) - 1) + "l")
+
+
+def describe_zero_roots(analysis: LinearAnalysis) -> str:
+    """Returns a sentence about the roots that are zero by the structure of the system.
+
+    For example, if all arms were moved to another common pose, nothing would bring them back.
+    Such roots do not count for the stability of the loop.
+
+    Args:
+        analysis: The analysis.
+    """
+    count = analysis.decisive.zeros
+    if not count:
+        return "no root at zero"
+    subject = "root is" if count == 1 else "roots are"
+    origins = "shared poses"
+    if analysis.conditions.sites[0].layout.task:
+        origins += ", joints that the task leaves free"
+    return f"{count} {subject} zero by structure: {origins}, and estimates without excitation"
+
+
+def describe_linear_verdict(analysis: LinearAnalysis) -> str:
+    """Returns a sentence that says whether small motions of the coupled arms decay.
+
+    The sentence states the growth rate and the frequency of the slowest decaying, or fastest
+    growing, motion. They belong to the characteristic root with the largest real part. Motions
+    that neither decay nor grow, but keep a constant speed ("drifting"), are only counted. An
+    example is "stable: the slowest motion goes as exp(-1.2 t / s) at 3.4 rad/s, as computed
+    tick by tick".
+
+    Args:
+        analysis: Result of the linear stability analysis. The roots that determine stability
+            (`decisive`) are those of the sampled loop, whose controllers compute in ticks, if
+            it could be analysed, and otherwise those of the continuous loop.
+
+    Returns:
+        The sentence, which begins with the verdict "stable", "unstable" or "at the edge".
+    """
+    rightmost = analysis.decisive.rightmost
+    drifting_count = analysis.decisive.drifting
+    motions = "motions keep their" if drifting_count > 1 else "motion keeps its"
+    drift = f"{drifting_count} {motions} speed"
+    if rightmost is None:
+        return f"{analysis.verdict}: {drift if drifting_count else 'nothing moves'}"
+
+    growth = f"exp({rightmost.s.real:.4g} t / s)"
+    if rightmost.s.imag:
+        growth += f" at {rightmost.s.imag:.4g} rad/s"
+    is_of_sampled_loop = analysis.sampled is not None
+    if is_of_sampled_loop:
+        # If ticks differ, the basis is a phrase such as ", over the period of 0.05 s".
+        ticks = analysis.decisive.basis.removeprefix(",") or " tick by tick"
+        growth += f", as computed{ticks}"
+
+    motion = "the slowest motion"
+    if drifting_count:
+        motion = f"{drift}, and the slowest of the others"
+    return f"{analysis.verdict}: {motion} goes as {growth}"
+
+
+_MAX_BANDS = 3
+"""Largest number of listed frequency bands."""
+_MAX_SEPARATE_JOINTS = 2
+"""Largest number of joints for which every failing two-port has a separate line."""
+WEIGHTS_ALIKE = 1e-9
+"""Largest difference of weights that count as equal."""
+
+
+def describe_ports(ports: PortAnalysis) -> list[str]:
+    """Returns lines for the user about what operators feel and whether arms stay stable.
+
+    The lines are about three properties:
+
+    - passivity: the arms never supply energy to the operators,
+    - absolute stability: the arms are stable with any passive operators,
+    - transparency: the impedance that an operator feels while another arm is free or clamped.
+
+    If the arms are unstable without operators, the other properties are not defined and the
+    lines end there. If they are unstable while one of them is clamped, the lines about
+    transparency are left out.
+
+    Args:
+        ports: Results for the joints at which the operators act.
+    """
+    lines = _describe_conditions(ports)
+    if ports.verdict == "unstable":
+        lines.append(
+            "  the loop without operators is unstable: not passive, and without an impedance"
+        )
+        return lines
+    lines += _describe_port_passivity(ports)
+    absolute = _describe_absolute_stability(ports)
+    lines.append(f"  a passive operator in {ports.speed} per site, best weights: {absolute}")
+    lines += [f"    Llewellyn, {text}" for text in _describe_two_ports(ports)]
+    if ports.measured is not None:
+        bands = ports.measured.below
+        result = "stable"
+        if bands:
+            result = f"not shown {_list_bands(bands)}, where they damp too little"
+        lines.append(f"  the measured operators at the masters, any at each: {result}")
+    if ports.clamped_verdict == "unstable":
+        clamped = ports.transparency[0].other_site
+        lines.append(
+            f"  with {clamped} clamped the loop is unstable: it has no steady impedance"
+        )
+        return lines
+    for transparency in ports.transparency:
+        lines.append(f"  {_describe_transparency(ports, transparency)}")
+    return lines
+
+
+def _describe_conditions(ports: PortAnalysis) -> list[str]:
+    """Returns the lines about the analysed ports and the grid of frequencies."""
+    low_hz, high_hz = ports.band_hz
+    conditions = f"operators and environments off, {low_hz:g}-{high_hz:g} Hz"
+    grid = "(a grid refined at minima: evidence, no proof)"
+    lines = [f"Ports of {', '.join(ports.sites)}, {conditions} {grid}"]
+    if ports.resolved_hz < high_hz:
+        beyond = f"above {ports.resolved_hz:.3g} Hz"
+        lines.append(f"  {beyond} the grid does not follow the phase of the longest delay")
+    return lines
+
+
+def _describe_port_passivity(ports: PortAnalysis) -> list[str]:
+    """Returns the lines about the passivity of all ports, of each joint, and of the proof.
+
+    A port is a joint or axis at which an operator holds an arm. The arms are passive if they
+    never supply energy to the operators. The stability proof assumes operators that are passive
+    in r, the velocity plus Lambda times the error e, instead of the velocity.
+
+    At zero frequency, the admittance Y (velocities per torque) may have a pole: a constant
+    torque makes a velocity grow. For free masses, this is compatible with passivity.
+
+    Args:
+        ports: Results for the ports.
+    """
+    lines = []
+    pole = ports.pole
+    if pole.order:
+        meaning = "as of free masses" if pole.passive else "which no passive network has"
+        lines.append(f"  at zero frequency Y has a pole of order {pole.order}, {meaning}")
+    all_ports_text = _describe_passivity(ports.velocity, ports.impedance_unit(), ports.kind)
+    lines.append(f"  operators passive in {ports.speed}, coupled or not: {all_ports_text}")
+    # Each joint alone, without operators at the others.
+    for joint, passivity in ports.joints.items():
+        unit = ports.impedance_unit(joint)
+        joint_text = _describe_passivity(passivity, unit, ports.kind)
+        lines.append(f"    {ports.name_port(joint)} alone: {joint_text}")
+    if ports.proof is not None:
+        premise = f"r = {ports.speed} + Lambda e, the proof's premise"
+        proof_text = _describe_proof(ports, ports.proof)
+        lines.append(f"  operators passive in {premise}: {proof_text}")
+    return lines
+
+
+def _describe_proof(ports: PortAnalysis, proof: Passivity) -> str:
+    """Returns a sentence about the passivity in r that the stability proof assumes.
+
+    Args:
+        ports: Analysed ports.
+        proof: Passivity in r, with the ports of each site weighted as in the proof.
+    """
+    beta = ", ".join(f"{weight:.3g}" for weight in ports.beta)
+    text = f"{_describe_passivity(proof)}; sites weighted {beta}"
+    if np.ptp(ports.beta) > WEIGHTS_ALIKE:
+        text += ", which says nothing about operators coupled to each other"
+    if proof.passive or ports.estimates_true:
+        return text
+    return (
+        f"{text}; the estimates are not true, and the proof counts the energy that they store"
+    )
+
+
+def _describe_passivity(passivity: Passivity, unit: str = "", kind: str = "") -> str:
+    """Returns a sentence about passivity, and about the damping that is missing.
+
+    Args:
+        passivity: Result for one port or for all ports.
+        unit: Unit of the missing damping. Empty to leave out the damping.
+        kind: Kind of the ports, "joint" or "axis".
+    """
+    if passivity.passive:
+        return "passive"
+    minima = passivity.minima
+    least = f"least eigenvalue {minima.least:.3g} at {minima.least_hz:.3g} Hz"
+    text = f"not passive {_list_bands(minima.below)}; {least}"
+    if not unit:
+        return text
+    if math.isinf(passivity.lacking_nm_s_rad):
+        plural = "axes" if kind == "axis" else "joints"
+        return f"{text}; no damping at the {plural} would make it so"
+    damping = f"{passivity.lacking_nm_s_rad:.3g} {unit}"
+    return f"{text}; {damping} more at each {kind} would make it so"
+
+
+def _list_bands(bands: tuple[FrequencyBand, ...]) -> str:
+    """Returns frequency bands as text, at most `_MAX_BANDS` of them."""
+    ranges = [f"{band.from_hz:.3g}-{band.to_hz:.3g}" for band in bands[:_MAX_BANDS]]
+    text = f"at {', '.join(ranges)} Hz"
+    if len(bands) > _MAX_BANDS:
+        text += f" and {count_nouns(len(bands) - _MAX_BANDS, 'range')} more"
+    return text
+
+
+def _describe_absolute_stability(ports: PortAnalysis) -> str:
+    """Returns whether passive operators can make the loop unstable, with the margin."""
+    minima = ports.absolute
+    if not minima.below:
+        return "stable"
+    operators = "some make" if len(ports.sites) <= 3 else "some may make"
+    margin = f"margin {minima.least:.3g} at {minima.least_hz:.3g} Hz"
+    return f"{operators} it unstable {_list_bands(minima.below)}; {margin}"
+
+
+def _describe_two_ports(ports: PortAnalysis) -> list[str]:
+    """Returns the lines about Llewellyn's criterion, which decides on stability for two sites.
+
+    A two-port is one joint of two sites, at which one operator each acts. A third site is free,
+    or its arm is clamped. The criterion fails if some passive operators make the two-port
+    unstable, which is so if Llewellyn's parameter is below 1 in some band of frequencies. A
+    line describes a failing two-port, or a group of them, and a last line counts those for
+    which the criterion holds.
+
+    Args:
+        ports: Results for the joints at which the operators act.
+    """
+    failing = [two_port for two_port in ports.two_ports if two_port.minima.below]
+
+    # For arms with many joints, the failing two-ports of a pair of sites share a line.
+    has_line_per_joint = len(ports.joints) <= _MAX_SEPARATE_JOINTS
+    groups: dict[tuple[object, ...], list[TwoPort]] = {}
+    for two_port in failing:
+        joint = two_port.joint if has_line_per_joint else ""
+        line_key = (two_port.sites, two_port.clamped, joint)
+        groups.setdefault(line_key, []).append(two_port)
+    lines = [_describe_failing(ports, group) for group in groups.values()]
+
+    holding_count = len(ports.two_ports) - len(failing)
+    if not holding_count:
+        return lines
+    subject = "the others"
+    if not failing:
+        subject = f"every pair and {ports.kind}"
+        if any(two_port.clamped for two_port in ports.two_ports):
+            subject += ", the third site free or clamped"
+    return [*lines, f"{subject}: holds ({holding_count} two-ports)"]
+
+
+def _describe_failing(ports: PortAnalysis, group: list[TwoPort]) -> str:
+    """Returns a line that says at which frequencies Llewellyn's criterion fails.
+
+    A two-port is one joint of two sites. It fails at a frequency if Llewellyn's parameter is
+    below 1 there. The line ends with the smallest value of the parameter and its frequency. An
+    example is "m1 and s, joint 1: fails at 2-5 Hz; least 0.8 at 3 Hz".
+
+    Args:
+        ports: Results for all joints, from which the names of joints and axes are taken.
+        group: Failing two-ports of the same two sites. They have the same third site clamped,
+            or none.
+    """
+    worst = min(group, key=lambda two_port: two_port.minima.least)
+    minima = worst.minima
+
+    # In task space, the numbers of the ports stand for axes with names.
+    port_names = []
+    for two_port in group:
+        port_name = ports.axes.get(two_port.joint, two_port.joint)
+        port_names.append(str(port_name))
+    subject = " and ".join(worst.sites)
+    if worst.clamped:
+        subject += f", {worst.clamped} clamped"
+    subject += f", {ports.kind} {', '.join(port_names)}"
+
+    if len(group) == 1:
+        frequencies = _list_bands(minima.below)
+    else:
+        # Several two-ports have too many bands to list. The range that contains them is stated.
+        bands = [band for two_port in group for band in two_port.minima.below]
+        from_hz = min(band.from_hz for band in bands)
+        to_hz = max(band.to_hz for band in bands)
+        frequencies = f"within {from_hz:.3g}-{to_hz:.3g} Hz"
+    least = f"least {minima.least:.3g} at {minima.least_hz:.3g} Hz"
+    return f"{subject}: fails {frequencies}; {least}"
+
+
+def _describe_transparency(ports: PortAnalysis, transparency: Transparency) -> str:
+    """Returns a sentence about the impedance that an operator feels.
+
+    The impedance is given with the other site free and with it clamped. The larger their ratio,
+    the better the operator can feel what the other site touches.
+    """
+    unit = ports.impedance_unit(transparency.joint)
+    port = ports.name_port(transparency.joint)
+    free, clamped = transparency.interpolate_magnitudes(QUOTED_AT_HZ)
+    low_hz, high_hz = transparency.band_hz
+    return (
+        f"{transparency.operator_site} feels of {transparency.other_site}, {port}: "
+        f"{free:.4g} {unit} free and {clamped:.4g} clamped at {QUOTED_AT_HZ:g} Hz; "
+        f"over {low_hz:g}-{high_hz:g} Hz the ratio is {transparency.ratio_db:.3g} dB, "
+        f"the difference {transparency.difference_nm_s_rad:.3g} {unit}"
+    )

@@ -1,0 +1,192 @@
+"""Writes the report of a recorded run: a web page and a file with the numbers of the run.
+
+A run is a session of two or more sites, each of which is a process that controls one arm. The
+log of the run is an MCAP file. `write_report` computes the numbers of the run from the log,
+draws the figures that explain whether the run was stable, and writes two files:
+
+- `report.html`, a page for people. `render_report` fills the template `assets/report.html`.
+  Each section of the page comes from one module `page_...`, in the order of the page:
+  `page_summary`, `page_charts` and `page_leaders` (the first screen), `page_charts` (motion),
+  `page_timeline`, `page_links`, `page_sites`, `page_certificate`, `page_sites` (the loops) and
+  `page_origin`.
+- `summary.json`, the same numbers for programs.
+
+The interactive charts are drawn in the browser by scripts. `charts.ChartBuilder` computes their
+data, which the page contains as JSON.
+
+Invariant:
+    - The page is a single file that contains its images, styles and scripts. It loads nothing
+      from a network, so that it can be sent by mail and read offline.
+    - Every text that comes from a scenario or from a log is escaped where its element is made.
+      Such a text therefore cannot add HTML to the page.
+    - The page has the colours and the type of the live page, which both read `theme.css`.
+    - Empty tables are left out.
+"""
+
+import json
+from collections.abc import Iterable, Sequence
+from html import escape
+from importlib import resources
+from pathlib import Path
+from string import Template
+from typing import Any
+
+from ..analysis.certificate.stability_certificate import Certificate
+from ..analysis.file_overview import summarise_run
+from ..files import make_folder, write_whole
+from ..log.findings import Finding
+from ..log.log_reader import Log
+from ..results import JsonObject
+from ..scenario import Scenario
+from .appearance import SITE_COLOURS
+from .charts import ChartBuilder
+from .page_certificate import render_certificate
+from .page_charts import render_chart_groups, render_overview
+from .page_html import render_section
+from .page_links import render_links
+from .page_origin import render_origin, summarise_origin
+from .page_sites import render_loops, render_sites
+from .page_summary import render_alarms, render_checks, render_key_numbers, render_verdict
+from .page_timeline import render_timeline
+
+_ASSETS = resources.files("trilat_net.presentation") / "assets"
+
+
+def write_report(
+    log: Log,
+    folder: Path,
+    *,
+    certificate: Certificate,
+    twin: Log | None = None,
+    verdicts: Iterable[Finding] = (),
+) -> list[Path]:
+    """Writes report.html and summary.json into a folder.
+
+    Args:
+        log: Log of the run.
+        folder: Folder of both files. It is created if it does not exist.
+        certificate: Judgement whether the run was stable, with its reasons.
+        twin: Log of the same run, simulated without the people or programs that move the arms.
+            The page shows the difference, which is the motion due to these operators. None
+            leaves this section out.
+        verdicts: Results of the checks of the log. They are read only after the figures of the
+            certificate are drawn, because another process may still check the log until then.
+
+    Returns:
+        The paths of the page and of the summary.
+    """
+    make_folder(folder)
+    facts = summarise_run(log, twin)
+    facts["certificate"] = certificate.to_dict()
+    reasons = render_certificate(log, certificate)
+
+    findings = list(verdicts)
+    facts["checks"] = [finding.to_row() for finding in findings]
+    page = render_report(
+        log=log,
+        twin=twin,
+        verdicts=findings,
+        facts=facts,
+        verdict=render_verdict(log, certificate, findings),
+        reasons=reasons,
+    )
+
+    page_path = folder / "report.html"
+    summary_path = folder / "summary.json"
+    write_whole(page_path, page)
+    write_whole(summary_path, _to_json(facts, indent=2) + "\n")
+    return [page_path, summary_path]
+
+
+def render_report(
+    log: Log,
+    twin: Log | None,
+    verdicts: Sequence[Finding],
+    facts: JsonObject,
+    verdict: str = "",
+    reasons: str = "",
+) -> str:
+    """Composes the HTML page that reports a run.
+
+    Args:
+        log: Log of the run.
+        twin: Log of the same run without operators, or None, see `write_report`.
+        verdicts: Results of the checks of the log.
+        facts: Numbers of the run, from `summarise_run`.
+        verdict: HTML of the judgement about stability, with which the page begins. Empty for
+            none.
+        reasons: HTML of the section that explains the judgement. Empty for no such section.
+
+    Returns:
+        The whole page.
+    """
+    scenario = log.scenario
+    builder = ChartBuilder(log, twin)
+    data, missing = builder.build()
+    groups = {
+        place: render_chart_groups(log, place, data.charts, missing)
+        for place in ("motion", "links", "loops")
+    }
+    # A "<" in a text could end the script element that contains the data. In JSON, "\u003c"
+    # means the same character.
+    data_json = _to_json(data.to_builtins()).replace("<", "\\u003c")
+    return Template(_read_asset("report.html")).substitute(
+        name=escape(scenario.name),
+        title=escape(scenario.title or scenario.name),
+        origin_line=escape(summarise_origin(log)),
+        verdict=verdict,
+        alarms=render_alarms(log),
+        checks=render_checks(verdicts, facts),
+        numbers=render_key_numbers(log, facts),
+        overview=render_overview(log, builder, data.charts),
+        motion=_render_motion(groups["motion"]),
+        timeline=render_timeline(log, facts),
+        links=render_links(log, facts, groups["links"]),
+        sites=render_sites(log, facts),
+        reasons=reasons,
+        loops=render_loops(log, facts, groups["loops"]),
+        origin=render_origin(log, facts, _read_asset("uPlot-LICENSE")),
+        data=data_json,
+        css=_read_asset("theme.css") + _read_asset("report.css"),
+        site_css=_render_site_css(scenario),
+        js=_read_asset("report.js") + _read_asset("arms.js"),
+        uplot_css=_read_asset("uPlot.min.css"),
+        uplot_js=_read_asset("uPlot.iife.min.js"),
+    )
+
+
+def _read_asset(name: str) -> str:
+    """Returns the text of a file of the page, such as its template, its style or a script."""
+    return (_ASSETS / name).read_text(encoding="utf-8")
+
+
+def _to_json(value: Any, indent: int | None = None) -> str:
+    """Returns a value as JSON text. Raises ValueError for NaN and infinity."""
+    return json.dumps(value, allow_nan=False, ensure_ascii=False, indent=indent)
+
+
+def _render_motion(charts: str) -> str:
+    """Returns the section with positions, torques and estimates. Empty without charts."""
+    if not charts:
+        return ""
+    intro = (
+        "Drag over a chart to zoom all, double-click to see the whole run, click a name to "
+        "hide its line. Fig. 3 to 6 are those of the paper; symbols: docs/vocabulary.md."
+    )
+    heading = "Positions, torques and estimates over time"
+    return render_section(heading, intro, charts, "figures")
+
+
+def _render_site_css(scenario: Scenario) -> str:
+    """Returns the CSS rules for the colours of the sites, in the colours of `theme.css`.
+
+    The site with index i has the classes `site-i`, for lines in its colour, and `fill-i`, for
+    areas in its colour. Colours repeat if there are more sites than colours.
+    """
+    colours = scenario.assign_colours(len(SITE_COLOURS))
+    rules = ""
+    for index in range(len(scenario.sites)):
+        value = f"var(--site-{colours[index % len(colours)]})"
+        rules += f".site-{index} {{ stroke: {value}; }} "
+        rules += f".fill-{index} {{ background: {value}; fill: {value}; }}\n"
+    return rules

@@ -1,0 +1,142 @@
+"""Renders the section of a report's page that explains whether the run was stable.
+
+A certificate judges from its log whether a run was stable, and gives the reasons. V is the
+energy function of the stability proof.
+
+Invariant:
+    - The sentences are those that `trilat certify` prints, with longer names of the checks.
+    - The figures are embedded as PNG data, because the page must be a single file.
+"""
+
+import base64
+import io
+from html import escape
+
+from matplotlib.figure import Figure
+
+from ..analysis.certificate.stability_certificate import Certificate
+from ..analysis.twins.twin_growth import PushedTwins
+from ..log.log_reader import Log
+from .certificate_text import describe_certificate, list_energies
+from .figures.certificate_energy import draw_functional, draw_observed_energy
+from .figures.twin_differences import draw_twins
+from .page_html import (
+    render_details,
+    render_folds,
+    render_note,
+    render_scrolling,
+    render_section,
+    render_table,
+)
+from .style import typeset
+
+_PAGE_DPI = 110
+_PREMISE_MARKS = {True: "holds", False: '<b class="bad">fails</b>', None: "undecided"}
+_SENTENCE_MARKS = {"ok": "✓", "FAIL": "✗", "open": "?", "note": "·"}
+_SENTENCE_CLASSES = {"ok": "passed", "FAIL": "failed", "open": "open", "note": "note"}
+_LONG_NAMES = {
+    "e and qd": "end (e: error, qd: joint speed)",
+    "this rest": "roots of small motions about the final pose",
+    "twins": "twins, runs with a small push",
+    "log": "the log itself",
+}
+"""Names of the checks on the page, by their names on a terminal."""
+_BALANCE_NOTE = (
+    "V is the energy function of the stability theorem: a weighted sum of the energies of the "
+    "arms, of their errors and of the estimates (docs/certificate-energy.md). What is left of "
+    "V − V(0) + dissipation − work must vanish, whatever the operators do."
+)
+
+
+def render_certificate(log: Log, certificate: Certificate) -> str:
+    """Renders the section about stability: the reasons, and folded tables and figures.
+
+    Args:
+        log: Log of the run.
+        certificate: Judgement whether the run was stable, with its reasons.
+    """
+    _, *grounds = describe_certificate(certificate)
+    items = ""
+    for line in grounds:
+        mark = _SENTENCE_MARKS[line.mark]
+        css_class = _SENTENCE_CLASSES[line.mark]
+        text = escape(typeset(_lengthen_name(line.text)))
+        items += f'<li class="{css_class}"><b>{mark}</b>{text}</li>'
+    body = f'<ul class="verdicts">{items}</ul>'
+    folds = []
+    if certificate.premises:
+        premises = _render_premises(certificate)
+        folds.append(
+            render_details("What the theorem requires, and whether it holds here", premises)
+        )
+    if certificate.balance is not None:
+        energies = list_energies(certificate.balance)
+        rows = [(escape(name), f"{energy_j:.4g}") for name, energy_j in energies]
+        table = render_table({"energy": "", "J": "energy over the whole run"}, rows)
+        note = render_note(_BALANCE_NOTE)
+        folds.append(render_details("Energy balance", table + note))
+    figures = _draw_certificate(log, certificate)
+    if figures:
+        pictures = "".join(_render_picture(title, figure) for title, figure in figures)
+        names = ", ".join(title for title, _ in figures)
+        folds.append(render_details(f"Figures: {names}", pictures))
+    body += render_folds(folds)
+    intro = (
+        "✓ speaks for stability, ✗ against it, ? decides nothing, · is a remark or does not "
+        "apply (`trilat certify --all`)."
+    )
+    if certificate.has_functional:
+        intro += " V: the energy function of the paper's theorem."
+    return render_section("Why this judgement", intro, body, "certificate")
+
+
+def _lengthen_name(sentence: str) -> str:
+    """Returns a sentence of a certificate with the long name of the check that it is about."""
+    name, colon, rest = sentence.partition(": ")
+    return f"{_LONG_NAMES.get(name, name)}{colon}{rest}"
+
+
+def _render_premises(certificate: Certificate) -> str:
+    """Returns the table of the premises, which are the conditions of the stability theorem."""
+    premises = ""
+    for premise in certificate.premises:
+        name = escape(premise.name)
+        mark = _PREMISE_MARKS[premise.holds]
+        text = escape(premise.text)
+        premises += f'<tr><th scope="row">{name}</th><td>{mark}</td><td>{text}</td></tr>'
+    return render_scrolling(f'<table class="facts">{premises}</table>', "premises")
+
+
+def _draw_certificate(log: Log, certificate: Certificate) -> list[tuple[str, Figure]]:
+    """Draws the figures of a certificate.
+
+    Which figures exist depends on the evidence of the certificate: the energy function of the
+    stability proof and its energies, the energies that the control laws declare, and twins,
+    which are repeated runs with a small push that grows or decays.
+
+    Returns:
+        Title and figure of each.
+    """
+    observed = certificate.observed
+    twins = certificate.twins
+    figures = []
+    if certificate.balance is not None:
+        figures.append(
+            ("V, the energy of the theorem, and its parts", draw_functional(log, certificate))
+        )
+    if observed is not None and observed.curves:
+        title = "energies that the laws declare"
+        figures.append((title, draw_observed_energy(log, observed)))
+    if twins is not None and twins.pushes:
+        title = "growth or decay of small pushes"
+        figures.append((title, draw_twins(PushedTwins(log, 0.0, twins))))
+    return figures
+
+
+def _render_picture(title: str, figure: Figure) -> str:
+    """Returns a figure as an image with embedded PNG data."""
+    drawing = io.BytesIO()
+    figure.savefig(drawing, format="png", dpi=_PAGE_DPI)
+    data = base64.b64encode(drawing.getvalue()).decode()
+    source = f"data:image/png;base64,{data}"
+    return f'<img src="{source}" alt="{title}" class="picture">'

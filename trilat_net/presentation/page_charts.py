@@ -1,0 +1,139 @@
+"""Renders the places on the page of a report into which its scripts draw charts and arms.
+
+A report is a web page about a recorded run of several robot arms. The scripts `report.js` and
+`arms.js` draw the charts and the moving arms in the browser, into empty containers.
+
+Invariant:
+    - Each group of charts unfolds. At first at most `_MOST_OPEN_CHARTS` charts are unfolded.
+    - The page names the charts for which the log has no value.
+"""
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from html import escape
+from importlib import resources
+from typing import Any
+
+from ..log.log_reader import Log
+from .charts import ChartBuilder
+from .figures.age_and_lateness import explain_missing_loop_times
+from .figures.arm_poses import render_arms_svg
+from .figures.joint_motion import explain_absent_operator
+from .page_data import Chart
+from .page_html import render_details, render_note
+from .page_leaders import describe_leads, render_lead_bars
+
+_TEXTS: dict[str, dict[str, Any]] = tomllib.loads(
+    (resources.files("trilat_net.presentation") / "assets" / "report.toml").read_text("utf-8")
+)
+"""Heading and note of each section of charts, by place and section, and other notes."""
+_OPEN_SECTIONS = ("torques", "errors", "positions")
+"""Sections of charts that may be unfolded at first."""
+_MOST_OPEN_CHARTS = 10
+"""Largest number of charts of a place that are unfolded at first."""
+_MOST_HALF_CHARTS = 2
+"""Largest number of charts of a group that takes half of the width of the page."""
+_NO_VALUE = "the log has no value to draw"
+"""Reason why a chart is left out."""
+
+_ARM_PLAYER = """<div id="arms" class="screen">
+<div class="row"></div>
+<div class="controls"><button type="button">play</button>
+<input type="range" min="0" max="1000" value="0" step="1"
+aria-label="time"><output>0.000 s</output></div>
+</div>
+"""
+_ARM_NOTE = (
+    "Solid: the arm; dashed: where the other arms lead it, delayed and weighted. The arms "
+    "follow the slider, and the pointer in any chart."
+)
+
+
+def render_overview(log: Log, builder: ChartBuilder, charts: Sequence[Chart]) -> str:
+    """Renders the moving arms, who leads, the error over time and the delay over time.
+
+    Args:
+        log: Log of the run.
+        builder: Builder of the charts, which knows the box around the motion and the scale.
+        charts: Charts of the page.
+    """
+    html = ""
+    has_records = any(len(log[site]) for site in log.sites)
+    if has_records:
+        html = _ARM_PLAYER + render_lead_bars(log, builder.leads)
+        html += render_note(" ".join([*describe_leads(log, builder.leads), _ARM_NOTE]))
+    absent = [site for site in log.sites if not len(log[site])]
+    if absent:
+        html += render_note(f"Not drawn, because there is no record: {', '.join(absent)}.")
+    if any(chart.section == "overview" for chart in charts):
+        html += '<div class="charts" data-section="overview"></div>'
+    if has_records:
+        pictures = render_arms_svg(log, builder.bounds_m, builder.units_per_m)
+        summary = "The arms at a few instants, with the path of the end effector until then"
+        html += render_details(summary, pictures)
+    return html
+
+
+def render_chart_groups(
+    log: Log, place: str, charts: Sequence[Chart], missing: Mapping[str, Sequence[str]]
+) -> str:
+    """Renders the groups of charts of a place, and a note about the charts that the page lacks.
+
+    Args:
+        log: Log of the run.
+        place: Place on the page, a table of `report.toml`, such as "motion" or "links".
+        charts: Charts of the page.
+        missing: Titles of the charts for which the log has no value, by section.
+    """
+    has_chains = any(arm.chain for arm in log.scenario.arms.values())
+    absence_reasons = {
+        "torques": explain_absent_operator(log),
+        "timing": explain_missing_loop_times(log),
+    }
+    html = ""
+    lacking: dict[str, list[str]] = {}  # titles by the reason
+    unfolded = 0
+    for section, (heading, note) in _TEXTS[place].items():
+        name = f"{heading[0].lower()}{heading[1:]}"
+        count = sum(chart.section == section for chart in charts)
+        if count:
+            is_small = has_chains and section == "estimates"
+            text = _TEXTS["notes"]["chain_estimates"] if is_small else note
+            fits = unfolded + count <= _MOST_OPEN_CHARTS
+            is_open = section in _OPEN_SECTIONS and fits
+            unfolded += count if is_open else 0
+            html += _render_group(section, heading, text, count, is_open, is_small)
+            lacking.setdefault(_NO_VALUE, []).extend(missing.get(section, ()))
+        elif absence_reasons.get(section):
+            lacking.setdefault(absence_reasons[section], []).append(name)
+        elif section in missing:
+            lacking.setdefault(_NO_VALUE, []).append(name)
+
+    groups = f'<div class="groups">{html}</div>' if html else ""
+    if place == "loops":  # the section of the loops says itself what is missing
+        return groups
+    for reason, titles in lacking.items():
+        if titles:
+            groups += render_note(f"Not on this page, because {reason}: {'; '.join(titles)}.")
+    return groups
+
+
+def _render_group(
+    section: str, heading: str, note: str, count: int, is_open: bool, is_small: bool
+) -> str:
+    """Returns a group of charts, as an empty container that unfolds.
+
+    Args:
+        section: Key of the section, as in `report.toml`.
+        heading: Heading of the group.
+        note: Sentence about the charts.
+        count: Number of charts.
+        is_open: True if the group is unfolded at first.
+        is_small: True for small charts without legends, of which there are many.
+    """
+    width = "half" if count <= _MOST_HALF_CHARTS else "whole"
+    css_class = "charts small" if is_small else "charts"
+    attribute = " open" if is_open else ""
+    summary = f'<summary>{escape(heading)} <span class="note">{escape(note)}</span></summary>'
+    container = f'<div class="{css_class}" data-section="{section}"></div>'
+    return f'<details class="group {width}"{attribute}>{summary}{container}</details>'

@@ -1,0 +1,249 @@
+"""Renders who leads each slave over time, as thin bars below the moving arms of a report.
+
+A site is a process that controls one arm. A slave follows its peers, the other sites, each with
+a weight: the dominance factor. The peer with the larger factor leads. The factors may change
+during a run, by the scenario or by a command.
+
+Invariant:
+    - The factors are those with which the slave computed, from the scenario and the records.
+    - Where the factors never change, a sentence replaces the bar.
+    - The bar has the time axis of the slider that moves the arms.
+"""
+
+from collections.abc import Sequence
+from html import escape
+from typing import NamedTuple
+
+import numpy as np
+
+from ..analysis.dominance_history import list_ramps, trace_dominance
+from ..analysis.timeline import recorded_end_s
+from ..core.step.vectors import Array
+from ..log.log_reader import Log
+from ..scenario import Scenario
+from .page_data import LeadBar
+from .page_html import join_words, render_swatch
+
+_MAX_BARS = 4
+"""Largest number of slaves with a bar or a sentence."""
+_MAX_PHASES = 6
+"""Largest number of spans of time that the text beside a bar describes."""
+_INSTANTS = 600
+"""Number of equally spaced instants at which the factors are computed."""
+_STEP_S = 1e-6
+"""Time before a sudden change at which the old factors still apply, in s."""
+_SAME_SHARE = 1e-9
+"""Largest difference of two factors that count as equal."""
+
+
+class Lead(NamedTuple):
+    """Who leads a slave over time.
+
+    Attributes:
+        slave: Name of the slave.
+        peers: Names of the P peers that the slave follows at some time.
+        t_s: Times of the K points between which the factors change linearly, in s.
+        shares: Dominance factor of each peer at these times, shape (K, P).
+    """
+
+    slave: str
+    peers: list[str]
+    t_s: Array
+    shares: Array
+
+    @property
+    def is_constant(self) -> bool:
+        """True if no factor changes during the run."""
+        return len(self.t_s) < 2 or bool(np.ptp(self.shares, axis=0).max() <= _SAME_SHARE)
+
+
+def name_role(scenario: Scenario, site: str) -> str:
+    """Returns the role of a site in words, such as "master 2", or "slave" if there is only one.
+
+    Args:
+        scenario: Scenario of the run.
+        site: Name of the site.
+    """
+    role = scenario.sites[site].role
+    with_role = [name for name, spec in scenario.sites.items() if spec.role == role]
+    return role if len(with_role) == 1 else f"{role} {with_role.index(site) + 1}"
+
+
+def caption_site(scenario: Scenario, site: str) -> str:
+    """Returns the name and the role of a site, as in "m1, master 1"."""
+    return f"{site}, {name_role(scenario, site)}"
+
+
+def trace_leads(log: Log) -> list[Lead]:
+    """Traces with which weights each slave follows its peers.
+
+    Args:
+        log: Log of the run.
+
+    Returns:
+        An entry for each slave with records that follows somebody, for at most `_MAX_BARS`.
+    """
+    leads = []
+    for site, spec in log.scenario.sites.items():
+        if spec.role == "slave" and len(log[site]):
+            lead = _trace_lead(log, site)
+            if lead.peers:
+                leads.append(lead)
+    return leads[:_MAX_BARS]
+
+
+def _trace_lead(log: Log, slave: str) -> Lead:
+    """Traces the dominance factors of a slave, at the points at which their slopes change."""
+    end_s = recorded_end_s(log)
+    _, ramps = list_ramps(log, slave)
+    times_s = [np.linspace(0.0, end_s, _INSTANTS)]
+    for ramp in ramps:
+        start_s = ramp.start_ns * 1e-9
+        times_s.append(np.array([start_s - _STEP_S, start_s, ramp.end_ns * 1e-9]))
+    t_s = np.unique(np.clip(np.concatenate(times_s), 0.0, end_s))
+    alpha = trace_dominance(log, slave, t_s).alpha
+    followed = np.flatnonzero(alpha.max(axis=0) > 0.0)
+    shares = alpha[:, followed]
+    kept = _find_corners(t_s, shares)
+    peers = [log.scenario.peers(slave)[index] for index in followed]
+    return Lead(slave, peers, t_s[kept], shares[kept])
+
+
+def _find_corners(t_s: Array, shares: Array) -> list[int]:
+    """Returns the indices of the points that a line through the other points would miss."""
+    slopes = np.diff(shares, axis=0) / np.diff(t_s)[:, np.newaxis]
+    turns = np.abs(np.diff(slopes, axis=0)).max(axis=1, initial=0.0)
+    corners = np.flatnonzero(turns > _SAME_SHARE) + 1
+    return [0, *corners.tolist(), len(t_s) - 1]
+
+
+def list_lead_bars(leads: Sequence[Lead]) -> list[LeadBar]:
+    """Returns the data with which the page writes who leads at the time of the slider.
+
+    Args:
+        leads: Who leads each slave, from `trace_leads`.
+    """
+    bars = []
+    for lead in leads:
+        if not lead.is_constant:
+            bar = LeadBar(
+                site=lead.slave,
+                peers=lead.peers,
+                t=lead.t_s.tolist(),
+                shares=lead.shares.T.tolist(),
+            )
+            bars.append(bar)
+    return bars
+
+
+def render_lead_bars(log: Log, leads: Sequence[Lead]) -> str:
+    """Renders a bar for each slave whose dominance factors change.
+
+    Args:
+        log: Log of the run.
+        leads: Who leads each slave, from `trace_leads`.
+    """
+    return "".join(_render_bar(log, lead) for lead in leads if not lead.is_constant)
+
+
+def describe_leads(log: Log, leads: Sequence[Lead]) -> list[str]:
+    """Returns a sentence for each slave whose dominance factors never change.
+
+    Args:
+        log: Log of the run.
+        leads: Who leads each slave, from `trace_leads`.
+    """
+    return [describe_constant_lead(log.scenario, lead) for lead in leads if lead.is_constant]
+
+
+def describe_constant_lead(scenario: Scenario, lead: Lead) -> str:
+    """Returns a sentence about factors that never change: who leads, with which percentages.
+
+    Args:
+        scenario: Scenario of the run.
+        lead: Who leads the slave.
+    """
+    slave = _name_slave(scenario, lead.slave)
+    first, *others = lead.peers
+    if not others:
+        return f"{first} alone leads {slave}, during the whole run."
+    texts = [f"{first} leads {slave} with {_format_percent(lead.shares[0, 0])}"]
+    for peer, share in zip(others, lead.shares[0, 1:], strict=True):
+        texts.append(f"{peer} with {_format_percent(share)}")
+    return f"{join_words(texts)}, during the whole run."
+
+
+def describe_phases(lead: Lead) -> str:
+    """Returns who leads when, as in "0 to 10 s: m1 90 %, m2 10 %; from 12 s: m1 10 %, m2 90 %".
+
+    Ramps between two spans are left out, because the spans around them say how they begin and
+    end. If there are more than `_MAX_PHASES` spans, the last ones are counted.
+
+    Args:
+        lead: Who leads the slave.
+    """
+    phases = []
+    start = 0
+    for index in range(1, len(lead.t_s) + 1):
+        is_last = index == len(lead.t_s)
+        if not is_last and np.abs(lead.shares[index] - lead.shares[start]).max() <= _SAME_SHARE:
+            continue
+        if index - 1 > start:  # a span, not a point within or between ramps
+            from_s = lead.t_s[start]
+            to_s = lead.t_s[index - 1]
+            span = f"from {from_s:.4g} s" if is_last else f"{from_s:.4g} to {to_s:.4g} s"
+            phases.append(f"{span}: {_list_shares(lead, start)}")
+        start = index
+    if not phases:
+        end = len(lead.t_s) - 1
+        phases = [f"at first {_list_shares(lead, 0)}", f"at the end {_list_shares(lead, end)}"]
+    if len(phases) > _MAX_PHASES:
+        others = len(phases) - _MAX_PHASES
+        phases = [*phases[:_MAX_PHASES], f"and {others} more"]
+    return "; ".join(phases)
+
+
+def _render_bar(log: Log, lead: Lead) -> str:
+    """Returns the bar of a slave: an area for each peer, with its share as the height."""
+    end_s = recorded_end_s(log)
+    tops = 1.0 - np.cumsum(lead.shares, axis=1)
+    bottoms = tops + lead.shares
+    areas = ""
+    items = ""
+    for column, peer in enumerate(lead.peers):
+        upper = _list_points(lead.t_s, tops[:, column])
+        lower = _list_points(lead.t_s[::-1], bottoms[::-1, column])
+        colour = log.sites.index(peer)
+        areas += f'<polygon class="fill-{colour}" points="{" ".join([*upper, *lower])}"/>'
+        items += f"<span>{render_swatch(log, peer)}{escape(peer)}</span> "
+    slave = escape(_name_slave(log.scenario, lead.slave))
+    phases = escape(describe_phases(lead))
+    return (
+        f'<div class="lead"><p>Who leads {slave}: {items}<span class="soft">{phases}</span></p>'
+        f'<div class="bar"><svg viewBox="0 0 {end_s:.6g} 1" preserveAspectRatio="none" '
+        f'role="img" aria-label="Who leads {slave} over time: {phases}">{areas}'
+        '<line class="now" x1="0" x2="0" y1="0" y2="1"/></svg><output></output></div></div>'
+    )
+
+
+def _list_points(t_s: Array, heights: Array) -> list[str]:
+    """Returns points of an SVG shape, with the time in s to the right."""
+    points = zip(t_s.tolist(), heights.tolist(), strict=True)
+    return [f"{time_s:.6g},{height:.4f}" for time_s, height in points]
+
+
+def _list_shares(lead: Lead, index: int) -> str:
+    """Returns the percentages of all peers at a point, as in "m1 90 %, m2 10 %"."""
+    shares = zip(lead.peers, lead.shares[index], strict=True)
+    return ", ".join(f"{peer} {_format_percent(share)}" for peer, share in shares)
+
+
+def _name_slave(scenario: Scenario, slave: str) -> str:
+    """Returns "the slave", with its name if there are several slaves."""
+    roles = [spec.role for spec in scenario.sites.values()]
+    return "the slave" if roles.count("slave") == 1 else f"the slave {slave}"
+
+
+def _format_percent(share: float) -> str:
+    """Returns a dominance factor in percent, with three digits."""
+    return f"{100.0 * share:.3g} %"

@@ -1,0 +1,245 @@
+"""Renders what happened in a run, in the order of time, as sentences on the page of a report.
+
+A site is a process that controls one robot arm. Its mode is what it does in a tick of its
+control loop: it follows its peers, holds its position, brakes or returns. A change is a command
+that alters the run, such as another delay of a link.
+
+Invariant:
+    - Every sentence comes from the scenario or from a record.
+    - Changes have the same numbers as their marks in the charts.
+    - Moments beyond `MAX_SHOWN` are folded, and none is left out before `_MAX_MOMENTS`.
+"""
+
+from collections.abc import Iterator
+from html import escape
+from typing import NamedTuple
+
+import numpy as np
+
+from ..analysis.aligned import Bools
+from ..analysis.site_signals import shared_unit, sites_with_operator
+from ..analysis.timeline import (
+    find_mode_intervals,
+    list_alarms,
+    recorded_end_s,
+)
+from ..core.step.vectors import Array
+from ..errors import count_nouns
+from ..log.log_reader import Log
+from ..results import JsonObject
+from ..scenario import Scenario
+from .page_html import join_words, render_details, render_section, render_swatch
+from .page_summary import find_error_peak
+from .style import typeset
+
+MAX_SHOWN = 7
+"""Largest number of moments that are not folded."""
+_MAX_MOMENTS = 400
+"""Largest number of moments on the page. summary.json has all modes and changes."""
+_MAX_PUSHES = 3
+"""Largest number of pushes of a site with a sentence each. More pushes share a sentence."""
+_PAUSE_S = 0.2
+"""Shortest pause between two pushes, in s. Shorter pauses do not divide a push."""
+_LEAST_PUSH_NM = 1e-3
+"""Torque below which nobody pushes, in N m."""
+_DID = {
+    "hold": "held still",
+    "brake": "braked",
+    "return": "returned to following",
+    "waiting": "waited for the other sites",
+    "fault": "stood still with a fault",
+    "stopped": "stood by order",
+}
+"""What a site did in each mode, in the past tense. Other modes have the words of records."""
+
+
+class RunMoment(NamedTuple):
+    """Something that happened in a run, at a time.
+
+    Attributes:
+        t_s: Time at which it happened or began, in s.
+        sentence: Sentence about it.
+        site: Name of the site that did it. Empty if it concerns all sites.
+        number: Number of the change, which charts show. None for other moments.
+        is_bad: True for alarms and divergence.
+    """
+
+    t_s: float
+    sentence: str
+    site: str = ""
+    number: int | None = None
+    is_bad: bool = False
+
+
+def render_timeline(log: Log, facts: JsonObject) -> str:
+    """Renders the section with what happened, in the order of time.
+
+    Args:
+        log: Log of the run.
+        facts: Numbers of the run, from `summarise_run`.
+    """
+    moments = list_moments(log, facts)
+    body = _render_moments(log, moments[:MAX_SHOWN])
+    others = moments[MAX_SHOWN:_MAX_MOMENTS]
+    if others:
+        summary = f"{count_nouns(len(moments) - MAX_SHOWN, 'more moment')}"
+        body += render_details(summary, _render_moments(log, others))
+    intro = "What was done to the arms, and how they reacted."
+    if facts["changes"]:
+        intro += " Charts mark changes by number."
+    return render_section("What happened", intro, body, "moments")
+
+
+def _render_moments(log: Log, moments: list[RunMoment]) -> str:
+    """Returns moments as a list with a time, a number and a sentence each."""
+    items = ""
+    for moment in moments:
+        swatch = render_swatch(log, moment.site) if moment.site in log.sites else ""
+        number = "" if moment.number is None else f"<b>{moment.number}</b> "
+        css_class = ' class="bad"' if moment.is_bad else ""
+        time = f"<time>{moment.t_s:.3f} s</time>"
+        sentence = escape(typeset(moment.sentence))
+        items += f"<li{css_class}>{time}<span>{swatch}{number}{sentence}</span></li>"
+    return f'<ol class="moments">{items}</ol>'
+
+
+def list_moments(log: Log, facts: JsonObject) -> list[RunMoment]:
+    """Lists what happened in a run, in the order of time.
+
+    Args:
+        log: Log of the run.
+        facts: Numbers of the run, from `summarise_run`.
+    """
+    moments = [
+        RunMoment(0.0, f"The run starts; {describe_dominance(log.scenario)}."),
+        *_list_changes(log, facts),
+        *_list_pushes(log),
+        *_list_modes(log),
+        *_list_errors(log, facts),
+        RunMoment(recorded_end_s(log), "The record ends."),
+    ]
+    return sorted(moments, key=lambda moment: moment.t_s)
+
+
+def describe_dominance(scenario: Scenario) -> str:
+    """Returns which peers each site follows at the start, as in "m1 follows s 0.7, m2 0.3".
+
+    A peer is another site whose states the site receives. The number is the dominance factor,
+    the weight with which the site follows the peer. Peers with the factor 0 are left out.
+
+    Args:
+        scenario: Scenario of the run.
+    """
+    sentences = []
+    for site, shares in scenario.dominance.items():
+        followed = [f"{peer} {share:g}" for peer, share in shares.items() if share]
+        sentences.append(f"{site} follows {', '.join(followed) or 'nobody'}")
+    return "; ".join(sentences)
+
+
+def _list_changes(log: Log, facts: JsonObject) -> Iterator[RunMoment]:
+    """Yields the changes of the run, numbered as in the charts."""
+    for number, change in enumerate(facts["changes"], 1):
+        tick = change["taken_at_tick"]
+        # Changes of the scenario have a time only. Commands are applied at a tick.
+        origin = "scenario"
+        if tick is not None:
+            origin = f"command, applied at tick {tick} of {change['site']}"
+        sentence = change["sentence"]
+        subject = sentence.partition(" ")[0]
+        # The name of a site keeps its letters, also at the beginning of a sentence.
+        if subject not in log.sites:
+            sentence = f"{sentence[:1].upper()}{sentence[1:]}"
+        text = f"{sentence} ({origin})."
+        yield RunMoment(change["at_s"], text, change["site"], number)
+
+
+def _list_pushes(log: Log) -> Iterator[RunMoment]:
+    """Yields when hands, walls or bodies pushed the arm of each site, and how strongly."""
+    for site in sites_with_operator(log):
+        records = log[site]
+        torques = np.abs(records.tau_x).max(axis=1, initial=0.0)
+        spans = _find_spans(records.t_s, torques > _LEAST_PUSH_NM)
+        if not spans:
+            continue
+        subject = _name_pusher(log, site)
+        largest = f"with at most {torques.max():.3g} N m"
+        first_s = spans[0][0]
+        last_s = spans[-1][1]
+        if len(spans) > _MAX_PUSHES:
+            times = f"{len(spans)} times until {last_s:.3f} s"
+            yield RunMoment(first_s, f"{subject} pushes {site} {times}, {largest}.", site)
+            continue
+        for start_s, end_s in spans:
+            inside = (records.t_s >= start_s) & (records.t_s <= end_s)
+            largest = f"with at most {torques[inside].max():.3g} N m"
+            until = "to the end" if end_s >= records.t_s[-1] else f"until {end_s:.3f} s"
+            text = f"{subject} pushes {site} {until}, {largest}."
+            yield RunMoment(start_s, text, site)
+
+
+def _find_spans(t_s: Array, acts: Bools) -> list[tuple[float, float]]:
+    """Returns the start and the end of each time in which a condition holds, in s.
+
+    Pauses that are shorter than `_PAUSE_S` do not divide such a time.
+
+    Args:
+        t_s: Times of K records, shape (K,).
+        acts: True for the records at which the condition holds, shape (K,).
+    """
+    times_s = t_s[acts]
+    if not len(times_s):
+        return []
+    before_pause = np.flatnonzero(np.diff(times_s) > _PAUSE_S)
+    starts_s = times_s[np.append(0, before_pause + 1)]
+    ends_s = times_s[np.append(before_pause, len(times_s) - 1)]
+    return list(zip(starts_s.tolist(), ends_s.tolist(), strict=True))
+
+
+def _name_pusher(log: Log, site: str) -> str:
+    """Returns who may push the arm of a site: an operator, its environment, or both."""
+    spec = log.scenario.sites[site]
+    if spec.hands and spec.environment:
+        return "An operator or a wall"
+    if spec.environment:
+        return "A wall"
+    return "An operator" if spec.hands else "Something"
+
+
+def _list_modes(log: Log) -> Iterator[RunMoment]:
+    """Yields when sites did not follow their peers, with the reason if there was an alarm."""
+    reasons = {(alarm.site, alarm.from_s): alarm for alarm in list_alarms(log)}
+    end_s = recorded_end_s(log)
+    sites: dict[tuple[float, str], list[str]] = {}
+    bad_sites = set()
+    for site in log.sites:
+        for mode, from_s, to_s in find_mode_intervals(log[site]):
+            alarm = reasons.get((site, from_s))
+            reason = "" if alarm is None else f" ({alarm.word}: {alarm.reason})"
+            until = "to the end" if to_s >= end_s else f"until {to_s:.3f} s"
+            text = f"{_DID.get(mode, mode)} {until}{reason}"
+            # Sites that do the same at the same time share a sentence.
+            sites.setdefault((from_s, text), []).append(site)
+            if alarm is not None:
+                bad_sites.add((from_s, text))
+    for (from_s, text), names in sites.items():
+        site = names[0] if len(names) == 1 else ""
+        sentence = f"{join_words(names)} {text}."
+        yield RunMoment(from_s, sentence, site, is_bad=(from_s, text) in bad_sites)
+
+
+def _list_errors(log: Log, facts: JsonObject) -> Iterator[RunMoment]:
+    """Yields the largest error, when all errors became small, and when a site diverged."""
+    unit = shared_unit(log)
+    peak = find_error_peak(log)
+    if peak is not None and peak.error > 0.0:
+        text = f"{peak.site} has the largest error of the run, {peak.error:.3g} {unit}."
+        yield RunMoment(peak.t_s, text, peak.site)
+    if facts["settle_s"]:
+        limit = f"{facts['settle_below_rad']:g} {unit}"
+        yield RunMoment(facts["settle_s"], f"From here on, every |e| stays below {limit}.")
+    for name, site in facts["sites"].items():
+        diverged_s = site["diverged_at_s"]
+        if diverged_s is not None:
+            text = f"{name} diverged: a joint exceeded qd_limit_rad_s."
+            yield RunMoment(diverged_s, text, name, is_bad=True)

@@ -1,0 +1,62 @@
+"""Renders the records of a site as HTML, as Jupyter notebooks display them.
+
+A site is a process that controls one arm. A record is the stored result of one tick of the
+site's control loop. The HTML has a heading and a table that summarises each quantity over the
+run.
+
+Invariant:
+    - The table has only quantities that the records of this site contain.
+    - Rendering does not change the records.
+"""
+
+from collections.abc import Iterator
+from html import escape
+
+from ..core.step.vectors import Array
+from ..log.site_log import SiteLog
+from .result_text import TextTable, format_number
+
+FIELDS = ("q", "qd", "q_des", "e", "tau", "tau_x", "theta_hat", "x", "xd", "wrench")
+"""Vectors of a record that the table shows, a row per element."""
+
+
+def render_site_html(site: SiteLog) -> str:
+    """Renders the records of one site as HTML, for display in a notebook.
+
+    A heading is followed by a table with a row per number of a record. A row has the first,
+    last, least and greatest value over the run. Without records there is only the heading.
+
+    Args:
+        site: Records of the site.
+    """
+    heading = f"<p>{escape(repr(site).strip('<>'))}</p>"
+    if not len(site):
+        return heading
+    headers = ("quantity", "first", "last", "least", "greatest", "meaning")
+    table = TextTable(headers, list(_list_rows(site)), align="lrrrrl")
+    return heading + table.html()
+
+
+def _list_rows(site: SiteLog) -> Iterator[list[str]]:
+    """Yields the rows of the table: the time, then a row per element of each vector."""
+    start = format_number(float(site.t_s[0]))
+    end = format_number(float(site.t_s[-1]))
+    yield ["t_s", start, end, start, end, "time, s"]
+    for field in FIELDS:
+        vectors = getattr(site, field)
+        for index, values in enumerate(vectors.T):
+            # Only the first row of a vector has its meaning.
+            meaning = _describe_field(field) if index == 0 else ""
+            yield [f"{field}[{index}]", *_summarize(values), meaning]
+
+
+def _summarize(values: Array) -> list[str]:
+    """Returns the first, last, least and greatest of the values, shape (K,), as texts."""
+    numbers = (values[0], values[-1], values.min(), values.max())
+    return [format_number(float(number)) for number in numbers]
+
+
+def _describe_field(field: str) -> str:
+    """Returns the meaning of a vector: the first line of the docstring of its property."""
+    docstring = getattr(SiteLog, field).__doc__ or ""
+    return docstring.split("\n")[0].rstrip(".")

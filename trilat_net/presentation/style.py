@@ -1,0 +1,900 @@
+"""Defines the common style of all figures, and draws their common parts.
+
+A figure looks the same wherever it appears: each site, a process that controls one arm, has its
+own colour; sites beyond the number of colours are told apart by dashes. This module provides
+the lines, axes, panels and legends in this style, and writes figures to files.
+
+Most figures show signals over the time of a run. `TimeFigure` draws them: panels with a line
+per site, markers, a time axis and a legend. The markers show when a site did not follow its
+peers (it held, braked or returned), and when a change was applied, such as another delay of a
+link.
+
+Invariant:
+    - Matplotlib's global state stays unchanged, so that users' own figures keep their style.
+    - Equal figures give equal bytes: files contain no date, and fonts are embedded as TrueType.
+    - Figures of a run without events have no markers.
+"""
+
+import base64
+import io
+import math
+import textwrap
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from importlib import resources
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from numpy.typing import NDArray
+
+from ..analysis.site_signals import decimate
+from ..analysis.timeline import find_mode_intervals, list_changes, recorded_end_s
+from ..core.step.ticks import Mode
+from ..core.step.vectors import Array
+from ..files import write_whole
+from ..log.log_reader import Log
+from ..log.record_columns import Ints
+from ..log.site_log import SiteLog
+from ..scenario.arms import TASK_AXES
+from .appearance import REPORT_SIZE, SITE_COLOURS, FigureSize, list_site_colours
+
+AxesGrid = NDArray[np.object_]
+"""Panels of a figure, shape (rows, columns), of `Axes`."""
+LineOptions = dict[str, Any]
+"""Options of a line: keyword arguments of `Axes.plot`."""
+LegendEntry = tuple[str, LineOptions]
+"""Text of a line in a legend, and the options of the line."""
+LegendEntries = Sequence[LegendEntry]
+
+DASHES: tuple[Any, ...] = (
+    "-",
+    (0, (5, 1.5)),
+    (0, (1, 1)),
+    (0, (5, 1.5, 1, 1.5)),
+)
+"""Line styles: solid, and three patterns of dashes."""
+REFERENCE = "#333333"
+"""Dark grey, the colour of references, limits and marks."""
+FAINT = "#8c8c8c"
+"""Light grey, the colour of texts in empty panels and of bands."""
+
+LIMIT_LINE: LineOptions = {
+    "color": REFERENCE,
+    "linestyle": (0, (4, 2)),
+    "linewidth": 0.8,
+}
+"""Options of the line of a desired, true, stated or allowed value."""
+
+REPORT_DPI = REPORT_SIZE.dpi
+_NOTEBOOK_DPI = 200
+_LEAST_RANGE = 1e-9
+"""Values whose range is smaller than this differ by rounding errors only."""
+BUCKETS_PER_PANEL = 700
+"""Number of intervals of time to which the signals of a panel are decimated.
+
+Half a page is 700 pixels wide, so that more points would not be visible.
+"""
+
+_STYLE_SHEET = resources.files("trilat_net.presentation") / "assets" / "figures.mplstyle"
+_RC: Any = {
+    **mpl.rc_params_from_file(str(_STYLE_SHEET), use_default_template=False),
+    "figure.dpi": REPORT_DPI,
+    "savefig.dpi": REPORT_DPI,
+}
+_NARROW_RC: Any = {
+    "legend.handlelength": 1.5,
+    "legend.columnspacing": 1.0,
+    "legend.borderaxespad": 0.2,
+}
+
+
+@contextmanager
+def styled_figure(form: FigureSize, height_in: float) -> Iterator[Figure]:
+    """Provides an empty figure in the common style, for use in a `with` statement.
+
+    The style applies only to what is drawn within the statement.
+
+    Args:
+        form: Width of the figure and sizes of its texts.
+        height_in: Height of the figure, in inches.
+    """
+    settings: Any = dict(_RC)
+    settings["xtick.labelsize"] = form.tick_pt
+    settings["ytick.labelsize"] = form.tick_pt
+    if form.narrow:
+        settings.update(_NARROW_RC)
+    with mpl.rc_context(settings):
+        yield NotebookFigure(figsize=(form.width_in, height_in), layout="constrained")
+
+
+class NotebookFigure(Figure):
+    """A Matplotlib figure that a Jupyter notebook displays as a picture.
+
+    A plain Matplotlib figure that was made without pyplot would be displayed as its size in
+    words.
+    """
+
+    def _repr_png_(self) -> bytes:
+        """Returns the picture. Jupyter calls this method by its name."""
+        return _render_figure(self, "png", _NOTEBOOK_DPI)
+
+    def _repr_html_(self) -> str:
+        """Returns the picture as HTML. Jupyter calls this method by its name."""
+        # Two pixels of the picture per pixel of the page look sharp on screens of high density.
+        width = round(self.get_figwidth() * _NOTEBOOK_DPI / 2)
+        picture = base64.b64encode(self._repr_png_()).decode()
+        return f'<img alt="figure" width="{width}" src="data:image/png;base64,{picture}">'
+
+
+def add_panels(figure: Figure, rows: int, columns: int, **options: Any) -> AxesGrid:
+    """Adds a grid of panels to a figure.
+
+    Args:
+        figure: The Matplotlib figure.
+        rows: Number of rows.
+        columns: Number of columns.
+        **options: Options of `Figure.subplots`.
+
+    Returns:
+        The panels, shape (rows, columns), even if there is only one row or column.
+    """
+    grid: AxesGrid = figure.subplots(rows, columns, squeeze=False, **options)
+    return grid
+
+
+def site_colour(log: Log, site: str) -> str:
+    """Returns the colour of a site, which is the same in every figure.
+
+    Args:
+        log: Log with the site.
+        site: Name of the site.
+    """
+    colours = list_site_colours(log.scenario)
+    return colours[log.sites.index(site) % len(SITE_COLOURS)]
+
+
+_WIDEST_PT = 2.0
+"""Width of the line of the first site in a panel of all sites."""
+_THINNER_PT = 1.2
+"""Difference of the widths of the first and the last site's lines in such a panel."""
+
+
+def site_line(log: Log, site: str, width: float | None = None) -> LineOptions:
+    """Returns the colour, dashes and width of the lines that belong to a site.
+
+    A site is a process that runs one arm. If there are more sites than colours, colours are
+    repeated with dashes.
+
+    Args:
+        log: Log with the site.
+        site: Name of the site.
+        width: Width of the line, in pt. None if the lines of all sites are in one panel. Each
+            further site then has a thinner line, so that lines on top of one another stay
+            visible.
+    """
+    index = log.sites.index(site)
+    last = len(log.sites) - 1
+    if width is None:
+        width = _WIDEST_PT
+        if last > 0:  # not for a single site, which would divide by zero
+            width = _WIDEST_PT - _THINNER_PT * index / last
+    repetitions = index // len(SITE_COLOURS)
+    return {
+        "color": site_colour(log, site),
+        "linestyle": DASHES[repetitions % len(DASHES)],
+        "linewidth": width,
+    }
+
+
+def site_title(log: Log, site: str) -> str:
+    """Returns the name of a site with its role, such as master or slave, for legends.
+
+    Args:
+        log: Log with the site.
+        site: Name of the site.
+    """
+    return f"{site} ({log.scenario.sites[site].role})"
+
+
+def plot_decimated(axes: Axes, tick: Ints, t_s: Array, values: Array, **options: Any) -> None:
+    """Draws a signal over time with fewer points, such that all extremes stay visible.
+
+    Args:
+        axes: Panel of the figure, as Matplotlib axes.
+        tick: Ticks of the values, shape (K,).
+        t_s: Times of the values, in s, shape (K,).
+        values: Values of the signal, shape (K,).
+        **options: Options of the line.
+    """
+    trace = decimate(tick, t_s, values[:, np.newaxis], BUCKETS_PER_PANEL)
+    axes.plot(trace.t_s, trace.values[:, 0], **options)
+
+
+def positive(values: Array) -> Array:
+    """Replaces zero and negative values by NaN, as a logarithmic axis cannot show them.
+
+    Args:
+        values: The values.
+    """
+    return np.where(values > 0.0, values, np.nan)
+
+
+SPREAD_BUCKETS = 120
+"""Number of intervals of time for which `plot_spread` draws a median and a band."""
+SPREAD: LineOptions = {"color": FAINT, "alpha": 0.35, "linewidth": 6.0}
+"""Options of the line that represents the band of a spread in a legend."""
+
+
+def plot_spread(axes: Axes, t_s: Array, values: Array, **options: Any) -> None:
+    """Draws a fluctuating signal as its median in a band from least to largest value.
+
+    The time is divided into `SPREAD_BUCKETS` intervals with equal numbers of values. Each
+    interval gives a point of the median and of the edges of the band.
+
+    Args:
+        axes: Panel of the figure, as Matplotlib axes.
+        t_s: Times of the values, in s, shape (K,).
+        values: The values, shape (K,). NaN values are ignored.
+        **options: Options of the line of the median. They must include a "color", which the
+            band has too.
+    """
+    buckets = np.array_split(np.arange(len(values)), SPREAD_BUCKETS)
+    rows = []
+    for bucket in buckets:
+        if len(bucket):
+            middle_s = t_s[bucket].mean()
+            rows.append((middle_s, *_compute_spread(values[bucket])))
+    middles_s, low, median, high = np.array(rows).reshape(-1, 4).T
+    axes.fill_between(
+        middles_s,
+        low,
+        high,
+        color=options["color"],
+        alpha=SPREAD["alpha"],
+        linewidth=0.0,
+    )
+    axes.plot(middles_s, median, **options)
+
+
+def _compute_spread(values: Array) -> tuple[float, float, float]:
+    """Returns the least, median and largest of the finite values, or NaN if there are none."""
+    # NumPy prints a warning if all values are NaN.
+    if not np.isfinite(values).any():
+        return np.nan, np.nan, np.nan
+    return np.nanmin(values), np.nanmedian(values), np.nanmax(values)
+
+
+def set_plain_log_axis(axis: Axis, steps: Sequence[float] = (1.0, 2.0, 5.0)) -> None:
+    """Labels a logarithmic axis with plain numbers, such as 20 instead of a power of 10.
+
+    Args:
+        axis: The axis.
+        steps: Multiples of each power of 10 that have a label.
+    """
+    axis.set_major_locator(LogLocator(subs=steps))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_locator(LogLocator(subs=range(1, 10)))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def name_joints(log: Log) -> list[str]:
+    """Returns the titles of the joints' panels.
+
+    A title is the number of the joint. Names are added only if the arms are chains whose joints
+    all have the same names. The arm with the most joints decides the number of titles.
+
+    Args:
+        log: Log with the arms.
+    """
+    arms = [log.scenario.arms[site] for site in log.sites]
+    longest = max(arms, key=lambda arm: arm.counts.joints)
+    numbers = range(1, longest.counts.joints + 1)
+    names_differ = len({arm.joint_names for arm in arms}) > 1
+    if longest.chain is None or names_differ:
+        return [f"joint {number}" for number in numbers]
+    units = longest.joint_units("rad")
+    titles = []
+    for number, name, unit in zip(numbers, longest.joint_names, units, strict=True):
+        # The axes of the figure have the units of revolute joints. Prismatic joints differ.
+        quantity = " (m, N)" if unit == "m" else ""
+        titles.append(f"{number}: {name}{quantity}")
+    return titles
+
+
+def name_shared(log: Log) -> list[str]:
+    """Returns titles for the coordinates that the sites exchange.
+
+    They are joints, or axes of the task space if the sites exchange poses of their end
+    effectors.
+
+    Args:
+        log: Log with the sites.
+    """
+    arm = log.scenario.arms[log.sites[0]]
+    if arm.shares_pose:
+        return list(TASK_AXES[: arm.counts.shared])
+    return name_joints(log)
+
+
+def title_joints(log: Log, row: Sequence[Axes], titles: Sequence[str] = ()) -> None:
+    """Writes titles above a row of panels, one for each joint.
+
+    Args:
+        log: Log with the joints.
+        row: A panel per title.
+        titles: The titles. Empty for the names of the joints.
+    """
+    for title, axes in zip(titles or name_joints(log), row, strict=True):
+        axes.set_title(title)
+
+
+def label_row(axes: Axes, text: str, form: FigureSize) -> None:
+    """Writes a label beside a row of low panels, in several lines.
+
+    Args:
+        axes: First panel of the row, beside which the label is written.
+        text: The label. It is wrapped after 12 characters.
+        form: Size of the figure, which determines the size of the text.
+    """
+    lines = textwrap.wrap(text, 12)
+    axes.set_ylabel("\n".join(lines), fontsize=form.tick_pt)
+
+
+def flatten_rounding(axes: Axes) -> None:
+    """Widens the value axis of a panel whose curves differ only by rounding errors.
+
+    Without this, Matplotlib would scale the axis to the rounding errors, and a constant would
+    look like noise.
+
+    Args:
+        axes: The panel. Its axis is changed in place.
+    """
+    low, high = axes.get_ylim()
+    if high - low < _LEAST_RANGE:
+        axes.set_ylim(low - 0.05, high + 0.05)
+
+
+class JointPanels(NamedTuple):
+    """Panels of a figure that shows each joint in a panel of its own.
+
+    `add_joint_panels` creates and arranges them.
+
+    Attributes:
+        joints: A panel per joint.
+        columns: Number of panels in a row.
+        lowest: Lowest panel of each column, which has the time axis.
+        below: Panel below the others, over the whole width. None if there is no such panel.
+    """
+
+    joints: list[Axes]
+    columns: int
+    lowest: list[Axes]
+    below: Axes | None
+
+
+def arrange_joints(joints: int, narrow: bool) -> list[list[str]]:
+    """Arranges the panels of joints in a grid with few rows and few empty cells.
+
+    Args:
+        joints: Number of joints.
+        narrow: True if only two panels fit beside each other. Otherwise three or four fit.
+
+    Returns:
+        The rows of the grid. A cell is the index of a joint as text, or "." if it is empty.
+    """
+
+    def count_cells(columns: int) -> tuple[int, int]:
+        """Returns the size of the grid of panels for a given number of columns.
+
+        Args:
+            columns: Number of columns.
+
+        Returns:
+            The number of rows, and the number of cells in the last row that stay empty.
+        """
+        rows = math.ceil(joints / columns)
+        return rows, rows * columns - joints
+
+    choices = (2,) if narrow or joints == 2 else (3, 4)
+    # The fewest rows win. Of arrangements with as many rows, the fewest empty cells win.
+    columns = min(choices, key=count_cells)
+    _, empty = count_cells(columns)
+    cells = [str(joint) for joint in range(joints)]
+    cells += ["."] * empty
+    return [cells[first : first + columns] for first in range(0, len(cells), columns)]
+
+
+def add_joint_panels(
+    figure: Figure, joints: int, form: FigureSize, below: str = ""
+) -> JointPanels:
+    """Adds a panel per joint to a figure, and optionally a wide panel below them.
+
+    Two joints share their value axis. More joints have an axis each, because the torques of
+    wrists are much smaller than those of shoulders.
+
+    Args:
+        figure: The Matplotlib figure.
+        joints: Number of joints.
+        form: Width, type sizes and resolution of the figure.
+        below: Name of the wide panel. Empty for no wide panel.
+    """
+    grid = arrange_joints(joints, form.narrow)
+    columns = len(grid[0])
+    rows = list(grid)
+    if below:
+        rows.append([below] * columns)
+    panels: dict[str, Axes] = figure.subplot_mosaic([[*row] for row in rows])
+    joint_panels = [panels[str(joint)] for joint in range(joints)]
+
+    # Only the lowest panel of a column has a labelled time axis.
+    for upper, lower in zip(joint_panels, joint_panels[columns:], strict=False):
+        upper.sharex(lower)
+        upper.tick_params(labelbottom=False)
+    if joints == 2:
+        joint_panels[1].sharey(joint_panels[0])
+        joint_panels[1].tick_params(labelleft=False)
+    return JointPanels(
+        joints=joint_panels,
+        columns=columns,
+        lowest=joint_panels[-columns:],
+        below=panels.get(below),
+    )
+
+
+def typeset(text: str) -> str:
+    """Replaces "+-" and "->", as the terminal shows them, by the signs ± and →.
+
+    Args:
+        text: A text for the terminal.
+    """
+    return text.replace("+-", "±").replace("->", " → ")
+
+
+def typeset_unit(unit: str) -> str:
+    """Replaces "^2" in a unit by the sign ².
+
+    Args:
+        unit: The unit, such as "rad/s^2".
+    """
+    return unit.replace("^2", "²")
+
+
+def typeset_symbol(parameter: str) -> str:
+    """Returns the symbol of an inertial parameter, with its index as a subscript.
+
+    Args:
+        parameter: Name of the parameter: a moment of inertia such as "Ixx", a first moment such
+            as "mc_x", or the mass.
+    """
+    if parameter[0] == "I":
+        stem = parameter[:1]
+        index = parameter[1:]
+    else:
+        stem = parameter[:2]
+        index = parameter[3:]  # behind the underscore
+    return f"${stem.strip()}_{{{index}}}$" if index else f"${stem}$"
+
+
+_MAX_LEGEND_COLUMNS = 6
+
+
+def add_legend(figure: Figure, entries: LegendEntries, **options: Any) -> None:
+    """Adds a legend of lines above the panels of a figure.
+
+    Args:
+        figure: The Matplotlib figure.
+        entries: Text and line of each entry.
+        **options: Options of `Figure.legend`.
+    """
+    handles = []
+    for text, line in entries:
+        handles.append(Line2D([], [], label=text, **line))
+    place_legend(figure, handles, **options)
+
+
+def place_legend(figure: Figure, handles: Sequence[Any], **options: Any) -> None:
+    """Adds a legend above the panels, with as many columns as fit the width of the figure.
+
+    Args:
+        figure: The Matplotlib figure.
+        handles: Matplotlib objects of the entries, which have a label.
+        **options: Options of `Figure.legend`.
+    """
+    renderer = FigureCanvasAgg(figure).get_renderer()  # type: ignore[no-untyped-call]
+    most_columns = min(len(handles), _MAX_LEGEND_COLUMNS)
+    for columns in range(most_columns, 0, -1):
+        legend = figure.legend(
+            handles=handles, loc="outside upper center", ncols=columns, **options
+        )
+        width = legend.get_window_extent(renderer).width
+        fits = width <= figure.bbox.width
+        if fits or columns == 1:
+            return
+        legend.remove()  # try again with fewer columns
+
+
+def site_legend_entries(log: Log, sites: Sequence[str]) -> list[LegendEntry]:
+    """Returns the entries of a legend that explains the lines of several sites.
+
+    A site is a process that runs one arm. An entry consists of a text, such as "m1 (master)",
+    and the colour, dashes and width of the site's line.
+
+    Args:
+        log: Log with the sites.
+        sites: Names of the sites.
+    """
+    return [(site_title(log, site), site_line(log, site)) for site in sites]
+
+
+_CENTRED: dict[str, Any] = {"ha": "center", "va": "center"}
+_EMPTY_FIGURE_CHARACTERS_PER_IN = 17
+
+
+def empty_figure(text: str, form: FigureSize = REPORT_SIZE) -> Figure:
+    """Returns a figure that contains only the reason why there is nothing to draw.
+
+    Args:
+        text: The reason.
+        form: Width, type sizes and resolution of the figure.
+    """
+    characters = round(_EMPTY_FIGURE_CHARACTERS_PER_IN * form.width_in)
+    lines = textwrap.wrap(text, characters)
+    with styled_figure(form, 1.0) as figure:
+        figure.text(0.5, 0.5, "\n".join(lines), color=REFERENCE, **_CENTRED)
+    return figure
+
+
+def annotate_empty_panel(axes: Axes, text: str) -> None:
+    """Writes the reason why a panel is empty into the panel.
+
+    Args:
+        axes: Panel of the figure, as Matplotlib axes.
+        text: The reason.
+    """
+    axes.text(0.5, 0.5, text, color=FAINT, transform=axes.transAxes, **_CENTRED)
+
+
+FIGURE_FORMATS = ("pdf", "png", "svg")
+"""Suffixes of the files to which figures can be written."""
+
+_FILE_RC: Any = {
+    "pdf.fonttype": 42,
+    "ps.fonttype": 42,
+    "svg.fonttype": "path",
+    "svg.hashsalt": "trilat-net",
+}
+_UNDATED: dict[str, dict[str, Any]] = {
+    "pdf": {"CreationDate": None},
+    "png": {},
+    "svg": {"Date": None},
+}
+
+
+def write_figure(figure: Figure, path: Path, dpi: int) -> None:
+    """Writes a figure to a file.
+
+    Args:
+        figure: The Matplotlib figure.
+        path: The file. Its suffix determines the format, which is one of `FIGURE_FORMATS`.
+        dpi: Resolution of a .png file.
+
+    Raises:
+        UsageError: The file cannot be created.
+        LogRefused: The disk refused the data.
+    """
+    kind = path.suffix.removeprefix(".").lower()
+    write_whole(path, _render_figure(figure, kind, dpi))
+
+
+def _render_figure(figure: Figure, kind: str, dpi: int) -> bytes:
+    """Returns a figure as the bytes of a file that contains no date.
+
+    Args:
+        figure: The Matplotlib figure.
+        kind: Format of the file, one of `FIGURE_FORMATS`.
+        dpi: Resolution of a PNG file.
+    """
+    drawing = io.BytesIO()
+    with mpl.rc_context(_FILE_RC):
+        figure.savefig(drawing, format=kind, dpi=dpi, metadata=_UNDATED[kind])
+    return drawing.getvalue()
+
+
+MOST_EXPLAINED_CHANGES = 12
+"""Largest number of changes explained in a figure; the page lists all changes."""
+
+SiteSignal = Callable[[str], tuple[Ints, Array, Array]]
+"""Function of a site that returns ticks (K,), times in s (K,), and values (K, J)."""
+
+_HOLD_ALPHA = 0.22
+"""Opacity of the shading while a site holds or brakes."""
+_RETURN_ALPHA = 0.09
+"""Opacity of the shading while a site returns."""
+_LETTERS_PER_IN = 120.0
+"""Average number of letters per inch of a font of 1 pt."""
+_CHANGE_LINE: LineOptions = {
+    "color": REFERENCE,
+    "linestyle": (0, (1, 1.5)),
+    "linewidth": 0.7,
+}
+"""Options of the vertical line at a change."""
+_CHANGE_NUMBER: dict[str, Any] = {
+    "xytext": (1.5, -0.5),
+    "textcoords": "offset points",
+    "va": "top",
+    "color": REFERENCE,
+    "bbox": {
+        "boxstyle": "square,pad=0.05",
+        "facecolor": "white",
+        "edgecolor": "none",
+        "alpha": 0.7,
+    },
+}
+
+
+def site_records(log: Log, values: Callable[[SiteLog], Array]) -> SiteSignal:
+    """Makes a function that reads the values to draw from the records of a site.
+
+    A site is a process that runs one arm. `TimeFigure.joint_row` draws what the function
+    returns.
+
+    Args:
+        log: Log with the records of the sites.
+        values: Function that computes the values, shape (K, J), from the K records of a site. J
+            is the number of values per record.
+
+    Returns:
+        A function of the site's name that returns the ticks, times and values of its records.
+    """
+
+    def read_signal(site: str) -> tuple[Ints, Array, Array]:
+        """Reads the values to draw from the K records of a site.
+
+        A site is a process that runs one arm, and a record contains the values of one tick
+        (period of its control loop).
+
+        Args:
+            site: Name of the site.
+
+        Returns:
+            The numbers of the ticks, shape (K,).
+            Their times, shape (K,), in s.
+            The values, shape (K, J), with J values per record.
+        """
+        records = log[site]
+        return records.tick, records.t_s, values(records)
+
+    return read_signal
+
+
+@contextmanager
+def time_figure(
+    log: Log,
+    form: FigureSize,
+    height_in: float,
+    interval_s: tuple[float, float] | None = None,
+) -> Iterator["TimeFigure"]:
+    """Provides an empty figure over the time of a run, for use in a `with` statement.
+
+    Args:
+        log: Log of the run.
+        form: Width of the figure and sizes of its texts.
+        height_in: Height of the figure, in inches.
+        interval_s: First and last time that the figure shows, in s. None for the whole run.
+    """
+    with styled_figure(form, height_in) as figure:
+        yield TimeFigure(log, form, figure, interval_s)
+
+
+class TimeFigure:
+    """A figure that shows signals of a log over the time of the run, with markers.
+
+    `time_figure` creates it. A figure function adds panels to `figure`, draws into them with
+    `trace` or `joint_row`, and calls `finish` at the end.
+
+    Args:
+        log: Log of the run.
+        form: Width of the figure and sizes of its texts.
+        figure: Empty Matplotlib figure.
+        interval_s: First and last time that the figure shows, in s. None for the whole run.
+
+    Attributes:
+        log: Log of the run.
+        figure: The Matplotlib figure.
+    """
+
+    def __init__(
+        self,
+        log: Log,
+        form: FigureSize,
+        figure: Figure,
+        interval_s: tuple[float, float] | None = None,
+    ) -> None:
+        self.log = log
+        self.figure = figure
+        self._small_pt = form.small_pt
+        self._interval_s = interval_s or (0.0, recorded_end_s(log))
+        changes = list_changes(log)
+        if interval_s is not None:
+            # Numbers of other changes would be drawn beside the panels.
+            first_s, last_s = interval_s
+            changes = [entry for entry in changes if first_s <= entry.change.at_s <= last_s]
+        self._changes = list(enumerate(changes, 1))
+        self._modes = {site: find_mode_intervals(log[site]) for site in log.sites}
+
+    def trace(
+        self, axes: Axes, site: str, values: Array, width: float | None = None, **options: Any
+    ) -> None:
+        """Draws a line over time with one value for each record of a site.
+
+        Args:
+            axes: Panel of the figure, as Matplotlib axes.
+            site: Name of the site.
+            values: A value per record, shape (K,).
+            width: Width of the line, see `site_line`.
+            **options: Options of the line, which take precedence over those of the site.
+        """
+        records = self.log[site]
+        line = {**site_line(self.log, site, width), **options}
+        plot_decimated(axes, records.tick, records.t_s, values, **line)
+
+    def joint_row(self, row: Sequence[Axes], sites: Sequence[str], signal: SiteSignal) -> None:
+        """Draws a signal over time, with a panel per joint and a line per site.
+
+        A site is a process that runs one arm. Times in which a site does not follow other sites
+        are shaded, and changes of settings are marked.
+
+        Args:
+            row: The panels, as Matplotlib axes.
+            sites: Names of the sites.
+            signal: Function of a site's name that returns its ticks, times and values.
+        """
+        for site in sites:
+            tick, t_s, values = signal(site)
+            line = site_line(self.log, site)
+            for axes, joint_values in zip(row, values.T, strict=False):
+                plot_decimated(axes, tick, t_s, joint_values, **line)
+        for axes in row:
+            self.mark(axes, sites)
+            if len(row) > 2:
+                flatten_rounding(axes)
+
+    def mark(
+        self, axes: Axes, sites: Sequence[str], link: str = "", *, numbered: bool = True
+    ) -> None:
+        """Marks events in a panel.
+
+        The panel is shaded in the colour of a site while the site does not follow its peers. It
+        has a vertical line at each change that the sites applied.
+
+        Args:
+            axes: Panel of the figure, as Matplotlib axes.
+            sites: Names of the sites whose events are marked.
+            link: Link whose changes alone are marked, such as "m1->s". Empty for all changes.
+            numbered: True to write the number of each change, which the text below the panels
+                explains.
+        """
+        for site in sites:
+            self._shade_modes(axes, site)
+        for number, applied in self._changes:
+            is_other_link = bool(link) and applied.change.link != link
+            if applied.site in sites and not is_other_link:
+                at_s = applied.change.at_s
+                self._mark_change(axes, at_s, str(number) if numbered else "")
+
+    def _shade_modes(self, axes: Axes, site: str) -> None:
+        """Shades a panel in the colour of a site while the site does not follow its peers."""
+        colour = site_colour(self.log, site)
+        for mode, from_s, to_s in self._modes[site]:
+            axes.axvspan(
+                from_s,
+                to_s,
+                color=colour,
+                alpha=_RETURN_ALPHA if mode == "return" else _HOLD_ALPHA,
+                linewidth=0.0,
+                zorder=0.5,
+            )
+
+    def _mark_change(self, axes: Axes, at_s: float, number: str) -> None:
+        """Draws a vertical line at the time of a change.
+
+        Args:
+            axes: Panel of the figure, as Matplotlib axes.
+            at_s: Time of the change, in s.
+            number: Number of the change as text. Empty to write no number.
+        """
+        axes.axvline(at_s, zorder=0.6, **_CHANGE_LINE)
+        if number:
+            axes.annotate(
+                text=number,
+                xy=(at_s, 1.0),
+                # x in s, y from 0 to 1 over the height of the panel
+                xycoords=axes.get_xaxis_transform(),
+                fontsize=self._small_pt,
+                **_CHANGE_NUMBER,
+            )
+
+    def finish(
+        self,
+        lowest: Sequence[Axes],
+        entries: LegendEntries,
+        *,
+        links: bool = False,
+        title: str = "",
+    ) -> None:
+        """Completes the figure with time axes, a legend, and a text about marked changes.
+
+        A function that draws a figure calls this last.
+
+        Args:
+            lowest: Lowest panel of each column, which gets a time axis.
+            entries: Entries of the legend.
+            links: False to explain all changes of settings below the panels. True to explain
+                only changes of network links, because the panels mark no others.
+            title: Title of the legend. Empty for no title.
+        """
+        for axes in lowest:
+            axes.set_xlabel("time (s)")
+            axes.set_xlim(*self._interval_s)
+        if title:
+            add_legend(self.figure, entries, title=title, title_fontsize=8.0)
+        else:
+            add_legend(self.figure, entries)
+        self._add_footnote(self._explain_changes(links=links), self._explain_shading())
+
+    def _add_footnote(self, *sentences: str) -> None:
+        """Writes sentences below the panels, each on new lines. Empty ones are left out."""
+        letters = int(_LETTERS_PER_IN * self.figure.get_figwidth() / self._small_pt)
+        lines: list[str] = []
+        for sentence in sentences:
+            lines += textwrap.wrap(sentence, letters)
+        if lines:
+            self.figure.supxlabel(
+                typeset("\n".join(lines)),
+                x=0.01,
+                ha="left",
+                fontsize=self._small_pt,
+                color=REFERENCE,
+            )
+
+    def _explain_changes(self, *, links: bool) -> str:
+        """Returns a sentence that explains the numbered changes.
+
+        Args:
+            links: True to explain changes of links only.
+
+        Returns:
+            The sentence. Empty if there are no changes.
+        """
+        marked = []
+        for number, applied in self._changes:
+            if applied.change.link or not links:
+                marked.append(f"{number}: {applied.subject} {applied.text}")
+        if not marked:
+            return ""
+        parts = marked[:MOST_EXPLAINED_CHANGES]
+        more = len(marked) - len(parts)
+        if more:
+            parts.append(f"and {more} more")
+        return f"Changes: {'; '.join(parts)}"
+
+    def _explain_shading(self) -> str:
+        """Returns a sentence that explains the shaded times. Empty if nothing is shaded."""
+        meanings = set()
+        for intervals in self._modes.values():
+            meanings |= {interval.meaning for interval in intervals}
+        if not meanings:
+            return ""
+        parts = []
+        for meaning in sorted(meanings):
+            shade = " (lighter)" if meaning.mode is Mode.RETURN else ""
+            parts.append(f"{meaning.does}{shade}")
+        return f"Shaded in the color of a site: it {', '.join(parts)}"

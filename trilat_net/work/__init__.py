@@ -1,0 +1,1 @@
+"""Work in many runs: processes that share it, folders that keep it, and intervals."""

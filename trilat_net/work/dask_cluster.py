@@ -1,0 +1,335 @@
+"""Connects to a Dask cluster, whose workers run the items of a study.
+
+Dask distributes work over several machines: a scheduler assigns items, such as simulated runs,
+to worker processes. Results can be compared only if all workers compute in exactly the same
+way. Therefore workers are checked before any item is sent. Each worker also checks itself
+before every batch of items, so that a worker that joins later meets the same requirements.
+
+A user's control law is not sent to the workers, because its hash covers only one file, which
+may import others. The worker must have the file already.
+
+Invariant:
+    - An item runs only on a worker with the same program, the same arithmetic and the same
+      versions of the computing packages.
+"""
+
+import hashlib
+import platform
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ..core.step.fingerprint import compute_fingerprint
+from ..errors import RunFailed, ScenarioError, UsageError
+from ..files import import_extra
+from ..log.log_layout import collect_provenance
+from ..net.clock import SystemClock
+from ..net.host_names import UnknownHost, check_hosts
+from ..scenario.code_consent import ImportedCode
+from ..scenario.imported_code import read_code
+
+CONNECT_S = 10.0
+"""Longest time to wait for a scheduler to reply, and for its first worker, in s."""
+NO_WORKER_S = 60.0
+"""Longest time for which a cluster may be without a worker, in s."""
+_PACKAGES = ("numpy", "numba", "scipy")
+"""Packages whose versions influence the results."""
+
+
+def _import_distributed() -> Any:
+    """Imports the package `distributed`, which contains the client of Dask.
+
+    Raises:
+        UsageError: The package is not installed.
+    """
+    return import_extra("distributed", "cluster", "clusters")
+
+
+WorkerIdentity = Mapping[str, str]
+"""Properties of a worker as texts: the versions of the program, its sources, commit,
+arithmetic, Python and packages.
+"""
+
+
+@cache
+def describe_worker() -> WorkerIdentity:
+    """Describes this process by everything on which its numerical results depend.
+
+    A worker of a cluster may run items of a study only if its description equals that of the
+    process that started the study, as otherwise results could differ.
+    """
+    root = Path(__file__).resolve().parents[1]
+    digest = hashlib.sha256()
+    for file in sorted(root.rglob("*.py")):
+        digest.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes())
+    provenance = collect_provenance()
+    return {
+        "trilat-net": provenance["version_trilat-net"],
+        "source files": digest.hexdigest()[:16],
+        "commit": provenance["commit"][:12],
+        "arithmetic": compute_fingerprint(),
+        "Python": ".".join(platform.python_version_tuple()[:2]),
+        **{name: metadata.version(name) for name in _PACKAGES},
+    }
+
+
+class WorkerRequirements(NamedTuple):
+    """What a worker of a cluster must have to compute the same results as this process.
+
+    Attributes:
+        identity: Properties that the worker must have.
+        laws: Name of each imported control law, such as "mylaws:Spring", with the SHA-256 of
+            its file, which the worker must have.
+    """
+
+    identity: WorkerIdentity
+    laws: tuple[tuple[str, str], ...] = ()
+
+
+def explain_unfit_worker(
+    required: WorkerRequirements, identity: WorkerIdentity, lacks: Sequence[str]
+) -> str:
+    """Explains why a worker of a cluster may not run items of a study.
+
+    A worker must have the same source files, the same versions of packages, the same floating
+    point results, and the same files of control laws as the process that started the study.
+    Its Git commit may differ, since commits can differ in documentation only. If the source
+    files differ, the explanation also names the commits, as a hint.
+
+    Args:
+        required: What a worker must have.
+        identity: Versions and other properties of the worker.
+        lacks: Imported control laws whose file the worker does not have.
+
+    Returns:
+        The end of a sentence that begins with "the worker". Empty if the worker may run items.
+    """
+    local = required.identity
+    differing = [
+        name for name in local if name != "commit" and identity.get(name) != local[name]
+    ]
+    if differing:
+        if "source files" in differing:
+            differing.append("commit")
+        remote_text = _list_properties(identity, differing)
+        local_text = _list_properties(local, differing)
+        return (
+            f"has {remote_text}, but the study needs {local_text}; results from both cannot "
+            "be mixed"
+        )
+    if lacks:
+        return (
+            f"lacks the control law {', '.join(lacks)}, or has another file of it: "
+            "put the file that the scenario names into the worker's folder or PYTHONPATH"
+        )
+    return ""
+
+
+def _list_properties(identity: WorkerIdentity, names: Sequence[str]) -> str:
+    """Returns some properties of a worker as a string for an error message."""
+    return ", ".join(f"{name} {identity.get(name, 'unknown')}" for name in names)
+
+
+def find_missing_laws(laws: Sequence[tuple[str, str]]) -> list[str]:
+    """Returns the laws whose file this process does not have, or has with other contents.
+
+    Args:
+        laws: Name of each law, with the SHA-256 of its file.
+    """
+    missing = []
+    for code, sha256 in laws:
+        try:
+            local_sha256 = read_code(code, "control.law").sha256
+        except ScenarioError:
+            local_sha256 = ""
+        if local_sha256 != sha256:
+            missing.append(code)
+    return missing
+
+
+def check_this_worker(required: WorkerRequirements) -> None:
+    """Checks that this process, a worker of a cluster, computes the same results as the study.
+
+    Args:
+        required: Versions of the program and its packages, and files of control laws, that
+            every worker must have.
+
+    Raises:
+        UsageError: This process differs. The message names the worker and the differences.
+    """
+    reason = explain_unfit_worker(required, describe_worker(), find_missing_laws(required.laws))
+    if reason:
+        worker = _import_distributed().get_worker()
+        raise UsageError(f"the worker {worker.address} {reason}")
+
+
+def _make_probe() -> Callable[
+    [Sequence[tuple[str, str]]], tuple[WorkerIdentity, Sequence[str]]
+]:
+    """Returns a function that describes the process in which it is called.
+
+    A worker may have another version of this program, or none. Dask sends the code of a nested
+    function itself, and not only its name, so that the function runs on such a worker too.
+    """
+
+    def probe(laws: Sequence[tuple[str, str]]) -> tuple[WorkerIdentity, Sequence[str]]:
+        """Describes the worker process in which it is called, and checks its control laws.
+
+        Args:
+            laws: Name of each imported control law, with the SHA-256 of its file.
+
+        Returns:
+            The versions on which the results of this process depend; and the names of the laws
+            whose file this process does not have, or has with other contents.
+        """
+        try:
+            from trilat_net.work import dask_cluster
+        except ImportError:
+            return {"trilat-net": "of another version, or none"}, ()
+        return dask_cluster.describe_worker(), dask_cluster.find_missing_laws(laws)
+
+    return probe
+
+
+class DaskCluster:
+    """Connection to the scheduler of a Dask cluster, whose workers run the items of a study.
+
+    It is a context manager that closes the connection. Items that have not finished by then are
+    cancelled.
+
+    Args:
+        address: Address of the scheduler, such as "tcp://HOST:PORT".
+
+    Raises:
+        UsageError: Dask is not installed, or no scheduler replies at the address.
+    """
+
+    def __init__(self, address: str) -> None:
+        self.address = address
+        self._clock = SystemClock()
+        self._last_worker_ns = -1
+        try:
+            check_hosts([address])
+            self._client = _import_distributed().Client(
+                address, timeout=CONNECT_S, set_as_default=False
+            )
+        except UnknownHost as unknown:
+            raise UsageError(f"--on {unknown}") from None
+        except (OSError, ValueError, TypeError) as error:  # TimeoutError is an OSError
+            reason = str(error).splitlines()[0]
+            raise UsageError(
+                f"--on {address}: no Dask scheduler responds at this address: {reason}"
+            ) from None
+
+    def __enter__(self) -> "DaskCluster":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._client.close()
+
+    @property
+    def executor(self) -> Executor:
+        """Runs functions on the workers of the cluster, as a `concurrent.futures.Executor`."""
+        executor: Executor = self._client.get_executor(pure=False)
+        return executor
+
+    @property
+    def workers(self) -> int:
+        """Number of items that all workers together run at the same time."""
+        workers = self._client.scheduler_info()["workers"]
+        return sum(worker["nthreads"] for worker in workers.values())
+
+    def require(self, laws: Sequence[ImportedCode]) -> WorkerRequirements:
+        """Determines what workers need for a study, and checks the workers that are present.
+
+        A worker must have the same program, arithmetic and versions of packages as this
+        process, and the files of all imported control laws.
+
+        Args:
+            laws: Imported control laws that the items of the study need.
+
+        Returns:
+            The requirements, against which later workers check themselves.
+
+        Raises:
+            UsageError: No worker appeared within `CONNECT_S`, or a worker does not meet the
+                requirements.
+        """
+        try:
+            self._client.wait_for_workers(1, timeout=CONNECT_S)
+        except TimeoutError:
+            raise UsageError(
+                f"--on {self.address}: the scheduler has no worker; "
+                f"start some with: dask worker {self.address}"
+            ) from None
+
+        files = tuple(dict.fromkeys((law.code, law.source_sha256) for law in laws))
+        required = WorkerRequirements(describe_worker(), files)
+        # Dask itself reports the versions of Python. They are checked first, because code
+        # cannot be sent between different versions.
+        python = required.identity["Python"]
+        for worker, versions in self._client.get_versions()["workers"].items():
+            worker_python = ".".join(str(versions["host"]["python"]).split(".")[:2])
+            if worker_python != python:
+                raise UsageError(
+                    f"the worker {worker} has Python {worker_python}, "
+                    f"but this program runs on Python {python}"
+                )
+        answers = self._client.run(_make_probe(), files, on_error="return")
+        for worker, answer in answers.items():
+            if isinstance(answer, BaseException):
+                raise UsageError(f"the worker {worker} does not report its version: {answer}")
+            identity, missing_laws = answer
+            reason = explain_unfit_worker(required, identity, missing_laws)
+            if reason:
+                raise UsageError(f"the worker {worker} {reason}")
+        return required
+
+    def check_alive(self) -> None:
+        """Checks that the cluster can still run items.
+
+        A study calls this regularly while it waits for results, so that it ends with an error
+        instead of waiting forever.
+
+        Raises:
+            RunFailed: The scheduler is gone, or had no worker for `NO_WORKER_S`.
+        """
+        try:
+            workers = self.workers
+        except (OSError, TimeoutError) as error:
+            raise RunFailed(
+                f"the scheduler at {self.address} no longer responds: {error}"
+            ) from None
+        now_ns = self._clock.monotonic_ns()
+        if workers or self._last_worker_ns < 0:
+            self._last_worker_ns = now_ns
+        elif now_ns - self._last_worker_ns > NO_WORKER_S * 1e9:
+            raise RunFailed(
+                f"the cluster at {self.address} has had no worker for {NO_WORKER_S:g} s"
+            )
+
+    def is_worker_loss(self, error: BaseException) -> bool:
+        """Distinguishes the death of a worker process from an error in its item.
+
+        After the death of a worker its items may be tried again on another one. After an error
+        of the item, such as a worker that does not meet the requirements, this would be
+        useless.
+
+        Args:
+            error: Error with which an item ended.
+
+        Returns:
+            True if the workers of the item died.
+
+        Raises:
+            RunFailed: The scheduler is gone, or a worker cannot receive items.
+        """
+        if isinstance(error, _import_distributed().KilledWorker):
+            return True
+        if isinstance(error, UsageError):
+            return False
+        reason = f"{type(error).__name__}: {error}".splitlines()[0]
+        raise RunFailed(f"the cluster at {self.address} cannot continue: {reason}") from None

@@ -1,0 +1,291 @@
+"""Manages the folder of a study: its plan, and a journal of the finished runs.
+
+A study consists of many runs, for example a sweep over parameters. Each finished run is
+appended to the journal as a line. If the study is interrupted, it continues after the runs in
+the journal. A line is JSON, a tab, and a checksum in hexadecimal digits: the CRC-32 of the text
+that identifies the study, followed by the JSON. The journal is only appended to.
+
+Invariant:
+    - A torn line, and a line of another study, has a wrong checksum and is ignored.
+    - A process that dies at any moment loses no earlier line and spoils no later line.
+    - A run that is in the journal is never repeated.
+"""
+
+import csv
+import errno
+import io
+import json
+import os
+import zlib
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
+
+import msgspec
+import tomli_w
+
+from ..core.step.fingerprint import compute_fingerprint
+from ..errors import ScenarioError
+from ..files import describe_write_error, extend_file
+from ..log.log_layout import collect_provenance
+from ..process import join_arguments
+from ..scenario.imported_code import name_law_classes
+from .executor import Progress, WorkerPool
+
+
+def format_command(*arguments: str) -> str:
+    """Returns a command line of this program, with its arguments quoted for a shell."""
+    return join_arguments(["trilat", *arguments])
+
+
+def set_options(overrides: Iterable[str]) -> list[str]:
+    """Returns the command line options that apply overrides of a scenario.
+
+    Args:
+        overrides: Texts KEY=VALUE, as in "link.delay_ms=100".
+
+    Returns:
+        The arguments "--set" and KEY=VALUE, in turn.
+    """
+    arguments = []
+    for text in overrides:
+        arguments += ["--set", text]
+    return arguments
+
+
+def format_toml_value(value: Any) -> str:
+    """Returns a value as TOML on one line, for commands and overrides.
+
+    A number is written as short as possible, if it still parses back to the same number.
+
+    Args:
+        value: A number, text, list or table.
+
+    Raises:
+        ScenarioError: TOML cannot express the value.
+    """
+    value = name_law_classes(value)
+    if isinstance(value, Mapping):
+        entries = []
+        for key, entry in value.items():
+            entry_text = format_toml_value(entry)
+            entries.append(f"{key} = {entry_text}")
+        return f"{{{', '.join(entries)}}}"
+    if isinstance(value, list | tuple):
+        items = map(format_toml_value, value)
+        return f"[{', '.join(items)}]"
+    if isinstance(value, float) and float(f"{value:g}") == value:
+        return f"{value:g}"
+    try:
+        assignment = tomli_w.dumps({"v": value})
+        return assignment.removeprefix("v = ").removesuffix("\n")
+    except TypeError:
+        raise ScenarioError(
+            f"{value!r:.80} cannot be a value in a scenario: scenarios contain TOML values only"
+        ) from None
+
+
+# Packages that compute the results, by their keys in the provenance of a log.
+_VERSIONS = ("version_trilat-net", "version_numba", "version_numpy")
+
+
+def describe_program() -> tuple[str, dict[str, str]]:
+    """Returns the properties of this program and machine on which numerical results depend.
+
+    Results of a study are mixed only if these properties are the same.
+
+    Returns:
+        A fingerprint of how the machine rounds floating point numbers; and the versions of the
+        program and of the packages that compute the results.
+    """
+    provenance = collect_provenance()
+    versions = {name: provenance[name] for name in _VERSIONS}
+    return compute_fingerprint(), versions
+
+
+def build_resume_hint(*arguments: str) -> str:
+    """Returns advice on how to continue a study that was interrupted by a full disk.
+
+    Args:
+        arguments: Arguments of the command that continues the study.
+    """
+    command = format_command(*arguments)
+    return f"finished runs are kept: make room, and continue with: {command}"
+
+
+def encode_csv(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = ()) -> str:
+    """Returns rows as CSV text with a header. None becomes an empty field.
+
+    Args:
+        rows: The rows, as values by column.
+        columns: The columns. Empty stands for all keys of the rows, in the order in which they
+            first appear.
+    """
+    stream = io.StringIO()
+    header = columns or list(dict.fromkeys(key for row in rows for key in row))
+    writer = csv.DictWriter(stream, header, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return stream.getvalue()
+
+
+class JournalEntry(Protocol):
+    """Interface of an entry of a `RunJournal`: the result of a finished run.
+
+    An entry is a structure of plain values. The cell and the seed together identify its run.
+    """
+
+    @property
+    def cell(self) -> Hashable:
+        """Identifier of the part of the study to which the run belongs.
+
+        For example, the number of a grid point in a sweep over parameters.
+        """
+
+    @property
+    def seed(self) -> int:
+        """Seed of the random numbers of the run, which distinguishes the runs of a cell."""
+
+
+P = TypeVar("P")
+T = TypeVar("T")
+E = TypeVar("E", bound=JournalEntry)
+
+
+class RunJournal(Generic[E]):
+    """File to which a study appends the result of each run as soon as it has finished.
+
+    If the study is interrupted, it continues from this file without repeating finished runs.
+    The object is a context manager that closes the file.
+
+    Args:
+        path: Path of the file. Existing lines are read.
+        study: Text that identifies the study, such as the digest of its plan.
+        kind: Type of the entries.
+        remedy: Advice in the error message if the disk is full.
+
+    Attributes:
+        done: Finished runs, by cell and seed. Lines of another study are ignored.
+    """
+
+    def __init__(self, path: Path, study: str, kind: type[E], remedy: str) -> None:
+        self._path = path
+        self._study = study
+        self._remedy = remedy
+        self.done: dict[tuple[Any, int], E] = {}
+        content = path.read_bytes() if path.exists() else b""
+        for line in content.split(b"\n"):
+            text, tab, digits = line.rpartition(b"\t")
+            if tab and digits == b"%08x" % self._checksum(text):
+                # The module json is used, because msgspec does not accept infinity.
+                values = json.loads(text)
+                entry = msgspec.convert(values, kind)
+                self.done.setdefault((entry.cell, entry.seed), entry)
+        self._file = extend_file(path)
+        if content and not content.endswith(b"\n"):
+            # The last line is torn. It is ended here, so that it does not spoil the next one.
+            self._write(b"\n")
+
+    def __enter__(self) -> "RunJournal[E]":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        os.fsync(self._file.fileno())
+        self._file.close()
+
+    def add(self, entry: E) -> None:
+        """Appends the result of a run to the file at once.
+
+        Thus an interruption of the study cannot lose the run. A run that the journal contains
+        already is ignored.
+
+        Args:
+            entry: Result of the run.
+
+        Raises:
+            LogRefused: The disk is full.
+        """
+        if (entry.cell, entry.seed) in self.done:
+            return
+        values = msgspec.to_builtins(entry)
+        text = json.dumps(values, separators=(",", ":")).encode()
+        checksum = self._checksum(text)
+        self._write(b"%s\t%08x\n" % (text, checksum))
+        self.done[entry.cell, entry.seed] = entry
+
+    def run_pending(
+        self,
+        pool: WorkerPool,
+        run: Callable[[T], E],
+        tasks: Iterable[T],
+        done: int,
+        total: int,
+        show: Progress,
+    ) -> None:
+        """Executes the runs of a study that are not finished yet, and writes each as it ends.
+
+        Args:
+            pool: Workers that execute the runs.
+            run: Function that executes the run of a task.
+            tasks: Tasks of the pending runs, at most `total - done`.
+            done: Number of finished runs.
+            total: Number of all runs.
+            show: Function that is called with the number of finished runs and `total`.
+
+        Raises:
+            LogRefused: The disk is full.
+        """
+        results = pool.iterate_results(run, tasks, count=total - done)
+        for number, (_, entry) in enumerate(results, done + 1):
+            self.add(entry)
+            show(number, total)
+
+    def _write(self, data: bytes) -> None:
+        """Appends bytes to the file.
+
+        Raises:
+            LogRefused: The disk is full.
+        """
+        try:
+            # On a full disk, write() returns a smaller number of bytes without an error.
+            written = self._file.write(data)
+            if written != len(data):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        except OSError as error:
+            raise describe_write_error(self._path, error, self._remedy) from None
+
+    def _checksum(self, text: bytes) -> int:
+        """Returns the CRC-32 of the study's identification and the text of a line."""
+        study_checksum = zlib.crc32(self._study.encode())
+        return zlib.crc32(text, study_checksum)
+
+
+class StudyFolder(NamedTuple, Generic[P, E]):
+    """Folder with the plan, the journal and the results of a study.
+
+    A study is a set of simulated runs, such as a sweep over a parameter. It can be interrupted,
+    and continued from its folder.
+
+    Attributes:
+        path: Path of the folder.
+        plan: Plan of the study.
+        facts: Plain values that identify the study, its arithmetic and the package versions.
+        remedy: Advice in the error message if the disk is full.
+        journal: Function that opens the journal.
+    """
+
+    path: Path
+    plan: P
+    facts: Mapping[str, Any]
+    remedy: str
+    journal: Callable[[], RunJournal[E]]
+
+    def read_done(self) -> list[tuple[Any, int]]:
+        """Reads from the journal which runs of the study have finished.
+
+        Returns:
+            The cell (the part of the study) and the seed of each finished run. Empty if no run
+            has finished.
+        """
+        with self.journal() as journal:
+            return list(journal.done)
