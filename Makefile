@@ -51,7 +51,7 @@ $(VENV)/runtime.stamp: requirements/runtime.lock pyproject.toml | $(VENV)/uv.sta
 	@$(PIP) --quiet --no-deps --no-build-isolation -e .
 	@touch $@
 
-$(VENV)/compiled.stamp: $(VENV)/runtime.stamp $(wildcard trilat_net/core/*.py)
+$(VENV)/compiled.stamp: $(VENV)/runtime.stamp $(wildcard trilat_net/core/*/*.py)
 	@$(BIN)/python -m tests.compile_core paper
 	@touch $@
 

@@ -22,10 +22,16 @@ def tree(path: Path) -> ast.Module:
     return ast.parse(path.read_text(encoding="utf-8"))
 
 
+INNER_ROOMS = {("app", "api"), ("app", "cli"), ("analysis", "theory")}
+"""Folders and files of rooms that have rules of their own."""
+
+
 def room(path: Path) -> str:
     """Returns the room of a file: its top-level folder, or one of those of `trilat_net`."""
     top, *below = path.relative_to(ROOT).with_suffix("").parts
-    return below[0] if top == "trilat_net" else top
+    if top != "trilat_net":
+        return top
+    return below[1] if tuple(below[:2]) in INNER_ROOMS else below[0]
 
 
 def imported_names(path: Path) -> Iterator[tuple[str, ...]]:

@@ -30,9 +30,8 @@ PARTS = {
     "people": r"studies/experiment|^live/|sites/devices|device_hand|hand_impedance",
     "studies": r"^trilat_net/studies/",
     "kernel": r"^trilat_net/(core|laws)/|^trilat_net/(fields|errors|files|process|results)\.py",
-    "analysis": r"^trilat_net/(analysis|theory)/",
-    "app": r"^trilat_net/(cli|reporting)/|^trilat_net/(api|__init__|__main__)\.py|^trilat_net/app/play/"
-    r"|sites/(doctor|network_benchmark|session_ping|running_session|monitor|demo_session)\.py",
+    "analysis": r"^trilat_net/analysis/",
+    "app": r"^trilat_net/(app|presentation|work)/|^trilat_net/(__init__|__main__)\.py",
     "session": r"^trilat_net/(scenario|net|log|execution)/|^sites/|^recorder/",
 }
 """The files of each part by their paths; the first pattern that matches decides."""

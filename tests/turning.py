@@ -14,7 +14,7 @@ from trilat_net.execution.virtual import write_virtual_log
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, load_scenario
 
-CASE = Path(__file__).parent / "reporting" / "cases" / "tool_down.toml"
+CASE = Path(__file__).parent / "presentation" / "cases" / "tool_down.toml"
 MOTIONS = range(30)
 RECORDS = 150
 AXES = (

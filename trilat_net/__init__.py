@@ -103,8 +103,8 @@ _NAMES = {
     "trilat_net.app.running_session": "hand session start",
     "trilat_net.analysis.file_overview": "info",
     "trilat_net.analysis.twins.twin_growth": "twin",
-    "trilat_net.app.api": "bench certify export linear margin metrics report simulate sweep tune "
-    "verify view",
+    "trilat_net.app.api": "bench certify export linear margin metrics report simulate sweep "
+    "tune verify view",
     "trilat_net.core.plug.compiled_law": "compiled",
     "trilat_net.core.life.own_hand": "HandContext HandView",
     "trilat_net.core.plug.user_law": "LawContext LawInput",

@@ -4,8 +4,8 @@ The commands of the terminal and the functions of the Python interface return th
 The terminal prints the text, and programs read the values.
 
 Invariant:
-    - A result contains only values. Its text is composed by the package `reporting`, which is
-      imported when the text is requested. Modules that compute therefore do not depend on
+    - A result contains only values. Its text is composed by the package `presentation`, which
+      is imported when the text is requested. Modules that compute therefore do not depend on
       modules that format.
     - JSON contains no NaN and no infinity. An unknown quantity is null.
 """
@@ -84,7 +84,7 @@ class Result:
 
 def _texts() -> Any:
     """Imports the module that composes the texts of results, and returns it."""
-    return import_module(f"{__package__}.reporting.result_text")
+    return import_module(f"{__package__}.presentation.result_text")
 
 
 JsonObject = dict[str, Any]

@@ -13,8 +13,8 @@ from typing import Annotated
 import msgspec
 import typer
 
-from ..reporting import terminal_output as terminal
-from ..reporting.result_text import TextTable
+from ..presentation import terminal_output as terminal
+from ..presentation.result_text import TextTable
 from ..studies.executor import open_worker_pool
 from ..studies.study_folder import RunJournal
 from . import options

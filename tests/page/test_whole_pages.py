@@ -5,13 +5,13 @@ from pathlib import Path
 from playwright.sync_api import Browser
 
 from tests.live.browsers import needs_browser
-from trilat_net import presentation as reporting
+from trilat_net import presentation
 
 from .whole_pages import watched_page
 
 pytestmark = needs_browser
 
-LIBRARY = Path(reporting.__file__).with_name("assets") / "uPlot.iife.min.js"
+LIBRARY = Path(presentation.__file__).with_name("assets") / "uPlot.iife.min.js"
 CHART = """<figure id="frame"><h2>ages</h2></figure><script>{library}</script><script>
 const lines = [{{ label: "a", stroke: "red" }},
   {{ label: "b", stroke: "blue", points: {{ show: {points} }} }}];

@@ -3,5 +3,5 @@
 A log contains a record for every tick of every site, the process that runs one arm.
 
 Invariant:
-    - Nothing in this package draws, formats or prints. The package `reporting` does so.
+    - Nothing in this package draws, formats or prints. The package `presentation` does so.
 """

@@ -1,1 +1,1 @@
-"""The modes of a site from its start to its end, its safeguards, and hands that move it live."""
+"""The modes of a site from its start to its end, its safeguards, and hands that move it."""

@@ -113,7 +113,7 @@ def digest_sibling_sources(function: Callable[..., Any]) -> str:
         The hash. Empty if the function is not part of this package; its code is not stored.
     """
     folder = Path(function.__code__.co_filename).parent
-    if not folder.is_relative_to(Path(__file__).parents[1]):
+    if not folder.is_relative_to(Path(__file__).parents[2]):
         return ""
     files = sorted(folder.glob("*.py"))
     sources = [file.read_bytes() for file in files]

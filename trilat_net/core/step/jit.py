@@ -57,6 +57,12 @@ with suppress(OSError, IndexError):  # only Linux has the file
         raise MemoryError
 
 
+_CORE = Path(__file__).parents[1]
+"""Folder of the core, to which this package belongs."""
+_CORE_PACKAGE = __package__.rpartition(".")[0]
+"""Name of the package of the core."""
+
+
 def _cache_root() -> Path:
     """Returns the user's cache directory, by the convention of the platform."""
     if sys.platform == "win32":
@@ -69,7 +75,7 @@ def _cache_root() -> Path:
 def _core_digest() -> str:
     """Returns a hash of all source files of the core and of Numba's version."""
     digest = hashlib.sha256(numba.__version__.encode())
-    for source in sorted(Path(__file__).parent.rglob("*.py")):
+    for source in sorted(_CORE.rglob("*.py")):
         digest.update(source.read_bytes())
     return digest.hexdigest()[:16]
 
@@ -89,7 +95,7 @@ def _writable_cache() -> Path | None:
 
 _config: Any = numba.config  # set from the environment at import; its stubs name no options
 _CACHE = None if _config.DISABLE_JIT else _writable_cache()
-_SHIPPED = Path(__file__).parent / "compiled" / _core_digest()
+_SHIPPED = _CORE / "compiled" / _core_digest()
 _ships = _SHIPPED.is_dir()
 
 
@@ -143,7 +149,7 @@ class _CompilingNotice(event.Listener):
         """
         self._restorers.append(end_process_at_signals())
         module = event_data.data["dispatcher"].py_func.__module__
-        if not self.is_reported and module.startswith(__package__):
+        if not self.is_reported and module.startswith(_CORE_PACKAGE):
             self.is_reported = True
             self.report(COMPILING)
 

@@ -1,6 +1,6 @@
 """Executes the runs of the benchmark suite: judges and measures each run, and stores it.
 
-A run is judged as its stability certificate would judge it (`theory.run_certificate`): by its
+A run is judged as its stability certificate would judge it (`analysis.judge`): by its
 end, by the characteristic roots of its loop, and by its twins where they matter. A twin is a
 repetition of the run with a small disturbance, which shows whether disturbances grow.
 A run is made longer if its judgement needs more time: it then lasts for `TIME_CONSTANTS` of its

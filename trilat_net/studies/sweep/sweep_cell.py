@@ -8,7 +8,7 @@ again.
 Invariant:
     - A result is a function of the cell's scenario and of the longest allowed duration.
     - A log of the same run gets the same decision, because a cell is judged by
-      `run_certificate.judge_virtual_run`, and its roots are those of `loop_roots`.
+      `judge.judge_virtual_run`, and its roots are those of `loop_roots`.
     - To save space, a run stores only how the text of its scenario differs from the text of the
       sweep's scenario. The stored difference restores every text exactly.
 """

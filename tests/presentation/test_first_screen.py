@@ -9,7 +9,7 @@ from playwright.sync_api import Browser, Page
 from tests.analysis import logs
 from tests.live.browsers import needs_browser
 from tests.page.whole_pages import grave_findings, watched_page
-from trilat_net import presentation as reporting
+from trilat_net import presentation
 from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net.log.findings import Finding
 from trilat_net.presentation.appearance import DARK_SITE_COLOURS, SITE_COLOURS
@@ -75,7 +75,7 @@ def test_arms_play_at_once_unless_motion_is_reduced(browser: Browser, tmp_path: 
 
 
 def test_theme_has_the_colours_of_the_figures() -> None:
-    assets = Path(reporting.__file__).with_name("assets")
+    assets = Path(presentation.__file__).with_name("assets")
     light, dark = (assets / "theme.css").read_text("utf-8").split("@media")
     for css, colours in ((light, SITE_COLOURS), (dark, DARK_SITE_COLOURS)):
         for index, colour in enumerate(colours):
