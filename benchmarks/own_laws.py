@@ -6,9 +6,9 @@ on the machine bears on all alike.
 
 import time
 
-from trilat_net.process import count_cores, worker_pool
 from trilat_net.scenario import load_scenario
 from trilat_net.studies.sweep.sweep_cell import classify_cell
+from trilat_net.workers import count_cores, worker_pool
 
 CELLS = 400
 PLAIN = 8

@@ -30,7 +30,7 @@ from trilat_net.files import describe_write_error, make_subfolder
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.net.zenoh_bus import ZenohBus
-from trilat_net.process import Interrupt
+from trilat_net.signals import Interrupt
 from trilat_net.studies.experiment.experiment_run import LOGS, Experiment, Note
 from trilat_net.studies.experiment.protocol import PlannedTrial, Step
 from trilat_net.studies.experiment.trial_run import ExperimentTrial

@@ -27,8 +27,8 @@ from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock
 from trilat_net.net.connection import Connection
 from trilat_net.net.discovery import connect_to_session
-from trilat_net.process import Interrupt
 from trilat_net.scenario import embedded_names_reader, find_site
+from trilat_net.signals import Interrupt
 
 from .page_orders import OrderDesk
 from .session_view import SessionView

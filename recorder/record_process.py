@@ -31,8 +31,8 @@ from trilat_net.net.membership import Epoch, EventPublisher, describe_member, ne
 from trilat_net.net.pinging import describe_clocks
 from trilat_net.net.session import SessionJoin
 from trilat_net.net.zenoh_bus import share_threads
-from trilat_net.process import Interrupt
 from trilat_net.scenario import Scenario, embedded_names_reader, parse_embedded
+from trilat_net.signals import Interrupt
 
 from .session_recording import RecorderReport, Recording
 from .site_reception import InboundQueue

@@ -30,13 +30,13 @@ from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.net.connection import Connection, open_bus
 from trilat_net.net.membership import read_messages
 from trilat_net.net.requests import HandMessage, HandViewMessage
-from trilat_net.process import Interrupt
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.operators.program_hand import (
     HandSite,
     find_own_hand,
     make_hand_program,
 )
+from trilat_net.signals import Interrupt
 
 POLL_NS = 500_000
 """Time between two polls for views, in ns."""

@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from trilat_net import process
+from trilat_net import workers
 from trilat_net.errors import count_nouns
 from trilat_net.net.clock import Clock
 
@@ -84,7 +84,7 @@ def describe_load(busy_share: float | None) -> str:
     """
     if busy_share is None or busy_share < BUSY_SHARE:
         return ""
-    cores = process.count_cores()
+    cores = workers.count_cores()
     processors = "one processor is"
     if cores > 1:
         processors = count_nouns(cores, "processor is", "processors are")

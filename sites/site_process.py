@@ -25,6 +25,7 @@ import msgspec
 import numpy as np
 from msgspec.structs import asdict
 
+from sites.line_printer import LinePrinter
 from trilat_net.core.step.site_setup import StaleAction
 from trilat_net.core.step.ticks import (
     NS_PER_S,
@@ -53,11 +54,11 @@ from trilat_net.net.session import SessionJoin
 from trilat_net.net.timing import ClockNotice, PeerClock, SiteTiming, find_turn_ns
 from trilat_net.net.wire import encode
 from trilat_net.net.zenoh_bus import share_threads
-from trilat_net.process import Interrupt, LinePrinter
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.run_changes import count_skipped_ticks, describe_change
 from trilat_net.scenario.scenario_types import Change
 from trilat_net.scenario.validate import check_outside_arms
+from trilat_net.signals import Interrupt
 
 from . import realtime
 from .external_arm import ExternalArm

@@ -21,8 +21,9 @@ from tests.task_arms import planar_task
 from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net.errors import count_nouns
 from trilat_net.execution.fused import FusedRun
-from trilat_net.process import Interrupt, count_cores, worker_pool
 from trilat_net.scenario import Scenario, load_scenario, parse_scenario
+from trilat_net.signals import Interrupt
+from trilat_net.workers import count_cores, worker_pool
 
 OF_TESTS = ("paper", "six joints", "task space")
 SHIPPED = ("paper", "six_joints", "seven_joints", "unlike_arms")

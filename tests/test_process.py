@@ -17,14 +17,10 @@ import pytest
 from tests.live.processes import is_running
 from tests.net.waiting import until
 from tests.other_systems import replace_os
-from trilat_net import process
-from trilat_net.process import (
-    ENDING_SIGNALS,
-    Interrupt,
-    hold_sigint,
-    join_arguments,
-    worker_pool,
-)
+from trilat_net import errors, process, signals, workers
+from trilat_net.errors import join_arguments
+from trilat_net.signals import ENDING_SIGNALS, Interrupt, hold_sigint
+from trilat_net.workers import worker_pool
 
 
 def test_a_signal_is_remembered_and_ends_nothing() -> None:
@@ -38,7 +34,7 @@ def test_a_signal_is_remembered_and_ends_nothing() -> None:
 
 def test_only_a_later_second_signal_insists(monkeypatch: pytest.MonkeyPatch) -> None:
     now_s = 5.0
-    monkeypatch.setattr(process.os, "times", lambda: SimpleNamespace(elapsed=now_s))
+    monkeypatch.setattr(signals.os, "times", lambda: SimpleNamespace(elapsed=now_s))
     with Interrupt() as interrupt:
         for number in (signal.SIGHUP, signal.SIGHUP, signal.SIGINT, signal.SIGINT):
             os.kill(os.getpid(), number)
@@ -141,7 +137,7 @@ def test_interrupt_ends_workers_in_middle_of_something_that_never_ends() -> None
 def test_workers_end_when_their_parent_is_killed() -> None:
     script = (
         "import os, signal, threading\n"
-        "from trilat_net.process import worker_pool\n"
+        "from trilat_net.workers import worker_pool\n"
         "with worker_pool(1) as pool:\n"
         "    print(pool.submit(os.getpid).result(), flush=True)\n"
         "    pool.submit(threading.Event().wait)\n"
@@ -192,7 +188,7 @@ WINDOWS_WORDS = [
 
 def test_a_command_is_quoted_as_the_shell_takes_it(monkeypatch: pytest.MonkeyPatch) -> None:
     assert shlex.split(join_arguments(WINDOWS_WORDS)) == WINDOWS_WORDS
-    monkeypatch.setattr(process, "os", replace_os())
+    monkeypatch.setattr(errors, "os", replace_os())
     plain = r'trilat sweep "my runs\\one" "m1->s" "say \"no\"" C:\\runs --set a=-1.5'
     assert join_arguments(WINDOWS_WORDS) == plain
 
@@ -212,13 +208,13 @@ def test_a_worker_ends_with_its_parent_as_on_windows(
         codes.append(code)
         raise ProcessEndedError
 
-    monkeypatch.setattr(process, "os", replace_os(_exit=end, getppid=lambda: 4))
+    monkeypatch.setattr(workers, "os", replace_os(_exit=end, getppid=lambda: 4))
     monkeypatch.setattr(
         multiprocessing, "parent_process", lambda: SimpleNamespace(sentinel=ended.fileno())
     )
     alive.close()
     with pytest.raises(ProcessEndedError):
-        process._exit_after(4)
+        workers._exit_after(4)
     assert codes == [1]
 
 
@@ -227,7 +223,7 @@ def test_a_closed_window_is_a_signal_as_on_windows() -> None:
         "import signal\n"
         "signal.SIGBREAK = signal.SIGHUP\n"
         "del signal.SIGHUP, signal.pthread_sigmask\n"
-        "from trilat_net.process import ENDING_SIGNALS\n"
+        "from trilat_net.signals import ENDING_SIGNALS\n"
         "assert ENDING_SIGNALS == (signal.SIGINT, signal.SIGTERM, signal.SIGBREAK)"
     )
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0

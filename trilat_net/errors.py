@@ -337,3 +337,20 @@ def find_nearest(word: str, valid: Sequence[str], elsewhere: Sequence[str] = ())
         if matches:
             return words[matches[0]]
     return ""
+
+
+def join_arguments(arguments: Iterable[str]) -> str:
+    """Returns a command as a user would type it into a shell of this operating system.
+
+    Args:
+        arguments: Name of the program and its arguments.
+    """
+    if os.name != "nt":
+        return shlex.join(arguments)
+    # Both cmd and PowerShell accept this form.
+    texts = []
+    for argument in arguments:
+        escaped = argument.replace('"', '\\"')
+        needs_quotes = not re.fullmatch(r"[\w.:/\\=+-]+", escaped)
+        texts.append(f'"{escaped}"' if needs_quotes else escaped)
+    return " ".join(texts)

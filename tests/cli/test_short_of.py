@@ -14,7 +14,7 @@ import pytest
 
 from tests.cli.running import COMMAND, PLAIN, trilat
 from trilat_net.core.step.jit import COMPILING
-from trilat_net.process import ENDING_SIGNALS, Interrupt, end_process_at_signals
+from trilat_net.signals import ENDING_SIGNALS, Interrupt, end_process_at_signals
 
 LOG = Path(__file__).parents[1] / "golden" / "v3.mcap"
 WITHOUT_COMPILING = {**PLAIN, "NUMBA_DISABLE_JIT": "1", "PYTHONDONTWRITEBYTECODE": "1"}

@@ -23,8 +23,8 @@ from trilat_net.net.bus import Bus
 from trilat_net.net.messages import Event, LinkStats, State
 from trilat_net.net.requests import ChangeRequest
 from trilat_net.net.wire import decode, encode, split_states
-from trilat_net.process import Interrupt
 from trilat_net.scenario import Scenario, load_scenario
+from trilat_net.signals import Interrupt
 
 from .fault_schedule import (
     MEMBERS,

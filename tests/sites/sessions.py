@@ -23,8 +23,8 @@ from trilat_net.net.clock import Clock, SkewedClock
 from trilat_net.net.connection import Connection
 from trilat_net.net.messages import State
 from trilat_net.net.wire import decode, encode_state
-from trilat_net.process import Interrupt
 from trilat_net.scenario import Scenario, load_scenario
+from trilat_net.signals import Interrupt
 
 from .relay import Killed, Relay, RelayClock
 

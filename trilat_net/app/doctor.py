@@ -29,7 +29,7 @@ from typing import Any, Literal, NamedTuple
 from sites.machine_load import describe_load, measure_busy_share
 from sites.site_loop import PeerInbox, StateBlock, run_loop
 from sites.site_parts import warm_up
-from trilat_net import process
+from trilat_net import workers
 from trilat_net.core.step.jit import is_core_cached
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import NS_PER_S, Arrival, TickInput, TickRecord
@@ -694,7 +694,7 @@ def examine_room(folder: Path) -> Iterator[DoctorFinding]:
         yield DoctorFinding("disk", "fail", f"{existing} cannot be written to")
     yield DoctorFinding("disk", state, f"{free / 1e9:.1f} GB are free in {existing}")
 
-    cores = process.count_cores()
+    cores = workers.count_cores()
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
     text = f"{count_nouns(cores, 'processor')}, of which {load:.1f} are busy"
     warning = describe_load(measure_busy_share(SystemClock()))

@@ -30,9 +30,9 @@ from ..log.findings import CheckReport, Finding
 from ..log.log_reader import Log
 from ..log.mcap_reader import Progress
 from ..log.site_log import SiteLog
-from ..process import worker_pool
 from ..scenario.code_consent import may_run_user_laws
 from ..scenario.imported_code import allowed_code
+from ..workers import worker_pool
 from .certificate_text import CertificateLine, describe_certificate, describe_theorem
 from .result_text import MARKS, Block, MarkedText, TextTable
 from .summary_text import format_run_lines

@@ -26,8 +26,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.text import Text
 
-from ..errors import count_nouns
-from ..process import join_arguments
+from ..errors import count_nouns, join_arguments
 
 if TYPE_CHECKING:
     from ..log.log_reader import Log

@@ -33,7 +33,7 @@ from ...files import (
     require_libraries,
 )
 from ...presentation.terminal_output import err, print_error, print_line
-from ...process import Interrupt
+from ...signals import Interrupt
 from . import options, sessions
 from .options import flag
 

@@ -19,7 +19,7 @@ from ...errors import CodeWithheld, RunFailed, UsageError, count_nouns
 from ...net.clock import Clock, SystemClock, make_system_clock
 from ...presentation import terminal_output as terminal
 from ...presentation.result_text import TextTable
-from ...process import Interrupt
+from ...signals import Interrupt
 from . import options
 from .options import flag, seconds, value
 

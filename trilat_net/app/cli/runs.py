@@ -17,7 +17,7 @@ from rich.markup import escape
 from ...errors import UsageError
 from ...presentation import terminal_output as terminal
 from ...presentation.result_text import TextTable
-from ...process import Interrupt
+from ...signals import Interrupt
 from . import options
 from .options import flag, value
 

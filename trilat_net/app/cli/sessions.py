@@ -17,7 +17,7 @@ from ...errors import UsageError
 from ...net.clock import SystemClock, make_system_clock
 from ...presentation import terminal_output as terminal
 from ...presentation.result_text import MARKS
-from ...process import Interrupt
+from ...signals import Interrupt
 from . import options
 from .options import flag, value
 

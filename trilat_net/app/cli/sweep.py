@@ -17,9 +17,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ...errors import UsageError, count_nouns
+from ...errors import UsageError, count_nouns, join_arguments
 from ...presentation import terminal_output as terminal
-from ...process import join_arguments
 from . import options
 from .options import flag, value
 from .studies import parse_seeds, run_in_own_folder, show_progress

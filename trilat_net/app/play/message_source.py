@@ -26,7 +26,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trilat_net import process
+from trilat_net import process, signals
 from trilat_net.errors import LogError, RuntimeFault
 
 from .batch import BatchBuilder, MessageBatch, PlayedMessage
@@ -129,7 +129,7 @@ class MessageSource:
         self._process = context.Process(
             target=feed_player, args=(reader_pipe, paths, selection, loop), daemon=True
         )
-        with process.hold_sigint():  # on Ctrl-C the player ends the reader process
+        with signals.hold_sigint():  # on Ctrl-C the player ends the reader process
             self._process.start()
         reader_pipe.close()
 

@@ -43,7 +43,7 @@ from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import CPUDispatcher
 from numba.core.sigutils import normalize_signature
 
-from ...process import end_process_at_signals
+from ...signals import end_process_at_signals
 
 P = ParamSpec("P")
 R = TypeVar("R")

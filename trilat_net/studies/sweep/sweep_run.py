@@ -27,11 +27,11 @@ from ...errors import ScenarioError, UsageError, count_nouns
 from ...execution.virtual import simulate_scenario
 from ...files import make_results_folder, write_whole
 from ...net.clock import SystemClock
-from ...process import count_cores
 from ...scenario.code_consent import list_imported_code
 from ...scenario.laws import identify_law
 from ...work import executor
 from ...work.study_folder import RunJournal, StudyFolder, build_resume_hint, describe_program
+from ...workers import count_cores
 from . import sweep_cell
 from .sweep_cell import CellResult, CellRun
 from .sweep_plan import JUDGES, SweepCell, SweepPlan, plan_from_json

@@ -35,11 +35,11 @@ from ...core.step.vectors import Array
 from ...errors import ScenarioError, UsageError, count_nouns
 from ...execution.fused import FusedRun
 from ...net.clock import SystemClock
-from ...process import count_cores
 from ...results import Result
 from ...scenario import Scenario
 from ...scenario.imported_code import name_law_classes
 from ...work.executor import Progress, Workers, ignore_progress, open_worker_pool
+from ...workers import count_cores
 from .candidate import (
     CLASS_MEANINGS,
     CandidateClass,

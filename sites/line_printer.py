@@ -1,0 +1,48 @@
+"""Prints lines without making a control loop wait for the terminal."""
+
+import queue
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+
+
+class LinePrinter:
+    """Prints lines in a separate thread, so that a control loop never waits for the terminal.
+
+    It is used as a context manager. Up to 256 lines wait to be printed, and further lines are
+    lost.
+
+    Args:
+        print_line: Function that prints a line.
+    """
+
+    def __init__(self, print_line: Callable[[str], None]) -> None:
+        self._print_line = print_line
+        self._lines: queue.Queue[str | None] = queue.Queue(256)
+        self._thread = threading.Thread(target=self._print_lines, daemon=True)
+
+    def __enter__(self) -> "LinePrinter":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with suppress(queue.Full):
+            self._lines.put(None, timeout=1.0)
+        self._thread.join(1.0)
+
+    def put(self, text: str) -> None:
+        """Adds a line to the lines that wait to be printed. The method does not wait.
+
+        The line is lost if too many lines wait already.
+
+        Args:
+            text: The line.
+        """
+        with suppress(queue.Full):
+            self._lines.put_nowait(text)
+
+    def _print_lines(self) -> None:
+        """Prints the waiting lines until None arrives, in the thread of the printer."""
+        while (text := self._lines.get()) is not None:
+            with suppress(OSError):
+                self._print_line(text)

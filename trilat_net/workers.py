@@ -1,0 +1,93 @@
+"""Starts worker processes, each of which computes a part of a large task.
+
+The parts, for example the runs of a sweep, are computed at the same time.
+
+Invariant:
+    - Worker processes ignore Ctrl-C, and leave it to the process that started them. They end
+      when that process ends or fails.
+"""
+
+import os
+import signal
+import threading
+import warnings
+from collections.abc import Iterator
+from concurrent.futures import Executor
+from contextlib import contextmanager
+
+from .errors import TrilatError
+from .signals import hold_sigint
+
+_PARENT_POLL_S = 0.5
+"""Period in which a worker process checks that its parent process still exists, in s."""
+
+
+def count_cores() -> int:
+    """Returns the number of processors that this process may use.
+
+    It may be smaller than the number of processors of the machine, for example in a container.
+    """
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+@contextmanager
+def worker_pool(count: int) -> Iterator[Executor]:
+    """Yields an executor with worker processes, which have all ended when the block ends.
+
+    The processes are started anew, not forked, so that threads and compiled code are safe. They
+    do not import the script of the caller. If the block raises an exception, for example
+    because of Ctrl-C, they are killed in the middle of their work.
+
+    Args:
+        count: Number of processes.
+    """
+    from loky import ProcessPoolExecutor
+
+    # loky misses pgrep, but the workers have no children to kill.
+    warnings.filterwarnings("ignore", "Failed to kill subprocesses")
+    # A worker whose memory grows is restarted, since it keeps the laws that it compiled.
+    warnings.filterwarnings("ignore", "A worker was restarted")
+    arguments = (os.getpid(), TrilatError.in_command)
+    pool = ProcessPoolExecutor(count, initializer=_prepare_worker, initargs=arguments)
+    try:
+        with hold_sigint():
+            # The first task starts all processes, which inherit the held signal.
+            pool.submit(os.getpid)
+        yield pool
+        pool.shutdown()
+    finally:
+        pool.shutdown(kill_workers=True)
+
+
+def _prepare_worker(parent: int, in_command: bool) -> None:
+    """Prepares a worker process: it ignores Ctrl-C, and ends after its parent process.
+
+    Args:
+        parent: Process number of the parent.
+        in_command: True if the parent runs a command of `trilat`, which changes the wording of
+            errors (`TrilatError.in_command`).
+    """
+    TrilatError.in_command = in_command
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_exit_after, args=(parent,), daemon=True).start()
+
+
+def _exit_after(parent: int) -> None:
+    """Waits until the parent process has ended, and then ends this process.
+
+    Args:
+        parent: Process number of the parent.
+    """
+    from multiprocessing import connection, parent_process
+
+    sentinel = getattr(parent_process(), "sentinel", None)
+    # On Windows the number of the parent does not change when the parent has ended.
+    if os.name == "nt" and sentinel is not None:
+        connection.wait([sentinel])
+        os._exit(1)
+    pause = threading.Event()
+    while os.getppid() == parent:
+        pause.wait(_PARENT_POLL_S)
+    os._exit(1)
