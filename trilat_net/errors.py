@@ -13,8 +13,10 @@ Invariant:
       (`tests/test_wording.py`).
 """
 
+import os
 import re
-from collections.abc import Sequence
+import shlex
+from collections.abc import Iterable, Sequence
 from functools import partial
 from typing import ClassVar
 
