@@ -48,7 +48,7 @@ FIRST_CHECKS = 61
 """The same number in the first tick, in which the code may still be compiled."""
 
 
-def read_thread_usage() -> tuple[int, int]:
+def _read_thread_usage() -> tuple[int, int]:
     """Returns how long this thread has computed, and how often it was interrupted.
 
     Returns:
@@ -84,7 +84,7 @@ class WatchedCode:
         rate_hz: int,
         fail: Callable[[int, str], Exception],
         clock: Clock,
-        usage: Callable[[], tuple[int, int]] = read_thread_usage,
+        usage: Callable[[], tuple[int, int]] = _read_thread_usage,
     ) -> None:
         self.hiccups = 0
         self.longest_ns = 0

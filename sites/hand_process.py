@@ -120,7 +120,7 @@ class HandProcess(SiteClient):
         """
         self.answered += 1
         try:
-            target_or_force = self._program.act(read_view(message))
+            target_or_force = self._program.act(_read_view(message))
             numbers = None  # releases the arm
             if target_or_force is not None:
                 numbers = [float(number) for number in target_or_force]
@@ -145,7 +145,7 @@ class HandProcess(SiteClient):
         self._sender.send(HandMessage, source=self._code, n=k // self._ticks_per_view, **fields)
 
 
-def read_view(message: HandViewMessage) -> HandView:
+def _read_view(message: HandViewMessage) -> HandView:
     """Converts a message about the state of a site to the object that a user's class receives.
 
     Args:

@@ -145,7 +145,7 @@ class SiteParts:
         self.site = Site(self.setup)
         self.boot = new_boot()
         self.stats = LoopStats(self.site, self.boot)
-        self.watchdog, self.step = watch_law(scenario, self.site, clock)
+        self.watchdog, self.step = _watch_law(scenario, self.site, clock)
 
         # Queues of the samples from the peers.
         readers = make_sample_readers(self.setup)
@@ -390,7 +390,7 @@ def warm_up(scenario: Scenario, name: str, clock: Clock | None = None) -> None:
     """
     setup = scenario.setup(name)
     site = Site(setup)
-    watchdog, step = watch_law(scenario, site, clock or SystemClock())
+    watchdog, step = _watch_law(scenario, site, clock or SystemClock())
     try:
         with watchdog:
             _run_warm_up(setup, site, step)
@@ -401,7 +401,7 @@ def warm_up(scenario: Scenario, name: str, clock: Clock | None = None) -> None:
         raise LawFailed(problem, site=name, code=failed.code, tick=failed.tick) from None
 
 
-def watch_law(
+def _watch_law(
     scenario: Scenario, site: Site, clock: Clock
 ) -> tuple[CodeWatchdog, Callable[[TickInput], TickRecord]]:
     """Creates the function that computes a tick, and a watchdog of a user's control law.

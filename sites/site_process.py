@@ -113,7 +113,7 @@ def run_site(
         RunFailed: The run diverged, the user's law failed, or the arm fell silent.
     """
     check_outside_arms(scenario)
-    # A site that rejoins a session needs its keys for less time: see `join_session`.
+    # A site that rejoins a session needs its keys for less time: see `_join_session`.
     if not scenario.sites_may_return:
         options.connection.require_keys_until(scenario.duration_s)
     share_threads()
@@ -170,14 +170,14 @@ def join_and_run(parts: SiteParts) -> int:
             continue
         if not device.wait_for_first(stopped, give_up_ns, parts.say):
             return parts.interrupt.exit_code
-    running = join_session(parts, give_up_ns)
+    running = _join_session(parts, give_up_ns)
     if running is None:
         return parts.interrupt.exit_code
     running.run()
     return running.leave_session()
 
 
-def join_session(parts: SiteParts, give_up_ns: int) -> "RunningSite | None":
+def _join_session(parts: SiteParts, give_up_ns: int) -> "RunningSite | None":
     """Announces the site, and waits for the other members and for the start of the session.
 
     The members agree on the epoch, the common start time of the session.
@@ -263,7 +263,7 @@ def _describe_failed_join(parts: SiteParts, joining: SessionJoin) -> SessionErro
 class RunningSite:
     """Runs a site from the epoch, the common start of the session, until it leaves the session.
 
-    `join_session` creates this object. The loop calls its methods: `should_stop` and `step` in
+    `_join_session` creates this object. The loop calls its methods: `should_stop` and `step` in
     every tick, `report_tick` after ticks in which something changed, and `run_housekeeping` ten
     times a second. After the last tick, `leave_session` completes the work.
 

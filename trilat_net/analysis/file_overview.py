@@ -198,7 +198,7 @@ class FileInventory:
             "rate_hz": (len(log_ns) - 1) / span_s if span_s else None,
             "first_log_time_ns": first_ns,
             "last_log_time_ns": last_ns,
-            "between_ms": compute_percentiles(np.diff(signed_ns), unit=1e6),
+            "between_ms": _compute_percentiles(np.diff(signed_ns), unit=1e6),
             "encoding": channel.encoding,
             "schema": channel.schema,
         }
@@ -341,10 +341,10 @@ def _describe_log(log: Log) -> JsonObject:
     links = {}
     for site in log.sites:
         for peer in log[site].peers:
-            links[f"{peer}->{site}"] = describe_link_health(log, peer, site)
+            links[f"{peer}->{site}"] = _describe_link_health(log, peer, site)
     return {
         "kind": "trilat",
-        "session": describe_session(log),
+        "session": _describe_session(log),
         "sites": {site: describe_site_health(log, site) for site in log.sites},
         "links": links,
     }
@@ -355,7 +355,7 @@ _LAST_EPOCH_NS = 253_402_300_799 * NS_PER_S
 """The last second of the year 9999 in Unix time, the latest time that `datetime` represents."""
 
 
-def describe_session(log: Log) -> JsonObject:
+def _describe_session(log: Log) -> JsonObject:
     """Collects the facts about the session of a log that `trilat log info` shows.
 
     They are the start time, the length, how each site ended, the scenario, and the versions of
@@ -429,16 +429,16 @@ def describe_site_health(log: Log, site: str) -> JsonObject:
         "role": spec.role,
         "rate_hz": spec.rate_hz,
         "records": len(part),
-        "made_ticks": count_executed_ticks(log, site),
+        "made_ticks": _count_executed_ticks(log, site),
         "expected_ticks": log.scenario.ticks(site),
         "missing": log.missing(site),
-        "late_us": compute_percentiles(part.late_us) if is_timed else None,
-        "busy_us": compute_percentiles(part.busy_us) if is_timed else None,
-        "overruns": count_overruns(part) if is_timed else None,
+        "late_us": _compute_percentiles(part.late_us) if is_timed else None,
+        "busy_us": _compute_percentiles(part.busy_us) if is_timed else None,
+        "overruns": _count_overruns(part) if is_timed else None,
     }
 
 
-def describe_link_health(log: Log, peer: str, site: str) -> JsonObject:
+def _describe_link_health(log: Log, peer: str, site: str) -> JsonObject:
     """Collects how well the link from a peer to a site worked.
 
     The facts are the delay that the scenario prescribes, the age of the samples in use, the
@@ -468,8 +468,8 @@ def describe_link_health(log: Log, peer: str, site: str) -> JsonObject:
         counts = {name: getattr(last_stats, name).get(peer) for name in counts}
     return {
         "stated": log.scenario.links[f"{peer}->{site}"].describe(),
-        "age_ms": compute_percentiles(sample_ages_ns(log, peer, site), unit=1e6),
-        "one_way_ms": compute_percentiles(one_way_us, unit=1e3),
+        "age_ms": _compute_percentiles(sample_ages_ns(log, peer, site), unit=1e6),
+        "one_way_ms": _compute_percentiles(one_way_us, unit=1e3),
         "clock_offset_us": None if clock is None else clock.offset_us,
         "clock_bound_us": None if clock is None else clock.bound_us,
         **counts,
@@ -480,7 +480,7 @@ PERCENTILES = {"p50": 50.0, "p99": 99.0, "max": 100.0}
 _LATENESS_PERCENTILES = {"p50": 50.0, "p99": 99.0, "p99_9": 99.9, "max": 100.0}
 
 
-def compute_percentiles(
+def _compute_percentiles(
     values: ArrayLike,
     shares: Mapping[str, float] = PERCENTILES,
     unit: float = 1.0,
@@ -503,7 +503,7 @@ def compute_percentiles(
     return dict(zip(shares, percentiles.tolist(), strict=True))
 
 
-def count_executed_ticks(log: Log, site: str) -> int | None:
+def _count_executed_ticks(log: Log, site: str) -> int | None:
     """Returns the number of ticks that a site executed, as the site itself reported.
 
     The site reports it at the end of a run, in its event "end".
@@ -522,7 +522,7 @@ def count_executed_ticks(log: Log, site: str) -> int | None:
     return ticks
 
 
-def count_overruns(part: SiteLog) -> int:
+def _count_overruns(part: SiteLog) -> int:
     """Counts the ticks that started late, by more than a whole tick period.
 
     Args:
@@ -620,11 +620,11 @@ def _summarise_site(log: Log, site: str, twin: Log | None) -> JsonObject:
     if twin is not None:
         displacement = operator_displacement(log, twin, site)[2]
 
-    executed = count_executed_ticks(log, site)
+    executed = _count_executed_ticks(log, site)
     expected = log.scenario.ticks(site)
     ticks = expected if executed is None else executed
-    late_us = compute_percentiles(part.late_us, _LATENESS_PERCENTILES)
-    busy_us = compute_percentiles(part.busy_us)
+    late_us = _compute_percentiles(part.late_us, _LATENESS_PERCENTILES)
+    busy_us = _compute_percentiles(part.busy_us)
     tau_limit_nm = spec.limits.tau_limit_nm
     at_limit = np.abs(part.tau) >= tau_limit_nm
 
@@ -652,7 +652,7 @@ def _summarise_site(log: Log, site: str, twin: Log | None) -> JsonObject:
         "saturated_ticks": int(np.count_nonzero(at_limit.any(axis=1))),
         "late_us": late_us or dict.fromkeys(_LATENESS_PERCENTILES),
         "busy_us": busy_us or dict.fromkeys(PERCENTILES),
-        "overruns": count_overruns(part),
+        "overruns": _count_overruns(part),
         "hands_moved_max_rad": moved_max_rad,
         "hands_moved_end_rad": moved_end_rad,
     }

@@ -230,7 +230,7 @@ def count_sent(log: Log, peer: str, newest: int) -> int:
     return min(max(newest + 1, recorded_ticks, *end_ticks), log.scenario.ticks(peer))
 
 
-def mark_judged_samples(
+def _mark_judged_samples(
     log: Log,
     site: str,
     stamp_ns: Ints,
@@ -617,7 +617,7 @@ def _summarise_link(
 
     # losses, and bursts of successive losses
     first = arrivals.first
-    is_judged = mark_judged_samples(log, site, delivery.stamp_ns, first)
+    is_judged = _mark_judged_samples(log, site, delivery.stamp_ns, first)
     for first_skipped, last_skipped in log.absences.get(peer, ()):
         is_judged[first_skipped : last_skipped + 1] = False  # the peer sent none of these
     has_not_arrived = np.ones(len(is_judged), dtype=np.bool_)

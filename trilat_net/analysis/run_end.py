@@ -413,8 +413,8 @@ def classify_run_end(scenario: Scenario, trace: RunTrace) -> RunEnd:
     span_s = count / BUCKETS_PER_S
     all_t_s = rows / BUCKETS_PER_S
 
-    acted_s = max(trace.pushed_until_s, find_last_operator_action(scenario, span_s))
-    changed_s = max(trace.changed_until_s, find_last_change(scenario, span_s))
+    acted_s = max(trace.pushed_until_s, _find_last_operator_action(scenario, span_s))
+    changed_s = max(trace.changed_until_s, _find_last_change(scenario, span_s))
     quiet_from_s = max(acted_s, changed_s)
     first, is_disturbed = _choose_judged_part(all_t_s, quiet_from_s)
     _, operator_disturbs = _choose_judged_part(all_t_s, acted_s)
@@ -966,7 +966,7 @@ def find_hanging_sites(scenario: Scenario, ends: Mapping[str, Array]) -> list[st
     return hanging
 
 
-def find_last_operator_action(scenario: Scenario, span_s: float) -> float:
+def _find_last_operator_action(scenario: Scenario, span_s: float) -> float:
     """Returns the last time before `span_s` at which an operator changed its action, in s.
 
     The action is known from the scenario, which states what each operator does over time.
@@ -1001,7 +1001,7 @@ def find_last_operator_action(scenario: Scenario, span_s: float) -> float:
     return last_s
 
 
-def find_last_change(scenario: Scenario, span_s: float) -> float:
+def _find_last_change(scenario: Scenario, span_s: float) -> float:
     """Returns the time of the last planned change in the control of the arms, in s.
 
     These changes are the scenario's changes of settings, and the start and end of environments,

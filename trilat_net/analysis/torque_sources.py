@@ -126,7 +126,7 @@ def compute_target_motion(source: TorqueSource, t_s: Array) -> tuple[Array, Arra
     return position, velocity
 
 
-def compute_spring_effort(
+def _compute_spring_effort(
     source: TorqueSource,
     t_s: Array,
     position: Array,
@@ -195,9 +195,9 @@ def compute_source_torque(
     elif kind is TorqueKind.VISCOUS:
         torque = -np.array(source.B) * qd
     elif kind is TorqueKind.HAND:
-        torque = compute_spring_effort(source, t_s, q, qd)
+        torque = _compute_spring_effort(source, t_s, q, qd)
     elif kind is TorqueKind.TASK_HAND:
-        force = compute_spring_effort(source, t_s, position, speed)
+        force = _compute_spring_effort(source, t_s, position, speed)
         torque = _map_to_joints(J, force)
     elif kind is TorqueKind.OWN_JOINTS:
         torque = source.model.effort(t_s, q, qd)
@@ -395,7 +395,7 @@ def compute_operator_script(source: TorqueSource, t_s: Array, J: Array) -> Array
         intent = effort @ J if acts_at_tip else effort
     else:
         origin = np.zeros((len(t_s), len(source.a)))
-        effort = compute_spring_effort(source, t_s, origin, origin)
+        effort = _compute_spring_effort(source, t_s, origin, origin)
         intent = effort @ J if source.kind is TorqueKind.TASK_HAND else effort
     is_active = _is_active(source, t_s)
     return np.where(is_active[:, np.newaxis], intent, 0.0)

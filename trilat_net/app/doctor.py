@@ -127,7 +127,7 @@ def examine_machine(
     yield from examine_clock(clock)
     if session is not None:
         safe = secure_connection(connection, member_keys, insecure=insecure)
-        yield from examine_offsets(safe, clock, session)
+        yield from _examine_offsets(safe, clock, session)
     yield examine_system()
     yield from examine_rights()
     yield examine_rate()
@@ -386,7 +386,7 @@ def examine_clock(clock: Clock) -> Iterator[DoctorFinding]:
         yield DoctorFinding("clock", "ok", text)
 
 
-def examine_offsets(
+def _examine_offsets(
     connection: Connection, clock: Clock, session: str
 ) -> Iterator[DoctorFinding]:
     """Compares the clock of this machine with those of a session's members.

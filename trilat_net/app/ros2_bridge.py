@@ -339,7 +339,7 @@ class RobotArm:
         if is_other_robot:
             return
 
-        indices = find_joint_indices(self._joints, state)
+        indices = _find_joint_indices(self._joints, state)
         if len(state.velocity) != len(state.position):
             positions = count_nouns(len(state.position), "position")
             velocities = count_nouns(len(state.velocity), "velocity")
@@ -426,7 +426,7 @@ def _order_joints(
     return joint_order
 
 
-def find_joint_indices(joints: JointNames, state: cdr.RosJoints) -> list[int]:
+def _find_joint_indices(joints: JointNames, state: cdr.RosJoints) -> list[int]:
     """Finds the index of each joint of an arm in a message with joint states.
 
     The message may contain further joints, and the joints may have any order.
@@ -478,7 +478,7 @@ def read_joint_target(joints: JointNames, data: bytes) -> list[float]:
         ValueError: The message cannot be read, or lacks a joint.
     """
     state = cdr.read_joint_state(data)
-    indices = find_joint_indices(joints, state)
+    indices = _find_joint_indices(joints, state)
     return _check_finite([state.position[index] for index in indices])
 
 
@@ -587,7 +587,7 @@ class Bridge:
             self._subscribe_dominance(site, running)
         for site in scenario.open_hands:
             self._subscribe_target(site)
-        serve_orders(graph, running, scenario.names)
+        _serve_orders(graph, running, scenario.names)
 
     def _subscribe_dominance(self, site: str, running: RunningSession) -> None:
         """Subscribes to the topic that sets the weights of a site."""
@@ -616,7 +616,7 @@ class Bridge:
         )
 
         frame = self._sites[site].frame
-        topic_name, kind, read, apply = describe_target(self._scenario, site, hand, frame)
+        topic_name, kind, read, apply = _describe_target(self._scenario, site, hand, frame)
         topic = ends.topic(site, topic_name)
 
         target = TargetTopic(hand, read, apply, ends.clock)
@@ -713,7 +713,7 @@ class Bridge:
         self._diagnostics.put(data)
 
 
-def describe_target(
+def _describe_target(
     scenario: Scenario,
     site: str,
     hand: Hand,
@@ -745,7 +745,7 @@ def describe_target(
     end_effector = scenario.arms[site].end_effector(initial_q)
     axes = len(end_effector)  # 2 for an arm in a plane, 3 in space
     if operator.mode == "joint":
-        read_joints = partial(read_joint_target, list_joint_names(scenario, site))
+        read_joints = partial(read_joint_target, _list_joint_names(scenario, site))
         return "target_joint", cdr.JOINT_STATE, read_joints, hand.turn
     if operator.mode == "force":
         wrench_length = 6  # force and moment
@@ -756,7 +756,7 @@ def describe_target(
     return "target_pose", cdr.POSE, read_position, hand.move
 
 
-def list_joint_names(scenario: Scenario, site: str) -> list[tuple[str, ...]]:
+def _list_joint_names(scenario: Scenario, site: str) -> list[tuple[str, ...]]:
     """Lists the names by which ROS messages may call each joint of an arm.
 
     Args:
@@ -773,7 +773,7 @@ def list_joint_names(scenario: Scenario, site: str) -> list[tuple[str, ...]]:
     return [tuple(dict.fromkeys(pair)) for pair in pairs]
 
 
-def serve_orders(graph: Ros2Graph, running: RunningSession, sites: Sequence[str]) -> None:
+def _serve_orders(graph: Ros2Graph, running: RunningSession, sites: Sequence[str]) -> None:
     """Offers the orders to stop, enable and reset arms, and to end a session, as ROS services.
 
     Their names are `/<session>/stop` for all sites, `/<session>/<site>/stop` for one site, and
@@ -938,7 +938,7 @@ def publish_session(
                 robots[site] = stack.enter_context(robot_context)
 
         say(f"waiting for session {ends.session!r} to begin")
-        info = await_site(ends, stopped, running=False)
+        info = _await_site(ends, stopped, running=False)
         if info is None:
             return False
         scenario = parse_embedded(info.scenario, ends.session)
@@ -946,7 +946,7 @@ def publish_session(
         for site in scenario.outside:
             if site not in robots:
                 robot = ends.table.robots.get(site, RobotTable())
-                names = list_joint_names(scenario, site)
+                names = _list_joint_names(scenario, site)
                 robot_context = open_robot(ends, site, robot, names)
                 robots[site] = stack.enter_context(robot_context)
             robots[site].armed = True
@@ -954,7 +954,7 @@ def publish_session(
             # a site is in fault when its arm's measurements are delayed by 0.2 s
             raise_priority(LOOP_NICE)
 
-        running_info = await_site(ends, stopped, running=True)
+        running_info = _await_site(ends, stopped, running=True)
         if running_info is None:
             return False
 
@@ -1074,7 +1074,7 @@ def refuse_other_robots(table: TopicTable, scenario: Scenario) -> None:
             )
 
 
-def await_site(ends: BridgeEnds, stopped: Callable[[], bool], *, running: bool) -> Info | None:
+def _await_site(ends: BridgeEnds, stopped: Callable[[], bool], *, running: bool) -> Info | None:
     """Waits until any site of the session replies to a query for its identity.
 
     Args:

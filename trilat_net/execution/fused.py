@@ -218,7 +218,7 @@ class RunInputs(NamedTuple):
     longest_us: int = 0
 
 
-def make_prompt_inputs(sites: int) -> RunInputs:
+def _make_prompt_inputs(sites: int) -> RunInputs:
     """Returns the inputs of a run that receives nothing from outside.
 
     A site is a simulated process that runs one arm. In such a run, every sample (the state that
@@ -282,7 +282,7 @@ class FusedRun:
         self.ran_s = 0.0
         self._scenario = scenario
         self._settled_rad = settled_rad
-        self._inputs = inputs or make_prompt_inputs(count)
+        self._inputs = inputs or _make_prompt_inputs(count)
         self._hands: dict[int, HandActor] = {}
         if inputs is None:
             self._connect_hands({**make_hand_players(scenario), **hands}, setups)
@@ -975,7 +975,7 @@ def read_run_inputs(log: Log) -> RunInputs:
         longest_us = max_delay_us(new_models, no_traces)
 
     # In a log of virtual time, all samples arrived at once.
-    feed = make_prompt_inputs(len(log.scenario.names)).feed
+    feed = _make_prompt_inputs(len(log.scenario.names)).feed
     late_ns = 0
     if log.driver != "virtual":
         first_arrivals, sample_ticks, late_ns = _read_arrivals(log, ticks)

@@ -180,7 +180,7 @@ class _CommonRecords(NamedTuple):
         return LogAndRerun(before, after)
 
 
-def compare_site_rerun(
+def _compare_site_rerun(
     log: Log, request: RerunRequest, site: RerunSite, ticks: Sequence[RerunTick]
 ) -> tuple[SiteEffect, list[LinkEffect]]:
     """Computes what a rerun changed at a site, and on the links over which the site receives.
@@ -373,7 +373,7 @@ class Rerun(Result):
             session=session,
             driver=RERUN_DRIVER,
             epoch_unix_ns=epoch_unix_ns,
-            facts=collect_rerun_metadata(log, request),
+            facts=_collect_rerun_metadata(log, request),
             views_hz=views_hz,
         )
 
@@ -510,7 +510,7 @@ def rerun(
         ticks = list(execution.run(progress))
         for name, site in execution.sites.items():
             site_ticks = [tick for tick in ticks if tick.site == name]
-            sites[name], effects = compare_site_rerun(before, request, site, site_ticks)
+            sites[name], effects = _compare_site_rerun(before, request, site, site_ticks)
             links.update({effect.link: effect for effect in effects})
     return Rerun(before, request, ticks, sites, links)
 
@@ -527,7 +527,7 @@ def _parse_epoch(log: Log) -> int:
     return int(text)
 
 
-def collect_rerun_metadata(log: Log, request: RerunRequest) -> dict[str, str]:
+def _collect_rerun_metadata(log: Log, request: RerunRequest) -> dict[str, str]:
     """Returns the metadata with which the log of a rerun tells where it comes from.
 
     Args:

@@ -129,7 +129,7 @@ class Twins(NamedTuple):
     same: bool
 
 
-def list_joints(scenario: Scenario) -> tuple[str, ...]:
+def _list_joints(scenario: Scenario) -> tuple[str, ...]:
     """Returns the names of the joints of all sites, for example "m1 joint 1".
 
     Args:
@@ -166,7 +166,7 @@ def choose_pushes(scenario: Scenario, count: int | None = None) -> list[Push]:
             `MAX_PUSHES`.
     """
     # The target of "m1 joint 1" is "m1.q1".
-    joint_targets = [joint.replace(" joint ", ".q") for joint in list_joints(scenario)]
+    joint_targets = [joint.replace(" joint ", ".q") for joint in _list_joints(scenario)]
     learns = any(scenario.gains(name).law is Law.ADAPTIVE for name in scenario.names)
     complete_count = len(joint_targets) + 2
     if count is None:
@@ -384,7 +384,7 @@ class _TwinRuns:
     ) -> None:
         self._log = log
         self._pushes = pushes
-        self._joints = list_joints(scenario)
+        self._joints = _list_joints(scenario)
         self._layouts = [scenario.layout(name) for name in scenario.names]
         rates_hz = [scenario.sites[name].rate_hz for name in scenario.names]
         durations_s = [count / rate_hz for count, rate_hz in zip(ticks, rates_hz, strict=True)]

@@ -93,7 +93,7 @@ def equal_bits(a: float, b: float) -> bool:
     return a.hex() == b.hex()
 
 
-def equal_to_tolerance(a: float, b: float) -> bool:
+def _equal_to_tolerance(a: float, b: float) -> bool:
     """True if two numbers agree within `TOLERANCE`.
 
     Two platforms may round some operations differently. Results of the same computation on both
@@ -388,7 +388,7 @@ class SiteVerifier:
         self._start_tick = 0
         self._applied: list[CoreChange] = []
         self._resume_every = resume_every
-        self._equal = equal_bits if result.whole_run else equal_to_tolerance
+        self._equal = equal_bits if result.whole_run else _equal_to_tolerance
         self._certain = True
         self._law_failed = False
         self._inputs = RecordedInputs(
@@ -742,7 +742,7 @@ def verify(
         )
 
         copied_sites = [name for name in log.sites if name not in sites]
-        source = open_rerun_source(log) if copied_sites else None
+        source = _open_rerun_source(log) if copied_sites else None
         if source is not None:
             for name in copied_sites:
                 _compare_with_source(log[name], source[name], result)
@@ -823,7 +823,7 @@ def _compare_with_source(recorded: SiteLog, source: SiteLog, result: VerifyResul
         return
 
 
-def open_rerun_source(log: Log) -> Log | None:
+def _open_rerun_source(log: Log) -> Log | None:
     """Opens the log from which a rerun was made, if it is in the same folder as the rerun.
 
     Args:

@@ -365,7 +365,7 @@ def check_virtual(scenario: Scenario) -> None:
             Site(scenario.setup(name))
 
 
-def find_skips(commands: Mapping[int, Sequence[CoreChange]]) -> dict[int, int]:
+def _find_skips(commands: Mapping[int, Sequence[CoreChange]]) -> dict[int, int]:
     """Finds the ticks that a site skipped because its control loop was too late.
 
     A site is a process that runs one arm, and a tick is a period of its control loop. The
@@ -431,7 +431,7 @@ def execute_virtual(
         min(scenario.ticks(name), ends.get(name, scenario.ticks(name)) + 1)
         for name in scenario.names
     ]
-    skips = [find_skips(commands.get(name, {})) for name in scenario.names]
+    skips = [_find_skips(commands.get(name, {})) for name in scenario.names]
     # The next tick of each site as (time in ns, index of the site, tick), in order of time.
     pending = [(0, index, 0) for index in range(len(sites)) if tick_counts[index]]
     last_ns = round(scenario.duration_s * NS_PER_S)

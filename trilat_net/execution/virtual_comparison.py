@@ -87,7 +87,7 @@ class LateSample(NamedTuple):
         return f"{sample} was due at tick {self.due_tick} of {self.site} and {outcome}"
 
 
-def compare_records(
+def _compare_records(
     log: Log, executed: Iterable[tuple[str, TickRecord]], *, arrivals: bool
 ) -> RecordComparison:
     """Compares every record of a log with another execution, bit for bit.
@@ -318,11 +318,11 @@ def compare_with_virtual(log: Log, progress: Progress | None = None) -> VirtualC
                 yield site.name, record
 
         arrivals = {name: _read_arrivals(log, name) for name in log.sites}
-        fed = compare_records(log, execute(RecordedNetwork(arrivals, peers), 0), arrivals=True)
+        fed = _compare_records(log, execute(RecordedNetwork(arrivals, peers), 0), arrivals=True)
         if arm_states:
             plain = RecordComparison(0, 0, None)
         else:
-            plain = compare_records(log, execute(None, total // 2), arrivals=False)
+            plain = _compare_records(log, execute(None, total // 2), arrivals=False)
         return VirtualComparison(fed, plain, find_absent_samples(log))
 
 

@@ -232,7 +232,7 @@ def read_field_docs(kind: type[msgspec.Struct]) -> dict[str, FieldDoc]:
     return docs
 
 
-def to_int_array(
+def _to_int_array(
     values: Iterable[int], source: str, field: str, kind: Any = np.int64
 ) -> NDArray[Any]:
     """Converts integers of a log to an array, and refuses those that are too large for it.
@@ -672,8 +672,8 @@ def build_link_table(site: SiteLog, timed: TimedMessages[LinkStats], source: str
         LogError: A number is out of range.
     """
     stats = timed.messages
-    tick = to_int_array((s.tick for s in stats), source, "tick")
-    t_s = to_int_array((s.t_ns for s in stats), source, "t_ns") / NS_PER_S
+    tick = _to_int_array((s.tick for s in stats), source, "tick")
+    t_s = _to_int_array((s.t_ns for s in stats), source, "t_ns") / NS_PER_S
     columns = list(_make_time_columns(tick, t_s, timed.log_ns, timed.publish_ns))
     for field, (unit, text, kind) in read_field_docs(LinkStats).items():
         if field in ("v", "site", "boot", "tick", "t_ns"):
@@ -688,7 +688,7 @@ def build_link_table(site: SiteLog, timed: TimedMessages[LinkStats], source: str
 
         values: NDArray[Any]
         if kind == "integer":
-            values = to_int_array(fields, source, field)
+            values = _to_int_array(fields, source, field)
         else:
             values = np.array(fields, dtype=np.object_)
         columns.append(Column(name=field, values=values, unit=unit, meaning=text, source=field))
@@ -749,7 +749,7 @@ def _make_entry_column(
     meaning = meaning_of_field.removeprefix("per peer, ")
     return Column(
         name=f"{stem}_{_to_word(name)}_{ending}",
-        values=to_int_array((n or 0 for n in numbers), source, field),
+        values=_to_int_array((n or 0 for n in numbers), source, field),
         unit=unit,
         meaning=f"{name}: {meaning}",
         source=f"{field}.{name}",
@@ -771,7 +771,7 @@ def build_events_table(timed: TimedMessages[Event], source: str) -> Table:
         LogError: An integer of an event is too large for 64 bits.
     """
     events = timed.messages
-    t_ns = to_int_array((event.t_ns for event in events), source, "t_ns")
+    t_ns = _to_int_array((event.t_ns for event in events), source, "t_ns")
     # Events before the start of the session have the time -1.
     t_s = np.where(t_ns >= 0, t_ns / NS_PER_S, np.nan)
     columns = list(_make_time_columns(None, t_s, timed.log_ns, timed.publish_ns))
@@ -783,7 +783,7 @@ def build_events_table(timed: TimedMessages[Event], source: str) -> Table:
         if kind == "integer":
             # The boot is a random number of 64 bits.
             bits = np.uint64 if field == "boot" else np.int64
-            values = to_int_array(fields, source, field, bits)
+            values = _to_int_array(fields, source, field, bits)
         else:
             values = np.array(list(map(_to_text, fields)), dtype=np.object_)
         columns.append(Column(name=field, values=values, unit=unit, meaning=text, source=field))

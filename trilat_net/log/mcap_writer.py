@@ -72,14 +72,14 @@ class Sink(Protocol):
         """Writes all bytes that are stored in the buffer."""
 
 
-def pack_text(text: str) -> bytes:
+def _pack_text(text: str) -> bytes:
     """Encodes a string as MCAP files require: its length in bytes, then its bytes in UTF-8."""
     # The name of a file may contain surrogates, which UTF-8 cannot encode.
     data = text.encode(errors="backslashreplace")
     return _pack_bytes(data)
 
 
-def pack_text_map(texts: Mapping[str, str]) -> bytes:
+def _pack_text_map(texts: Mapping[str, str]) -> bytes:
     """Encodes a map of texts as MCAP files require.
 
     The length of the encoded map in bytes comes first, then each key and each value.
@@ -87,7 +87,7 @@ def pack_text_map(texts: Mapping[str, str]) -> bytes:
     Args:
         texts: The map.
     """
-    data = b"".join(pack_text(key) + pack_text(value) for key, value in texts.items())
+    data = b"".join(_pack_text(key) + _pack_text(value) for key, value in texts.items())
     return _pack_bytes(data)
 
 
@@ -150,7 +150,7 @@ class McapWriter:
         self._summary = {opcode: bytearray() for opcode in _SUMMARY}
         self._summary_counts: Counter[Opcode] = Counter()
         self._chain = RunningDigest()
-        header = pack_text(profile) + pack_text(library)
+        header = _pack_text(profile) + _pack_text(library)
         self._chain.add_entry(Opcode.HEADER, header)
         self._write(MAGIC + pack_record(Opcode.HEADER, header))
 
@@ -218,7 +218,7 @@ class McapWriter:
             The identifier of the schema in the file, which `register_channel` needs.
         """
         number = self._summary_counts[Opcode.SCHEMA] + 1
-        body = struct.pack("<H", number) + pack_text(name) + pack_text(encoding)
+        body = struct.pack("<H", number) + _pack_text(name) + _pack_text(encoding)
         body += _pack_bytes(data)
         self._chain.add_entry(Opcode.SCHEMA, body)
         self._write(self._add_to_summary(Opcode.SCHEMA, body))
@@ -246,8 +246,8 @@ class McapWriter:
         """
         number = len(self._counts) + 1
         body = struct.pack("<HH", number, schema_id)
-        body += pack_text(topic) + pack_text(message_encoding)
-        body += pack_text_map(metadata or {})
+        body += _pack_text(topic) + _pack_text(message_encoding)
+        body += _pack_text_map(metadata or {})
         self._chain.add_entry(Opcode.CHANNEL, body)
         self._write(self._add_to_summary(Opcode.CHANNEL, body))
         self._counts[number] = 0
@@ -286,12 +286,12 @@ class McapWriter:
             name: Name of the metadata.
             data: The map.
         """
-        content = pack_text(name) + pack_text_map(data)
+        content = _pack_text(name) + _pack_text_map(data)
         if name != DIGESTS:
             self._chain.add_entry(Opcode.METADATA, content)
         record = pack_record(Opcode.METADATA, content)
         offset = self._write(record)
-        index = struct.pack("<QQ", offset, len(record)) + pack_text(name)
+        index = struct.pack("<QQ", offset, len(record)) + _pack_text(name)
         self._add_to_summary(Opcode.METADATA_INDEX, index)
 
     def add_attachment(
@@ -307,7 +307,7 @@ class McapWriter:
             data: Content of the attachment.
         """
         times = struct.pack("<QQ", log_time, create_time)
-        names = pack_text(name) + pack_text(media_type)
+        names = _pack_text(name) + _pack_text(media_type)
         body = times + names + _pack_long_bytes(data)
         body += struct.pack("<I", zlib.crc32(body))
         self._chain.add_entry(Opcode.ATTACHMENT, body)
@@ -365,7 +365,7 @@ class McapWriter:
         end_ns = max(max(entries[::2]) for entries in used.values())
         unpacked_bytes = len(self._open_chunk)
         crc = zlib.crc32(self._open_chunk)
-        head = _CHUNK.pack(start_ns, end_ns, unpacked_bytes, crc) + pack_text(_COMPRESSION)
+        head = _CHUNK.pack(start_ns, end_ns, unpacked_bytes, crc) + _pack_text(_COMPRESSION)
         chunk_record = pack_record(Opcode.CHUNK, head + _pack_long_bytes(packed))
         chunk_offset = self._write(chunk_record)
 
@@ -384,7 +384,7 @@ class McapWriter:
         # The fields of a chunk index, in the order of the specification.
         chunk_index = struct.pack("<QQQQ", start_ns, end_ns, chunk_offset, len(chunk_record))
         chunk_index += _pack_bytes(index_offsets)
-        chunk_index += struct.pack("<Q", indexes_bytes) + pack_text(_COMPRESSION)
+        chunk_index += struct.pack("<Q", indexes_bytes) + _pack_text(_COMPRESSION)
         chunk_index += struct.pack("<QQ", len(packed), unpacked_bytes)
         self._add_to_summary(Opcode.CHUNK_INDEX, chunk_index)
 

@@ -73,7 +73,7 @@ class TornChunk(NamedTuple):
 
         Returns:
             The head of the chunk, and its compressed bytes. The bytes end before the first page
-            of the file that was probably not written correctly, see `find_doubtful_page`.
+            of the file that was probably not written correctly, see `_find_doubtful_page`.
 
         Raises:
             UnreadableRecord: The head of the chunk contains impossible values.
@@ -87,7 +87,7 @@ class TornChunk(NamedTuple):
         if head.end_ns < head.start_ns:
             raise UnreadableRecord("the end time of a chunk is before its start time")
 
-        trusted_bytes = find_doubtful_page(scanner, begin, begin + len(content)) - begin
+        trusted_bytes = _find_doubtful_page(scanner, begin, begin + len(content)) - begin
         packed = content[head.data_offset : max(head.data_offset, trusted_bytes)]
         return cls(head, packed, begin + head.data_offset)
 
@@ -134,7 +134,7 @@ class TornChunk(NamedTuple):
                 yield block
 
 
-def find_doubtful_page(scanner: RecordScanner, begin: int, end: int) -> int:
+def _find_doubtful_page(scanner: RecordScanner, begin: int, end: int) -> int:
     """Finds the first page in a part of a file that was probably not written correctly.
 
     A page is a block of `PAGE_BYTES` that the operating system writes as a whole. If a computer

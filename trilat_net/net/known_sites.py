@@ -173,7 +173,7 @@ def _is_alive(pid: int) -> bool:
     return True
 
 
-def list_endpoints(known_sites: Sequence[KnownSite]) -> list[Endpoint]:
+def _list_endpoints(known_sites: Sequence[KnownSite]) -> list[Endpoint]:
     """Returns the network endpoints at which some sites can be reached, each endpoint once.
 
     Args:
@@ -212,7 +212,7 @@ def find_known_endpoints(session: str, connection: "Connection") -> list[Endpoin
 
     known_names = {known.site for known in known_sites}
     all_names = set(known_sites[0].sites)
-    return list_endpoints(known_sites) if known_names == all_names else None
+    return _list_endpoints(known_sites) if known_names == all_names else None
 
 
 def stop_at_once(arguments: Sequence[str]) -> int | list[str]:
@@ -254,7 +254,7 @@ def stop_at_once(arguments: Sequence[str]) -> int | list[str]:
         # The search continues at the endpoints of the known sites.
         option = "--router" if known_sites[0].mode == "client" else "--connect"
         remaining_arguments = list(arguments)
-        for endpoint in list_endpoints(known_sites):
+        for endpoint in _list_endpoints(known_sites):
             if isinstance(endpoint, str):  # other endpoints cannot be given as an option
                 remaining_arguments += [option, endpoint]
         return remaining_arguments
@@ -329,7 +329,7 @@ def _order_stop(known_sites: Sequence[KnownSite], sites: Sequence[str], keys: st
     clock = SystemClock()
     begun_ns = clock.monotonic_ns()
     next_query_ns = begun_ns
-    endpoints = list_endpoints(known_sites)
+    endpoints = _list_endpoints(known_sites)
     with closing(ZenohBus([], endpoints, known_sites[0].mode, settings)) as bus:
         while remaining:
             now_ns = clock.monotonic_ns()

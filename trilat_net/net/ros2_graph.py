@@ -173,7 +173,7 @@ def find_type_hash(kind: str, distro: str) -> str:
     return _NO_HASH if distro == "humble" else f"RIHS01_{TYPE_HASHES[kind]}"
 
 
-def name_dds_type(kind: str) -> str:
+def _name_dds_type(kind: str) -> str:
     """Returns the name of a ROS message type in the notation of DDS.
 
     Over Zenoh, ROS uses this notation in the keys of messages, and in the tokens that announce
@@ -201,7 +201,7 @@ def topic_key(
         kind: Name of its type, such as "std_msgs/msg/String".
         type_hash: Hash of the type, which differs between versions of the type.
     """
-    return f"{domain}/{name}/{name_dds_type(kind)}/{type_hash}"
+    return f"{domain}/{name}/{_name_dds_type(kind)}/{type_hash}"
 
 
 class Ros2Member(NamedTuple):
@@ -249,7 +249,7 @@ class Ros2Member(NamedTuple):
             qos: Quality of service, for example if lost messages are sent again.
         """
         node = f"@ros2_lv/{self.domain}/{self.zid}/0/{number}/{end}/{self._path()}"
-        return f"{node}/{_mangle('/' + name)}/{name_dds_type(kind)}/{type_hash}/{qos.encode()}"
+        return f"{node}/{_mangle('/' + name)}/{_name_dds_type(kind)}/{type_hash}/{qos.encode()}"
 
     def _path(self) -> str:
         """Returns the part of a token that names the node."""
@@ -276,8 +276,8 @@ def describe_mismatch(token: str, domain: int, kind: str) -> str:
     _, token_domain, *_, token_type, token_hash, _ = token.split("/")
     if token_domain != str(domain):
         return f"in domain {token_domain}, but this subscription is in domain {domain}"
-    if token_type != name_dds_type(kind):
-        return f"as {token_type}, but this subscription expects {name_dds_type(kind)}"
+    if token_type != _name_dds_type(kind):
+        return f"as {token_type}, but this subscription expects {_name_dds_type(kind)}"
     if token_hash not in (find_type_hash(kind, "jazzy"), _NO_HASH):
         return f"with another definition of {kind}, {token_hash}"
     return ""

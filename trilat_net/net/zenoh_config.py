@@ -89,7 +89,7 @@ LISTEN_EXIT_ON_FAILURE = {"router": True, "peer": True, "client": True}
 """Zenoh's setting `listen/exit_on_failure` by mode. These are the defaults of Zenoh."""
 
 
-def limit_sizes(name: str, messages: list[str], size: int) -> dict[str, Any]:
+def _limit_sizes(name: str, messages: list[str], size: int) -> dict[str, Any]:
     """Returns a Zenoh filter that drops incoming messages above a size.
 
     Without the filter, another program could occupy the memory of a member with huge messages.
@@ -109,8 +109,8 @@ def limit_sizes(name: str, messages: list[str], size: int) -> dict[str, Any]:
 
 
 SIZE_LIMITS = [
-    limit_sizes("puts", ["put", "delete"], MOST_PUT_BYTES),
-    limit_sizes("queries", ["query"], MOST_QUERY_BYTES),
+    _limit_sizes("puts", ["put", "delete"], MOST_PUT_BYTES),
+    _limit_sizes("queries", ["query"], MOST_QUERY_BYTES),
 ]
 """Size limits of every member, with and without keys."""
 
@@ -650,7 +650,7 @@ def make_access_rules(members: Sequence[str]) -> dict[str, Any]:
         "access_control": {**control, "subjects": subjects, "policies": policies},
         "low_pass_filter": [
             *SIZE_LIMITS,
-            limit_sizes("replies", ["reply"], MOST_REPLY_BYTES),
+            _limit_sizes("replies", ["reply"], MOST_REPLY_BYTES),
         ],
     }
 

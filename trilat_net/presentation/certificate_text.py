@@ -149,7 +149,7 @@ def describe_certificate(certificate: Certificate) -> list[CertificateLine]:
     lines = _describe_verdict(certificate)
     if certificate.balance is not None:
         mark = _BALANCE_MARKS.get(certificate.verdict.finding, "ok")
-        balance = describe_balance(certificate.balance)
+        balance = _describe_balance(certificate.balance)
         lines.append(CertificateLine(mark, f"energy balance: {balance}"))
     observed = certificate.observed
     if observed is not None:
@@ -299,7 +299,7 @@ def _mark_twins(twins: TwinGrowth) -> str:
     return "ok" if decays else "open"
 
 
-def describe_balance(balance: EnergyBalance) -> str:
+def _describe_balance(balance: EnergyBalance) -> str:
     """Returns a sentence about how well the energy balance of a run closes.
 
     V is the energy function of the stability proof, in J. Its change should equal the work that

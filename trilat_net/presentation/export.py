@@ -233,7 +233,7 @@ def write_table_files(
         lambda table: f"{table.label}{suffix}",
         lambda table, file_name: write_table(table, folder / file_name),
     )
-    describe_folder(log, folder, description)
+    _describe_folder(log, folder, description)
 
 
 def _describe_table(table: Table) -> JsonObject:
@@ -248,7 +248,7 @@ def _describe_table(table: Table) -> JsonObject:
     return {"row": table.about, "rows": len(table), "columns": columns}
 
 
-def describe_folder(log: Log, folder: Path, about: str) -> None:
+def _describe_folder(log: Log, folder: Path, about: str) -> None:
     """Writes the files that explain an exported folder: a description and the scenario.
 
     Args:

@@ -57,7 +57,7 @@ class Lead(NamedTuple):
         return len(self.t_s) < 2 or bool(np.ptp(self.shares, axis=0).max() <= _SAME_SHARE)
 
 
-def name_role(scenario: Scenario, site: str) -> str:
+def _name_role(scenario: Scenario, site: str) -> str:
     """Returns the role of a site in words, such as "master 2", or "slave" if there is only one.
 
     Args:
@@ -71,7 +71,7 @@ def name_role(scenario: Scenario, site: str) -> str:
 
 def caption_site(scenario: Scenario, site: str) -> str:
     """Returns the name and the role of a site, as in "m1, master 1"."""
-    return f"{site}, {name_role(scenario, site)}"
+    return f"{site}, {_name_role(scenario, site)}"
 
 
 def trace_leads(log: Log) -> list[Lead]:
@@ -153,10 +153,10 @@ def describe_leads(log: Log, leads: Sequence[Lead]) -> list[str]:
         log: Log of the run.
         leads: Who leads each slave, from `trace_leads`.
     """
-    return [describe_constant_lead(log.scenario, lead) for lead in leads if lead.is_constant]
+    return [_describe_constant_lead(log.scenario, lead) for lead in leads if lead.is_constant]
 
 
-def describe_constant_lead(scenario: Scenario, lead: Lead) -> str:
+def _describe_constant_lead(scenario: Scenario, lead: Lead) -> str:
     """Returns a sentence about factors that never change: who leads, with which percentages.
 
     Args:

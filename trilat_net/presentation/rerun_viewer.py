@@ -112,7 +112,7 @@ def open_rerun(
 
         layout = build_plot_layout(read_ros2_channels(path))
         layout_path = Path(folder) / "layout.rbl"
-        save_blueprint(layout, path.stem, layout_path)
+        _save_blueprint(layout, path.stem, layout_path)
         environment = {**_QUIET_ENVIRONMENT, **os.environ}
         for arguments in _list_commands(options, path, layout_path, print_line):
             exit_code = run_command([*_PROGRAM, *arguments], environment)
@@ -233,7 +233,7 @@ PlotPage = list[list[CurvePlot]]
 class PlotLayout(NamedTuple):
     """The layout of all views in which Rerun shows a log: pages, plots and arms.
 
-    `build_plot_layout` creates it, and `save_blueprint` writes it for Rerun.
+    `build_plot_layout` creates it, and `_save_blueprint` writes it for Rerun.
 
     Attributes:
         pages: Rows of plots on each page, by the name of the page.
@@ -484,7 +484,7 @@ _PALE_COLORS = [(150, 190, 225), (245, 175, 120)]
 _TIMELINE = "message_publish_time"
 
 
-def save_blueprint(layout: PlotLayout, application: str, path: Path) -> None:
+def _save_blueprint(layout: PlotLayout, application: str, path: Path) -> None:
     """Writes a layout as a blueprint, the file from which Rerun reads it.
 
     Args:

@@ -88,8 +88,8 @@ def format_run_lines(log: Log) -> list[str]:
         *_limit_lines([f"*** {alarm}" for alarm in list_alarms(log)]),
         *format_outside_lines(log),
         *format_link_lines(log),
-        *format_change_lines(log),
-        *format_mode_lines(log),
+        *_format_change_lines(log),
+        *_format_mode_lines(log),
         *format_clock_lines(log),
     ]
 
@@ -134,7 +134,7 @@ def format_link_lines(log: Log) -> list[str]:
         measured = any(state.link.measured for state in use.stated)
         origin = "" if measured else "stated "
 
-        parts = [f"link {use.name}: {origin}{format_stated_models(use.stated)}"]
+        parts = [f"link {use.name}: {origin}{_format_stated_models(use.stated)}"]
         if use.one_way_us is not None and measured:
             parts.append(f"one way {_format_spread(use.one_way_us, 1e-3)}")
         if use.age_ms is None:
@@ -147,7 +147,7 @@ def format_link_lines(log: Log) -> list[str]:
     return _limit_lines(lines)
 
 
-def format_change_lines(log: Log) -> list[str]:
+def _format_change_lines(log: Log) -> list[str]:
     """Returns a line for each change that was made during the run.
 
     A change is a command to a site, another model of a link, or other dominance factors, which
@@ -164,7 +164,7 @@ def format_change_lines(log: Log) -> list[str]:
     return _limit_lines(lines)
 
 
-def format_mode_lines(log: Log) -> list[str]:
+def _format_mode_lines(log: Log) -> list[str]:
     """Returns a line for each site that at times did not follow its peers.
 
     Such a site held its position, braked or returned. The line states when it did.
@@ -200,11 +200,11 @@ def format_clock_lines(log: Log) -> list[str]:
         for peer in log[site].peers:
             use = link_summary.summarise_clock(log, peer, site)
             if use is not None and not use.shared:
-                lines.append(f"clock of {peer} seen by {site}: {format_clock(use)}")
+                lines.append(f"clock of {peer} seen by {site}: {_format_clock(use)}")
     return _limit_lines(lines)
 
 
-def format_stated_models(states: Sequence[StatedModel]) -> str:
+def _format_stated_models(states: Sequence[StatedModel]) -> str:
     """Describes how a link between two arms delays and loses messages during a run.
 
     The description follows the scenario (description of the experiment) and its changes.
@@ -225,7 +225,7 @@ def format_stated_models(states: Sequence[StatedModel]) -> str:
     return ", then ".join(parts)
 
 
-def format_clock(use: link_summary.ClockSummary) -> str:
+def _format_clock(use: link_summary.ClockSummary) -> str:
     """Describes the difference between the clocks of two sites.
 
     Args:

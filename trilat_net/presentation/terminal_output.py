@@ -43,7 +43,7 @@ Line feeds and tabs are not among them.
 """
 
 
-def escape_controls(text: str) -> str:
+def _escape_controls(text: str) -> str:
     """Replaces control characters of a text by their names, as in <U+001B>.
 
     Otherwise a text from another program could control the terminal.
@@ -69,7 +69,7 @@ class TextConsole(Console):
             text: The text.
             **options: Options of Rich.
         """
-        return super().render_str(escape_controls(text), **options)
+        return super().render_str(_escape_controls(text), **options)
 
 
 out = TextConsole(highlight=False)
@@ -188,7 +188,7 @@ def print_line(text: str) -> None:
     Args:
         text: The line.
     """
-    sys.stdout.write(escape_controls(text) + "\n")
+    sys.stdout.write(_escape_controls(text) + "\n")
     sys.stdout.flush()
 
 

@@ -198,7 +198,7 @@ def _split_joint_key(key: str) -> tuple[str, str, str]:
     return "", "", ""
 
 
-def find_window_problem(
+def _find_window_problem(
     window: ExpectWindow, joint_counts: Mapping[str, int]
 ) -> KeyProblem | None:
     """Returns the reason why no run could satisfy a window of expectations.
@@ -343,7 +343,7 @@ def find_expect_problem(expect: Expect, joint_counts: Mapping[str, int]) -> KeyP
             )
 
     for n, window in enumerate(expect.windows):
-        problem = find_window_problem(window, joint_counts)
+        problem = _find_window_problem(window, joint_counts)
         if problem is not None:
             return problem._replace(key=f"windows[{n}].{problem.key}".rstrip("."))
 

@@ -546,7 +546,7 @@ def _execute(module: str, source: CodeSource) -> Any:
     return executed
 
 
-def name_law_class(kind: type) -> str:
+def _name_law_class(kind: type) -> str:
     """Returns the name with which a scenario names a user's class.
 
     For example, the class Spring in the file mylaws.py has the name "mylaws:Spring".
@@ -575,7 +575,7 @@ def name_law_class(kind: type) -> str:
 def name_law_classes(value: Any) -> Any:
     """Converts a value that a Python program passed to types that TOML supports.
 
-    A user's class becomes its name (see `name_law_class`), and a number or an array of NumPy
+    A user's class becomes its name (see `_name_law_class`), and a number or an array of NumPy
     becomes a number or a list. Tables are converted entry by entry. Other values are returned
     unchanged.
 
@@ -583,7 +583,7 @@ def name_law_classes(value: Any) -> Any:
         value: Value for a scenario.
     """
     if isinstance(value, type):
-        return name_law_class(value)
+        return _name_law_class(value)
     if isinstance(value, Mapping):
         return {str(key): name_law_classes(entry) for key, entry in value.items()}
     return value.tolist() if hasattr(value, "tolist") else value

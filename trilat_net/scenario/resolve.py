@@ -158,9 +158,9 @@ def resolve_scenario(tables: TomlTable, folder: Path | None) -> TomlTable:
     site_names = list(sites)
     expect = _resolve_expect(tables.get("expect", {}), sites, urdf_texts)
     dominance_rows = _resolve_dominance(tables["dominance"], site_names)
-    links = resolve_links(tables, site_names, folder)
+    links = _resolve_links(tables, site_names, folder)
     _resolve_views(sites, folder)
-    timeline = resolve_timeline(tables.get("timeline", []), links, site_names)
+    timeline = _resolve_timeline(tables.get("timeline", []), links, site_names)
 
     top_level: TomlTable = {"duration_s": 20.0, "seed": _DEFAULT_SEED, "scheme": "second_order"}
     for key in _TOP_LEVEL_KEYS:
@@ -893,7 +893,7 @@ def resolve_dominance_row(written: Any, names: list[str], site: str, path: str) 
     return factors
 
 
-def resolve_links(tables: TomlTable, names: list[str], folder: Path | None) -> TomlTable:
+def _resolve_links(tables: TomlTable, names: list[str], folder: Path | None) -> TomlTable:
     """Returns the complete table of every link, from the tables `link` and `links`.
 
     A link is the directed connection from a peer to a site. The table `link` applies to all
@@ -907,12 +907,12 @@ def resolve_links(tables: TomlTable, names: list[str], folder: Path | None) -> T
     link_names = [f"{peer}->{site}" for site in names for peer in names if peer != site]
     link_paths = [key for key in _list_group_paths() if key.startswith("link.")]
     written = check_keys(tables.get("links", {}), link_names, "links", link_paths)
-    default = resolve_link(tables.get("link", {}), {}, "link")
+    default = _resolve_link(tables.get("link", {}), {}, "link")
     links: TomlTable = {}
     for name in link_names:
         path = f"links.{name}"
         local_table = written.get(name, {})
-        link = resolve_link(local_table, default, path)
+        link = _resolve_link(local_table, default, path)
         has_default_file = "file" in default and "file" not in local_table
         links[name] = _complete_link(
             link=link,
@@ -933,7 +933,7 @@ def _resolve_views(sites: TomlTable, folder: Path | None) -> None:
     for name, site in sites.items():
         if "view" in site:
             path = f"sites.{name}.view"
-            link = resolve_link(site["view"], {}, path)
+            link = _resolve_link(site["view"], {}, path)
             site["view"] = _complete_link(link, name, path, folder)
 
 
@@ -964,7 +964,7 @@ def _complete_link(
     return link
 
 
-def resolve_link(written: Any, base: TomlTable, path: str) -> TomlTable:
+def _resolve_link(written: Any, base: TomlTable, path: str) -> TomlTable:
     """Completes the settings of a link with defaults.
 
     A link is the one-way network connection between two sites, the processes of the arms. The
@@ -1057,7 +1057,7 @@ def _read_trace_file(link: TomlTable, name: str, path: str, folder: Path | None)
     return link
 
 
-def resolve_timeline(written: Any, links: TomlTable, names: list[str]) -> list[TomlTable]:
+def _resolve_timeline(written: Any, links: TomlTable, names: list[str]) -> list[TomlTable]:
     """Returns the planned changes of a scenario, each complete in itself.
 
     A change affects a link or the dominance factors of a site. An author may state only those
@@ -1158,7 +1158,7 @@ def _change_link(written: Any, link: str, current_links: TomlTable, path: str) -
         raise ScenarioError(f"there is no link {link!r}{hint}", path=f"{path}.link")
 
     before = current_links[link]
-    after = resolve_link(written, before, f"{path}.to")
+    after = _resolve_link(written, before, f"{path}.to")
     if any(key in after for key in TRACE_KEYS):
         raise ScenarioError("no file can be named here", path=f"{path}.to.file")
     if after["model"] == "trace" and after.get("trace") != before.get("trace"):

@@ -138,7 +138,7 @@ def refuse_live_only(scenario: Scenario) -> None:
         )
 
 
-def check_law(name: str, site: SiteSpec, sites: int) -> None:
+def _check_law(name: str, site: SiteSpec, sites: int) -> None:
     """Refuses a control law that its site cannot carry out.
 
     Keys of the site that contradict its plant are refused as well. The plant says who computes
@@ -252,7 +252,7 @@ def build_scenario(resolved: TomlTable) -> Scenario:
     _check_energy_laws(scenario)
 
     for name, site in scenario.sites.items():
-        check_law(name, site, len(scenario.sites))
+        _check_law(name, site, len(scenario.sites))
         joints = scenario.layout(name).joints
         check_sends(scenario.channel(name), joints, f"sites.{name}.control")
         _check_actors(site.hands, f"sites.{name}.hands")

@@ -154,7 +154,7 @@ def compare(*logs: str | Path | Log) -> LogComparison:
             "name at least two logs; or a scenario, as in: trilat compare --tune free"
         )
     files = [Path(log.sources[0]) for log in opened]
-    names = name_columns(files)
+    names = _name_columns(files)
     remarks = {}
     for name, log in zip(names, opened, strict=True):
         judgement = certify_run(log, own_laws=may_run_user_laws(log.scenario))
@@ -167,12 +167,12 @@ def compare(*logs: str | Path | Log) -> LogComparison:
         logs=tuple(opened),
         metrics=metrics,
         differences=list(compare_scenarios(scenarios)),
-        means=average_repeats(opened, metrics),
+        means=_average_repeats(opened, metrics),
         remarks=remarks,
     )
 
 
-def name_columns(files: Sequence[Path]) -> list[str]:
+def _name_columns(files: Sequence[Path]) -> list[str]:
     """Returns a short and distinct name for the column of each log.
 
     The name is the file's name without its suffix, preceded by as many of its folders as are
@@ -194,7 +194,7 @@ def name_columns(files: Sequence[Path]) -> list[str]:
     return [f"{n}: {file}" for n, file in enumerate(files, 1)]
 
 
-def average_repeats(
+def _average_repeats(
     logs: Sequence[Log], metrics: MetricComparison
 ) -> list[MeanInterval | None]:
     """Averages each quantity over logs that repeat one experiment with different seeds.

@@ -686,7 +686,7 @@ class RunMetrics(msgspec.Struct, frozen=True, kw_only=True):
     metrics: dict[str, Metric] = {}
 
 
-def compute_run_metrics(
+def _compute_run_metrics(
     scenario: Scenario,
     site_stats: Mapping[str, SiteStats],
     *,
@@ -879,7 +879,7 @@ def measure_virtual_run(scenario: Scenario) -> RunMetrics:
         expected = sum(scenario.ticks(name) for name in scenario.names)
         recorded = sum(stats.records for stats in site_stats.values())
         missing = expected - recorded
-    return compute_run_metrics(
+    return _compute_run_metrics(
         scenario,
         site_stats,
         diverged_at_s=diverged_at_s,
@@ -932,7 +932,7 @@ def measure_log(log: Log, expect: Expect | None = None) -> RunMetrics:
     for sample in find_absent_samples(log):
         if sample.arrived_tick is not None:
             late_samples += 1
-    metrics = compute_run_metrics(
+    metrics = _compute_run_metrics(
         scenario,
         site_stats,
         diverged_at_s=diverged_at_s,

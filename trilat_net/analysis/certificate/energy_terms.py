@@ -777,14 +777,14 @@ def compute_work(site: SiteMotion) -> dict[str, Increment]:
     for j, peer in enumerate(site.peers):
         work[f"{peer}->{records.site}"] = link_work(site, j)
     work["shares"] = dominance_change_work(site)
-    work["rule"] = stale_rule_work(site)
-    work["torque limit"] = torque_limit_work(site)
-    work["estimates"] = estimate_work(site)
+    work["rule"] = _stale_rule_work(site)
+    work["torque limit"] = _torque_limit_work(site)
+    work["estimates"] = _estimate_work(site)
 
     if c.unknown_friction.any():
-        work["friction"] = unknown_friction_work(site)
+        work["friction"] = _unknown_friction_work(site)
     if c.axes:
-        work["singular poses"] = singular_pose_work(site)
+        work["singular poses"] = _singular_pose_work(site)
     return work
 
 
@@ -883,7 +883,7 @@ def dominance_change_work(site: SiteMotion) -> Increment:
     return _trapezoid(site, left, right, jump)
 
 
-def stale_rule_work(site: SiteMotion) -> Increment:
+def _stale_rule_work(site: SiteMotion) -> Increment:
     """Computes the work on a site that is caused by missing samples of its peers.
 
     When samples of a peer stop arriving, a rule of the scenario determines the reference, the
@@ -925,7 +925,7 @@ def stale_rule_work(site: SiteMotion) -> Increment:
     )
 
 
-def torque_limit_work(site: SiteMotion) -> Increment:
+def _torque_limit_work(site: SiteMotion) -> Increment:
     """Computes the work of the part of the torque that the control law did not demand.
 
     It is the integral of r'(tau - tau_law) over time. Here r is the filtered error and r' its
@@ -946,7 +946,7 @@ def torque_limit_work(site: SiteMotion) -> Increment:
     return _integrate_power(site, power)
 
 
-def unknown_friction_work(site: SiteMotion) -> Increment:
+def _unknown_friction_work(site: SiteMotion) -> Increment:
     """Computes the work of the part of the friction that the control law does not compensate.
 
     The power of this work is minus the filtered error r, times the uncompensated part of the
@@ -973,7 +973,7 @@ def unknown_friction_work(site: SiteMotion) -> Increment:
     return _trapezoid(site, left, right)
 
 
-def singular_pose_work(site: SiteMotion) -> Increment:
+def _singular_pose_work(site: SiteMotion) -> Increment:
     """Computes the work that arises because motion is damped near singular poses of the arm.
 
     In a singular pose the end effector cannot move in some direction. Near it, the controller
@@ -1063,7 +1063,7 @@ def measure_torque_error(site: SiteMotion) -> Array:
     return np.where(is_comparable, largest, 0.0)
 
 
-def estimate_work(site: SiteMotion) -> Increment:
+def _estimate_work(site: SiteMotion) -> Increment:
     """Computes the work of parameter estimates that do not follow the adaptive law.
 
     There are two cases:

@@ -487,7 +487,7 @@ def _measure_participation(pencil: Pencil, s: complex) -> tuple[int, Array] | No
     return count, np.abs(np.diag(residue))
 
 
-def count_zero_roots(pencil: Pencil) -> tuple[int, int]:
+def _count_zero_roots(pencil: Pencil) -> tuple[int, int]:
     """Counts the roots that are zero by structure, and how many of them drift.
 
     The characteristic matrix has the Taylor series Delta(s) = D_0 + s D_1 + s^2 D_2 + .... A
@@ -604,7 +604,7 @@ def compute_delay_spectrum(loop: LinearLoop, wanted: int = 6) -> Spectrum:
     """
     with limit_blas_threads():
         pencil, names, idle_count = find_moving_part(loop)
-        zeros, drifting = count_zero_roots(pencil)
+        zeros, drifting = _count_zero_roots(pencil)
         if not len(names):
             return Spectrum(
                 roots=(),
@@ -642,7 +642,7 @@ def _guess_roots(pencil: Pencil, order: int, zeros: int) -> Complex:
         order: Order of the discretisation. 0 for a loop without delays.
         zeros: Number of roots at zero.
     """
-    matrix = discretise_generator(pencil, order) if order else pencil.A
+    matrix = _discretise_generator(pencil, order) if order else pencil.A
     if pencil.E is not None:
         matrix = _eliminate_states(matrix, pencil.E)
     values = np.linalg.eigvals(matrix).astype(np.complex128)
@@ -686,7 +686,7 @@ def _agree(previous: list[CharacteristicRoot], roots: list[CharacteristicRoot]) 
     return True
 
 
-def discretise_generator(pencil: Pencil, order: int) -> Array:
+def _discretise_generator(pencil: Pencil, order: int) -> Array:
     """Approximates a loop with delays by a system of ordinary differential equations.
 
     The state of a loop with delays includes its history over the longest delay T_max. The

@@ -182,7 +182,7 @@ def find_delay_margin(loop: LinearLoop) -> DelayMargin:
     Returns:
         The intervals of stable delays, and the crossings that limit them.
     """
-    crossings, lossless = find_axis_crossings(loop)
+    crossings, lossless = _find_axis_crossings(loop)
     if lossless:
         return DelayMargin((), (), lossless)
 
@@ -237,7 +237,7 @@ def _count_unstable_roots(loop: LinearLoop) -> int:
     return count
 
 
-def find_axis_crossings(loop: LinearLoop) -> tuple[list[AxisCrossing], bool]:
+def _find_axis_crossings(loop: LinearLoop) -> tuple[list[AxisCrossing], bool]:
     """Finds the delays, common to all links, at which roots cross the imaginary axis.
 
     The stability of a loop can change only at such delays.
@@ -301,7 +301,7 @@ def _is_same_crossing(last: AxisCrossing, crossing: AxisCrossing) -> bool:
 class _FrequencySweep:
     """Eigenvalues of the open-loop frequency response G(j w) over the frequency w.
 
-    `find_axis_crossings` uses them to find the frequencies at which a modulus is 1.
+    `_find_axis_crossings` uses them to find the frequencies at which a modulus is 1.
 
     Args:
         pencil: Matrices of the loop, with a single delay.

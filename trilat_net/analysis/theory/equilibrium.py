@@ -262,7 +262,7 @@ def _refuse_singular_poses(conditions: OperatingConditions, rest: Equilibrium) -
             )
 
 
-def predict_from_start(conditions: OperatingConditions, scenario: Scenario) -> Equilibrium:
+def _predict_from_start(conditions: OperatingConditions, scenario: Scenario) -> Equilibrium:
     """Predicts the equilibrium that the loop reaches from the start poses of a scenario.
 
     The linear loop is x' = A x + sum_k A_k x(t - T_k), with the state x and the matrices A_k of
@@ -398,7 +398,7 @@ def predict_equilibrium(scenario: Scenario) -> Equilibrium:
         ScenarioError: The scenario has no linear loop, or no equilibrium near the prediction.
     """
     conditions = derive_operating_conditions(scenario)
-    return _require_equilibrium(scenario, predict_from_start(conditions, scenario))
+    return _require_equilibrium(scenario, _predict_from_start(conditions, scenario))
 
 
 def follow_equilibrium(scenario: Scenario, rest: Equilibrium) -> Equilibrium:
@@ -531,7 +531,7 @@ def _build_at_pose(pose: tuple[float, ...], conditions: OperatingConditions) -> 
         raise UsageError(f"--pose must be {expected}, as in --pose 0.1,0.3{more}, not {pose}")
 
     target = np.array(pose, dtype=np.float64)
-    q = [reach_pose(site, target) if task else target for site in conditions.sites]
+    q = [_reach_pose(site, target) if task else target for site in conditions.sites]
     rest = Equilibrium(
         q=pad_rows(q),
         theta_hat=_complete_estimates(conditions),
@@ -557,7 +557,7 @@ def _describe_pose(coordinates: int, *, task: bool) -> str:
     return f"{count_nouns(str(coordinates), 'angle')} in rad, one per joint"
 
 
-def reach_pose(site: SiteSetup, pose: Array) -> Array:
+def _reach_pose(site: SiteSetup, pose: Array) -> Array:
     """Returns joint angles at which a site's end effector has a pose, in rad, shape (n,).
 
     Gauss-Newton steps from the start pose find the nearest such angles.
@@ -632,7 +632,7 @@ def _find_at_run_end(scenario: Scenario, conditions: OperatingConditions) -> Equ
             break
         until_s *= 2.0
     if run.diverged_s is not None:
-        rest = predict_from_start(conditions, scenario)
+        rest = _predict_from_start(conditions, scenario)
         how = f"the run diverges at {run.ran_s:.4g} s; {rest.how}"
         return _require_equilibrium(scenario, rest._replace(how=how))
     if is_at_rest:

@@ -110,7 +110,7 @@ class SiteTickMap(NamedTuple):
     names: tuple[str, ...]
 
 
-def linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian) -> SiteTickMap:
+def _linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian) -> SiteTickMap:
     """Builds the linear model of one site over one tick, from a model in continuous time.
 
     A site is a process that runs one arm, and a tick is one period of its control loop.
@@ -247,7 +247,7 @@ def couple_ticks(conditions: OperatingConditions, rest: Equilibrium) -> CoupledT
     jacobians = differentiate_rates(conditions, rest)
     maps = []
     for site, jacobian in zip(conditions.sites, jacobians, strict=True):
-        maps.append(linearise_site_tick(site, jacobian))
+        maps.append(_linearise_site_tick(site, jacobian))
     sizes = [len(tick_map.P) for tick_map in maps]
     owners = np.repeat(np.arange(len(maps)), sizes)
     names = [name for tick_map in maps for name in tick_map.names]

@@ -217,7 +217,7 @@ def compute_references(conditions: OperatingConditions, rest: Equilibrium) -> li
     return [evaluate_reference(shares, pose, poses) for shares, pose in pairs]
 
 
-def differentiate_references(
+def _differentiate_references(
     conditions: OperatingConditions, rest: Equilibrium
 ) -> dict[tuple[int, int], Array]:
     """Computes how the pose that a site follows depends on the poses of the other sites.
@@ -282,7 +282,7 @@ def compute_couplings(
         For each pair (i, j), the effect of the values that site j sends on the inputs of site
         i, shape (inputs, 3 m).
     """
-    references = differentiate_references(conditions, rest)
+    references = _differentiate_references(conditions, rest)
     couplings = {}
     for i, j in conditions.coupled_pairs:
         layout = sites[i].layout
@@ -350,7 +350,7 @@ def differentiate_rates(
         The models, in the order of the sites.
     """
     arguments = gather_site_arguments(conditions, rest)
-    references = differentiate_references(conditions, rest)
+    references = _differentiate_references(conditions, rest)
     jacobians = []
     for i, (site, x) in enumerate(zip(conditions.sites, arguments, strict=True)):
         layout = site_dynamics.lay_out_arguments(site)
@@ -543,7 +543,7 @@ def linearise_loop(
     )
     if all_estimates or not conditions.has_forms:
         return loop
-    return add_law_forms(conditions, sites, loop)
+    return _add_law_forms(conditions, sites, loop)
 
 
 def _name_states(
@@ -583,7 +583,7 @@ def _sort_terms(terms: dict[float, tuple[Array, Array]]) -> tuple[DelayedTerm, .
     return tuple(delayed)
 
 
-def add_law_forms(
+def _add_law_forms(
     conditions: OperatingConditions,
     sites: Sequence[SiteJacobian],
     loop: LinearLoop,

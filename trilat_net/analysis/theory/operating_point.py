@@ -295,7 +295,7 @@ def _describe_laws(scenario: Scenario) -> list[str]:
     return notes
 
 
-def is_constant_link(link: LinkBase) -> bool:
+def _is_constant_link(link: LinkBase) -> bool:
     """Returns True if a link delays every sample by the same time and loses none.
 
     Args:
@@ -431,7 +431,7 @@ def compute_effective_delay(
     site_hz = scenario.sites[site].rate_hz
     peer_hz = scenario.sites[peer].rate_hz
     model = link.to_core_model()
-    is_constant = is_constant_link(link)
+    is_constant = _is_constant_link(link)
     if is_constant and site_hz == peer_hz:
         delay_us = max(round(model.location), model.playout_us)
         # The negated floor division rounds up to whole ticks.

@@ -91,7 +91,7 @@ def linearise_teleoperator(conditions: OperatingConditions, rest: Equilibrium) -
         rest: The equilibrium.
     """
     frozen = freeze_external_torques(conditions, rest)
-    return move_ports_to_end_effectors(frozen, rest, linearise_loop(frozen, rest))
+    return _move_ports_to_end_effectors(frozen, rest, linearise_loop(frozen, rest))
 
 
 def build_proof_output(
@@ -124,14 +124,14 @@ def build_proof_output(
     for i, site in enumerate(sites):
         Lambda = np.broadcast_to(site.gains.Lambda, site.layout.shared)
         ports = port_response.find_site_ports(loop, site.name)
-        followed = list_followed_axes(site)
+        followed = _list_followed_axes(site)
         for port, joint in zip(ports, followed, strict=True):
             gain = Lambda[joint - 1]
             position = loop.names.index(f"{site.name}.q{joint}")
             C[port, position] += gain
             for j in np.flatnonzero(conditions.alpha[i]):
                 peer = sites[j]
-                if joint not in list_followed_axes(peer):
+                if joint not in _list_followed_axes(peer):
                     continue
                 peer_position = loop.names.index(f"{peer.name}.q{joint}")
                 factor = gain * conditions.alpha[i, j]
@@ -157,7 +157,7 @@ def compute_proof_weights(conditions: OperatingConditions) -> Array:
     """
     Kd = np.full((len(conditions.sites), conditions.sites[0].layout.shared), np.nan)
     for site_Kd, site in zip(Kd, conditions.sites, strict=True):
-        followed = [n - 1 for n in list_followed_axes(site)]
+        followed = [n - 1 for n in _list_followed_axes(site)]
         site_Kd[followed] = np.broadcast_to(site.gains.Kd, site_Kd.shape)[followed]
     return compute_lyapunov_weights(conditions.alpha, Kd).beta
 
@@ -341,7 +341,7 @@ def analyse_ports(
         two_ports=_check_two_ports(loop, Y, w_rad_s),
         transparency=tuple(transparency),
         clamped_verdict=compute_delay_spectrum(clamped_loop, 1).verdict,
-        axes=name_ports(conditions),
+        axes=_name_ports(conditions),
         measured=check_against_hands(
             Y, w_rad_s, held=held_hands.hands, places=held_hands.places
         ),
@@ -423,7 +423,7 @@ def _locate_hands(
         tip_by_ports = np.zeros((len(J), len(loop.inputs)))
         if site.layout.task:
             # the ports are axes already
-            for axis, port in zip(list_followed_axes(site), ports, strict=True):
+            for axis, port in zip(_list_followed_axes(site), ports, strict=True):
                 if axis <= len(J):
                     tip_by_ports[axis - 1, port] = 1.0
         else:
@@ -593,7 +593,7 @@ def _transparency_to_json(transparency: Transparency) -> dict[str, Any]:
     }
 
 
-def list_followed_axes(site: SiteSetup) -> list[int]:
+def _list_followed_axes(site: SiteSetup) -> list[int]:
     """Lists the coordinates along which a site follows its peers.
 
     Args:
@@ -607,7 +607,7 @@ def list_followed_axes(site: SiteSetup) -> list[int]:
     return [n for n, is_followed in enumerate(site.chain.task.axes, 1) if is_followed]
 
 
-def name_ports(conditions: OperatingConditions) -> dict[int, str]:
+def _name_ports(conditions: OperatingConditions) -> dict[int, str]:
     """Returns the names of the axes along which operators move the end effectors.
 
     Args:
@@ -619,11 +619,11 @@ def name_ports(conditions: OperatingConditions) -> dict[int, str]:
     """
     if not conditions.sites[0].layout.task:
         return {}
-    followed = sorted({n for site in conditions.sites for n in list_followed_axes(site)})
+    followed = sorted({n for site in conditions.sites for n in _list_followed_axes(site)})
     return {n: TASK_AXES[n - 1] for n in followed}
 
 
-def move_ports_to_end_effectors(
+def _move_ports_to_end_effectors(
     conditions: OperatingConditions,
     rest: Equilibrium,
     loop: LinearLoop,
@@ -656,7 +656,7 @@ def move_ports_to_end_effectors(
     arguments = gather_site_arguments(conditions, rest)
     for site, x in zip(conditions.sites, arguments, strict=True):
         layout = lay_out_arguments(site)
-        followed = list_followed_axes(site)
+        followed = _list_followed_axes(site)
         arm = place_arm(site, x[layout.q])
         full_J = compute_following(site, arm, x).J
         assert full_J is not None

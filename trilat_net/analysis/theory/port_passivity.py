@@ -227,7 +227,7 @@ def find_least_eigenvalue(Y: Complex) -> Array:
     return np.asarray(least, dtype=np.float64)
 
 
-def find_lacking_damping(Y: Complex, w_rad_s: Array) -> float:
+def _find_lacking_damping(Y: Complex, w_rad_s: Array) -> float:
     """Returns the damping that must be added at operators' ports to make arms passive.
 
     A port is where an operator acts on an arm. A damper b at every port adds b to the impedance
@@ -299,7 +299,7 @@ def check_passivity(
     size = np.asarray(largest_singular_value, dtype=np.float64)
     lacking = 0.0
     if minima.below:
-        lacking = find_lacking_damping(Y, minima.w_rad_s)
+        lacking = _find_lacking_damping(Y, minima.w_rad_s)
     return Passivity(minima, size, lacking)
 
 

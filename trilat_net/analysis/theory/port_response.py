@@ -263,7 +263,7 @@ def find_site_ports(loop: LinearLoop, site: str) -> list[int]:
     return ports
 
 
-def parse_port_joint(port: str) -> int:
+def _parse_port_joint(port: str) -> int:
     """Returns the number of the joint to which a port belongs.
 
     Args:
@@ -284,7 +284,7 @@ def group_ports_by_joint(loop: LinearLoop) -> dict[int, list[int]]:
     """
     ports: dict[int, list[int]] = {}
     for port, name in enumerate(loop.inputs):
-        joint = parse_port_joint(name)
+        joint = _parse_port_joint(name)
         ports.setdefault(joint, []).append(port)
     return dict(sorted(ports.items()))
 
@@ -608,7 +608,7 @@ def measure_transparency(loop: LinearLoop, at: str, of: str) -> tuple[Transparen
         transparency = Transparency(
             operator_site=at,
             other_site=of,
-            joint=parse_port_joint(loop.inputs[port]),
+            joint=_parse_port_joint(loop.inputs[port]),
             w_rad_s=w_rad_s,
             free=1.0 / free[:, n, n],
             clamped=1.0 / clamped[:, n, n],

@@ -57,7 +57,7 @@ _INERTIA_ENTRIES = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))
 """Rows and columns of Ixx, Ixy, Iyy, Ixz, Iyz, Izz."""
 
 
-def build_cross_matrix(a: Numbers) -> Numbers:
+def _build_cross_matrix(a: Numbers) -> Numbers:
     """Returns the matrix A with A b = a x b for every vector b, shape (3, 3, ...).
 
     Args:
@@ -76,7 +76,7 @@ def _build_inertia_units() -> Numbers:
     mass = units[0]
     mass[:3, :3] = np.eye(3)
     for n, axis in enumerate(np.eye(3)):
-        cross = build_cross_matrix(axis)
+        cross = _build_cross_matrix(axis)
         first_moment = units[1 + n]
         first_moment[:3, 3:] = -cross
         first_moment[3:, :3] = cross
@@ -101,10 +101,10 @@ def _cross_motion(V: Numbers) -> Numbers:
     angular = V[3:]
     columns = V.shape[1:]
     matrix = np.zeros((6, 6, *columns), V.dtype)
-    rotation = build_cross_matrix(angular)
+    rotation = _build_cross_matrix(angular)
     matrix[:3, :3] = rotation
     matrix[3:, 3:] = rotation
-    matrix[:3, 3:] = build_cross_matrix(linear)
+    matrix[:3, 3:] = _build_cross_matrix(linear)
     return matrix
 
 
@@ -423,7 +423,7 @@ class PlacedChain:
 
         link_angular_velocity = V_last[3:]
         angular_velocity = multiply_columns(last.R_base, link_angular_velocity)
-        spin = build_cross_matrix(angular_velocity)
+        spin = _build_cross_matrix(angular_velocity)
         J = self.pose_jacobian()
         linear = _multiply(spin, J[:3])
         angular = _multiply(spin, J[3:])
@@ -434,7 +434,7 @@ class PlacedChain:
         """Returns spatial velocities of the last link at the tip and along base axes."""
         R = self._links[-1].R_base
         tip_m = np.array(self._chain.tip_m)
-        tip_cross = build_cross_matrix(tip_m)
+        tip_cross = _build_cross_matrix(tip_m)
         angular = columns[3:]
         lever_term = np.einsum("ab,bn...->an...", tip_cross, angular)
         linear = columns[:3] - lever_term
@@ -457,7 +457,7 @@ def _transform_velocities(R: Numbers, p: Numbers) -> Numbers:
         p: Origin of the link in that frame, shape (3, ...), in m.
     """
     R_transposed = _transpose(R)
-    p_cross = build_cross_matrix(p)
+    p_cross = _build_cross_matrix(p)
     lever = _multiply(R_transposed, p_cross)
     columns = p.shape[1:]
     number_type = np.result_type(R, p)
@@ -500,7 +500,7 @@ def _place_joint(joint: ChainJoint, q: Numbers) -> tuple[Numbers, Numbers]:
         direction = R_0 @ axis
         shift = np.multiply.outer(direction, q)
         return R, p + shift
-    K = build_cross_matrix(axis)
+    K = _build_cross_matrix(axis)
     R_0_K = R_0 @ K
     sine_term = np.multiply.outer(R_0_K, np.sin(q))
     cosine_factor = 1.0 - np.cos(q)
@@ -536,7 +536,7 @@ def rotation_from_vector(vector: Numbers) -> Numbers:
     cosine_quotient = versine / angle**2
     sine_factor = np.where(is_small, sine_series, sine_quotient)
     cosine_factor = np.where(is_small, cosine_series, cosine_quotient)
-    K = build_cross_matrix(vector)
+    K = _build_cross_matrix(vector)
     K_squared = _multiply(K, K)
     column_axes = vector.ndim - 1
     identity = _add_axes(np.eye(3), (3, 3), column_axes)
@@ -633,7 +633,7 @@ def _find_quaternion(R: Numbers) -> Numbers:
     return with_positive_w
 
 
-def relative_rotation_vector(other: Numbers, R: Numbers) -> Numbers:
+def _relative_rotation_vector(other: Numbers, R: Numbers) -> Numbers:
     """Returns the rotation that turns one orientation into another, as a rotation vector.
 
     The rotation vector has the direction of the axis and the length of the angle. Its
@@ -680,7 +680,7 @@ def evaluate_reference(shares: Array, site_pose: Numbers, shared: Sequence[Numbe
     for share, pose in followed:
         peer_rotation = pose[POSITION:]
         R_peer = rotation_from_vector(peer_rotation)
-        rotation = relative_rotation_vector(R_peer, R)
+        rotation = _relative_rotation_vector(R_peer, R)
         weighted.append(share * rotation)
     difference = np.asarray(sum(weighted))
     turn_back = rotation_from_vector(-difference)
@@ -894,7 +894,7 @@ def _subtract_poses(x: Numbers, x_des: Numbers) -> Numbers:
     desired_rotation = columns_of_x_des[POSITION:]
     R = rotation_from_vector(rotation)
     R_des = rotation_from_vector(desired_rotation)
-    turn = relative_rotation_vector(R_des, R)
+    turn = _relative_rotation_vector(R_des, R)
     return np.concatenate([e[:POSITION], turn])
 
 

@@ -447,7 +447,7 @@ def judge_twins(
     has_motion = twins.speed.any(axis=1) | np.isfinite(twins.paths[0].largest).any(axis=1)
     rows = np.flatnonzero(has_motion)
     end = int(rows[-1]) if len(rows) else 0  # without the last interval, which may be one tick
-    period_s = find_varying_period_s(scenario)
+    period_s = _find_varying_period_s(scenario)
     counts_from_s = _fit_to_period(counts_from_s, float(t_s[end]), period_s)
     first = min(int(np.searchsorted(t_s, counts_from_s)), end)
     quiet = slice(int(np.searchsorted(t_s, quiet_from_s)), end)
@@ -488,7 +488,7 @@ def judge_twins(
     )
 
 
-def find_varying_period_s(scenario: Scenario) -> float | None:
+def _find_varying_period_s(scenario: Scenario) -> float | None:
     """Returns the period of delays that vary, in s, as it is at the end of a scenario.
 
     Args:

@@ -36,7 +36,7 @@ def demo_command(
 
     Each site runs in its own process, and so does the recorder; they communicate over Zenoh.
     """
-    run_and_report(run.load(scenario), run)
+    _run_and_report(run.load(scenario), run)
 
 
 def _describe_log(path: Path) -> str:
@@ -58,7 +58,7 @@ def _describe_log(path: Path) -> str:
     return ""
 
 
-def run_and_report(
+def _run_and_report(
     chosen: "Scenario", run: options.RunOptions, page: "PageAttendant | None" = None
 ) -> None:
     """Runs a scenario live, then verifies its log and writes a report.
@@ -160,7 +160,7 @@ def live_command(
             "--connect, --router, --zenoh-config and --keys can be used only with --session"
         )
     with PageAttendant(page, clock) as attendant:
-        run_and_report(run.load(scenario, MAX_DURATION_S), run, attendant)
+        _run_and_report(run.load(scenario, MAX_DURATION_S), run, attendant)
 
 
 _START_OPTIONS = {
@@ -552,7 +552,7 @@ _UNITS = {"us": 1e-3, "ms": 1.0, "s": 1e3}
 """Units of time in ms."""
 
 
-def parse_milliseconds(text: str) -> float:
+def _parse_milliseconds(text: str) -> float:
     """Parses a time with its unit, such as 350ms or 0.35s.
 
     Returns:
@@ -570,7 +570,7 @@ def parse_milliseconds(text: str) -> float:
     raise UsageError(f"a time must be a number with a unit, as in 350ms or 0.35s, not {text!r}")
 
 
-def parse_share(text: str) -> float:
+def _parse_share(text: str) -> float:
     """Parses a number or a percentage, such as 0.05 or 5%.
 
     Returns:
@@ -589,7 +589,7 @@ def parse_share(text: str) -> float:
         ) from None
 
 
-def parse_pairs(texts: list[str], example: str) -> dict[str, Any]:
+def _parse_pairs(texts: list[str], example: str) -> dict[str, Any]:
     """Parses texts KEY=VALUE, in which a value is TOML or a bare word.
 
     Args:
@@ -657,13 +657,13 @@ def set_link_command(
     ] = None,
 ) -> None:
     """Changes keys of a directed link; a model or a preset replaces all keys."""
-    table = parse_pairs(to or [], "deviation_ms=20")
+    table = _parse_pairs(to or [], "deviation_ms=20")
     if preset is not None:
         table["preset"] = preset
     if delay is not None:
-        table["delay_ms"] = parse_milliseconds(delay)
+        table["delay_ms"] = _parse_milliseconds(delay)
     if loss is not None:
-        table["loss"] = parse_share(loss)
+        table["loss"] = _parse_share(loss)
     if not table:
         raise UsageError("nothing to change: give --delay, --loss, --preset or --to KEY=VALUE")
     _, arrow, receiver = name.partition("->")
@@ -690,9 +690,9 @@ def set_dominance_command(
     ] = "1s",
 ) -> None:
     """Changes one row of the dominance matrix along a linear ramp; the row always sums to 1."""
-    pairs = parse_pairs(shares, "m1=0.9")
-    table = {peer: parse_share(str(share)) for peer, share in pairs.items()}
-    ramp_s = parse_milliseconds(ramp) / 1e3
+    pairs = _parse_pairs(shares, "m1=0.9")
+    table = {peer: _parse_share(str(share)) for peer, share in pairs.items()}
+    ramp_s = _parse_milliseconds(ramp) / 1e3
     _send_change(context, site, {"dominance": site, "to": table, "ramp_s": ramp_s})
 
 

@@ -194,7 +194,7 @@ def build_site_arrays(
         channel=_build_channel(setup, pages) if has_channel else None,
     )
     for ramp in setup.ramps:
-        add_ramp(arrays, ramp)
+        _add_ramp(arrays, ramp)
     return arrays
 
 
@@ -364,7 +364,7 @@ class CalendarSizer:
         return arrays
 
 
-def add_ramp(arrays: SiteArrays, ramp: DominanceRamp) -> None:
+def _add_ramp(arrays: SiteArrays, ramp: DominanceRamp) -> None:
     """Adds a planned change of the weights with which an arm follows the other arms.
 
     The table of changes is sorted by their start times.
@@ -461,7 +461,7 @@ def apply_change(arrays: SiteArrays, change: CoreChange, t_ns: int) -> None:
             raise ValueError(
                 f"at most {MAX_RAMPS} changes to the shares of a site can be pending at once"
             )
-        add_ramp(arrays, change.ramp)
+        _add_ramp(arrays, change.ramp)
 
 
 _NEAR_NS = NS_PER_S // 4

@@ -65,14 +65,14 @@ The slave touched no wall, the arms did not come to rest, or a run diverged.
 """
 
 
-def list_figures_with_values(results: BenchResults) -> list[str]:
+def _list_figures_with_values(results: BenchResults) -> list[str]:
     """Lists the figures of a benchmark for which the results contain at least one number.
 
     Args:
         results: The results of the benchmark, which compares control laws.
 
     Returns:
-        Names of figures that `draw_bench` can draw. Empty if there are no numbers at all.
+        Names of figures that `_draw_bench` can draw. Empty if there are no numbers at all.
     """
     names = []
     for name in FIGURES_OF_BENCH:
@@ -100,12 +100,12 @@ def _collect_fields(results: BenchResults, name: str) -> dict[str, Array]:
     return {task: _collect(results, task, quantity) for task in tasks}
 
 
-def draw_bench(results: BenchResults, name: str) -> Figure:
+def _draw_bench(results: BenchResults, name: str) -> Figure:
     """Draws one of the figures that compare the control laws of the suite.
 
     Args:
         results: The results of the suite.
-        name: Name of the figure, from `list_figures_with_values`.
+        name: Name of the figure, from `_list_figures_with_values`.
     """
     label, quantity = FIGURES_OF_BENCH[name]
     links = results.plan.links
@@ -270,7 +270,7 @@ def write_bench(results: BenchResults, folder: Path, command: str) -> list[Path]
     Returns:
         The paths of the Markdown page, the CSV tables and the PNG figures.
     """
-    names = list_figures_with_values(results)
+    names = _list_figures_with_values(results)
     pictures = {}
     for name in names:
         label, _ = FIGURES_OF_BENCH[name]
@@ -287,7 +287,7 @@ def write_bench(results: BenchResults, folder: Path, command: str) -> list[Path]
     figure_paths = []
     for name in names:
         path = folder / f"bench-{name}.png"
-        figure = draw_bench(results, name)
+        figure = _draw_bench(results, name)
         style.write_figure(figure, path, style.REPORT_DPI)
         figure_paths.append(path)
     text_paths = [folder / name for name in texts]

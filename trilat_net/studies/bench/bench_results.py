@@ -316,18 +316,18 @@ class BenchResults(Result):
         for each measured quantity, such as the error. In the study "round-trips", a last table
         has the effects of delay and loss.
         """
-        yield from describe_bench(self)
+        yield from _describe_bench(self)
         yield ""
-        yield tabulate_verdicts(self)
+        yield _tabulate_verdicts(self)
         for task in self.plan.tasks:
-            yield tabulate_properties(self, task)
-        for task, quantity in list_quantities(self):
+            yield _tabulate_properties(self, task)
+        for task, quantity in _list_quantities(self):
             if quantity != "effort_nm":
                 yield ""
                 yield f"{task}: {QUANTITIES[quantity]}"
-                yield tabulate_quantity(self, task, quantity)
+                yield _tabulate_quantity(self, task, quantity)
         if self.plan.study == "round-trips":
-            yield tabulate_round_trips(self)
+            yield _tabulate_round_trips(self)
 
     def headline(self) -> str:
         """Returns a sentence with the study's name and its numbers of cells and runs.
@@ -423,7 +423,7 @@ UNSTABLE_MARK = "!"
 """Mark of a cell in tables: at least one run is not stable."""
 
 
-def list_quantities(results: BenchResults) -> list[tuple[str, str]]:
+def _list_quantities(results: BenchResults) -> list[tuple[str, str]]:
     """Lists which measured quantities are printed for which task.
 
     Args:
@@ -451,7 +451,7 @@ def name_law(law: str, form: str) -> str:
     return law if form == "three" else f"{law} (two sites)"
 
 
-def tabulate_verdicts(results: BenchResults) -> TextTable:
+def _tabulate_verdicts(results: BenchResults) -> TextTable:
     """Returns a table of how many links each law copes with: a row per law, a column per task.
 
     An entry counts the links over which the law is stable, those over which it only settles,
@@ -488,7 +488,7 @@ def _count_verdicts(results: BenchResults, law: str, form: str, task: str) -> st
     return " / ".join(str(verdicts.count(judgement)) for judgement in _JUDGEMENTS)
 
 
-def tabulate_properties(results: BenchResults, task: str) -> TextTable:
+def _tabulate_properties(results: BenchResults, task: str) -> TextTable:
     """Returns a table of the properties of a task's runs: a row per law.
 
     There is a column per property, such as passivity. An entry such as 3/12 means that all runs
@@ -563,7 +563,7 @@ def _format_least_energy(law_results: Sequence[BenchCellResult]) -> str:
     return f"{least_j:.2g}"
 
 
-def tabulate_quantity(results: BenchResults, task: str, quantity: str) -> TextTable:
+def _tabulate_quantity(results: BenchResults, task: str, quantity: str) -> TextTable:
     """Returns a table of the mean of a quantity: a row per control law, a column per link.
 
     The mean is over the runs of the law with different random seeds. An entry has a mark if not
@@ -615,7 +615,7 @@ def _describe_result(result: BenchCellResult, quantity: str) -> str:
     return text + mark
 
 
-def tabulate_round_trips(results: BenchResults) -> TextTable:
+def _tabulate_round_trips(results: BenchResults) -> TextTable:
     """Returns a table of how the error of each law grows with delay and with losses.
 
     A row is a task and a control law. Its columns are the error at the shortest round trip,
@@ -669,7 +669,7 @@ def _format_ratio(numerator: float | None, denominator: float | None) -> str:
     return f"{numerator / denominator:.3g}"
 
 
-def describe_bench(results: BenchResults) -> Iterator[str]:
+def _describe_bench(results: BenchResults) -> Iterator[str]:
     """Yields lines that introduce the results.
 
     They name the study, its runs, its tasks, and the laws that did not run.
@@ -706,7 +706,7 @@ def describe_bench(results: BenchResults) -> Iterator[str]:
         yield f"no runs, because no candidate was stable at the pose with the margin: {names}"
 
 
-def tabulate_gains(results: BenchResults) -> TextTable:
+def _tabulate_gains(results: BenchResults) -> TextTable:
     """Returns a table of the gains of each law at each round trip, and how they were selected.
 
     The column "stable" has the number of stable candidates and of all candidates. The column
@@ -747,23 +747,23 @@ def build_bench_page(
     parts = [
         f"# The suite: {results.plan.study}",
         f"    {command}",
-        "\n".join(f"- {line}" for line in describe_bench(results)),
-        tabulate_verdicts(results).markdown(),
+        "\n".join(f"- {line}" for line in _describe_bench(results)),
+        _tabulate_verdicts(results).markdown(),
         f"{OPEN_MARK}: some run is open. {UNSTABLE_MARK}: some run is not stable. "
         "+-: 95 % interval over the seeds of a link.",
     ]
     parts += [f"![{text}]({name})" for name, text in pictures.items()]
     for task in results.plan.tasks:
         parts.append(f"## {task}: properties")
-        parts.append(tabulate_properties(results, task).markdown())
-    for task, quantity in list_quantities(results):
+        parts.append(_tabulate_properties(results, task).markdown())
+    for task, quantity in _list_quantities(results):
         parts.append(f"## {task}: {QUANTITIES[quantity]}")
-        parts.append(tabulate_quantity(results, task, quantity).markdown())
+        parts.append(_tabulate_quantity(results, task, quantity).markdown())
     if results.plan.study == "round-trips":
         parts.append("## Delay against loss")
-        parts.append(tabulate_round_trips(results).markdown())
+        parts.append(_tabulate_round_trips(results).markdown())
     parts.append("## Gains")
-    parts.append(tabulate_gains(results).markdown())
+    parts.append(_tabulate_gains(results).markdown())
     return "\n\n".join(parts) + "\n"
 
 

@@ -235,7 +235,7 @@ def lengthen_run(judged: JudgedRun) -> JudgedRun:
 
     length_s = judged.scenario.duration_s
     required_s = TIME_CONSTANTS * _find_slowest_s(judged)
-    limit_s = compute_longest_s(judged.scenario)
+    limit_s = _compute_longest_s(judged.scenario)
     longer_s = float(math.ceil(min(required_s, limit_s)))
     if longer_s > length_s:
         judged = judge_bench_run(judged.scenario, longer_s)
@@ -249,7 +249,7 @@ def lengthen_run(judged: JudgedRun) -> JudgedRun:
     return judged._replace(text=f"{judged.text}; {limit_text}", at_limit=True)
 
 
-def compute_longest_s(scenario: Scenario) -> float:
+def _compute_longest_s(scenario: Scenario) -> float:
     """Returns the duration at which a run reaches the safety limit `MAX_RUN_TICKS`, in s.
 
     Args:

@@ -346,10 +346,10 @@ def search_margins(
     # The workers need the files of control laws that users wrote.
     laws = list_imported_code([plan.base])
     with open_worker_pool(jobs, on, most=len(searches), laws=laws) as pool:
-        return pool.map(search_margin_task, searches, progress)
+        return pool.map(_search_margin_task, searches, progress)
 
 
-def search_margin_task(task: MarginItem) -> GridPointMargin:
+def _search_margin_task(task: MarginItem) -> GridPointMargin:
     """Finds the limits of stability at one grid point of a sweep, by runs and by theory.
 
     The function needs nothing but its argument. Therefore any worker process can call it.

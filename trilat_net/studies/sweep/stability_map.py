@@ -800,7 +800,7 @@ _ABOUT_TWINS = (
 """Explanation of this line on the page of the map."""
 
 
-def trace_zero_exponent(panel: MapPanel) -> MapLine | None:
+def _trace_zero_exponent(panel: MapPanel) -> MapLine | None:
     """Finds the measured line on a map on which small disturbances neither grow nor die away.
 
     On this line, the growth exponent is zero. The exponent is the rate, in 1/s, at which a
@@ -1086,7 +1086,7 @@ def build_stability_map(
     loaders = [make_panel_loader(plan, panel, x.key, y.key) for panel in plane.panels]
     panel_lines = []
     for panel, load in zip(plane.panels, loaders, strict=True):
-        measured_line = trace_zero_exponent(panel)
+        measured_line = _trace_zero_exponent(panel)
         closed_form_line = trace_closed_form(load, x, y)
         panel_lines.append([measured_line, closed_form_line])
     remarks = list[str]()

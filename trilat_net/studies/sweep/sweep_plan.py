@@ -789,7 +789,7 @@ def label_axis(key: str, scenario: Scenario | None = None) -> str:
         key: Scenario key of the axis.
         scenario: Scenario in which the names of operators and walls are looked up.
     """
-    quantity, unit = describe_key(key, scenario)
+    quantity, unit = _describe_key(key, scenario)
     return f"{quantity} ({unit})" if unit else quantity
 
 
@@ -801,7 +801,7 @@ def label_setting(key: str, value: Any, scenario: Scenario | None = None) -> str
         value: Value of the key.
         scenario: Scenario in which the names of operators and walls are looked up.
     """
-    quantity, unit = describe_key(key, scenario)
+    quantity, unit = _describe_key(key, scenario)
     if isinstance(value, bool):
         text = str(value).lower()
     elif is_number(value):
@@ -811,7 +811,7 @@ def label_setting(key: str, value: Any, scenario: Scenario | None = None) -> str
     return " ".join(part for part in (quantity, text, unit) if part)
 
 
-def describe_key(key: str, scenario: Scenario | None = None) -> tuple[str, str]:
+def _describe_key(key: str, scenario: Scenario | None = None) -> tuple[str, str]:
     """Splits a scenario key into the name and the unit of its quantity, for labels.
 
     Args:

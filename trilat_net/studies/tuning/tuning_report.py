@@ -52,7 +52,7 @@ def compose_tuning(tuned: TuningResult) -> Iterator[Block]:
         tuned: Result of the comparison of control laws.
     """
     yield tabulate_laws(tuned)
-    yield from (f"  {line}" for line in list_class_meanings())
+    yield from (f"  {line}" for line in _list_class_meanings())
     yield from (f"note: {line}" for line in list_energy_notes(tuned))
 
     for search in tuned.found:
@@ -65,7 +65,7 @@ def compose_tuning(tuned: TuningResult) -> Iterator[Block]:
     )
 
     yield ""
-    yield tabulate_paper_gains(tuned)
+    yield _tabulate_paper_gains(tuned)
     for search in tuned.found:
         for gain in tuned.list_edge_gains(search):
             yield (
@@ -129,7 +129,7 @@ def _format_front_ends(search: CandidateSearch) -> list[str]:
     return [format_number(number) for number in numbers]
 
 
-def tabulate_search(plan: TuningPlan) -> TextTable:
+def _tabulate_search(plan: TuningPlan) -> TextTable:
     """Returns a table of the gains that are tuned, with the ranges in which they are searched.
 
     There is a row per gain. The information that a law gets about the model of the arm is named
@@ -181,7 +181,7 @@ def tabulate_front(
     return TextTable(("law", *heads, *_SCORE_HEADS), rows, align="lr")
 
 
-def tabulate_paper_gains(tuned: TuningResult) -> TextTable:
+def _tabulate_paper_gains(tuned: TuningResult) -> TextTable:
     """Returns a table of the scores of the adaptive law with its published gains.
 
     The gains are printed in the paper from which the law comes. The scores are the error, the
@@ -298,7 +298,7 @@ def list_energy_notes(tuned: TuningResult) -> list[str]:
     ]
 
 
-def list_class_meanings() -> list[str]:
+def _list_class_meanings() -> list[str]:
     """Returns a line for each class of behaviour, such as stable, with its meaning.
 
     The report prints these lines below the table of control laws. A run belongs to the first
@@ -307,7 +307,7 @@ def list_class_meanings() -> list[str]:
     return [f"{outcome.word}: {text}" for outcome, text in CLASS_MEANINGS.items()]
 
 
-def build_tuning_page(tuned: TuningResult) -> str:
+def _build_tuning_page(tuned: TuningResult) -> str:
     """Composes the Markdown page that reports a comparison of control laws.
 
     The page contains, for each point of a front, the command that repeats its run.
@@ -324,9 +324,9 @@ def build_tuning_page(tuned: TuningResult) -> str:
         _format_list(describe_procedure(tuned.plan)),
         tabulate_laws(tuned).markdown(),
         "Classes, the first that applies:",
-        _format_list([*list_class_meanings(), *list_energy_notes(tuned)]),
+        _format_list([*_list_class_meanings(), *list_energy_notes(tuned)]),
         "## Search ranges",
-        tabulate_search(tuned.plan).markdown(),
+        _tabulate_search(tuned.plan).markdown(),
         "## Fronts",
         "A * marks the points that no candidate of any law dominates.",
     ]
@@ -341,7 +341,7 @@ def build_tuning_page(tuned: TuningResult) -> str:
             parts.append("No candidate of this law is stable and at the pose.")
 
     parts.append("## As printed")
-    parts.append(tabulate_paper_gains(tuned).markdown())
+    parts.append(_tabulate_paper_gains(tuned).markdown())
     parts.append(_format_code([result.candidate.command for result in tuned.printed]))
     return "\n\n".join(parts) + "\n"
 
@@ -368,7 +368,7 @@ _MARKS = ("o", "s", "^", "D", "v", "P")
 _LABELS = {Objective.ERROR: "error (rad)", Objective.SETTLING: "settling time (s)"}
 
 
-def draw_front(tuned: TuningResult) -> Figure:
+def _draw_front(tuned: TuningResult) -> Figure:
     """Draws the Pareto fronts of all laws in one panel, with error against effort.
 
     The Pareto front of a law contains the best compromises between both. The axes are
@@ -490,8 +490,8 @@ def write_tuning(tuned: TuningResult, folder: Path) -> list[Path]:
     picture_paths = [folder / "front.png", folder / "front.pdf"]
     text = json.dumps(tuned.to_dict(), indent=2, ensure_ascii=False, allow_nan=False)
     write_whole(json_path, text + "\n")
-    write_whole(page_path, build_tuning_page(tuned))
-    figure = draw_front(tuned)
+    write_whole(page_path, _build_tuning_page(tuned))
+    figure = _draw_front(tuned)
     for path in picture_paths:
         style.write_figure(figure, path, style.REPORT_DPI)
     return [json_path, page_path, *picture_paths]
