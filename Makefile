@@ -123,7 +123,7 @@ suite-gains: setup
 
 suite: setup
 	$(BIN)/trilat bench
-	$(BIN)/trilat bench --study round-trips --seeds 4
+	$(BIN)/trilat bench --study round-trips
 
 lock: $(VENV)/uv.stamp
 	$(BIN)/uv pip compile -q --universal --generate-hashes --python-version 3.11 --no-annotate \

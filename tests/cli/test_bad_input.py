@@ -59,7 +59,7 @@ COMMANDS = {
         ["sim", "./none.toml"],
         ["none.toml", "No such file"],
     ),
-    "a directory as a scenario": (["sim", "./"], ["directory"]),
+    "a directory as a scenario": (["sim", "./"], ["is a folder"]),
     "an unknown site": (["site", "m9", "--scenario", "paper"], ["m9", "m1"]),
     "a session's name that is no key": (
         ["site", "m1", "--scenario", "paper", "--session", "a/*"],

@@ -232,7 +232,16 @@ RUN_NONE = {
     *("scenario list", "scenario show", "scenario check", "scenario new", "trace import"),
     *("experiment new", "experiment check", "experiment power"),
     *("experiment status", "experiment analyse"),
-    *("keys new", "keys renew", "keys pair", "keys info", "new law", "new hand", "new plant"),
+    *(
+        "keys new",
+        "keys add",
+        "keys renew",
+        "keys pair",
+        "keys info",
+        "new law",
+        "new hand",
+        "new plant",
+    ),
 }
 """Commands of which the page says that they run no code that a log or a scenario names."""
 

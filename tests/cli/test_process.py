@@ -44,7 +44,8 @@ def test_ctrl_c_while_computing_is_130_without_a_traceback(tmp_path: Path) -> No
 
 CALLED = """
 import sys, threading
-from trilat_net import __main__, cli
+from trilat_net import __main__
+from trilat_net.app import cli
 from trilat_net.net.zenoh_bus import ZenohBus
 called = threading.Event()
 def take(key, payload):
@@ -73,7 +74,8 @@ def test_process_that_zenoh_still_calls_ends_with_its_own_code() -> None:
 
 GOES_ON = """
 import sys, zenoh
-from trilat_net import __main__, cli
+from trilat_net import __main__
+from trilat_net.app import cli
 cli.main = lambda: None
 __main__.main()
 sys.exit(5)

@@ -413,7 +413,7 @@ def test_what_cannot_be_read_is_refused(tmp_path: Path) -> None:
     latin.write_bytes("title = 'Stärke'".encode("latin-1"))
     for path, words in (
         (tmp_path / "none.toml", "No such file"),
-        (tmp_path, "directory"),
+        (tmp_path, "is a folder"),
         (latin, "not UTF-8"),
     ):
         with pytest.raises(ScenarioError, match=words) as error:

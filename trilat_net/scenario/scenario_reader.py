@@ -268,9 +268,9 @@ def find_site(scenario: Scenario, name: str) -> SiteSpec:
     if name not in scenario.sites:
         hint = suggest_nearest(name, scenario.names)
         # A question mark ends a sentence.
-        known = f"{' The' if hint else '; the'} sites are {', '.join(scenario.names)}"
+        listing = " The sites are " if hint else "; the sites are "
         raise ScenarioError(
-            f"there is no site {name!r}{hint}{known}",
+            f"there is no site {name!r}{hint}" + listing + ", ".join(scenario.names),
             source=scenario.name,
         )
     return scenario.sites[name]

@@ -143,7 +143,7 @@ _NO_LAWS = ("conditions", "interface", "sent_vectors")
 
 def list_laws() -> list[str]:
     """Lists the names of the built-in control laws, without importing their modules."""
-    folder = str(Path(__file__).parents[1] / "laws")
+    folder = str(Path(__file__).parents[2] / "laws")
     return [module.name for module in iter_modules([folder]) if module.name not in _NO_LAWS]
 
 
