@@ -3,7 +3,7 @@
 `own-law.mcap` was made with this file: not a byte of it may change.
 """
 
-from trilat_net.core.plug.user_law import LawContext, LawInput
+from trilat_net.core.user_law import LawContext, LawInput
 
 
 class Spring:
