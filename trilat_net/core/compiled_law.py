@@ -1,4 +1,4 @@
-"""Names that files of users import from here: logs of their control laws name those files by hash."""
+"""Names that files of users import from here. Logs name those files by their hash."""
 
 from .plug.compiled_law import compiled
 
