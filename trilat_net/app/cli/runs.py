@@ -44,6 +44,7 @@ def sim_command(
     """
     from ...execution.virtual import record_virtual
     from ...log.ros2.viz_channels import parse_viz_rate
+    from ...scenario.code_consent import find_user_laws
 
     chosen = options.load_chosen_scenario(scenario, overrides, duration, seed)
     path = output if output is not None else Path(f"{chosen.name}.mcap")
@@ -68,7 +69,9 @@ def sim_command(
         terminal.print_json(open_log(path).to_dict())
     else:
         terminal.print_text(f"{path}: {chosen.duration_s:g} s of {', '.join(chosen.names)}")
-        terminal.print_text(f"next: trilat report {shlex.quote(str(path))}")
+        files = {f" --law {shlex.quote(str(law.file))}" for law in find_user_laws(chosen)}
+        report = f"trilat report {shlex.quote(str(path))}{''.join(sorted(files))}"
+        terminal.print_text(f"next: {report}")
 
     if not stayed_in_limits:
         remedy = ""
