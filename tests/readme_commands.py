@@ -45,10 +45,11 @@ CHAINS = [
         "trilat compare sim.mcap kd15.mcap",
         "trilat report sim.mcap",
         "trilat figure sim.mcap --with kd15.mcap -o figures",
-        "trilat sim docs/media/two_people.toml -o handover.mcap",
+        "trilat sim two_people -o handover.mcap",
         "trilat report handover.mcap",
         "trilat certify handover.mcap",
-        "trilat rerun handover.mcap --replace s --set control.Kd=15",
+        "trilat rerun handover.mcap --closed-loop --set link.delay_ms=800 -o slow.mcap",
+        "trilat compare handover.mcap slow.mcap",
     ],
     [
         "trilat log info sim.mcap",

@@ -46,7 +46,7 @@ from trilat_net.studies.tuning.search_space import (
 
 ROOT = Path(__file__).parents[1]
 NUMBER = r"([-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?)"
-WORDS = {"Twenty-two": "22", "eleven": "11", "twelve": "12", "−": "-"}
+WORDS = {"Twenty-three": "23", "eleven": "11", "twelve": "12", "−": "-"}
 G = 9.81
 WALL = "sites.s.environment.0"
 DIGITAL = {"scheme": "digital", "rate_hz": 100, "link.delay_ms": 0}
@@ -452,7 +452,7 @@ PAGES: dict[str, dict[str, Make]] = {
             energy.booked("paper", "digital").residual,
             *[energy.order("paper", "digital", rate_hz) for rate_hz in (1000, 2000)],
         ],
-        "{} runs of the twenty-two": lambda: [len(shipped_trials())],
+        "{} runs of the twenty-three": lambda: [len(shipped_trials())],
         "run once): {} s simulated": lambda: [
             sum(one.scenario.duration_s for one in shipped_trials())
         ],

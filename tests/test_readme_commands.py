@@ -4,7 +4,7 @@ import shlex
 from pathlib import Path
 
 from tests.cli.running import trilat
-from tests.documentation import ROOT, find_blocks
+from tests.documentation import find_blocks
 from tests.golden.surface import all_options
 from tests.readme_commands import (
     list_all,
@@ -33,8 +33,7 @@ def test_every_command_of_the_readme_is_run() -> None:
 
 def test_the_readme_shows_the_judgement_of_its_first_run(tmp_path: Path) -> None:
     (shown,) = (block.text for block in find_blocks("README.md") if not block.language)
-    scenario = ROOT / "docs" / "media" / "two_people.toml"
-    trilat("sim", str(scenario), "-o", "run.mcap", cwd=tmp_path).succeeds()
+    trilat("sim", "two_people", "-o", "run.mcap", cwd=tmp_path).succeeds()
     printed = trilat("certify", "run.mcap", cwd=tmp_path).succeeds().splitlines()
     assert printed[0] == shown.strip()
     assert len([line for line in printed if line.startswith(("ok ", "note "))]) == 7

@@ -14,6 +14,7 @@ Invariant:
 
 import math
 import pkgutil
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from importlib import import_module
@@ -206,10 +207,40 @@ _OWNERS = {
 }
 
 
+_SINGULAR = {
+    "joints": "joint",
+    "parameters": "parameter",
+    "axes": "axis",
+    "shared": "coordinate that the sites share",
+}
+
+
+def describe_wrong_type(value: Any, expected: str) -> str:
+    """Returns the problem of a value of a scenario that has the wrong type.
+
+    Args:
+        value: The value as it was read from TOML.
+        expected: What the value would have to be, such as "a number".
+
+    Returns:
+        The problem, such as "expected a number, got text", as the end of a sentence about the
+        key.
+    """
+    if isinstance(value, str):
+        return f"expected {expected}, got text{_WITHOUT_QUOTES}"
+    if isinstance(value, bool):
+        return f"expected {expected}, got true or false"
+    if isinstance(value, dict):
+        return f"expected {expected}, got a table"
+    return f"expected {expected}, got {value!r}"
+
+
 def find_count_problem(
     table: TomlTable, kind: StructType, counts: VectorCounts
 ) -> KeyProblem | None:
-    """Finds the first vector of a table that has too few or too many numbers.
+    """Finds the first vector of a table that is no list, or has too few or too many numbers.
+
+    The table is one that `expand_vectors` returned, in which a single number is a list already.
 
     Args:
         table: A table of a scenario.
@@ -224,10 +255,17 @@ def find_count_problem(
     for key, per in {**expandable, **points}.items():
         required = getattr(counts, per)
         value = table.get(key)
-        if not isinstance(value, list) or len(value) == required:
-            # Values of other types are refused elsewhere.
+        if key not in table or value is None:
             continue
         noun = "coordinates" if per == "shared" else per
+        if not isinstance(value, list):
+            if key in expandable:
+                expected = f"a number, or a list with one for each {_SINGULAR[per]}"
+            else:
+                expected = f"a list with one number for each {_SINGULAR[per]}"
+            return KeyProblem(key, describe_wrong_type(value, expected))
+        if len(value) == required:
+            continue
         numbers = count_nouns(len(value), "number")
         return KeyProblem(key, f"has {numbers}, and {_OWNERS[per]} {required} {noun}")
     return None
@@ -272,6 +310,18 @@ def split_refusal(error: msgspec.ValidationError) -> tuple[str, str]:
     return problem, path.strip("`$")
 
 
+_TYPE_NAMES = {
+    "float": "a number",
+    "int": "a whole number",
+    "bool": "true or false",
+    "str": "text",
+    "array": "a list",
+    "object": "a table",
+}
+"""Names of the types of TOML, by the name that msgspec gives them."""
+_WITHOUT_QUOTES = ": write it without quotes and unit, which the key's name states"
+
+
 def reword_problem(problem: str) -> str:
     """Rewords an error message of msgspec in terms of TOML, for the author of a scenario.
 
@@ -281,21 +331,18 @@ def reword_problem(problem: str) -> str:
     Returns:
         The reworded message. A message without terms of msgspec is returned unchanged.
     """
-    replacements = (
-        (" | null", ""),
-        ("`float`", "a number"),
-        ("`int`", "a whole number"),
-        ("`bool`", "true or false"),
-        ("`", ""),
-        ("Expected ", "expected "),
-        ("array", "list"),
-        ("str", "text"),
-    )
-    for old, new in replacements:
-        problem = problem.replace(old, new)
+    problem = re.sub("`([^`]*)`", _reword_types, problem)
+    if problem.startswith("Expected "):
+        problem = "e" + problem[1:]
     if problem.endswith("number, got text"):
-        problem += ": write it without quotes and unit, which the key's name states"
+        problem += _WITHOUT_QUOTES
     return problem
+
+
+def _reword_types(quoted: re.Match[str]) -> str:
+    """Returns the types that msgspec quotes, such as "`float | null`", in terms of TOML."""
+    types = quoted[1].split(" | ")
+    return " or ".join(_TYPE_NAMES.get(name, name) for name in types if name != "null")
 
 
 def check_keys(

@@ -2,7 +2,7 @@
 
 python docs/media/moving_picture.py [FOLDER]
 
-The run is `two_people.toml` in this folder, in virtual time. The picture is an animated SVG: its
+The run is the shipped scenario `two_people`, in virtual time. The picture is an animated SVG: its
 arms are the logged joint angles, its links carry samples as long as the logged samples took, and
 its bar is the dominance that the slave used. A viewer that shows no animation shows the instant
 STILL_S.
@@ -32,7 +32,7 @@ from trilat_net.presentation.appearance import (
 )
 
 HERE = Path(__file__).resolve().parent
-SCENARIO = HERE / "two_people.toml"
+SCENARIO = "two_people"
 PICTURES = HERE.parent / "img"
 PICTURE = "two-people.svg"
 
@@ -40,9 +40,10 @@ WIDTH, HEIGHT = 800, 500
 FRAMES_PER_S = 20
 STILL_S = 1.4
 """Time of the run that a viewer without animation shows, in s."""
-PIXELS_PER_M = 86.0
+LINK_PIXELS = 86.0
+"""Length of a link of an arm; both links are equally long."""
 PANEL_WIDTH, PANEL_HEIGHT, PANEL_TOP = 208, 224, 58
-BASE_X, BASE_Y = 68, 196
+BASE_X, BASE_Y = 86, 196
 """Base of an arm within its panel."""
 CHART_LEFT, CHART_RIGHT, CHART_TOP, CHART_BOTTOM = 54, 780, 370, 456
 SAMPLES_PER_LINK = 3
@@ -255,7 +256,7 @@ def draw_film(log: Log) -> str:
     """Returns the moving picture of a run as the text of an SVG file.
 
     Args:
-        log: Log of a run of `two_people.toml`.
+        log: Log of a run of `two_people`.
     """
     film = read_film(log)
     root = ET.Element(
@@ -338,8 +339,8 @@ def draw_panel(root: ET.Element, film: Film, seat: Seat) -> None:
 
 
 def draw_arm(parent: ET.Element, film: Film, site: str, style: str) -> ET.Element:
-    """Draws an arm with two links of 1 m; returns the group at its end effector."""
-    length = PIXELS_PER_M
+    """Draws an arm with two links of equal length; returns the group at its end effector."""
+    length = LINK_PIXELS
     base = add(parent, "g", transform=f"translate({BASE_X},{BASE_Y})")
     upper = add(base, "g")
     film.add_turn(upper, -film.q_deg[site][:, 0])

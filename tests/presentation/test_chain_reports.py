@@ -7,6 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+import trilat_net as tn
 from tests.chains import six_joints
 from tests.core.chain_references import chain_references
 from trilat_net.execution.virtual import simulate_scenario
@@ -146,6 +147,23 @@ def test_columns_and_messages_name_joints_and_links():
     assert channels.joints == JOINTS
     names = channels.arrays["theta_hat"].channel.about["names"].split(" ")
     assert (len(names), names[0], names[29]) == (60, "shoulder.m", "forearm.Izz")
+
+
+@pytest.mark.parametrize(
+    ("scenario", "side"),
+    [("two_people", charts.PICTURE_SIDE), ("paper", None)],
+)
+def test_lines_of_small_planar_arms_are_as_thin_as_those_of_large_ones(scenario, side):
+    log = tn.simulate(scenario, duration_s=0.5)
+    builder = charts.ChartBuilder(log, None)
+    data = builder.build().data.to_builtins()
+    left, right, bottom, top = data["bounds_m"]
+    arm_m = log.scenario.arms["s"].lengths_m
+    assert data["arms"][-1]["links_m"] == [builder.units_per_m * link_m for link_m in arm_m]
+    if side is None:
+        assert builder.units_per_m == 1.0
+    else:
+        assert max(right - left, top - bottom) == pytest.approx(side)
 
 
 @pytest.mark.long

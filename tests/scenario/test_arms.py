@@ -97,6 +97,26 @@ def test_shipped_arms_weigh_and_reach_what_their_makers_say() -> None:
         ),
         ({"arm.payload_kg": "x"}, "arm.payload_kg", "expected a number, got text"),
         ({"arm.payload_kg": -1.0}, "arm.payload_kg", ">= 0"),
+        (
+            {"control.Kp": "abc"},
+            "control.Kp",
+            "expected a number, or a list with one for each joint, got text",
+        ),
+        (
+            {"control.Gamma": True},
+            "control.Gamma",
+            "a list with one for each parameter, got true or false",
+        ),
+        (
+            {"limits.tau_limit_nm": "9 N m"},
+            "limits.tau_limit_nm",
+            "expected a number, or a list with one for each joint, got text",
+        ),
+        (
+            {"arm.payload_com_m": "abc"},
+            "arm.payload_com_m",
+            "expected a list",
+        ),
         ({"arm.tip": "wrist"}, "arm.tip", "did you mean 'wrist_3_link'"),
         ({"arm.base": "bas"}, "arm.base", "did you mean 'base'"),
         ({"arm.tip": "forearm"}, "arm.armature_kg_m2", "6 numbers, and the arm has 3 joints"),

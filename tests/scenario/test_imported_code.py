@@ -227,7 +227,7 @@ def test_law_that_sends_nothing_leaves_its_scenario_as_it_was(folder: Path) -> N
     [
         ("make()", "law", "must be written out as a literal"),
         ("{'u': {}, 'u': {}}", "law", "contains the same name twice"),
-        ("['u']", "law", "expected object, got list"),
+        ("['u']", "law", "expected a table, got a list"),
         ("{'u': {'units': 'J'}}", "law", "unknown field units"),
         ("{'u': {'length': 0}}", "law", ">= 1"),
         ("{'u': {'length': 'arms'}}", "law", "arms"),

@@ -79,7 +79,7 @@ _MAXIMA = 400
 _LEAST_DRAWN = 1e-6
 """Smallest drawn maximum, at which smaller ones are drawn. A logarithmic axis has no zero."""
 PICTURE_SIDE = 4.0
-"""Longer side of a picture of a chain, in the unit of the line widths of the page."""
+"""Longer side of a scaled picture, in the unit of the line widths of the page."""
 
 
 class PageCharts(NamedTuple):
@@ -106,8 +106,9 @@ class ChartBuilder:
 
     Attributes:
         bounds_m: Left, right, bottom and top of a box around the motion of all arms, in m.
-        units_per_m: Scale of the pictures of the arms, in units of the picture per m. It is 1
-            for planar arms. Pictures with a chain are scaled to the size `PICTURE_SIDE`.
+        units_per_m: Scale of the pictures of the arms, in units of the picture per m. Pictures
+            with a chain, and of planar arms that move in less than half of `PICTURE_SIDE`, are
+            scaled to that size, because the widths of lines are fixed. Otherwise it is 1.
         leads: Who leads each slave over time.
     """
 
@@ -125,9 +126,10 @@ class ChartBuilder:
         self.bounds_m = arm_poses.compute_pose_box_m(poses)
         self.units_per_m = 1.0
         arms = log.scenario.arms.values()
-        if any(arm.chain is not None for arm in arms):
-            left, right, bottom, top = self.bounds_m
-            longer_side_m = max(right - left, top - bottom)
+        left, right, bottom, top = self.bounds_m
+        longer_side_m = max(right - left, top - bottom)
+        has_chain = any(arm.chain is not None for arm in arms)
+        if has_chain or longer_side_m < PICTURE_SIDE / 2.0:
             self.units_per_m = PICTURE_SIDE / longer_side_m
 
         self._joint_titles = []
@@ -688,7 +690,7 @@ class ChartBuilder:
             colour=index,
             table=table,
             bodies=len(bodies),
-            links_m=list(arm.lengths_m),
+            links_m=[self.units_per_m * length_m for length_m in arm.lengths_m],
         )
 
     def _build_chain(self, index: int, site: str) -> ChainArm:

@@ -194,7 +194,7 @@ class PlanarArm(msgspec.Struct, frozen=True, kw_only=True, tag="planar", tag_fie
         table: Index of the table that the picture uses. It contains the actual and the desired
             angles of both joints, in rad, and then the outlines of the bodies.
         bodies: Number of bodies that the arm can touch.
-        links_m: Lengths of the links, in m.
+        links_m: Lengths of the links, in units of the picture.
     """
 
     site: str

@@ -42,6 +42,7 @@ from ..fields import (
     check_choice,
     check_finite,
     check_keys,
+    describe_wrong_type,
     expand_vectors,
     field_names,
     find_count_problem,
@@ -882,6 +883,12 @@ def _check_counts(site: TomlTable, counts: VectorCounts, path: str) -> None:
         if key == "qd_des_limit_rad_s":
             length = counts.shared
             owner = f"sites share {count_nouns(counts.shared, 'coordinate')}"
+        if isinstance(value, str | bool | dict):
+            each = "coordinate that the sites share" if key == "qd_des_limit_rad_s" else "joint"
+            raise ScenarioError(
+                describe_wrong_type(value, f"a number, or a list with one for each {each}"),
+                path=f"{path}.limits.{key}",
+            )
         if isinstance(value, list) and len(value) != length:
             raise ScenarioError(
                 f"has {count_nouns(len(value), 'number')}, and {owner}",
