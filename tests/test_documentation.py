@@ -184,6 +184,7 @@ COMMAND_PAGES = {
     "docs/delay-traces.md",
     "docs/fair-comparison.md",
     "docs/first-hour.md",
+    "docs/first-result.md",
     "docs/lab.md",
     "docs/laws.md",
     "docs/linear.md",
