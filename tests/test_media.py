@@ -7,6 +7,7 @@ from types import SimpleNamespace
 from typing import Any
 from xml.etree import ElementTree
 
+import numpy as np
 import pytest
 
 import trilat_net as tn
@@ -23,6 +24,24 @@ LARGEST_BYTES = 1_500_000
 @pytest.mark.long
 def test_the_picture_is_that_of_its_run() -> None:
     assert MEDIA.draw_film(tn.simulate(MEDIA.SCENARIO)) == PICTURE
+
+
+def test_hands_of_the_picture_push_as_people_do() -> None:
+    """The README and the scenario state 8 N, a torque far from its limit, and 0.6 s."""
+    log = tn.simulate(MEDIA.SCENARIO)
+    for name in ("m1", "m2"):
+        arm = log.scenario.sites[name].arm
+        site = log[name]
+        # Columns of the Jacobian of the end effector, from the positions of both links.
+        upper_rad = site.q[:, 0]
+        fore_rad = site.q.sum(axis=1)
+        fore = arm.l2_m * np.stack([-np.sin(fore_rad), np.cos(fore_rad)], axis=1)
+        upper = arm.l1_m * np.stack([-np.sin(upper_rad), np.cos(upper_rad)], axis=1)
+        transposed = np.stack([upper + fore, fore], axis=1)
+        forces_n = np.linalg.solve(transposed, site.tau_x[:, :, None])[:, :, 0]
+        assert 2.0 < np.linalg.norm(forces_n, axis=1).max() < 8.0
+        assert np.abs(site.tau).max() < 0.5 * log.scenario.sites[name].limits.tau_limit_nm
+    assert MEDIA.read_film(log).lags_s == pytest.approx((0.6, 0.6), abs=0.05)
 
 
 def test_the_picture_loads_nothing() -> None:

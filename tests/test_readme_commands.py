@@ -1,10 +1,11 @@
 """The list of commands that `.ci/readme` runs covers the tables of README.md and docs/commands.md."""
 
+import re
 import shlex
 from pathlib import Path
 
 from tests.cli.running import trilat
-from tests.documentation import find_blocks
+from tests.documentation import ROOT, find_blocks
 from tests.golden.surface import all_options
 from tests.readme_commands import (
     list_all,
@@ -37,6 +38,11 @@ def test_the_readme_shows_the_judgement_of_its_first_run(tmp_path: Path) -> None
     printed = trilat("certify", "run.mcap", cwd=tmp_path).succeeds().splitlines()
     assert printed[0] == shown.strip()
     assert len([line for line in printed if line.startswith(("ok ", "note "))]) == 7
+    page = (ROOT / "docs/first-result.md").read_text(encoding="utf-8")
+    explained = re.findall(r"^\| `(.+?)` \|", page, re.MULTILINE)
+    assert len(explained) == 7
+    for line, words in zip(printed, explained, strict=False):
+        assert line.partition(" ")[2].strip().startswith(words)
 
 
 def test_the_table_names_nearly_every_command() -> None:
