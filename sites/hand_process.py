@@ -22,7 +22,13 @@ import numpy as np
 
 from trilat_net.core.life.own_hand import HandProgram, HandView
 from trilat_net.core.plug.user_law import PeerView
-from trilat_net.errors import RunFailed, SessionError, UsageError, count_nouns
+from trilat_net.errors import (
+    RunFailed,
+    SessionError,
+    UsageError,
+    count_nouns,
+    describe_exception,
+)
 from trilat_net.net import topics
 from trilat_net.net.arm_client import SiteClient, make_hand_sender
 from trilat_net.net.bus import Bus
@@ -129,7 +135,7 @@ class HandProcess(SiteClient):
             class_name = self._code.split()[0]
             raise RunFailed(
                 f"the hand {class_name} of {message.site} failed at tick {message.k}: "
-                f"{type(error).__name__}: {error}; the hand has released the arm"
+                f"{describe_exception(error)}; the hand has released the arm"
             ) from error
         self._send(message.k, numbers)
 

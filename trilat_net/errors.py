@@ -16,8 +16,10 @@ Invariant:
 import os
 import re
 import shlex
+import traceback
 from collections.abc import Iterable, Sequence
 from functools import partial
+from pathlib import Path
 from typing import ClassVar
 
 _OPTION = re.compile(
@@ -356,3 +358,45 @@ def join_arguments(arguments: Iterable[str]) -> str:
         needs_quotes = not re.fullmatch(r"[\w.:/\\=+-]+", escaped)
         texts.append(f'"{escaped}"' if needs_quotes else escaped)
     return " ".join(texts)
+
+
+def describe_exception(error: BaseException) -> str:
+    """Returns an exception of a user's code in one line, with the place where it was raised.
+
+    The place is the innermost line that belongs neither to this program nor to a library. For
+    example: "NameError: name 'nw' is not defined (mylaw.py, line 14)".
+
+    Args:
+        error: The exception.
+    """
+    kind = type(error).__name__
+    lines = str(error).strip().splitlines()
+    text = f"{kind}: {lines[0]}" if lines else kind
+    # The message of a syntax error names the place itself.
+    if isinstance(error, SyntaxError):
+        return text
+    frames = traceback.extract_tb(error.__traceback__)
+    places = [frame for frame in frames if _is_users_file(frame.filename)]
+    if not places:
+        return text
+    return f"{text} ({Path(places[-1].filename).name}, line {places[-1].lineno})"
+
+
+def _is_users_file(name: str) -> bool:
+    """Returns True if a source file belongs neither to this program nor to a library.
+
+    Args:
+        name: Name of the file in a traceback. That of code without a file is "<string>".
+    """
+    file = Path(name)
+    if name.startswith("<") or "site-packages" in file.parts:
+        return False
+    return not any(file.is_relative_to(folder) for folder in _OTHER_CODE)
+
+
+_PROGRAM = Path(__file__).parents[1]
+_OTHER_CODE = (
+    *(_PROGRAM / package for package in ("trilat_net", "sites", "recorder", "live")),
+    Path(traceback.__file__).parent,
+)
+"""Folders of this program and of Python's standard library."""

@@ -9,7 +9,7 @@ from mcap.writer import Writer
 
 from tests.cli.running import trilat
 from tests.log_editing import edited, recorded, without
-from trilat_net.presentation.terminal_output import sanitize
+from trilat_net.presentation.untrusted_text import sanitize
 
 WHOLE = recorded("paper")
 

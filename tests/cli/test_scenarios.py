@@ -88,7 +88,8 @@ def test_refusal_of_a_real_arm_names_a_command_that_runs(
     options: tuple[str, ...], tmp_path: Path
 ) -> None:
     shutil.copy(EXAMPLES / "two_operators.toml", tmp_path)
-    sim = ("sim", "two_operators.toml", "--duration", "0.1", *options)
+    wanted = ("--duration", "0.1", "--seed", "3", "-o", "rehearsal.mcap")
+    sim = ("sim", "two_operators.toml", *wanted, *options)
     refused = trilat(*sim, cwd=tmp_path)
     assert refused.code == 2
     words = shlex.split(refused.err.rpartition("run: trilat ")[2])
@@ -96,6 +97,8 @@ def test_refusal_of_a_real_arm_names_a_command_that_runs(
     trilat(*words, cwd=tmp_path).succeeds()
     settings = [word for word in words if "=" in word]
     assert set(options[1:]) <= set(settings), "what was asked for stays"
+    log = tn.open_log(tmp_path / "rehearsal.mcap")
+    assert (log.scenario.seed, log.scenario.duration_s) == (3, 0.1)
 
 
 def test_other_commands_name_settings_that_work() -> None:

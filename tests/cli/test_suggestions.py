@@ -86,3 +86,42 @@ def test_the_case_of_a_gain_is_corrected(tmp_path: Path) -> None:
 def test_a_faint_similarity_elsewhere_suggests_nothing() -> None:
     assert suggest_nearest("foo", ["name", "seed"], ["control.follows"]) == ""
     assert find_nearest("x" * 81, ["x" * 81]) == ""
+
+
+SUM_OF_NOTHING = """
+class Torques:
+    def __init__(self, facts):
+        pass
+
+    def torque(self, now):
+        return [sum_of_nothing for _ in now.q]
+"""
+
+
+@pytest.mark.parametrize("written", ["torques.py", "torques"])
+def test_a_file_in_place_of_a_law_is_answered_with_its_class(
+    written: str, tmp_path: Path
+) -> None:
+    (tmp_path / "torques.py").write_text(SUM_OF_NOTHING, "utf-8")
+    words = ("sim", "two_sites", "--set", f"control.law={written}")
+    trilat(*words, cwd=tmp_path).refuses("write torques:Torques")
+
+
+def test_a_failing_law_is_reported_with_its_line(tmp_path: Path) -> None:
+    (tmp_path / "torques.py").write_text(SUM_OF_NOTHING, "utf-8")
+    words = ("sim", "two_sites", "--set", "control.law=torques:Torques", "-o", "run.mcap")
+    said = trilat(*words, "--duration", "0.1", cwd=tmp_path).err
+    line = (
+        SUM_OF_NOTHING.splitlines().index("        return [sum_of_nothing for _ in now.q]") + 1
+    )
+    assert f"'sum_of_nothing' is not defined (torques.py, line {line})" in said
+
+
+def test_the_next_command_permits_the_law_that_ran(tmp_path: Path) -> None:
+    text = SUM_OF_NOTHING.replace("sum_of_nothing", "0.0")
+    (tmp_path / "torques.py").write_text(text, "utf-8")
+    words = ("sim", "two_sites", "--set", "control.law=torques:Torques", "-o", "run.mcap")
+    printed = trilat(*words, "--duration", "0.1", cwd=tmp_path).succeeds()
+    (law,) = re.findall(r"next: trilat report run\.mcap --law (\S+)", printed)
+    judged = trilat("verify", "run.mcap", "--law", law, cwd=tmp_path).out
+    assert "200/200 records identical" in judged

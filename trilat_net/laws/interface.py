@@ -28,7 +28,7 @@ from msgspec.structs import asdict
 from ..core.plug.user_law import LawContext, UserLaw, UserLawFactory
 from ..core.step.site_setup import Gains, Law
 from ..core.step.vectors import Array
-from ..errors import ScenarioError, count_nouns
+from ..errors import ScenarioError, count_nouns, describe_exception
 from ..fields import Frozen, KeyProblem, NotNegative
 from ..files import find_page
 from .conditions import LawSituation, LinearForm, LinearSituation, StabilityCondition
@@ -665,6 +665,6 @@ def make_instance(
         error_path = path or f"sites.{context.site}.control"
         problem = (
             f"{code} cannot be created with {arguments or 'no settings'}: "
-            f"{type(error).__name__}: {error}"
+            f"{describe_exception(error)}"
         )
         raise ScenarioError(problem, path=error_path) from None

@@ -19,7 +19,7 @@ from ..analysis.metrics.measures import Metric, Quantity, quantities
 from ..errors import count_nouns
 from .certificate_text import CertificateLine, describe_certificate, select_premises
 from .result_text import MARKS, Block, MarkedText, TextTable
-from .terminal_output import sanitize
+from .untrusted_text import sanitize
 
 MOST_LINES = 10
 """Largest number of lines of a short text."""

@@ -12,7 +12,7 @@ Invariant:
       cores are used.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +22,7 @@ import numpy as np
 
 from ..analysis.judge import certify_run
 from ..analysis.site_signals import shared_unit
-from ..errors import CodeWithheld, LawFailed, RunFailed, ScenarioError
+from ..errors import CodeWithheld, LawFailed, RunFailed, ScenarioError, join_arguments
 from ..execution.log_checks import check_log_files
 from ..execution.virtual_comparison import simulate_without_operators
 from ..log.accounting import MIN_COVERAGE
@@ -33,6 +33,7 @@ from ..log.site_log import SiteLog
 from ..scenario.code_consent import may_run_user_laws
 from ..scenario.imported_code import allowed_code
 from ..workers import worker_pool
+from . import terminal_output
 from .certificate_text import CertificateLine, describe_certificate, describe_theorem
 from .result_text import MARKS, Block, MarkedText, TextTable
 from .summary_text import format_run_lines
@@ -252,3 +253,37 @@ def _list_timing_cells(records: SiteLog) -> list[str]:
     if len(records) > 1:
         busy_us = np.percentile(records.busy_us, (50, 99))
     return [f"{time_us:.0f}" for time_us in (*late_us, *busy_us)]
+
+
+def conclude_files(
+    paths: Sequence[Path], folder: Path, *, as_json: bool = False, png: bool = False
+) -> tuple[Log, Conclusion]:
+    """Checks a log that was just recorded, writes its report and prints the result.
+
+    If the user interrupts the drawing of figures, a note gives the command that draws the
+    report later.
+
+    Args:
+        paths: Files of the log.
+        folder: Folder of the report.
+        as_json: True to print the result as JSON.
+        png: True to write the figures as PNG files too.
+
+    Returns:
+        The log, and the result of the checks with the paths of the report.
+    """
+    if not as_json:
+        terminal_output.out.print("checking the log and drawing ...")
+    try:
+        log = terminal_output.open_with_progress(*paths)
+        with terminal_output.progress_bar("executing and drawing") as progress:
+            conclusion = conclude(log, folder, progress, png=png)
+    except KeyboardInterrupt:
+        files = join_arguments(map(str, paths))
+        command = f"trilat report {files} -o {join_arguments([str(folder)])} --force"
+        terminal_output.print_note(
+            f"the log is kept: {files}; its report can be drawn later: {command}"
+        )
+        raise
+    terminal_output.print_result(conclusion, as_json=as_json)
+    return log, conclusion

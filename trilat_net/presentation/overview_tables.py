@@ -21,7 +21,7 @@ from ..errors import count_nouns
 from ..log.accounting import describe_unknown_ends
 from ..results import JsonObject
 from .result_text import Block, MarkedText, TextTable
-from .terminal_output import sanitize
+from .untrusted_text import sanitize
 
 _MAX_GAPS = 4
 """Largest number of listed gaps of a channel, and of damaged parts of a file."""

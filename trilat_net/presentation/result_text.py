@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from rich.text import Text
 
 from ..results import Result
-from .terminal_output import MAX_LETTERS, sanitize
+from .untrusted_text import MAX_LETTERS, sanitize
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -38,7 +38,7 @@ from ..log.recover import Recovery
 from ..log.session_check import LogCheckResult
 from ..results import Result
 from .result_text import MARKS, Block, MarkedText, TextTable
-from .terminal_output import sanitize
+from .untrusted_text import sanitize
 
 MOST_LINES = 12
 """Largest number of lines of each kind. The file summary.json has all of them."""

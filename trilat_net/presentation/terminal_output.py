@@ -14,10 +14,9 @@ Invariant:
 """
 
 import json
-import re
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext, redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,32 +25,13 @@ from rich.console import Console
 from rich.markup import escape
 from rich.text import Text
 
-from ..errors import count_nouns, join_arguments
+from ..errors import count_nouns
+from .untrusted_text import CONTROLS, MAX_LETTERS, escape_controls, sanitize
 
 if TYPE_CHECKING:
     from ..log.log_reader import Log
     from ..results import Result
-    from .conclude import Conclusion
     from .result_text import TextTable
-
-_CONTROLS = re.compile(
-    r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u00ad\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ud800-\udfff]"
-)
-"""Characters that move the cursor, ring, colour, or change the direction of writing.
-
-Line feeds and tabs are not among them.
-"""
-
-
-def _escape_controls(text: str) -> str:
-    """Replaces control characters of a text by their names, as in <U+001B>.
-
-    Otherwise a text from another program could control the terminal.
-
-    Args:
-        text: The text.
-    """
-    return _CONTROLS.sub(lambda match: f"<U+{ord(match[0]):04X}>", text)
 
 
 class TextConsole(Console):
@@ -69,7 +49,7 @@ class TextConsole(Console):
             text: The text.
             **options: Options of Rich.
         """
-        return super().render_str(_escape_controls(text), **options)
+        return super().render_str(escape_controls(text), **options)
 
 
 out = TextConsole(highlight=False)
@@ -85,28 +65,8 @@ LINES_PERIOD_S = 10.0
 """Time between two lines of `progress_lines`, in s."""
 _MAX_DAMAGED = 3
 """Largest number of listed damaged parts of a log."""
-MAX_LETTERS = 4000
-"""Largest length of a printed line."""
 _PIPE_WIDTH = 160
 """Least width of tables, in characters, when the output is not a terminal."""
-
-
-def sanitize(text: object, most: int = 300) -> str:
-    """Makes a text from an unknown source fit for a terminal.
-
-    Characters that cannot be printed become a replacement character. A text that is longer than
-    `most` characters is cut off.
-
-    Args:
-        text: The text, or an object that is converted to a string.
-        most: Largest number of characters.
-    """
-    # One character more than the limit tells whether the text is too long.
-    beginning = str(text)[: most + 1]
-    plain = "".join(letter if letter.isprintable() else "\ufffd" for letter in beginning)
-    if len(plain) <= most:
-        return plain
-    return plain[:most] + "..."
 
 
 def print_text(text: object, console: Console = out, head: str = "") -> None:
@@ -179,7 +139,7 @@ def print_json(value: Any) -> None:
         ValueError: The value contains NaN or an infinite number.
     """
     text = json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False)
-    print_line(_CONTROLS.sub(lambda match: f"\\u{ord(match[0]):04x}", text))
+    print_line(CONTROLS.sub(lambda match: f"\\u{ord(match[0]):04x}", text))
 
 
 def print_line(text: str) -> None:
@@ -188,7 +148,7 @@ def print_line(text: str) -> None:
     Args:
         text: The line.
     """
-    sys.stdout.write(_escape_controls(text) + "\n")
+    sys.stdout.write(escape_controls(text) + "\n")
     sys.stdout.flush()
 
 
@@ -240,40 +200,6 @@ def lines_aside(aside: bool) -> Iterator[None]:
     """
     with redirect_stdout(sys.stderr) if aside else nullcontext():
         yield
-
-
-def conclude_files(
-    paths: Sequence[Path], folder: Path, *, as_json: bool = False, png: bool = False
-) -> "tuple[Log, Conclusion]":
-    """Checks a log that was just recorded, writes its report and prints the result.
-
-    If the user interrupts the drawing of figures, a note gives the command that draws the
-    report later.
-
-    Args:
-        paths: Files of the log.
-        folder: Folder of the report.
-        as_json: True to print the result as JSON.
-        png: True to write the figures as PNG files too.
-
-    Returns:
-        The log, and the result of the checks with the paths of the report.
-    """
-    from .conclude import conclude
-
-    if not as_json:
-        out.print("checking the log and drawing ...")
-    try:
-        log = open_with_progress(*paths)
-        with progress_bar("executing and drawing") as progress:
-            conclusion = conclude(log, folder, progress, png=png)
-    except KeyboardInterrupt:
-        files = join_arguments(map(str, paths))
-        command = f"trilat report {files} -o {join_arguments([str(folder)])} --force"
-        print_note(f"the log is kept: {files}; its report can be drawn later: {command}")
-        raise
-    print_result(conclusion, as_json=as_json)
-    return log, conclusion
 
 
 @contextmanager

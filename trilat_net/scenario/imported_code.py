@@ -31,7 +31,7 @@ from typing import Annotated, Any, ClassVar, NamedTuple, Protocol, cast
 from msgspec import Meta, field
 
 from ..core.plug.user_law import LawContext, UserLaw, UserLawFactory
-from ..errors import CodeWithheld, ScenarioError, suggest_nearest
+from ..errors import CodeWithheld, ScenarioError, describe_exception, suggest_nearest
 from ..files import find_page, open_regular
 from ..laws.interface import LawSettings, check_law_class
 from ..laws.sent_vectors import SentVectorSpecs, convert_sends, parse_classes
@@ -449,7 +449,7 @@ def import_class(key: CodeKey, path: str, method: str = "torque") -> Any:
                 imported = _import(module, source.sha256)
         # The user's code may raise anything.
         except (Exception, SystemExit) as error:
-            problem = f"{module} cannot be imported: {type(error).__name__}: {error}"
+            problem = f"{module} cannot be imported: {describe_exception(error)}"
             raise ScenarioError(problem, path=path) from None
     return getattr(imported, name)
 

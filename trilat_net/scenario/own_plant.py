@@ -23,7 +23,7 @@ from msgspec import Meta, field
 
 from ..core.step.ticks import PlantState
 from ..core.step.vectors import Array
-from ..errors import PlantFailed, ScenarioError, count_nouns
+from ..errors import PlantFailed, ScenarioError, count_nouns, describe_exception
 from ..fields import Frozen, is_number
 from .class_arguments import make_own_instance
 from .imported_code import CLASS_PATTERN, CodeKey, Watch, call_directly, import_class, read_code
@@ -322,7 +322,7 @@ class PlantPlayer:
             return result
         # The user's code may raise anything.
         except (Exception, SystemExit) as error:
-            raise self._make_error(tick, f"{type(error).__name__}: {error}") from error
+            raise self._make_error(tick, describe_exception(error)) from error
 
     def _make_error(self, tick: int, problem: str) -> PlantFailed:
         """Returns the error that reports a problem of the plant in a tick."""

@@ -27,7 +27,7 @@ import tomllib
 from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 import msgspec
 import numpy as np
@@ -51,7 +51,7 @@ from ..fields import (
     split_refusal,
 )
 from ..files import open_regular
-from ..laws.sent_vectors import read_sends
+from ..laws.sent_vectors import parse_classes, read_sends
 from .arms import BASE_KEYS, CHAIN_KEYS, Arm, ArmModel, Task, build_arm, read_arm
 from .delay_models import DELAY_MODELS
 from .delay_traces import read_trace
@@ -398,13 +398,38 @@ def _resolve_control(
     law = str(written.get("law", default_law))
     if ":" in law:
         return _resolve_user_law(law, written, default, path)
-    check_choice(law, [*LAWS, "package.module:Law"], f"{path}.law")
+    if law not in LAWS:
+        _refuse_law(law, f"{path}.law")
     gain_names = {name: field_names(kind) for name, kind in LAWS.items() if name != "own"}
     valid_keys = ("law", *field_names(LAWS[law]))
     _check_kind_keys(written, valid_keys, path, f"law {law}", gain_names)
     gains = check_keys(written, valid_keys, path)
     inherited = default if default_law == law else {}
     return expand_vectors({**inherited, **gains, "law": law}, LAWS[law], counts)
+
+
+def _refuse_law(law: str, path: str) -> NoReturn:
+    """Refuses the name of a control law that does not exist.
+
+    If a Python file of that name exists, the message contains the right name of its class.
+
+    Args:
+        law: The name.
+        path: Path of the key, for error messages.
+
+    Raises:
+        ScenarioError: In every case.
+    """
+    file = Path(law if law.endswith(".py") else f"{law}.py")
+    if file.is_file():
+        classes = parse_classes(file.read_bytes(), file, path)
+        names = [f"{file.stem}:{name}" for name in classes]
+        remedy = f"write {' or '.join(names)}" if names else "it defines no class"
+        raise ScenarioError(f"is {law!r}, but a law in a file is a class: {remedy}", path=path)
+    # "own" is the type of users' laws in canonical texts.
+    built_in = [name for name in LAWS if name != "own"]
+    check_choice(law, [*built_in, "module:Class"], path)
+    raise ScenarioError(f"is {law!r}, but must name a class as module:Class", path=path)
 
 
 def _resolve_user_law(

@@ -380,7 +380,9 @@ def _conclude(parts: list[Path], *, png: bool) -> None:
             could not be verified completely.
         RunFailed: The log failed a check, or the session ended with a failure.
     """
-    log, conclusion = terminal.conclude_files(parts, parts[0].parent, png=png)
+    from ...presentation.conclude import conclude_files
+
+    log, conclusion = conclude_files(parts, parts[0].parent, png=png)
     if conclusion.exit_code == CodeWithheld.exit_code:
         raise CodeWithheld(
             f"{parts[0]}: parts of this log were not checked, because code that the log names "

@@ -44,6 +44,7 @@ def sim_command(
     """
     from ...execution.virtual import record_virtual
     from ...log.ros2.viz_channels import parse_viz_rate
+    from ...scenario.code_consent import find_user_laws
     from ...scenario.validate import write_simulated_options
 
     chosen = options.load_chosen_scenario(scenario, overrides, duration, seed)
@@ -51,6 +52,10 @@ def sim_command(
         words = ["trilat", "sim", scenario]
         for text in options.list_overrides(overrides, duration):
             words += ["--set", text]
+        if seed is not None:
+            words += ["--seed", str(seed)]
+        if output is not None:
+            words += ["-o", str(output)]
         command = f"{shlex.join(words)} {write_simulated_options(chosen)}"
         raise ScenarioError(
             f"is 'external': {', '.join(chosen.outside)} is a real arm, which only a live "
@@ -80,7 +85,9 @@ def sim_command(
         terminal.print_json(open_log(path).to_dict())
     else:
         terminal.print_text(f"{path}: {chosen.duration_s:g} s of {', '.join(chosen.names)}")
-        terminal.print_text(f"next: trilat report {shlex.quote(str(path))}")
+        files = {f" --law {shlex.quote(str(law.file))}" for law in find_user_laws(chosen)}
+        report = f"trilat report {shlex.quote(str(path))}{''.join(sorted(files))}"
+        terminal.print_text(f"next: {report}")
 
     if not stayed_in_limits:
         remedy = ""

@@ -98,9 +98,10 @@ def _run_and_report(
     if not has_log:
         raise typer.Exit(outcome.exit_code)
 
-    _, conclusion = terminal.conclude_files(
-        [outcome.log], results, as_json=run.as_json, png=run.png
-    )
+    # imported after the session, whose start it would delay
+    from ...presentation.conclude import conclude_files
+
+    _, conclusion = conclude_files([outcome.log], results, as_json=run.as_json, png=run.png)
     if page is not None:
         page.offer_results((conclusion.page, outcome.log))
     if outcome.problems or not conclusion.passed:

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from ...errors import LawFailed, count_nouns
+from ...errors import LawFailed, count_nouns, describe_exception
 from ..step.vectors import Vector
 
 MAX_LAW_MEMORY = 1024
@@ -320,7 +320,7 @@ def describe_failure(
         tick: The tick. None if the exception was raised outside of a tick.
         error: The exception.
     """
-    problem = _one_line(error)
+    problem = describe_exception(error)
     if "LawVector" in problem:
         problem += "; for more than + - * / make it an array, as in numpy.asarray(now.q)"
     return _law_error(law, site, tick, problem)
@@ -428,10 +428,3 @@ def _law_error(law: UserLaw, site: str, tick: int | None, problem: str) -> LawFa
         problem: The problem, a sentence for the user.
     """
     return LawFailed(problem, site=site, code=law_name(law), tick=tick)
-
-
-def _one_line(error: BaseException) -> str:
-    """Returns the type of an exception and the first line of its message."""
-    kind = type(error).__name__
-    lines = str(error).strip().splitlines()
-    return f"{kind}: {lines[0]}" if lines else kind

@@ -24,6 +24,7 @@ from ...core.step.site_arrays import SiteArrays
 from ...core.step.site_step import Site
 from ...core.step.ticks import NS_PER_S, tick_ns
 from ...core.step.vectors import Array
+from ...errors import describe_exception
 from ..class_arguments import make_own_instance
 from ..imported_code import (
     CLASS_PATTERN,
@@ -297,7 +298,7 @@ class HandPlayer:
             self.hand.accept_decision(k, action)
         # The user's code may raise anything.
         except (Exception, SystemExit) as error:
-            self.fail(k, f"{type(error).__name__}: {error}")
+            self.fail(k, describe_exception(error))
 
     def fail(self, k: int, problem: str) -> None:
         """Makes the program let go of the arm for the rest of the run.

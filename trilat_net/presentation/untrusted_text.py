@@ -1,0 +1,45 @@
+"""Makes texts from files and from other computers safe to print.
+
+Such a text could contain control characters that move the cursor or hide other texts.
+"""
+
+import re
+
+CONTROLS = re.compile(
+    r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u00ad\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ud800-\udfff]"
+)
+"""Characters that move the cursor, ring, colour, or change the direction of writing.
+
+Line feeds and tabs are not among them.
+"""
+MAX_LETTERS = 4000
+"""Largest length of a printed line."""
+
+
+def escape_controls(text: str) -> str:
+    """Replaces control characters of a text by their names, as in <U+001B>.
+
+    Otherwise a text from another program could control the terminal.
+
+    Args:
+        text: The text.
+    """
+    return CONTROLS.sub(lambda match: f"<U+{ord(match[0]):04X}>", text)
+
+
+def sanitize(text: object, most: int = 300) -> str:
+    """Makes a text from an unknown source fit for a terminal.
+
+    Characters that cannot be printed become a replacement character. A text that is longer than
+    `most` characters is cut off.
+
+    Args:
+        text: The text, or an object that is converted to a string.
+        most: Largest number of characters.
+    """
+    # One character more than the limit tells whether the text is too long.
+    beginning = str(text)[: most + 1]
+    plain = "".join(letter if letter.isprintable() else "\ufffd" for letter in beginning)
+    if len(plain) <= most:
+        return plain
+    return plain[:most] + "..."
