@@ -128,7 +128,7 @@ NOT_RUN = {
     "docs/maps/round-trips.md: trilat sweep p_d_margin_two": "3 135 runs: minutes; it draws the page itself",
     "docs/maps/tick-rate.md: trilat sweep free": "870 runs: minutes; it draws the page itself",
     "docs/ros2.md: export RMW": "needs an installation of ROS 2",
-    "docs/two-operators.md: ros2": "needs an installation of ROS 2",
+    "docs/two-operators.md: ZENOH_CONFIG_OVERRIDE": "needs an installation of ROS 2",
     "docs/ros2.md: ros2": "needs an installation of ROS 2",
     "docs/lerobot.md: import glob": "needs LeRobot and a dataset that it recorded; done by hand with 0.6.1",
     "docs/network.md: docker compose up": "needs a container engine: .ci/compose starts the first",

@@ -21,10 +21,13 @@ from tests.net.waiting import until
 from tests.sites.devices import CapReports, HaplyService
 from tests.sites.relay import RelayClock
 from tests.sites.sessions import SESSION, Session, reached
+from trilat_net.app.ros2_bridge import refuse_other_robots
 from trilat_net.app.running_session import open_hand
+from trilat_net.log.ros2.topic_names import read_topic_table
 from trilat_net.net.arm_client import SwitchClient
 from trilat_net.net.bus import Bus
 from trilat_net.scenario import load_scenario
+from trilat_net.scenario.validate import list_simulated_settings
 
 LOOK = Path(__file__).parents[1] / "examples" / "look_into_a_log.py"
 
@@ -160,15 +163,39 @@ def test_scenario_for_headsets_holds_together() -> None:
     assert log.scenario.open_hands == ("m1", "m2")
 
 
-def test_scenario_of_two_operators_runs_with_a_simulated_robot() -> None:
-    path = LOOK.with_name("two_operators.toml")
+@pytest.mark.parametrize("name", ["two_operators", "two_operators_six_joints"])
+def test_scenarios_of_two_operators_run_with_a_simulated_robot(name: str) -> None:
+    path = LOOK.with_name(f"{name}.toml")
     live = trilat_net.load_scenario(path)
-    assert live.sites["s"].plant == "external"
+    assert live.outside == ("s",)
     assert {spec.on_stale.action for spec in live.sites.values()} == {"glide"}
-    settings = {"sites.s.plant": "simulated", "sites.s.arm.known": True, "link.model": "none"}
+    settings = {**list_simulated_settings(live), "link.model": "none"}
     log = trilat_net.simulate(path, settings, duration_s=2.0)
     assert log.scenario.open_hands == ("m1", "m2")
     assert abs(log["s"].q - log["s"].q[0]).max() < 1e-9  # no arm sinks
+
+
+def test_robot_of_six_joints_follows_a_push_within_its_limits() -> None:
+    path = LOOK.with_name("two_operators_six_joints.toml")
+    push = {"kind": "pulse", "start_s": 1.0, "end_s": 4.0, "peak_nm": [10, 10, 10, 3, 2, 1]}
+    settings = list_simulated_settings(trilat_net.load_scenario(path))
+    log = trilat_net.simulate(path, {**settings, "sites.m1.hands": [push]}, duration_s=20.0)
+    moved = abs(log["s"].q[-1] - log["s"].q[0])
+    assert min(moved) > 0.2, "each joint was pushed"
+    assert abs(log["s"].q[-1] - log["m1"].q[-1]).max() < 0.01
+    assert {"stopped", "fault"}.isdisjoint(log["s"].mode)
+
+
+def test_file_of_the_robot_fits_the_scenario_of_six_joints() -> None:
+    scenario = trilat_net.load_scenario(LOOK.with_name("two_operators_six_joints.toml"))
+    table = read_topic_table(str(LOOK.with_name("robot.toml")))
+    robot = table.robots["s"]
+    refuse_other_robots(table, scenario)
+    joints = len(scenario.sites["s"].q0_rad)
+    assert len(robot.joints) == len(robot.safe) == joints
+    assert sorted(robot.controller) == sorted(robot.joints)
+    assert table.find(scenario.name, "s", "robot_states") == "joint_states"
+    assert table.find(scenario.name, "s", "robot_commands") == "effort_controller/commands"
 
 
 def test_a_gamepad_says_what_it_lacks(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -83,3 +83,38 @@ def find_bare_plurals(path: Path) -> Iterator[str]:
 def test_no_text_counts_by_a_bare_plural() -> None:
     found = [place for path in house.files() for place in find_bare_plurals(path)]
     assert not found, "\n".join(["use count_nouns of trilat_net/errors.py:", *found])
+
+
+PRINT_ONE_LINE = {
+    "print_text",
+    "print_note",
+    "print_error",
+    "print_marked",
+    "print_texts",
+    "UsageError",
+    "ScenarioError",
+}
+"""What they print is a line: a newline in it would become a replacement character."""
+
+
+def find_broken_lines(tree: ast.Module) -> Iterator[int]:
+    """Yields the lines of calls that print one line, and have a text with a newline."""
+    for call in ast.walk(tree):
+        if not isinstance(call, ast.Call):
+            continue
+        called = getattr(call.func, "attr", getattr(call.func, "id", ""))
+        if called not in PRINT_ONE_LINE:
+            continue
+        for part in ast.walk(call):
+            if isinstance(part, ast.Constant) and "\n" in str(part.value):
+                yield call.lineno
+
+
+def test_no_text_of_one_line_has_a_newline() -> None:
+    assert list(find_broken_lines(ast.parse("print_text(f'{x}: run\\n  y')"))) == [1]
+    broken = {
+        str(path.relative_to(house.ROOT)): lines
+        for path in house.files()
+        if (lines := list(find_broken_lines(house.tree(path))))
+    }
+    assert not broken

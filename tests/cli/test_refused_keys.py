@@ -355,3 +355,31 @@ def test_the_right_keys_are_taken(made: Path, tmp_path: Path) -> None:
 
 def test_the_table_has_its_forty_rows() -> None:
     assert sum(map(len, (OF_ANOTHER, FROM_PYTHON, ENDPOINTS, ZENOH_FILES, SPOILT, NEW))) >= 40
+
+
+def test_what_is_printed_of_keys_agrees_with_their_rules(tmp_path: Path) -> None:
+    """A few lines for a person, the settings of Zenoh on request, and the same in JSON."""
+    create_keys(tmp_path / "k", MEMBERS_MADE, ["192.0.2.7"])
+    for member in MEMBERS_MADE:
+        folder = str(tmp_path / "k" / member)
+        lines = trilat("keys", "info", folder, cwd=tmp_path).succeeds().splitlines()
+        assert len(lines) <= 6
+        assert f" {member}, for a session with" in lines[0]
+        assert lines[1].startswith("valid until ")
+        assert lines[2].endswith(": localhost, 127.0.0.1, ::1, 192.0.2.7")
+        rules = json.loads(trilat("keys", "info", folder, "--rules", cwd=tmp_path).succeeds())
+        whole = json.loads(trilat("keys", "info", folder, "--json", cwd=tmp_path).succeeds())
+        assert {"member", "members", "until", "zenoh"} < set(whole)
+        assert whole["zenoh"] == rules
+        own_keys = {
+            key
+            for rule in rules["access_control"]["rules"]
+            if rule["id"].rpartition(" ")[0] == member
+            and "ingress" in rule["flows"]
+            and {"put", "query"} & set(rule["messages"])
+            for key in rule["key_exprs"]
+        }
+        orders_allowed = any(key.endswith("/*/set") for key in own_keys)
+        assert any("all orders" in line for line in lines) == orders_allowed
+        switch_allowed = any(key.endswith("/enable") for key in own_keys)
+        assert any("dead-man switch" in line for line in lines) == switch_allowed

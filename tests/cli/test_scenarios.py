@@ -1,12 +1,18 @@
+import re
+import shlex
+import shutil
 import tomllib
 from pathlib import Path
 
 import pytest
 
+import trilat_net as tn
+from trilat_net.errors import ScenarioError
 from trilat_net.scenario import list_shipped, load_scenario
 
 from .running import trilat
 
+EXAMPLES = Path(__file__).parents[2] / "examples"
 SHIPPED = {"paper", "paper_rods", "free", "asymmetric", "two_sites"}
 
 
@@ -58,7 +64,8 @@ def test_show_prints_overrides_resolved(tmp_path: Path) -> None:
 
 def test_check_says_what_follows_from_a_scenario(tmp_path: Path) -> None:
     text = trilat("scenario", "check", "asymmetric", cwd=tmp_path).succeeds()
-    assert "m1 1.279, m2 0.4655, s 1.256" in text
+    assert "weights of the sites in the proof of stability, sum 3 " in text
+    assert ": m1 1.279, m2 0.4655, s 1.256" in text
     assert "20000 ticks of m1" in text
     assert "m2->s: 310 ms" in text
     assert "assumed: " in text
@@ -72,3 +79,31 @@ def test_new_writes_a_valid_template_and_keeps_existing_files(tmp_path: Path) ->
     trilat("scenario", "new", path, "--force", cwd=tmp_path).succeeds()
     assert path.read_text().count("#") > 20
     trilat("scenario", "check", path, cwd=tmp_path).succeeds()
+
+
+@pytest.mark.parametrize(
+    "options", [(), ("--set", "sites.s.arm.dead_man=true"), ("--set", "control.Kd=7")]
+)
+def test_refusal_of_a_real_arm_names_a_command_that_runs(
+    options: tuple[str, ...], tmp_path: Path
+) -> None:
+    shutil.copy(EXAMPLES / "two_operators.toml", tmp_path)
+    wanted = ("--duration", "0.1", "--seed", "3", "-o", "rehearsal.mcap")
+    sim = ("sim", "two_operators.toml", *wanted, *options)
+    refused = trilat(*sim, cwd=tmp_path)
+    assert refused.code == 2
+    words = shlex.split(refused.err.rpartition("run: trilat ")[2])
+    assert words[:2] == ["sim", "two_operators.toml"]
+    trilat(*words, cwd=tmp_path).succeeds()
+    settings = [word for word in words if "=" in word]
+    assert set(options[1:]) <= set(settings), "what was asked for stays"
+    log = tn.open_log(tmp_path / "rehearsal.mcap")
+    assert (log.scenario.seed, log.scenario.duration_s) == (3, 0.1)
+
+
+def test_other_commands_name_settings_that_work() -> None:
+    with pytest.raises(ScenarioError, match="only run live") as refused:
+        tn.simulate(EXAMPLES / "two_operators.toml", duration_s=0.1)
+    settings = re.findall(r"set (\S+=\S+)", str(refused.value))
+    log = tn.simulate(EXAMPLES / "two_operators.toml", settings, duration_s=0.1)
+    assert log.scenario.outside == ()

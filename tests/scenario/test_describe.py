@@ -1,3 +1,5 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,8 @@ from trilat_net.scenario import load_scenario
 from trilat_net.scenario.describe import compare_scenarios, describe_scenario
 from trilat_net.scenario.resolve import SHIPPED_FOLDER
 from trilat_net.scenario.rest_bounds import find_rest_bounds
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 def told(*scenarios: tuple[str, list[str]]) -> dict[str, tuple[str, ...]]:
@@ -77,6 +81,19 @@ def test_a_chain_is_told_joint_by_joint_with_notes() -> None:
         in text
     )
     assert "arm of" not in "\n".join(describe_scenario(load_scenario("free")))
+
+
+def test_limits_of_a_real_arm_are_said_first() -> None:
+    (line,) = [
+        line for line in describe_scenario(EXAMPLES / "external_arm.toml")[:2] if "real" in line
+    ]
+    assert line == (
+        "s is a real arm: at most 60 N m, 6 rad/s, -2.5 to 2.5 rad; it starts at 0 rad: are "
+        "these your robot's?"
+    )
+    many = describe_scenario(EXAMPLES / "two_operators_six_joints.toml")[1]
+    assert many.startswith("s is a real arm: at most 60, 60, 60, 15, 15, 15 N m, 2 rad/s, ")
+    assert not [line for line in describe_scenario("free") if "real arm" in line]
 
 
 def test_it_says_how_often_a_site_will_hold() -> None:

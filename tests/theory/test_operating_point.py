@@ -66,7 +66,7 @@ def test_what_varies_is_said_with_its_mean() -> None:
     ("overrides", "facts"),
     [
         ({"link.model": "measured"}, ["links.", ".model", "is not known"]),
-        ({"sites.s.plant": "external"}, ["sites.s.plant", "plant = 'simulated'"]),
+        ({"sites.s.plant": "external"}, ["sites.s.plant", "set sites.s.plant=simulated"]),
         (
             {"control.law": "tests.plugged_laws:Line"},
             [".control.law", "sends vectors that the law defines"],

@@ -86,12 +86,15 @@ class MemberKeys(NamedTuple):
         ends: Time at which the validity of the keys ends, in UTC. The certificate is valid for
             `STOPPING_TIME` longer, so that the keys can still be used to stop arms.
         settings: Zenoh settings that use the keys, see `make_zenoh_config`.
+        hosts: Names and addresses at which other members can reach the member. A member that
+            listens elsewhere gets no connection.
     """
 
     member: str
     members: tuple[str, ...]
     ends: datetime.datetime
     settings: dict[str, Any]
+    hosts: tuple[str, ...] = ()
 
 
 def create_keys(
@@ -632,6 +635,19 @@ def _make_alternative_names(hosts: Sequence[str]) -> x509.SubjectAlternativeName
     return x509.SubjectAlternativeName(names)
 
 
+def _list_hosts(certificate: x509.Certificate) -> tuple[str, ...]:
+    """Returns the host names and addresses that the certificate of a member contains."""
+    try:
+        names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName)
+    except (ValueError, x509.ExtensionNotFound):
+        return ()
+    return tuple(
+        str(name.value)
+        for name in names.value
+        if isinstance(name, x509.DNSName | x509.IPAddress)
+    )
+
+
 def _write_folder(
     folder: Path,
     authority: x509.Certificate,
@@ -779,7 +795,13 @@ def read_member_keys(folder: str | Path, *, stops: bool = False) -> MemberKeys:
     )
     if fault:
         raise UsageError(f"{folder}: {fault}")
-    return MemberKeys(member, members, ends, _make_settings(folder.resolve(), members))
+    return MemberKeys(
+        member=member,
+        members=members,
+        ends=ends,
+        settings=_make_settings(folder.resolve(), members),
+        hosts=_list_hosts(certificate),
+    )
 
 
 def _find_key_fault(

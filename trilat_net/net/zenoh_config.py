@@ -611,6 +611,42 @@ ROLES = {
     ),
 }
 """Roles of the members that are not sites, by their names."""
+_CHANNEL_WORDS = {
+    topics.SAMPLE: "samples",
+    topics.STATE: "records",
+    topics.LINK: "statistics of its loop and links",
+    topics.EVENT: "events",
+    topics.MEASURED: "measurements of an external arm",
+    topics.VIEW: "views for an operator's program",
+    topics.STATS: "statistics of the recording",
+    topics.HAND: "live hands",
+    topics.ENABLE: "reports of a dead-man switch",
+    topics.SET: "all orders, such as set, enable and reset",
+    topics.STOP: "the order to stop",
+}
+"""Description of the messages of each channel, for the user."""
+
+
+def describe_role(member: str) -> list[str]:
+    """Describes what a member with keys may send, a line for each kind of receiver.
+
+    Answers, queries for information and signs of presence are left out.
+
+    Args:
+        member: Name of the member. It determines the role.
+    """
+    if member == ROUTER:
+        return ["forwards the messages of all members, whatever they contain"]
+    role = ROLES.get(member, SITE_ROLE)
+    orders = [channel for channel in role.queries if channel in (topics.SET, topics.STOP)]
+    to_others = [_CHANNEL_WORDS[channel] for channel in (*role.publishes_to, *orders)]
+    lines = []
+    if role.publishes:
+        own = [_CHANNEL_WORDS[channel] for channel in role.publishes]
+        lines.append(f"may send in its own name: {', '.join(own)}")
+    if to_others:
+        lines.append(f"may send to every site: {', '.join(to_others)}")
+    return lines
 
 
 def make_access_rules(members: Sequence[str]) -> dict[str, Any]:

@@ -259,6 +259,7 @@ def describe_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> li
     ]
     lines = [
         f"{scenario.name}: valid, sha256 {scenario.sha256[:16]}",
+        *_describe_real_arms(scenario),
         f"sites: {names}; {scenario.duration_s:g} s, {', '.join(tick_counts)}",
         *_describe_links(scenario),
         *_describe_shares(scenario),
@@ -276,6 +277,41 @@ def describe_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> li
                 f"drawn with seed {scenario.seed}: {key} = {drawn.value} ({drawn.describe()})"
             )
     return lines
+
+
+def _describe_real_arms(scenario: Scenario) -> list[str]:
+    """Returns a line for each real arm: its limits and start pose, for the user to confirm."""
+    lines = []
+    for name in scenario.outside:
+        spec = scenario.sites[name]
+        setup = scenario.setup(name)
+        arm = scenario.arms[name]
+        limits = scenario.motion_limits(name)
+        shape = np.shape(spec.q0_rad)
+        units = arm.joint_units("rad")
+        lows = np.broadcast_to(limits.q_min, shape)
+        highs = np.broadcast_to(limits.q_max, shape)
+        ranges = [f"{low:g} to {high:g}" for low, high in zip(lows, highs, strict=True)]
+        torques = _format_per_joint(setup.tau_limit_nm, arm.joint_units("N m"))
+        speeds = _format_per_joint(setup.qd_limit_rad_s, arm.joint_units("rad/s"))
+        lines.append(
+            f"{name} is a real arm: at most {torques}, {speeds}, {_join_equal(ranges, units)}; "
+            f"it starts at {_format_per_joint(spec.q0_rad, units)}: are these your robot's?"
+        )
+    return lines
+
+
+def _format_per_joint(values: Any, units: Sequence[str]) -> str:
+    """Returns a quantity of each joint as text, once if it is the same for all joints."""
+    texts = [f"{value:g}" for value in np.broadcast_to(values, len(units))]
+    return _join_equal(texts, units)
+
+
+def _join_equal(texts: Sequence[str], units: Sequence[str]) -> str:
+    """Joins the texts of all joints, with the units, and shortens what is equal."""
+    if len(set(units)) > 1:
+        return ", ".join(f"{text} {unit}" for text, unit in zip(texts, units, strict=True))
+    return f"{texts[0] if len(set(texts)) == 1 else ', '.join(texts)} {units[0]}"
 
 
 def _describe_links(scenario: Scenario) -> list[str]:
@@ -302,8 +338,8 @@ def _describe_shares(scenario: Scenario) -> list[str]:
         pairs = zip(scenario.names, beta, strict=True)
         weights = ", ".join(f"{name} {len(beta) * pi:.4g}" for name, pi in pairs)
     lines = [
-        "pi, the left null vector of Upsilon, sum N (beta_i = pi_i / c_i with Kd_i = c_i "
-        f"Kbar): {weights}"
+        f"weights of the sites in the proof of stability, sum {len(scenario.names)} (beta, if "
+        f"all have the same Kd): {weights}"
     ]
     if beta is not None and np.ptp(beta) >= ROW_SUM_TOLERANCE:
         lines.append(COUPLED_OPERATORS)

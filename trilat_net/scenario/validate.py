@@ -43,6 +43,41 @@ RANK_TOLERANCE = 1e-6
 """Ratio of a singular value to the largest one below which the direction counts as immobile."""
 
 
+def list_simulated_settings(scenario: Scenario) -> dict[str, Any]:
+    """Returns the settings with which a scenario runs with simulated arms only.
+
+    The masses of a simulated arm are known, and only a real arm has a dead-man switch.
+
+    Args:
+        scenario: Description of the experiment.
+
+    Returns:
+        The new value of each key that has to change, by the dotted name of the key.
+    """
+    settings: dict[str, Any] = {}
+    for name in scenario.external:
+        settings[f"sites.{name}.plant"] = "simulated"
+        arm = scenario.sites[name].arm
+        if not arm.known:
+            settings[f"sites.{name}.arm.known"] = True
+        if arm.dead_man:
+            settings[f"sites.{name}.arm.dead_man"] = False
+    return settings
+
+
+def write_simulated_options(scenario: Scenario) -> str:
+    """Returns the options `--set` with which a command runs with simulated arms only.
+
+    Args:
+        scenario: Description of the experiment.
+    """
+    options = []
+    for key, value in list_simulated_settings(scenario).items():
+        text = str(value).lower() if isinstance(value, bool) else value
+        options.append(f"--set {key}={text}")
+    return " ".join(options)
+
+
 def refuse_external_arms(scenario: Scenario, exempt: Collection[str] = ()) -> None:
     """Refuses scenarios with arms that the program does not simulate itself.
 
@@ -56,17 +91,18 @@ def refuse_external_arms(scenario: Scenario, exempt: Collection[str] = ()) -> No
     Raises:
         ScenarioError: The arm of another site is external.
     """
+    options = write_simulated_options(scenario)
     for name in scenario.external:
         if name in exempt:
             continue
         problem = (
-            "is a user's own plant, which runs in `trilat sim` and live, but not here: "
-            "plant = 'simulated' uses the arm of the scenario"
+            "is a user's own plant, which runs in `trilat sim` and live, but not here; to use "
+            f"the arm of the scenario instead, add: {options}"
         )
         if name in scenario.outside:
             problem = (
-                "is external: a scenario with an external arm can only run live; set plant = "
-                "'simulated' to run the scenario in virtual time"
+                "is external: a scenario with an external arm can only run live; to rehearse "
+                f"it with a simulated arm, add: {options}"
             )
         raise ScenarioError(problem, path=f"sites.{name}.plant", source=scenario.name)
 
@@ -186,8 +222,8 @@ def _check_plant(path: str, site: SiteSpec) -> None:
     external = site.plant != "simulated"
     if not site.arm.known and not external:
         raise ScenarioError(
-            "the masses of a simulated arm are always known: leave this key true, or set plant "
-            "= 'external' for an external arm",
+            "the masses of a simulated arm are always known: set this key to true, or set "
+            f"{path}.plant to 'external' for an external arm",
             path=f"{path}.arm.known",
         )
     if site.arm.dead_man and site.plant != "external":

@@ -6,18 +6,20 @@ measured on a network can be repeated in a simulation. Keys prove to the other p
 session which process is connected.
 """
 
+import shlex
 import sys
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from ...errors import count_nouns
+from ...errors import UsageError, count_nouns
 from ...files import refuse_existing, write_whole
 from ...presentation import terminal_output as terminal
 from ...presentation.result_text import TextTable
 from . import options
-from .options import value
+from .options import flag, value
 
 
 @options.command("")
@@ -329,21 +331,37 @@ def keys_pair_command(
 @options.command("keys/m1", page="docs/keys.md")
 def keys_info_command(
     folder: Annotated[Path, typer.Argument(help="Folder of one member's keys.", metavar="DIR")],
+    rules: Annotated[bool, flag("--rules", "Print the Zenoh settings with all rules.")] = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Shows whose keys they are, when they expire, and the Zenoh settings that they imply."""
+    """Shows whose keys they are, until when and where they hold, and what they permit."""
     from ...net.member_keys import read_member_keys
+    from ...net.zenoh_config import ROLES, ROUTER, describe_role
 
+    if rules and as_json:
+        raise UsageError("--rules and --json cannot be combined: --json contains the rules")
     keys = read_member_keys(folder)
     if as_json:
         description = {
             "member": keys.member,
             "members": list(keys.members),
             "until": keys.ends.isoformat(),
+            "hosts": list(keys.hosts),
             "zenoh": keys.settings,
         }
         return terminal.print_json(description)
-    terminal.print_line(
-        f"{keys.member} of {', '.join(keys.members)}; until {keys.ends:%Y-%m-%d %H:%M} UTC"
+    if rules:
+        return terminal.print_json(keys.settings)
+    kind = "" if keys.member in {*ROLES, ROUTER} else "site "
+    others = [member for member in keys.members if member != keys.member]
+    days = (keys.ends - datetime.now(UTC)).days
+    terminal.print_texts(
+        [
+            f"{folder}: keys of {kind}{keys.member}, for a session with {', '.join(others)}",
+            f"valid until {keys.ends:%Y-%m-%d %H:%M} UTC, {count_nouns(days, 'day')} from now",
+            f"others may reach it at: {', '.join(keys.hosts)}",
+            *describe_role(keys.member),
+            f"all rules: trilat keys info {shlex.quote(str(folder))} --rules",
+        ]
     )
-    return terminal.print_json(keys.settings)
+    return None

@@ -8,6 +8,7 @@ Invariant:
       commands are therefore safe for logs of unknown origin.
 """
 
+import shlex
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
@@ -254,9 +255,11 @@ def _write_viewer_files(file: Path, *, foxglove: bool, rviz: bool, force: bool) 
         )
     if rviz:
         config = write_rviz_config(file, force=force)
+        command = f"rviz2 -d {shlex.quote(str(config))}"
+        terminal.print_text(f"{config}: during a session with `trilat ros2`, run: {command}")
         terminal.print_text(
-            f"{config}: during a session with `trilat ros2`, run: rviz2 -d {config}\n"
-            "  for a bag: ros2 bag play --clock BAG, and add: --ros-args -p use_sim_time:=true"
+            f"  for a bag: ros2 bag play --clock BAG, and {command} --ros-args "
+            "-p use_sim_time:=true"
         )
 
 

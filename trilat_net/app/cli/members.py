@@ -809,10 +809,12 @@ def ros2_command(
 ) -> None:
     """Connects a session to ROS 2.
 
-    ROS programs can hold arms, and ROS robots can serve as arms. ROS must use
-    RMW_IMPLEMENTATION=rmw_zenoh_cpp, and its Zenoh router must run. This machine needs no ROS
-    installation. The bridge waits for the router, and ends with the session. docs/ros2.md lists
-    all topics and services.
+    ROS programs can hold arms, and ROS robots whose controllers take joint torques can serve as
+    arms. ROS must use RMW_IMPLEMENTATION=rmw_zenoh_cpp, and its Zenoh router must run. This
+    machine needs no ROS installation. The bridge waits for the router of ROS without a limit,
+    and for the session for the time of --timeout. It ends with the session. It was tested
+    against programs that speak the protocol of rmw_zenoh, but not with ROS itself and not with
+    a robot. docs/ros2.md lists all topics and services.
 
     Options:
         distro: ROS 2 distribution whose message format the bridge writes.

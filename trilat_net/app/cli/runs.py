@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.markup import escape
 
-from ...errors import UsageError
+from ...errors import ScenarioError, UsageError
 from ...presentation import terminal_output as terminal
 from ...presentation.result_text import TextTable
 from ...signals import Interrupt
@@ -45,8 +45,24 @@ def sim_command(
     from ...execution.virtual import record_virtual
     from ...log.ros2.viz_channels import parse_viz_rate
     from ...scenario.code_consent import find_user_laws
+    from ...scenario.validate import write_simulated_options
 
     chosen = options.load_chosen_scenario(scenario, overrides, duration, seed)
+    if chosen.outside:
+        words = ["trilat", "sim", scenario]
+        for text in options.list_overrides(overrides, duration):
+            words += ["--set", text]
+        if seed is not None:
+            words += ["--seed", str(seed)]
+        if output is not None:
+            words += ["-o", str(output)]
+        command = f"{shlex.join(words)} {write_simulated_options(chosen)}"
+        raise ScenarioError(
+            f"is 'external': {', '.join(chosen.outside)} is a real arm, which only a live "
+            f"session can move; to rehearse with a simulated arm, run: {command}",
+            path=f"sites.{chosen.outside[0]}.plant",
+            source=chosen.name,
+        )
     path = output if output is not None else Path(f"{chosen.name}.mcap")
     views_hz = parse_viz_rate(views)
 
