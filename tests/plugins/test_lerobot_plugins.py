@@ -16,6 +16,8 @@ import trilat_net
 from tests.sites.relay import RelayClock
 from tests.sites.sessions import SESSION, Session, reached
 from trilat_net.app.running_session import open_hand
+from trilat_net.errors import UsageError
+from trilat_net.log.log_reader import Log
 from trilat_net.net.bus import Bus
 from trilat_net.scenario import load_scenario
 
@@ -126,6 +128,31 @@ def test_a_dataset_has_the_actions_that_the_plugin_accepts(
     assert frames[f"action.{site}"].to_numpy() == pytest.approx(wanted[: len(frames)], abs=1e-6)
 
 
+@pytest.mark.parametrize("mode", ["tip", "joint", "force"])
+@pytest.mark.parametrize("space", [False, True])
+def test_a_dataset_has_the_observations_of_the_plugin(
+    found: dict[str, ModuleType], tmp_path: Path, mode: str, space: bool
+) -> None:
+    site = "m" if space else "m2"
+    hands = {f"sites.{site}.hands": [{"kind": "live", "mode": mode}], "duration_s": 0.1}
+    scenario = load_scenario(str(SPACE) if space else "play", hands)
+    (tmp_path / "held.toml").write_text(scenario.text, encoding="utf-8")
+    config = found[ROBOT].TrilatRobotConfig(scenario=str(tmp_path / "held.toml"), site=site)
+    robot = make_device(config)
+    settings = {"actions": "tip"} if mode == "force" else {}
+    log = trilat_net.simulate(scenario)
+    if mode == "force":
+        with pytest.raises(UsageError, match="commanded by forces"):
+            trilat_net.export(log, "lerobot", tmp_path / "none", observations="plugin")
+    trilat_net.export(log, "lerobot", tmp_path / "set", observations="plugin", **settings)
+    info = json.loads((tmp_path / "set" / "meta" / "info.json").read_text(encoding="utf-8"))
+    state = info["features"]["observation.state"]
+    assert state["names"] == list(robot.observation_features)
+    assert state["shape"] == [len(robot.observation_features)]
+    if mode != "force":
+        assert info["features"]["action"]["names"] == list(robot.action_features)
+
+
 @pytest.mark.parametrize("config", ["TrilatRobotConfig", "TrilatTeleoperatorConfig"])
 def test_an_arm_that_nobody_can_hold_is_refused(
     config: str, found: dict[str, ModuleType]
@@ -164,3 +191,20 @@ def test_policy_and_person_share_a_slave_and_one_takes_over(
     log = session.run()
     assert trilat_net.verify(log).passed
     assert_taken_over(seen, log)
+    assert_observed(seen["observed"], log, tmp_path / "set")
+
+
+def assert_observed(observed: dict[str, float], log: Log, folder: Path) -> None:
+    """The dataset has a frame with what the plugin saw of each arm, and the policy is its program."""
+    trilat_net.export(log, "lerobot", folder, observations="plugin", fps=200)
+    frames = pl.read_parquet(folder / "data" / "chunk-000" / "file-000.parquet")
+    state = frames["observation.state"].to_numpy()
+    seen = np.array(list(observed.values()), dtype=np.float32)
+    slave = [name.startswith("s.") for name in observed]
+    for part in (np.array(slave), ~np.array(slave)):
+        distance = np.abs(state[:, part] - seen[part]).max(axis=1)
+        assert distance.min() < 1e-5
+    about = json.loads((folder / "about.json").read_text(encoding="utf-8"))
+    assert about["program"] == about["sessions"][0]["plugin_site"] == "m2"
+    assert frames["intervention"].any()
+    assert not frames["intervention"].all()
