@@ -153,6 +153,38 @@ def test_a_dataset_has_the_observations_of_the_plugin(
         assert info["features"]["action"]["names"] == list(robot.action_features)
 
 
+def test_a_policy_is_asked_at_its_rate_with_both_states(
+    found: dict[str, ModuleType], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Names of the dataset, the numbers of the robot in its order, and actions by their keys."""
+    now_s = 0.0
+    sent, asked = list[Any](), list[float]()
+
+    def sleep(time_s: float) -> None:
+        nonlocal now_s
+        now_s += time_s
+
+    def decide(state: dict[str, list[float]]) -> list[float]:
+        nonlocal now_s
+        asked.append(now_s)
+        now_s += 0.01
+        assert list(state) == ["observation.state", "observation.environment_state"]
+        assert list(state.values()) == 2 * [[1.0, 2.0]]
+        return [3.0, 4.0]
+
+    clock = SimpleNamespace(sleep=sleep, monotonic=lambda: now_s)
+    monkeypatch.setattr(found[ROBOT], "time", clock)
+    robot = SimpleNamespace(
+        get_observation=lambda: {"b": 2, "a": 1},
+        observation_features={"a": float, "b": float},
+        action_features={"x.pos": float, "y.pos": float},
+        send_action=sent.append,
+    )
+    assert found[ROBOT].run_policy(robot, decide, 0.5, 10) == 5
+    assert asked == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
+    assert sent == 5 * [{"x.pos": 3.0, "y.pos": 4.0}]
+
+
 @pytest.mark.parametrize("config", ["TrilatRobotConfig", "TrilatTeleoperatorConfig"])
 def test_an_arm_that_nobody_can_hold_is_refused(
     config: str, found: dict[str, ModuleType]
