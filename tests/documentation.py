@@ -94,7 +94,7 @@ ELSEWHERE = {
     "docs/lerobot.md: $ make extras": "tests/cli/test_log_export.py",
     "docs/lerobot.md: $ python3.12 -m venv": "tests/plugins/test_lerobot_plugins.py",
     "docs/lerobot.md: $ trilat demo play": "tests/live/test_lerobot.py",
-    "docs/lerobot.md: import trilat_net": "tests/sites/test_running_session.py",
+    "docs/lerobot.md: $ trilat log export reach-log": "tests/plugins/test_lerobot_plugins.py",
     "docs/live-page.md: trilat live": "tests/live/test_live_page.py",
     "docs/measured-hands.md: trilat identify hand": "tests/cli/test_linears.py",
     "docs/replay.md: trilat replay": "tests/live/test_replay.py",
@@ -130,7 +130,7 @@ NOT_RUN = {
     "docs/ros2.md: export RMW": "needs an installation of ROS 2",
     "docs/two-operators.md: ZENOH_CONFIG_OVERRIDE": "needs an installation of ROS 2",
     "docs/ros2.md: ros2": "needs an installation of ROS 2",
-    "docs/lerobot.md: import glob": "needs LeRobot and a dataset that it recorded; done by hand with 0.6.1",
+    "docs/train-policies.md: from stable_baselines3": "needs Stable-Baselines3; done by hand",
     "docs/network.md: docker compose up": "needs a container engine: .ci/compose starts the first",
 }
 """Beginnings of blocks of which only the words are checked, with the reason."""

@@ -300,7 +300,11 @@ def run_python(page: str, folder: Path, names: dict[str, Any] | None = None) -> 
         patch.chdir(folder)
         for code in (
             AT_HAND.get(page, ""),
-            *(b.text for b in find_blocks(page) if b.language == "python"),
+            *(
+                b.text
+                for b in find_blocks(page)
+                if b.language == "python" and find_exception(b) not in NOT_RUN.values()
+            ),
         ):
             exec(compile(code, page, "exec"), space)
     return printed.getvalue()

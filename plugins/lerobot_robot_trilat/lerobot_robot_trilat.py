@@ -5,13 +5,18 @@ user drives the other. An action of the policy moves its master as an operator w
 hand" of the scenario). An observation consists of the newest states of the slave and of that
 master, and of the position and force of the operator.
 
+`python -m lerobot_robot_trilat FOLDER` runs a trained policy in a session. `lerobot-rollout` of
+LeRobot 0.6.1 cannot: it leaves out torques, forces and `observation.environment_state`.
+
 Invariant:
     - The scenario limits the force and speed with which an action moves the arm.
     - The slave follows all of its users, weighted by their dominance factors.
     - The keys of actions and observations depend on the scenario alone.
 """
 
+import argparse
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import Any
@@ -294,3 +299,111 @@ def _list_hand_axes(scenario: Any, site: str, mode: str) -> list[str]:
     end_effector = arm.end_effector(initial_q)
     axis_count = len(end_effector)
     return ["x", "y", "z"][:axis_count]
+
+
+def run_policy(
+    robot: Any,
+    decide: Callable[[dict[str, list[float]]], list[float]],
+    duration_s: float,
+    fps: int,
+) -> int:
+    """Lets a policy drive the arm of a robot at a fixed rate.
+
+    Args:
+        robot: The connected robot.
+        decide: The policy. Its argument has the keys of an exported dataset,
+            `observation.state` and `observation.environment_state`. Its result has a number for
+            each key of `action_features`.
+        duration_s: Time after which the policy ends, in s.
+        fps: Number of decisions per second, as in the dataset of the training.
+
+    Returns:
+        The number of decisions.
+    """
+    start_s = time.monotonic()
+    count = 0
+    while count < duration_s * fps:
+        observation = robot.get_observation()
+        numbers = [float(observation[key]) for key in robot.observation_features]
+        state = {
+            "observation.state": numbers,
+            "observation.environment_state": numbers,
+        }
+        action = dict(zip(robot.action_features, decide(state), strict=True))
+        robot.send_action(action)
+        count += 1
+        wait_s = start_s + count / fps - time.monotonic()
+        time.sleep(max(wait_s, 0.0))
+    return count
+
+
+def load_policy(folder: str) -> Callable[[dict[str, list[float]]], list[float]]:
+    """Loads a policy that `lerobot-train` has stored.
+
+    Args:
+        folder: Folder of the policy, which ends in `pretrained_model`.
+
+    Returns:
+        A function that decides, see `run_policy`.
+    """
+    # Imported here, because the import takes seconds and the robot does not need it.
+    import torch
+    from lerobot.configs.policies import PreTrainedConfig
+    from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+
+    policy_config = PreTrainedConfig.from_pretrained(folder)
+    policy = get_policy_class(policy_config.type).from_pretrained(folder)
+    policy.eval()
+    device = {"device_processor": {"device": str(policy.config.device)}}
+    prepare, restore = make_pre_post_processors(
+        policy.config, pretrained_path=folder, preprocessor_overrides=device
+    )
+    policy.reset()
+
+    def decide(state: dict[str, list[float]]) -> list[float]:
+        """Returns the action of the policy for an observation."""
+        tensors = {
+            key: torch.tensor([numbers], dtype=torch.float32)
+            for key, numbers in state.items()
+            if key in policy.config.input_features
+        }
+        with torch.inference_mode():
+            action = restore(policy.select_action(prepare(tensors)))
+        return [float(number) for number in action[0]]
+
+    return decide
+
+
+def main() -> None:
+    """Runs a trained policy in a session, as the command line says."""
+    parser = argparse.ArgumentParser(prog="python -m lerobot_robot_trilat")
+    parser.add_argument("folder", help="folder of the policy, which ends in pretrained_model")
+    parser.add_argument("--site", default="m2", help="master that the policy drives")
+    parser.add_argument("--slave", default="s", help="slave that the policy observes")
+    parser.add_argument("--session", default="play", help="name of the session")
+    parser.add_argument("--scenario", default="", help="scenario, if its name is another one")
+    parser.add_argument("--connect", action="append", default=[], help="endpoint; repeatable")
+    parser.add_argument("--keys", default="", help="folder of the operator's keys")
+    parser.add_argument("--duration", type=float, default=30.0, help="duration, s")
+    parser.add_argument("--fps", type=int, default=30, help="decisions per second")
+    options = parser.parse_args()
+    decide = load_policy(options.folder)
+    config = TrilatRobotConfig(
+        session=options.session,
+        scenario=options.scenario,
+        site=options.site,
+        slave=options.slave,
+        connect=options.connect,
+        keys=options.keys,
+    )
+    robot = TrilatRobot(config)
+    robot.connect()
+    try:
+        count = run_policy(robot, decide, options.duration, options.fps)
+    finally:
+        robot.disconnect()
+    print(f"{options.site}: {count} decisions in {options.duration:g} s")
+
+
+if __name__ == "__main__":
+    main()

@@ -70,7 +70,8 @@ def test_a_folder_of_logs_becomes_a_set_of_episodes(folder: Path) -> None:
     command = ("log", "export", "logs", "--to", "lerobot")
     text = trilat(*command, cwd=folder).succeeds()
     assert (
-        text == "logs-lerobot: 8 frames in 2 episodes; 0 frames lie in gaps and are left out\n"
+        text == "logs-lerobot: 8 frames in 2 episodes; 0 frames lie in gaps and are left out; "
+        "no program moved an arm, so there is no column intervention\n"
     )
     trilat(*command, cwd=folder).refuses("logs-lerobot: already exists", "--force")
     assert (
@@ -78,7 +79,7 @@ def test_a_folder_of_logs_becomes_a_set_of_episodes(folder: Path) -> None:
         in trilat(*command, "--set", "fps=50", "--force", cwd=folder).succeeds()
     )
     trilat(*command, "--set", "log=x", cwd=folder).refuses(
-        "no setting 'log'; the settings of lerobot are fps, program, actions"
+        "no setting 'log'; the settings of lerobot are fps, program, actions, observations"
     )
     (folder / "none").mkdir()
     trilat("log", "export", "none", "--to", "lerobot", cwd=folder).refuses(

@@ -16,6 +16,8 @@ import trilat_net
 from tests.sites.relay import RelayClock
 from tests.sites.sessions import SESSION, Session, reached
 from trilat_net.app.running_session import open_hand
+from trilat_net.errors import UsageError
+from trilat_net.log.log_reader import Log
 from trilat_net.net.bus import Bus
 from trilat_net.scenario import load_scenario
 
@@ -126,6 +128,63 @@ def test_a_dataset_has_the_actions_that_the_plugin_accepts(
     assert frames[f"action.{site}"].to_numpy() == pytest.approx(wanted[: len(frames)], abs=1e-6)
 
 
+@pytest.mark.parametrize("mode", ["tip", "joint", "force"])
+@pytest.mark.parametrize("space", [False, True])
+def test_a_dataset_has_the_observations_of_the_plugin(
+    found: dict[str, ModuleType], tmp_path: Path, mode: str, space: bool
+) -> None:
+    site = "m" if space else "m2"
+    hands = {f"sites.{site}.hands": [{"kind": "live", "mode": mode}], "duration_s": 0.1}
+    scenario = load_scenario(str(SPACE) if space else "play", hands)
+    (tmp_path / "held.toml").write_text(scenario.text, encoding="utf-8")
+    config = found[ROBOT].TrilatRobotConfig(scenario=str(tmp_path / "held.toml"), site=site)
+    robot = make_device(config)
+    settings = {"actions": "tip"} if mode == "force" else {}
+    log = trilat_net.simulate(scenario)
+    if mode == "force":
+        with pytest.raises(UsageError, match="commanded by forces"):
+            trilat_net.export(log, "lerobot", tmp_path / "none", observations="plugin")
+    trilat_net.export(log, "lerobot", tmp_path / "set", observations="plugin", **settings)
+    info = json.loads((tmp_path / "set" / "meta" / "info.json").read_text(encoding="utf-8"))
+    state = info["features"]["observation.state"]
+    assert state["names"] == list(robot.observation_features)
+    assert state["shape"] == [len(robot.observation_features)]
+    if mode != "force":
+        assert info["features"]["action"]["names"] == list(robot.action_features)
+
+
+def test_a_policy_is_asked_at_its_rate_with_both_states(
+    found: dict[str, ModuleType], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Names of the dataset, the numbers of the robot in its order, and actions by their keys."""
+    now_s = 0.0
+    sent, asked = list[Any](), list[float]()
+
+    def sleep(time_s: float) -> None:
+        nonlocal now_s
+        now_s += time_s
+
+    def decide(state: dict[str, list[float]]) -> list[float]:
+        nonlocal now_s
+        asked.append(now_s)
+        now_s += 0.01
+        assert list(state) == ["observation.state", "observation.environment_state"]
+        assert list(state.values()) == 2 * [[1.0, 2.0]]
+        return [3.0, 4.0]
+
+    clock = SimpleNamespace(sleep=sleep, monotonic=lambda: now_s)
+    monkeypatch.setattr(found[ROBOT], "time", clock)
+    robot = SimpleNamespace(
+        get_observation=lambda: {"b": 2, "a": 1},
+        observation_features={"a": float, "b": float},
+        action_features={"x.pos": float, "y.pos": float},
+        send_action=sent.append,
+    )
+    assert found[ROBOT].run_policy(robot, decide, 0.5, 10) == 5
+    assert asked == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
+    assert sent == 5 * [{"x.pos": 3.0, "y.pos": 4.0}]
+
+
 @pytest.mark.parametrize("config", ["TrilatRobotConfig", "TrilatTeleoperatorConfig"])
 def test_an_arm_that_nobody_can_hold_is_refused(
     config: str, found: dict[str, ModuleType]
@@ -164,3 +223,20 @@ def test_policy_and_person_share_a_slave_and_one_takes_over(
     log = session.run()
     assert trilat_net.verify(log).passed
     assert_taken_over(seen, log)
+    assert_observed(seen["observed"], log, tmp_path / "set")
+
+
+def assert_observed(observed: dict[str, float], log: Log, folder: Path) -> None:
+    """The dataset has a frame with what the plugin saw of each arm, and the policy is its program."""
+    trilat_net.export(log, "lerobot", folder, observations="plugin", fps=200)
+    frames = pl.read_parquet(folder / "data" / "chunk-000" / "file-000.parquet")
+    state = frames["observation.state"].to_numpy()
+    seen = np.array(list(observed.values()), dtype=np.float32)
+    slave = [name.startswith("s.") for name in observed]
+    for part in (np.array(slave), ~np.array(slave)):
+        distance = np.abs(state[:, part] - seen[part]).max(axis=1)
+        assert distance.min() < 1e-5
+    about = json.loads((folder / "about.json").read_text(encoding="utf-8"))
+    assert about["program"] == about["sessions"][0]["plugin_site"] == "m2"
+    assert frames["intervention"].any()
+    assert not frames["intervention"].all()

@@ -19,7 +19,7 @@ from tests.analysis import logs
 from tests.task_arms import planar_task, posed_arms
 from trilat_net.errors import LogError, UsageError
 from trilat_net.log.log_reader import Log
-from trilat_net.net.messages import State
+from trilat_net.net.messages import Event, State
 from trilat_net.presentation.export import Exporter
 from trilat_net.scenario import parse_scenario
 
@@ -65,6 +65,10 @@ def info(folder: Path, name: str = "meta/info") -> dict[str, Any]:
     return found
 
 
+def told(text: str, at_s: float, kind: str = "mark") -> Event:
+    return Event(member="a", boot=1, kind=kind, text=text, t_ns=round(at_s * 1e9))
+
+
 def newest(source: Log, site: str, field: str, count: int, fps: int) -> np.ndarray:
     """A vector of the newest records at or before the times of frames, by exact fractions."""
     part = source[site]
@@ -85,7 +89,7 @@ def test_columns_are_those_of_the_format(tmp_path: Path) -> None:
     schema = pq.read_schema(folder / "data" / FILE)
     wanted = {name: pa.list_(pa.float32(), size) for name, size in USERS.items()}
     wanted |= {"observation.state": pa.list_(pa.float32(), 4), "timestamp": pa.float32()}
-    wanted |= {"intervention": pa.bool_(), **dict.fromkeys(PLACES, pa.int64())}
+    wanted |= {"next.done": pa.bool_(), **dict.fromkeys(PLACES, pa.int64())}
     assert {field.name: field.type for field in schema} == wanted
     assert set(found["features"]) == set(wanted)
     assert found["features"]["observation.state"] == {
@@ -94,7 +98,7 @@ def test_columns_are_those_of_the_format(tmp_path: Path) -> None:
         "names": ["c.q1.pos", "c.q2.pos", "c.q1.vel", "c.q2.vel"],
     }
     assert found["features"]["dominance"]["names"] == ["a", "b"]
-    assert found["features"]["intervention"] == {"dtype": "bool", "shape": [1], "names": None}
+    assert found["features"]["next.done"] == {"dtype": "bool", "shape": [1], "names": None}
 
 
 @pytest.mark.parametrize("fps", [30, 7])
@@ -118,8 +122,8 @@ def test_a_frame_has_the_newest_records_before_it(fps: int, tmp_path: Path) -> N
 
 
 def test_whose_share_is_above_the_program_s_intervenes(tmp_path: Path) -> None:
-    """The program is b, the last user: a leads from 4 s on, and is at 0.7 half-way through the ramp."""
-    frames = read(exported(tmp_path, log()))
+    """The program is b: a leads from 4 s on, and is at 0.7 half-way through the ramp."""
+    frames = read(exported(tmp_path, log(), program="b"))
     shares = frames["dominance"].to_numpy()
     assert shares[120].tolist() == [0.5, 0.5]
     assert shares[135] == pytest.approx([0.7, 0.3])
@@ -137,6 +141,87 @@ def test_a_program_that_is_named_is_another_one(tmp_path: Path) -> None:
     assert np.array_equal(frames["action"].to_numpy(), frames["action.a"].to_numpy())
     with pytest.raises(UsageError, match="the program can hold the arm of a or b, not of 'c'"):
         Exporter("lerobot", tmp_path / "other", settings={"program": "c"}).export(log())
+
+
+def test_without_a_program_nobody_intervenes(tmp_path: Path) -> None:
+    """At equal shares the first user leads, and no column says that a person corrected b."""
+    for name, settings in (("found", {}), ("named", {"program": "none"})):
+        (tmp_path / name).mkdir()
+        folder = exported(tmp_path / name, log(), **settings)
+        frames = read(folder)
+        assert "intervention" not in frames.columns
+        assert np.array_equal(frames["action"].to_numpy(), frames["action.a"].to_numpy())
+        assert info(folder, "about")["program"] == "none"
+
+
+def test_a_policy_that_took_hold_is_the_program(tmp_path: Path) -> None:
+    """Among others that held arms; a log without a policy has no intervention."""
+    taken = [told("a: live page takes hold at t = 1.000 s", 1.0, "hand")]
+    taken += [told("b: policy takes hold at t = 2.000 s", 2.0, "hand")]
+    held = logs.rewritten(log(), others=taken)
+    folder = exported(tmp_path, held, log())
+    assert info(folder, "about")["program"] == "b and none"
+    assert [each["program"] for each in info(folder, "about")["sessions"]] == ["b", "none"]
+    frames = read(folder)
+    assert frames["intervention"].to_list() == [n > 120 for n in range(180)] + 180 * [False]
+
+
+def test_marks_divide_a_log_into_episodes(tmp_path: Path) -> None:
+    """1 to 2 s succeed, 3 to 4 s fail, and what begins at 5 s is interrupted by the end."""
+    marks = [
+        told(f"episode {text}", at_s)
+        for text, at_s in (
+            ("one begins", 1.0),
+            ("one succeeded", 2.0),
+            ("two begins", 3.0),
+            ("two failed", 4.0),
+            ("three begins", 5.0),
+        )
+    ]
+    source = logs.rewritten(log(), others=[told("look", 0.5), *reversed(marks)])
+    folder = exported(tmp_path, source, episodes="marks", task="stack the cups")
+    frames = read(folder)
+    assert read(folder, "meta/episodes")["length"].to_list() == [30, 30, 30]
+    ends = frames.filter(pl.col("next.done"))
+    assert ends["index"].to_list() == [29, 59, 89]
+    assert ends["next.success"].to_list() == [True, False, False]
+    assert frames["next.success"].sum() == 1
+    whole = newest(log(), "b", "q", 180, 30)
+    marked = np.vstack([whole[30:60], whole[90:120], whole[150:]])
+    assert np.array_equal(frames["action.b"].to_numpy(), marked)
+    (session,) = info(folder, "about")["sessions"]
+    outcomes = {one["name"]: one["outcome"] for one in session["episodes"]}
+    assert outcomes == {"one": "succeeded", "two": "failed", "three": "not stated"}
+    assert session["frames_outside_episodes"] == 90
+    tasks = pd.read_parquet(folder / "meta" / "tasks.parquet")
+    assert tasks.index.tolist() == ["stack the cups"]
+
+
+def test_a_log_without_marks_stays_one_episode(tmp_path: Path) -> None:
+    folder = exported(tmp_path, log(), episodes="marks")
+    assert read(folder)["next.done"].to_list() == 179 * [False] + [True]
+    assert "next.success" not in read(folder).columns
+
+
+def test_an_episode_outside_the_records_is_refused(tmp_path: Path) -> None:
+    late = logs.rewritten(log(), others=[told("episode one begins", 7.0)])
+    with pytest.raises(LogError, match="no marked episode contains a time"):
+        exported(tmp_path, late, episodes="marks")
+
+
+def test_the_environment_state_is_the_state(tmp_path: Path) -> None:
+    folder = exported(tmp_path, log(), environment_state="yes")
+    features = info(folder)["features"]
+    assert features["observation.environment_state"] == features["observation.state"]
+    state = read(folder)["observation.state"].to_numpy()
+    assert np.array_equal(read(folder)["observation.environment_state"].to_numpy(), state)
+
+
+def test_the_plugin_needs_an_arm_that_it_can_hold(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="needs an operator of kind 'live' or 'own' at b"):
+        exported(tmp_path, log(), observations="plugin")
+    with pytest.raises(UsageError, match="the plugin can hold the arm of a or b, not of 'c'"):
+        exported(tmp_path, log(), observations="plugin", site="c")
 
 
 def test_an_episode_ends_before_a_gap_and_nothing_bridges_it(tmp_path: Path) -> None:
@@ -234,6 +319,9 @@ def test_in_task_space_a_command_is_a_place(tmp_path: Path) -> None:
         ({"fps": "0"}, "not 0"),
         ({"fps": "x"}, "cannot be read"),
         ({"fps": 29.97}, "cannot be read"),
+        ({"observations": "all"}, "observations must be slave or plugin, not 'all'"),
+        ({"environment_state": True}, "environment_state must be no or yes, not 'True'"),
+        ({"episodes": "mark"}, "episodes must be log or marks, not 'mark'"),
     ],
 )
 def test_settings_that_are_none_are_refused(

@@ -331,6 +331,38 @@ def test_gymnasiums_wrappers_scale_actions_and_observations() -> None:
     wrapped.step(wrapped.action_space.sample())
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("flat", [False, True])
+@pytest.mark.parametrize("mode", ["tip", "joint", "force"])
+def test_normalized_environments_pass_the_checker(mode: str, flat: bool) -> None:
+    """Without a warning, which the checker gives of an action space that is not normalized."""
+    env = tn.make_env("paper", BENT, mode=mode, duration_s=1, flat=flat, normalize=True)
+    check_env(env, skip_render_check=True)
+    assert env.action_space.high.tolist() == 2 * [1.0]
+
+
+@pytest.mark.parametrize("mode", ["tip", "joint", "force"])
+def test_normalized_episodes_are_the_scaled_ones(mode: str) -> None:
+    """The same actions in other units give the same numbers, none of which is clipped here."""
+    env, scaled = (
+        tn.make_env("paper", BENT, mode=mode, duration_s=1, flat=True, normalize=normalize)
+        for normalize in (False, True)
+    )
+    limit = env.action_space.high[0]
+    seen, normal = env.reset(seed=2)[0], scaled.reset(seed=2)[0]
+    random = np.random.default_rng(6)
+    for _ in range(20):
+        wanted = seen / env.observation_scales
+        assert np.abs(wanted).max() <= 1.0
+        assert normal == pytest.approx(wanted, abs=1e-5)
+        action = random.uniform(-0.2, 0.2, size=2)
+        seen, reward = env.step(limit * action)[:2]
+        normal, same_reward = scaled.step(action)[:2]
+        assert same_reward == pytest.approx(reward, abs=1e-6)
+    beyond = scaled.step(np.array([5.0, -5.0]))[0]
+    assert beyond in scaled.observation_space
+
+
 class BufferedEnvs:
     """Several environments as Stable-Baselines3 runs them: one buffer, and a reset where an episode ends."""
 

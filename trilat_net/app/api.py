@@ -118,8 +118,8 @@ def export(
         to: Format: ros2, parquet, csv, npz, mat or lerobot.
         out: Path of the file, or of the folder for parquet, csv and lerobot.
         force: True to replace an existing file or folder.
-        settings: Settings of the format, as `fps=30`, `program="m2"` and `actions="tip"` of
-            lerobot.
+        settings: Settings of the format, as `fps=30`, `observations="plugin"` and
+            `task="grasp"` of lerobot (docs/lerobot.md).
 
     Raises:
         UsageError: There is no such format or setting, a package is missing, or the path

@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import numpy as np
 from msgspec.structs import replace
 
+from ..core.arms.task_space import POSITION
 from ..core.life.own_hand import HandView
 from ..core.step.site_arrays import SiteArrays
 from ..core.step.ticks import tick_ns
@@ -291,6 +292,9 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
             None, `render` returns None.
         flat: True if observations are one array of float32 instead of a dictionary, and actions
             are float32.
+        normalize: True if actions and observations are numbers in [-1, 1]. An action of 1 is
+            then the largest target or force. Observations are divided by
+            `observation_scales`, and numbers beyond these scales are clipped.
 
     Attributes:
         observation_names: With `flat`, the name of each number of an observation, as in
@@ -322,6 +326,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         leads: str = "s",
         render_mode: str | None = None,
         flat: bool = False,
+        normalize: bool = False,
     ) -> None:
         render_modes = self.metadata["render_modes"]
         if render_mode not in (None, *render_modes):
@@ -337,6 +342,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         self._delay_s = delay_ms * 1e-3
         self._vary = vary
         self._leads = leads
+        self._normalize = normalize
         self.task: EpisodeTask = task or ReachTask(leads)
         loaded = load_scenario(scenario, set, duration_s=duration_s)
         self._base = self._prepare(loaded)
@@ -353,7 +359,8 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         self._action_limit = limit
         self._action_size = hand.size
         shape = (hand.size,)
-        self.action_space: Any = spaces.Box(-limit, limit, shape, dtype)
+        bound = 1.0 if normalize else limit
+        self.action_space: Any = spaces.Box(-bound, bound, shape, dtype)
 
         self._begin(self._base)
         random = np.random.default_rng(0)
@@ -364,6 +371,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         self.observation_space: Any = self._dict_space
         self.observation_names: list[str] = []
         scales = self._scale_parts(scene_with_goal)
+        self._part_scales = scales
         self.observation_scales: Any = scales
         if flat:
             self.observation_space = _flatten_space(self._dict_space)
@@ -389,7 +397,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         boxes: dict[str, Any] = {}
         parts = self._observe(scene)
         for name, values in parts.items():
-            bound = bounds.get(name, FAR)
+            bound = 1.0 if self._normalize else bounds.get(name, FAR)
             low = 0.0 if name in NEVER_NEGATIVE else -bound
             boxes[name] = spaces.Box(low, bound, values.shape, np.float64)
         return spaces.Dict(boxes)
@@ -411,15 +419,23 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         scales["tau_x"][:] = user_limits.tau_limit_nm
         for index, peer in enumerate(base.peers(self._user)):
             limits = base.sites[peer].limits
-            if not base.arms[peer].shares_pose:
-                scales["peer_qd"][index] = limits.qd_limit_rad_s
-                scales["peer_tau_x"][index] = limits.tau_limit_nm
-        if not base.arms[self._user].shares_pose:
+            # Rates and forces of shared poses are those of an end effector 1 m from its base.
+            scales["peer_qd"][index] = limits.qd_limit_rad_s
+            scales["peer_tau_x"][index] = limits.tau_limit_nm
+        reach_m = self._find_reach_m()
+        if base.arms[self._user].shares_pose:
+            # Entries of a rotation matrix follow the position.
+            scales["q_des"][..., :POSITION] = reach_m
+            scales["peer_q"][..., :POSITION] = reach_m
+        else:
             scales["q_des"][:] = math.pi
             scales["peer_q"][:] = math.pi
         scales["q"][:] = math.pi
         scales["target"][:] = self._action_limit
-        scales["pose"][:] = self._find_reach()
+        hand = self._build_hand_site(base).describe()
+        scales["pose"][:] = math.pi if hand.mode == "joint" else reach_m
+        is_position = np.shape(self.task.goal) == scene.end_effector_m[self._leads].shape
+        scales["goal"][:] = reach_m if is_position else self.task.bound
         return scales
 
     def _prepare(self, scenario: Scenario) -> Scenario:
@@ -466,11 +482,15 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         In the mode "tip" an action is a position of the end effector, and the bound is its
         largest distance from the base, in m. In the mode "joint" it is an angle, in rad.
         """
-        arm = self._base.arms[self._user]
-        spec = self._base.sites[self._user]
         hand_site = self._build_hand_site(self._base)
         if hand_site.spec.mode == "joint":
             return 2.0 * math.pi
+        return self._find_reach_m()
+
+    def _find_reach_m(self) -> float:
+        """Returns the largest distance of the user's end effector from its base, in m."""
+        arm = self._base.arms[self._user]
+        spec = self._base.sites[self._user]
         if arm.chain is None:
             return float(sum(arm.lengths_m))
         # The reach of a chain is not known in closed form. This bound is generous.
@@ -563,6 +583,10 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
     def _format_observation(self, scene: Scene) -> Any:
         """Returns the user's observation of a state, in the form of the observation space."""
         parts = self._observe(scene)
+        if self._normalize:
+            for name, values in parts.items():
+                scaled = values / self._part_scales[name]
+                parts[name] = np.clip(scaled, -1.0, 1.0)
         if not self._flat:
             return parts
         arrays = [np.ravel(parts[name]) for name in self._dict_space]
@@ -727,6 +751,8 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         if not np.isfinite(values).all():
             raise UsageError(f"the action {values.tolist()} is not finite")
         limit = self._action_limit
+        if self._normalize:
+            values = limit * values
         return np.clip(values, -limit, limit)
 
     def render(self) -> Any:

@@ -123,7 +123,11 @@ def log_recover_command(
         raise typer.Exit(_LOSSY_EXIT_CODE)
 
 
-@options.command("run.mcap --to parquet", page="docs/log-tools.md")
+@options.command(
+    "run.mcap --to parquet",
+    "runs/ --to lerobot -o grasps --set observations=plugin --set task=grasp",
+    page="docs/log-tools.md",
+)
 def log_export_command(
     files: options.LogsOrFoldersArgument,
     form: Annotated[str, options.value("--to", "|".join(list_export_formats()))],
@@ -139,9 +143,11 @@ def log_export_command(
         form: Format. ros2: an MCAP file of standard messages at full rate; parquet or csv: a
             folder with a file for each site and kind of record; npz or mat: one file with an
             array for each column; lerobot: a LeRobot dataset with an episode for each log in
-            FILE.
-        settings: Setting of the format; repeatable. For lerobot: fps=30, or program=m2 if the
-            user m2 is a program. For ros2: names=crtk, or a file of names.
+            FILE (docs/lerobot.md).
+        settings: Setting of the format; repeatable. For lerobot: fps=30; observations=plugin
+            for a policy that the LeRobot plugin runs; task=TEXT; episodes=marks for the
+            episodes that session.episode marked; program=m2 if the user m2 is a program, or
+            program=none. For ros2: names=crtk, or a file of names.
         actions: For lerobot: store the actions as the LeRobot plugin accepts them, as positions
             of the end effectors (tip) or angles of the joints (joints). Default: the values
             that the sites exchange.

@@ -3,7 +3,7 @@
 LeRobot trains programs to move robots like people did. A dataset is a sequence of frames at a
 fixed rate, divided into episodes. A frame has the state of the slave arm, the command of every
 user, the dominance factors of the users (the weights with which the slave follows them), and
-whether a person intervened in place of the program.
+in a run with a program whether a person intervened in its place.
 
 Invariant:
     - A frame has the newest record of every site at or before its time. A record is the stored
@@ -14,11 +14,13 @@ Invariant:
     - Numbers are float32. An orientation is six numbers, which never jump (see
       `trilat_net.log.orientations`).
     - With the setting `actions`, actions have the names and units of `action_features` of the
-      plugin `lerobot_robot_trilat`, so that a trained program can command the plugin. A test
-      compares the two.
+      plugin `lerobot_robot_trilat`, so that a trained program can command the plugin. With
+      `observations=plugin`, the same holds for the observations. A test compares them.
+    - There is no column `intervention` unless a program moves the arm of a user of a log.
 """
 
 import json
+import re
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -30,6 +32,7 @@ from numpy.typing import NDArray
 from ...analysis.arm_rows import build_arm_rows
 from ...analysis.dominance_history import find_user_shares, find_users, trace_dominance
 from ...core.arms.task_space import POSITION
+from ...core.life.live_hand import TAKEN
 from ...core.step.ticks import NS_PER_S
 from ...core.step.vectors import Array
 from ...errors import LogError, UsageError, count_nouns
@@ -39,12 +42,18 @@ from ...log.log_reader import Log
 from ...log.orientations import MATRIX_ENTRIES, expand_poses
 from ...log.record_columns import Ints
 from ...scenario.arms import TASK_AXES
+from ...scenario.operators.program_hand import ProgramHand
 from ..export import EXPORT_MANIFEST, ExportFormat, Written
+from ..plugin_observation import find_plugin_actions, observe_as_plugin
 
 _EXTRA = ("pyarrow.parquet", "lerobot", "datasets of LeRobot")
 _FILE = "chunk-000/file-000.parquet"
 _MEANINGS = {
-    "observation.state": "angles, rad, and velocities, rad/s, of the slave's joints",
+    "observation.state": (
+        "angles, rad, and velocities, rad/s, of the slave's joints; with observations=plugin "
+        "the observation of lerobot_robot_trilat"
+    ),
+    "observation.environment_state": "the same numbers, for policies that need this name",
     "action": (
         "command of the leading user; action.USER is the command of each user: angles, rad, or "
         "a position, m, and an orientation"
@@ -57,7 +66,12 @@ _MEANINGS = {
         "external torque of Eq. (8) at the slave, N m; tau_x.USER is the torque that the hand "
         "of each user feels"
     ),
-    "intervention": "true if a user other than the program leads",
+    "intervention": "true if a user other than the program leads; left out without a program",
+    "next.done": "true in the last frame of an episode",
+    "next.success": (
+        "true in the last frame of an episode that a mark of the log calls succeeded; false "
+        "also if no mark says how the episode ended"
+    ),
     "frame": (
         "the newest record of each site at or before the time of the frame; nothing is "
         "interpolated"
@@ -84,6 +98,17 @@ ACTIONS = ("tip", "joints")
 These are also the modes of the LeRobot plugin that moves an arm to a position. Without one of
 them, actions are the values that the sites exchange.
 """
+OBSERVATIONS = ("slave", "plugin")
+"""Kinds of observations: the slave's joints, or what the LeRobot plugin observes."""
+EPISODES = ("log", "marks")
+"""Divisions into episodes: one for each log, or by the marks of `session.episode`."""
+SWITCHES = ("no", "yes")
+NO_PROGRAM = "none"
+"""Value of the setting `program` for runs in which no program moves an arm."""
+POLICY = "policy"
+"""Name by which the LeRobot plugin takes hold of an arm, see `lerobot_robot_trilat`."""
+_EPISODE_MARK = re.compile(r"episode (.+) (begins|ended|succeeded|failed)", re.DOTALL)
+_OUTCOMES = {"succeeded": True, "failed": False}
 Names = dict[str, list[str]]
 """Names of the numbers of each feature."""
 Columns = dict[str, NDArray[Any]]
@@ -104,6 +129,22 @@ class _Feature(NamedTuple):
     names: list[str]
 
 
+class _Attempt(NamedTuple):
+    """A part of a run that the marks of `session.episode` enclose.
+
+    Attributes:
+        name: Name of the episode. Empty for a run without marks.
+        begin_ns: First time of the part, in ns since the start of the session.
+        end_ns: Time after the part. None if it lasts until the end of the log.
+        succeeded: Whether the task was done. None if no mark says so.
+    """
+
+    name: str
+    begin_ns: int = 0
+    end_ns: int | None = None
+    succeeded: bool | None = None
+
+
 class _Frames(NamedTuple):
     """The F frames of a data set, each of which refers to a record of every site.
 
@@ -113,11 +154,27 @@ class _Frames(NamedTuple):
         rows: For each site, the index of each frame's record in the log, shape (F,).
         episode: Number of each frame's episode, from 0, shape (F,).
         left_out: Number of frames that are left out, because they lie in gaps.
+        outside: Number of frames that are left out, because they lie outside the attempts.
+        attempts: Parts of the run that contain the frames.
+        attempt: Index of each frame's part, shape (F,).
     """
 
     rows: dict[str, Ints]
     episode: Ints
     left_out: int
+    outside: int
+    attempts: list[_Attempt]
+    attempt: Ints
+
+
+class _Settings(NamedTuple):
+    """Settings of an export of logs, see `_write`."""
+
+    actions: str
+    observations: str
+    environment_state: bool
+    program: str
+    site: str
 
 
 def _write(
@@ -128,6 +185,11 @@ def _write(
     fps: int = 30,
     program: str = "",
     actions: str = "",
+    observations: str = "slave",
+    site: str = "",
+    environment_state: str = "no",
+    task: str = "",
+    episodes: str = "log",
 ) -> str:
     """Writes logs as one dataset.
 
@@ -136,9 +198,18 @@ def _write(
         folder: Folder of the dataset.
         written: Function that is called with the number of records of every log.
         fps: Number of frames per second.
-        program: Name of the user that is the program. Empty for the last user.
-        actions: Kind of the actions, one of `ACTIONS`. Empty for the values that sites
+        program: Name of the user that is the program, or `NO_PROGRAM`. Empty to find it in
+            each log.
+        actions: Kind of the actions, one of `ACTIONS`. Empty for the actions of the plugin if
+            the observations are those of the plugin, otherwise for the values that sites
             exchange.
+        observations: Kind of the observations, one of `OBSERVATIONS`.
+        site: Name of the user whose arm the plugin will hold. Empty for the program, or
+            without a program for the last user.
+        environment_state: "yes" to store the observation also under the name
+            `observation.environment_state`, without which some policies do not work.
+        task: Text of the task. Empty for the title of the scenario.
+        episodes: Division into episodes, one of `EPISODES`.
 
     Returns:
         A sentence about the size of the dataset.
@@ -147,15 +218,35 @@ def _write(
         LogError: A log has no frames, or the users or joints of the logs differ.
         UsageError: A setting is not valid.
     """
-    _check_settings(fps, actions)
+    if fps < 1:
+        raise UsageError(
+            f"fps must be a whole number of frames per second, at least 1, not {fps}"
+        )
+    if actions:
+        _check_choice("actions", actions, ACTIONS)
+    _check_choice("observations", observations, OBSERVATIONS)
+    _check_choice("environment_state", environment_state, SWITCHES)
+    _check_choice("episodes", episodes, EPISODES)
+
+    programs = [program or _find_program(log) for log in logs]
     names: Names = {}
     tasks: dict[str, int] = {}
     parts = list[Columns]()
     sessions = []
     left_out = 0
-    for log in logs:
-        frames = _choose_frames(log, fps)
-        columns, log_names = _read_columns(log, frames.rows, program, actions)
+    outside = 0
+    plugin_site = ""
+    for log, log_program in zip(logs, programs, strict=True):
+        settings = _Settings(
+            actions=actions,
+            observations=observations,
+            environment_state=environment_state == "yes",
+            program=log_program,
+            site=site,
+        )
+        attempts = _find_attempts(log) if episodes == "marks" else []
+        frames = _choose_frames(log, fps, attempts or [_Attempt("")])
+        columns, log_names = _read_columns(log, frames.rows, settings)
         names = names or log_names
         if log_names != names:
             first_source = logs[0].source
@@ -167,15 +258,32 @@ def _write(
             last_episode = parts[-1]["episode_index"][-1]
             first_episode = last_episode + 1
         columns["episode_index"] = frames.episode + first_episode
-        task_text = log.scenario.title or log.scenario.name
-        task = tasks.setdefault(task_text, len(tasks))
-        columns["task_index"] = np.full_like(frames.episode, task)
+        task_text = task or log.scenario.title or log.scenario.name
+        task_index = tasks.setdefault(task_text, len(tasks))
+        columns["task_index"] = np.full_like(frames.episode, task_index)
+        columns["next.success"] = _find_successes(frames)
         parts.append(columns)
-        sessions.append(_describe_session(log, frames))
+        session = _describe_session(log, frames, log_program)
+        if observations == "plugin":
+            plugin_site = _choose_plugin_site(log, settings)
+            session["plugin_site"] = plugin_site
+        sessions.append(session)
         left_out += frames.left_out
-        record_count = sum(len(log[site]) for site in log.sites)
+        outside += frames.outside
+        record_count = sum(len(log[name]) for name in log.sites)
         written(record_count)
 
+    has_program = any(log_program != NO_PROGRAM for log_program in programs)
+    has_outcome = any(
+        attempt["outcome"] != "not stated"
+        for session in sessions
+        for attempt in session["episodes"]
+    )
+    for part in parts:
+        if not has_program:
+            del part["intervention"]
+        if not has_outcome:
+            del part["next.success"]
     dataset: Columns = {}
     for key in parts[0]:
         column_parts = [part[key] for part in parts]
@@ -193,11 +301,13 @@ def _write(
     )
     provenance = collect_provenance()
     version = provenance["version_trilat-net"]
+    program_text = " and ".join(sorted(set(programs)))
     files[EXPORT_MANIFEST] = {
         "exported_by": f"trilat-net {version}",
         "meanings": _MEANINGS,
-        "actions": actions or "what sites share",
-        "program": program or "the last user",
+        "actions": actions or ("plugin" if observations == "plugin" else "what sites share"),
+        "observations": observations,
+        "program": program_text,
         "sessions": sessions,
     }
     _write_json(folder, files)
@@ -207,21 +317,115 @@ def _write(
     gaps_text = count_nouns(
         left_out, "frame lies in a gap and is", "frames lie in gaps and are"
     )
-    return f"{frames_text} in {episodes_text}; {gaps_text} left out"
+    text = f"{frames_text} in {episodes_text}; {gaps_text} left out"
+    if outside:
+        text += f"; {count_nouns(outside, 'frame')} outside the marked episodes"
+    if plugin_site:
+        text += f"; observations as the plugin makes them at {plugin_site}"
+    if not has_program:
+        return f"{text}; no program moved an arm, so there is no column intervention"
+    found = "" if program else " (found in the log)"
+    return f"{text}; the program is {program_text}{found}"
 
 
-def _check_settings(fps: int, actions: str) -> None:
-    """Checks the settings of an export, see `_write`.
+def _check_choice(name: str, value: str, choices: Sequence[str]) -> None:
+    """Checks a setting that has a few possible values.
+
+    Args:
+        name: Name of the setting.
+        value: Its value.
+        choices: The possible values.
 
     Raises:
-        UsageError: A setting is not valid.
+        UsageError: The value is not possible.
     """
-    if fps < 1:
-        raise UsageError(
-            f"fps must be a whole number of frames per second, at least 1, not {fps}"
-        )
-    if actions not in ("", *ACTIONS):
-        raise UsageError(f"actions must be {' or '.join(ACTIONS)}, not {actions!r}")
+    if value not in choices:
+        raise UsageError(f"{name} must be {' or '.join(choices)}, not {value!r}")
+
+
+def _find_program(log: Log) -> str:
+    """Returns the user whose arm a program moved in a run.
+
+    It is the last user with a hand of kind "own", or otherwise the last user whose arm a policy
+    held through the LeRobot plugin.
+
+    Args:
+        log: Log of the run.
+
+    Returns:
+        Name of the user, or `NO_PROGRAM`.
+    """
+    users = find_users(log.scenario)[1]
+    with_policy = []
+    with_program = []
+    for user in users:
+        begin = f"{user}: {POLICY} {TAKEN} "
+        if any(event.kind == "hand" and event.text.startswith(begin) for event in log.events):
+            with_policy.append(user)
+        hands = log.scenario.sites[user].hands
+        if any(isinstance(hand, ProgramHand) for hand in hands):
+            with_program.append(user)
+    return [NO_PROGRAM, *with_policy, *with_program][-1]
+
+
+def _choose_plugin_site(log: Log, settings: _Settings) -> str:
+    """Returns the user whose arm the LeRobot plugin will hold.
+
+    It is the user that the settings name, or else the program, or else the last user.
+
+    Args:
+        log: Log of a run with at least one user.
+        settings: Settings of the export, with the program of this log.
+
+    Raises:
+        UsageError: There is no user with the name in the settings.
+    """
+    users = find_users(log.scenario)[1]
+    program = settings.program if settings.program != NO_PROGRAM else ""
+    site = settings.site or program or users[-1]
+    if site not in users:
+        possible_users = " or ".join(users)
+        raise UsageError(f"the plugin can hold the arm of {possible_users}, not of {site!r}")
+    return site
+
+
+def _find_attempts(log: Log) -> list[_Attempt]:
+    """Finds the episodes that `session.episode` has marked in a log.
+
+    An episode ends where its end is marked, or where the next episode begins.
+
+    Args:
+        log: Log of the run.
+
+    Returns:
+        The episodes in their order in time. Empty if there are none.
+    """
+    marks = []
+    for event in log.events:
+        match = _EPISODE_MARK.fullmatch(event.text)
+        if event.kind == "mark" and match:
+            marks.append((event.t_ns, match[1], match[2]))
+    marks.sort(key=lambda mark: mark[0])  # stable: keeps the order of marks in one tick
+
+    attempts = list[_Attempt]()
+    for t_ns, name, change in marks:
+        last = attempts[-1] if attempts else None
+        is_open = last is not None and last.end_ns is None
+        if change == "begins":
+            if last is not None and is_open:
+                attempts[-1] = last._replace(end_ns=t_ns)
+            attempts.append(_Attempt(name, begin_ns=t_ns))
+        elif last is not None and is_open and last.name == name:
+            attempts[-1] = last._replace(end_ns=t_ns, succeeded=_OUTCOMES.get(change))
+    return attempts
+
+
+def _find_successes(frames: _Frames) -> NDArray[np.bool_]:
+    """Returns whether an attempt ends with success at each frame, shape (F,)."""
+    succeeded = np.array([attempt.succeeded is True for attempt in frames.attempts])
+    is_last = np.diff(frames.attempt, append=len(frames.attempts)) != 0
+    successes: NDArray[np.bool_] = is_last & succeeded[frames.attempt]
+    return successes
 
 
 def _write_json(folder: Path, files: dict[str, Any]) -> None:
@@ -237,12 +441,21 @@ def _write_json(folder: Path, files: dict[str, Any]) -> None:
         path.write_text(text, encoding="utf-8", newline="\n")
 
 
-def _describe_session(log: Log, frames: _Frames) -> dict[str, Any]:
-    """Returns the session of a log, its scenario, and the number of omitted frames."""
+def _describe_session(log: Log, frames: _Frames, program: str) -> dict[str, Any]:
+    """Returns the session of a log, its scenario, episodes, and the omitted frames."""
+    outcomes = {True: "succeeded", False: "failed", None: "not stated"}
+    episodes = []
+    for attempt in frames.attempts:
+        if attempt.name:
+            outcome = outcomes[attempt.succeeded]
+            episodes.append({"name": attempt.name, "outcome": outcome})
     return {
         **log.session,
         "scenario": log.scenario_text,
+        "program": program,
+        "episodes": episodes,
         "frames_left_out": frames.left_out,
+        "frames_outside_episodes": frames.outside,
     }
 
 
@@ -260,6 +473,8 @@ def _number_frames(dataset: Columns, fps: int) -> list[int]:
     index = np.arange(len(episode))
     episode_steps = np.diff(episode, prepend=-1)
     starts = np.flatnonzero(episode_steps)
+    is_last = np.diff(episode, append=episode[-1] + 1) != 0
+    dataset["next.done"] = is_last
     frame_index = index - starts[episode]
     times_s = frame_index / fps
     dataset["timestamp"] = times_s.astype(np.float32)
@@ -268,14 +483,20 @@ def _number_frames(dataset: Columns, fps: int) -> list[int]:
     return [int(start) for start in starts]
 
 
-def _choose_frames(log: Log, fps: int) -> _Frames:
+def _choose_frames(log: Log, fps: int, attempts: list[_Attempt]) -> _Frames:
     """Chooses the times of the frames of a log, and the records of each frame.
 
     The first frame is at the first time for which every site has a record. Records of a site
     that has diverged do not count.
 
+    Args:
+        log: Log of the run that is exported.
+        fps: Number of frames per second.
+        attempts: Parts of the run whose frames are chosen, in the order of their times.
+
     Raises:
-        LogError: A site has no records, or there is no time for which every site has a record.
+        LogError: A site has no records, or there is no time for which every site has a record,
+            or no such time in an attempt.
     """
     rows = {}
     for site in log.sites:
@@ -311,24 +532,41 @@ def _choose_frames(log: Log, fps: int) -> _Frames:
         is_fresh &= age_ns <= longer_period_ns
         rows[site] = rows[site][newest]
 
-    fresh_frames = np.flatnonzero(is_fresh)
-    if not len(fresh_frames):
+    if not is_fresh.any():
         raise LogError(f"{log.source}: there is no time for which every site has a record")
-    frame_steps = np.diff(fresh_frames, prepend=fresh_frames[0])
-    is_after_gap = frame_steps > 1
-    fresh_rows = {site: site_rows[fresh_frames] for site, site_rows in rows.items()}
+    attempt = np.full(len(frame_ns), -1)
+    for index, part in enumerate(attempts):
+        is_inside = frame_ns >= part.begin_ns
+        if part.end_ns is not None:
+            is_inside &= frame_ns < part.end_ns
+        attempt[is_inside] = index
+    is_inside = attempt >= 0
+    chosen = np.flatnonzero(is_fresh & is_inside)
+    if not len(chosen):
+        raise LogError(
+            f"{log.source}: no marked episode contains a time for which every site has a "
+            "record; without episodes=marks the whole log is one episode"
+        )
+    chosen_attempt = attempt[chosen]
+    frame_steps = np.diff(chosen, prepend=chosen[0])
+    attempt_steps = np.diff(chosen_attempt, prepend=chosen_attempt[0])
+    begins_episode = (frame_steps > 1) | (attempt_steps != 0)
+    chosen_rows = {site: site_rows[chosen] for site, site_rows in rows.items()}
+    inside_count = int(is_inside.sum())
     return _Frames(
-        rows=fresh_rows,
-        episode=np.cumsum(is_after_gap, dtype=np.int64),
-        left_out=len(frame_ns) - len(fresh_frames),
+        rows=chosen_rows,
+        episode=np.cumsum(begins_episode, dtype=np.int64),
+        left_out=inside_count - len(chosen),
+        outside=len(frame_ns) - inside_count,
+        attempts=attempts,
+        attempt=chosen_attempt,
     )
 
 
 def _read_columns(
     log: Log,
     rows: dict[str, Ints],
-    program: str,
-    actions: str,
+    settings: _Settings,
 ) -> tuple[Columns, Names]:
     """Returns the features of all frames of a log that follow from its records.
 
@@ -337,15 +575,16 @@ def _read_columns(
     Args:
         log: Log of the run that is exported.
         rows: For each site, the index of each frame's record, shape (F,).
-        program: Name of the user that is the program. Empty for the last user.
-        actions: Kind of the actions, one of `ACTIONS`, or empty.
+        settings: Settings of the export, with the program of this log.
 
     Returns:
-        The columns of the features, and the names of the numbers of each vector.
+        The columns of the features, and the names of the numbers of each vector. Without a
+        program, the column `intervention` is false.
 
     Raises:
         LogError: The log has no slave or no user, or the users have no common action.
-        UsageError: The program is not a user.
+        UsageError: The program or the user of the plugin is not a user, or the plugin cannot
+            hold an arm in this scenario.
     """
     slave, users = find_users(log.scenario)
     if not slave or not users:
@@ -355,12 +594,20 @@ def _read_columns(
     slave_rows = rows[slave]
     frame_times_s = slave_records.t_s[slave_rows]
     dominance = trace_dominance(log, slave, frame_times_s)
+    has_program = settings.program != NO_PROGRAM
+    program = settings.program if has_program else ""
     shared = find_user_shares(log.scenario, dominance.alpha, program)
+    # Without a program, the first user leads if no share is larger than the others.
+    leader = shared.leader if has_program else shared.shares.argmax(axis=1)
+    plugin_site = _choose_plugin_site(log, settings)
+    actions = settings.actions
+    if settings.observations == "plugin" and not actions:
+        actions = find_plugin_actions(log, plugin_site)
     commands, command_names = _read_commands(log, users, rows, actions)
     # The action of a frame is the command of the user with the largest dominance factor.
     all_commands = np.stack(commands)
     frame_indices = np.arange(len(dominance.alpha))
-    leading_commands = all_commands[shared.leader, frame_indices]
+    leading_commands = all_commands[leader, frame_indices]
 
     q = slave_records.q[slave_rows]
     qd = slave_records.qd[slave_rows]
@@ -371,11 +618,15 @@ def _read_columns(
         joints[site] = list(arm.joint_names)
     state_names = [f"{slave}.{joint}.pos" for joint in joints[slave]]
     state_names += [f"{slave}.{joint}.vel" for joint in joints[slave]]
+    if settings.observations == "plugin":
+        state, state_names = observe_as_plugin(log, slave, plugin_site, rows)
 
-    features = [
-        _Feature("observation.state", state, state_names),
-        _Feature("action", leading_commands, command_names),
-    ]
+    features = [_Feature("observation.state", state, state_names)]
+    if settings.environment_state:
+        environment = _Feature("observation.environment_state", state, state_names)
+        features.append(environment)
+    leading_action = _Feature("action", leading_commands, command_names)
+    features.append(leading_action)
     for user, command in zip(users, commands, strict=True):
         user_action = _Feature(f"action.{user}", command, command_names)
         features.append(user_action)
@@ -392,7 +643,7 @@ def _read_columns(
     for feature in features:
         columns[feature.key] = feature.values.astype(np.float32)
         names[feature.key] = feature.names
-    columns["intervention"] = shared.leader != shared.program
+    columns["intervention"] = has_program & (leader != shared.program)
     return columns, names
 
 

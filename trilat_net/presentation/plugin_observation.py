@@ -1,0 +1,149 @@
+"""Computes from a log the observation that the LeRobot plugin makes in a live session.
+
+The plugin `lerobot_robot_trilat` holds the arm of one user. It observes the slave, that arm,
+and the operator who moves the arm. A program that was trained with the observations of this
+module can therefore act through the plugin.
+
+Invariant:
+    - The names and their order are those of `observation_features` of the plugin. A test
+      compares the two.
+    - An angle is in rad, a velocity in rad/s, a torque in N m, a position in m, a force in N.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ..analysis.arm_rows import build_arm_rows
+from ..core.step.vectors import Array
+from ..errors import UsageError
+from ..log.log_reader import Log
+from ..log.record_columns import Ints
+from ..scenario.arms import TASK_AXES
+from ..scenario.operators.kernel_operators import LiveHand
+
+_HAND_ACTIONS = {"tip": "tip", "joint": "joints"}
+"""Kind of exported actions that an operator of each mode accepts as commands."""
+
+
+def find_plugin_hand(log: Log, site: str) -> LiveHand:
+    """Returns the operator through which the plugin moves the arm of a site.
+
+    Args:
+        log: Log of the run.
+        site: Name of the site.
+
+    Raises:
+        UsageError: The scenario has no such operator at this site.
+    """
+    hand = log.scenario.sites[site].find_live_hand()
+    if hand is None:
+        raise UsageError(
+            f"{log.source}: observations=plugin needs an operator of kind 'live' or 'own' at "
+            f"{site}, which the scenario does not have; choose another user by site=NAME, or "
+            "leave observations out"
+        )
+    return hand
+
+
+def find_plugin_actions(log: Log, site: str) -> str:
+    """Returns the kind of exported actions that the plugin accepts at a site.
+
+    Args:
+        log: Log of the run.
+        site: Name of the site.
+
+    Raises:
+        UsageError: The operator of the site is commanded by forces, which are not exported.
+    """
+    mode = find_plugin_hand(log, site).mode
+    if mode not in _HAND_ACTIONS:
+        raise UsageError(
+            f"{log.source}: the operator of {site} is commanded by forces, which are not "
+            "exported; set actions to tip or joints"
+        )
+    return _HAND_ACTIONS[mode]
+
+
+def observe_as_plugin(
+    log: Log, slave: str, site: str, rows: Mapping[str, Ints]
+) -> tuple[Array, list[str]]:
+    """Returns the plugin's observation in every frame.
+
+    Args:
+        log: Log of the run.
+        slave: Name of the slave.
+        site: Name of the site whose arm the plugin holds.
+        rows: For each site, the index of each frame's record, shape (F,).
+
+    Returns:
+        The observation, shape (F, n), and the names of its n numbers.
+
+    Raises:
+        UsageError: The scenario has no operator for the plugin at this site.
+    """
+    hand = find_plugin_hand(log, site)
+    values: list[Array] = []
+    names: list[str] = []
+    for observed_site in (slave, site):
+        records = log[observed_site]
+        site_rows = rows[observed_site]
+        joints = log.scenario.arms[observed_site].joint_names
+        quantities = {"pos": records.q, "vel": records.qd, "tau_x": records.tau_x}
+        for quantity, numbers in quantities.items():
+            values.append(numbers[site_rows])
+            names += [f"{observed_site}.{joint}.{quantity}" for joint in joints]
+
+    records = log[site]
+    site_rows = rows[site]
+    pose = records.q[site_rows]
+    pose_rate = records.qd[site_rows]
+    axes = tuple(log.scenario.arms[site].joint_names)
+    if hand.mode != "joint":
+        end_effector = build_arm_rows(log.scenario, site).place_end_effector(pose, pose_rate)
+        pose = end_effector.position
+        pose_rate = end_effector.speed
+        axes = TASK_AXES[: pose.shape[1]]
+    pull = _compute_pull(hand, records.hand[site_rows], pose, pose_rate)
+    # The operator feels the reaction of the force that moves the arm.
+    values += [pose, -pull]
+    names += [f"{axis}.pos" for axis in axes]
+    names += [f"{axis}.felt" for axis in axes]
+    return np.hstack(values), names
+
+
+def _compute_pull(hand: LiveHand, vectors: Array, pose: Array, pose_rate: Array) -> Array:
+    """Computes the force of the operator on the arm, as `Hand.force` does in a live session.
+
+    With the stiffness K and the damping B, the force is
+
+        F = K (target - pose) + B (target rate - pose rate)
+
+    The norm of F is limited, and F is multiplied by the grip, a number from 0 to 1.
+
+    Args:
+        hand: The operator.
+        vectors: Field `hand` of the records (`HandInForce`), shape (F, 3 + 2 n).
+        pose: Pose of the arm in the coordinates of the operator, shape (F, n).
+        pose_rate: Its time derivative, shape (F, n).
+
+    Returns:
+        The force in N, or in mode `joint` the torques in N m, shape (F, n).
+    """
+    source = hand.actor
+    size = pose.shape[1]
+    grip = vectors[:, :1]
+    target = vectors[:, 3 : 3 + size]
+    target_rate = vectors[:, 3 + size :]
+    pull = target
+    if hand.mode != "force":
+        stiffness = np.array(source.K)
+        damping = np.array(source.B)
+        pull = stiffness * (target - pose) + damping * (target_rate - pose_rate)
+    magnitude = np.linalg.norm(pull, axis=1, keepdims=True)
+    above_limit = magnitude > source.limit
+    limitation = np.divide(
+        source.limit, magnitude, out=np.ones_like(magnitude), where=above_limit
+    )
+    force: Array = grip * limitation * pull
+    return force
