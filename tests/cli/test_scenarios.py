@@ -72,3 +72,14 @@ def test_new_writes_a_valid_template_and_keeps_existing_files(tmp_path: Path) ->
     trilat("scenario", "new", path, "--force", cwd=tmp_path).succeeds()
     assert path.read_text().count("#") > 20
     trilat("scenario", "check", path, cwd=tmp_path).succeeds()
+
+
+def test_show_prints_the_scenario_of_a_log(tmp_path: Path) -> None:
+    text = load_scenario("two_sites", {"duration_s": 0.2}).text
+    (tmp_path / "own.toml").write_text(text, encoding="utf-8")
+    trilat("sim", "./own.toml", "-o", "run.mcap", cwd=tmp_path).succeeds()
+    shown = trilat("scenario", "show", "run.mcap", cwd=tmp_path)
+    assert shown.succeeds() == text
+    changed = trilat("scenario", "show", "run.mcap", "--seed", "3", cwd=tmp_path)
+    changed.refuses("printed as it is", "mine.toml")
+    trilat("scenario", "show", "none.mcap", cwd=tmp_path).refuses("none.mcap")
