@@ -16,6 +16,7 @@ from trilat_net.analysis.site_signals import SETTLED_ERROR_RAD, find_last_error
 from trilat_net.analysis.stability_decision import LoopRoots
 from trilat_net.log.findings import Finding
 from trilat_net.log.log_reader import Log
+from trilat_net.presentation.certificate_text import describe_certificate
 from trilat_net.presentation.conclude import _tabulate_sites
 from trilat_net.presentation.page_summary import (
     describe_basis,
@@ -185,8 +186,9 @@ def test_limits_stand_under_the_judgement() -> None:
     for brief in (True, False):
         texts = [block.lines()[0] for block in compose(found, brief=brief)]
         place = texts.index(f"note {remark}")
-        assert place in (1, 2)  # before the reasons, which the theorem begins
-        assert "theorem" in texts[place + 1]
+        reasons = [line.text for line in describe_certificate(found)]
+        assert place in (1, 2)  # before the reasons
+        assert texts[place + 1].endswith(reasons[1])
 
 
 def test_log_without_records_has_dashes() -> None:
