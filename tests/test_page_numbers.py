@@ -464,7 +464,8 @@ PAGES: dict[str, dict[str, Make]] = {
 }
 CERTIFIED = (
     "hands gave: {} J at 0 s, {} J at {} s",
-    "converged: |e| {} rad and |qd| {} rad/s in the last second",
+    "a small disturbance halves every {} s",
+    "converged: largest |e| {} rad of m1 joint 1 and |qd| {} rad/s of m2 joint 1 in the last second",
     "closes to {} of the largest energy, {} J; to {} once",
     "this rest: stable, {} /s at {} rad/s",
     "judged all {} ticks; the digest chain agrees over {} messages",

@@ -107,3 +107,14 @@ def test_other_commands_name_settings_that_work() -> None:
     settings = re.findall(r"set (\S+=\S+)", str(refused.value))
     log = tn.simulate(EXAMPLES / "two_operators.toml", settings, duration_s=0.1)
     assert log.scenario.outside == ()
+
+
+def test_show_prints_the_scenario_of_a_log(tmp_path: Path) -> None:
+    text = load_scenario("two_sites", {"duration_s": 0.2}).text
+    (tmp_path / "own.toml").write_text(text, encoding="utf-8")
+    trilat("sim", "./own.toml", "-o", "run.mcap", cwd=tmp_path).succeeds()
+    shown = trilat("scenario", "show", "run.mcap", cwd=tmp_path)
+    assert shown.succeeds() == text
+    changed = trilat("scenario", "show", "run.mcap", "--seed", "3", cwd=tmp_path)
+    changed.refuses("printed as it is", "mine.toml")
+    trilat("scenario", "show", "none.mcap", cwd=tmp_path).refuses("none.mcap")

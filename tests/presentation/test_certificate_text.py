@@ -1,6 +1,7 @@
 """What the report, a terminal and a program are told of a certificate."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,14 @@ import pytest
 from tests.analysis import logs
 from tests.analysis.certificate import runs
 from trilat_net.analysis.certificate.stability_certificate import certify
-from trilat_net.presentation.certificate_text import describe_certificate, list_energies
+from trilat_net.analysis.run_end import EndBehaviour
+from trilat_net.analysis.stability_decision import LoopRoots
+from trilat_net.presentation.certificate_text import (
+    describe_certificate,
+    describe_judgement,
+    describe_pace,
+    list_energies,
+)
 from trilat_net.presentation.figures.certificate_energy import draw_functional
 
 LOGS = {
@@ -69,7 +77,7 @@ def test_a_figure_is_a_function_of_the_log(name: str) -> None:
         ("jitter", "open open open ok ok"),
         ("rich", "open open open ok ok note"),
         ("p_d", "open open ok"),
-        ("diverged", "FAIL ok FAIL ok ok"),
+        ("diverged", "FAIL ok ok ok"),
     ],
 )
 def test_lines_give_the_judgement_and_then_verdict_end_and_balance(
@@ -81,7 +89,47 @@ def test_lines_give_the_judgement_and_then_verdict_end_and_balance(
     assert said[0].text.startswith(f"{found.stability}: {found.end.behaviour}")
     of_v = [] if name == "p_d" else [found.verdict.text]  # the law P+d has no V
     texts = [line.text for line in said]
-    assert texts[1 : 2 + len(of_v)] == [*of_v, f"e and qd: {found.end.text}"]
+    of_end = [] if name == "diverged" else [f"e and qd: {found.end.text}"]
+    assert texts[1 : 1 + len(of_v + of_end)] == of_v + of_end
+
+
+def test_divergence_is_said_once_with_its_joint() -> None:
+    log = logs.diverged()
+    found = certify(log)
+    cause = log.describe_divergence()
+    assert re.fullmatch(
+        r"(m1|m2|s) joint [12] reached 0\.\d+ rad/s \(limit 0\.5 rad/s\) at \S+ s", cause
+    )
+    texts = [line.text for line in describe_certificate(found)]
+    assert texts[0] == f"not stable: diverged: {cause}"
+    assert not [text for text in texts[1:] if "diverged at" in text or cause in text]
+    site = cause.split()[0]
+    speed_rad_s = float(cause.split("reached ")[1].split()[0])
+    assert np.abs(log[site].qd[-1]).max() == pytest.approx(speed_rad_s, rel=1e-2)
+
+
+def test_a_short_run_says_so_once_and_for_how_long() -> None:
+    slow = LoopRoots("stable", -0.25, True, "this rest: stable, -0.25 /s")
+    found = runs.run("free", {"duration_s": 4.0, "rate_hz": 200}).certificate
+    end = found.end._replace(behaviour=EndBehaviour.UNDECIDED, reasons=())
+    short = replace(found, end=end, roots=slow)
+    needed_s = 8.0 * np.log(2.0) / 0.25 + end.quiet_from_s
+    assert describe_judgement(short) == (
+        f"open: the run is too short to tell; a run of {needed_s:.3g} s would"
+    )
+    long = replace(short, end=end._replace(lasts_s=needed_s))
+    assert "too short" not in describe_judgement(long)
+    assert end.text not in describe_judgement(long)  # the line of the end has it
+
+
+def test_pace_is_that_of_the_slowest_root() -> None:
+    found = runs.run("free", {"duration_s": 4.0, "rate_hz": 200}).certificate
+    for rate_per_s, verb in ((-0.5, "halves"), (0.5, "doubles")):
+        verdict = "stable" if rate_per_s < 0.0 else "unstable"
+        roots = LoopRoots(verdict, rate_per_s, True, f"this rest: {verdict}")
+        judged = replace(found, roots=roots)
+        assert describe_pace(judged) == f"a small disturbance {verb} every 1.4 s"
+        assert describe_pace(replace(judged, roots=roots._replace(exact=False))) == ""
 
 
 def test_many_links_are_one_entry() -> None:

@@ -4,17 +4,20 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 
+import numpy as np
 import pytest
 
 from tests.analysis import logs
 from tests.analysis.certificate import runs
-from trilat_net.analysis.certificate.stability_certificate import Certificate
+from trilat_net.analysis.certificate.stability_certificate import Certificate, certify
 from trilat_net.analysis.file_overview import summarise_run
 from trilat_net.analysis.run_end import EndBehaviour, Stability
-from trilat_net.analysis.site_signals import SETTLED_ERROR_RAD
+from trilat_net.analysis.site_signals import SETTLED_ERROR_RAD, find_last_error
 from trilat_net.analysis.stability_decision import LoopRoots
 from trilat_net.log.findings import Finding
 from trilat_net.log.log_reader import Log
+from trilat_net.presentation.certificate_text import describe_certificate
+from trilat_net.presentation.conclude import _tabulate_sites
 from trilat_net.presentation.page_summary import (
     describe_basis,
     find_error_peak,
@@ -22,6 +25,7 @@ from trilat_net.presentation.page_summary import (
     render_key_numbers,
     render_verdict,
 )
+from trilat_net.presentation.result_text import compose
 
 STABLE_ROOTS = LoopRoots("stable", -0.5, True, "this rest: stable, -0.5 /s")
 PASSED = Finding("records", "8/8 in the file; judged all 8 ticks")
@@ -128,14 +132,63 @@ def test_check_that_did_not_pass_is_named(finding: Finding, words: str) -> None:
 
 def test_key_numbers_say_where_and_when() -> None:
     log = logs.simulated("paper")
-    peak = find_error_peak(log)
-    assert peak is not None
     facts = summarise_run(log)
-    assert peak.error == max(site["max_error_rad"] for site in facts["sites"].values())
     html = render_key_numbers(log, facts)
-    assert f"of {peak.site}, at {peak.t_s:.2f} s" in html
+    for sites, place in ((["s"], "from where its masters lead it"), (["m1", "m2"], "from the")):
+        peak = find_error_peak(log, sites)
+        assert peak is not None
+        assert peak.value == max(facts["sites"][site]["max_error_rad"] for site in sites)
+        joint = int(peak.joint.removeprefix(f"{peak.site} joint ")) - 1
+        row = int(np.searchsorted(log[peak.site].t_s, peak.t_s))
+        assert abs(log[peak.site].e[row, joint]) == peak.value
+        last = max(facts["sites"][site]["max_error_end_rad"] for site in sites)
+        assert f"<dt>{peak.site} {place}" in html
+        assert f"joint {joint + 1}, at {peak.t_s:.2f} s; {last:.3g} rad in the last" in html
+    assert html.index("<dt>s from") < html.index("<dt>m1 from")  # the remote arm is first
     assert "<dd>200 ms</dd>" in html
     assert "a measure of following, not of stability" in html
+
+
+@pytest.mark.parametrize("name", ["paper", "four"])
+def test_every_text_has_the_same_last_error(name: str) -> None:
+    """The page, the table of `report` and `certify` name one number and its joint."""
+    log = logs.simulated(name)
+    found = certify(log)
+    error = find_last_error(log)
+    assert error is not None
+    facts = summarise_run(log)
+    assert facts["max_error_end_rad"] == found.end.end_error_rad == error.value
+    assert f"{error.value:.3g} rad in the last second, of {error.joint}" in render_key_numbers(
+        log, facts
+    )
+    assert f"largest |e| {error.value:.3g} rad of {error.joint} and" in found.end.text
+    table = _tabulate_sites(log, is_timed=False)
+    row = next(row for row in table.rows if row[0] == error.site)
+    assert list(row[-2:]) == [f"{error.value:.3g}", error.joint.removeprefix(f"{error.site} ")]
+
+
+def test_limits_stand_under_the_judgement() -> None:
+    log = logs.simulated("paper")
+    limit_nm = log.scenario.sites["m1"].limits.tau_limit_nm
+    at_limit = logs.rewritten(
+        log,
+        change=lambda row: (
+            logs.replaced(row, tau=[-limit_nm, 0.0])
+            if row.site == "m1" and row.tick < 30
+            else row
+        ),
+    )
+    remark = "m1 was at its torque limit for 0.15 s"
+    assert remark not in certify(log).remarks
+    found = certify(at_limit)
+    assert found.remarks == (remark,)
+    assert f'<p class="remarks">{remark}.</p>' in render_verdict(at_limit, found, ())
+    for brief in (True, False):
+        texts = [block.lines()[0] for block in compose(found, brief=brief)]
+        place = texts.index(f"note {remark}")
+        reasons = [line.text for line in describe_certificate(found)]
+        assert place in (1, 2)  # before the reasons
+        assert texts[place + 1].endswith(reasons[1])
 
 
 def test_log_without_records_has_dashes() -> None:

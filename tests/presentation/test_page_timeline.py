@@ -43,5 +43,5 @@ def test_sites_that_act_together_share_a_sentence() -> None:
 
 
 def test_divergence_is_told() -> None:
-    told = sentences(logs.diverged())
-    assert any("diverged: a joint exceeded qd_limit_rad_s." in line for line in told)
+    log = logs.diverged()
+    assert any(f"diverged: {log.describe_divergence()}." in line for line in sentences(log))

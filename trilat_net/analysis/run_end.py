@@ -39,7 +39,7 @@ from ..log.record_columns import Ints
 from ..log.site_log import SiteLog
 from ..scenario import Scenario
 from .arm_rows import HANGING_RAD, build_arm_rows
-from .site_signals import SETTLED_ERROR_RAD
+from .site_signals import SETTLED_ERROR_RAD, find_last_error
 from .timeline import list_effective_commands
 from .torque_sources import compute_operator_script
 from .twins.envelope_trend import FLOOR_RAD, EnvelopeFit, EnvelopeTrend, fit_envelopes
@@ -146,6 +146,9 @@ class RunEnd(NamedTuple):
         speed: Trend of that joint's |qd|.
         end_error_rad: Largest |e| of the last second, of all joints.
         end_speed_rad_s: Largest |qd| of the last second, of all joints.
+        end_error_where: Name of the joint, or axis of the end effector, with that |e|. Empty if
+            it is not known.
+        end_speed_where: Name of the joint with that |qd|. Empty if it is not known.
         where: Name of the worst joint. Empty if there are no records.
         reasons: Sentences that say why the stability of the run remains open. Empty if it is
             decided.
@@ -153,6 +156,7 @@ class RunEnd(NamedTuple):
             only holding an arm.
         diverged_at_s: Time at which the first site exceeded its limits, in s. None if no site
             did.
+        divergence: Which joint exceeded its limit, and when. Empty if no log says so.
         frequency_hz: Frequency of a bounded oscillation. None if there is none.
         missing_sites: Sites without any record, which leave the run undecided.
         error_unit: Unit of |e|: "rad", or "m" if the sites follow positions in task space.
@@ -160,6 +164,7 @@ class RunEnd(NamedTuple):
             it is the judged part.
         quiet_from_s: Time from which no operator acts and the control loop does not change, in
             s.
+        lasts_s: Length of the record, in s.
     """
 
     behaviour: EndBehaviour
@@ -171,11 +176,15 @@ class RunEnd(NamedTuple):
     reasons: tuple[str, ...] = ()
     operator_acts: bool = False
     diverged_at_s: float | None = None
+    divergence: str = ""
     frequency_hz: float | None = None
     missing_sites: tuple[str, ...] = ()
     error_unit: str = "rad"
     counts_from_s: float = 0.0
     quiet_from_s: float = 0.0
+    end_error_where: str = ""
+    end_speed_where: str = ""
+    lasts_s: float = 0.0
 
     @property
     def stability(self) -> Stability:
@@ -215,13 +224,18 @@ class RunEnd(NamedTuple):
         """A sentence on the behaviour, with its numbers."""
         behaviour = self.behaviour
         if self.diverged_at_s is not None:
-            return f"diverged at {self.diverged_at_s:.4g} s: a joint passed its qd_limit_rad_s"
+            unnamed = f"a joint passed its qd_limit_rad_s at {self.diverged_at_s:.4g} s"
+            return f"diverged: {self.divergence or unnamed}"
         if self.missing_sites:
             return f"undecided: no record of {', '.join(self.missing_sites)}"
 
         end_error = f"|e| {self.end_error_rad:.3g} {self.error_unit}"
         end_speed = f"|qd| {self.end_speed_rad_s:.3g} rad/s"
-        end = f"{end_error} and {end_speed} in the last second"
+        if self.end_error_where:
+            end_error += f" of {self.end_error_where}"
+        if self.end_speed_where:
+            end_speed += f" of {self.end_speed_where}"
+        end = f"largest {end_error} and {end_speed} in the last second"
         if behaviour is EndBehaviour.CONVERGED:
             if self.end_error_rad > SETTLED_ERROR_RAD:
                 return f"{LASTING_ERRORS}: {end}"
@@ -387,6 +401,11 @@ def classify_log_end(log: Log) -> RunEnd:
         log: The log of the run.
     """
     end = classify_run_end(log.scenario, trace_log(log))
+    error = find_last_error(log)
+    if error is not None:
+        end = end._replace(end_error_rad=error.value, end_error_where=error.joint)
+    if end.behaviour is EndBehaviour.DIVERGED:
+        return end._replace(divergence=log.describe_divergence())
     if end.behaviour is not EndBehaviour.BOUNDED:
         return end
     parts = [log[site] for site in log.sites]
@@ -432,6 +451,7 @@ def classify_run_end(scenario: Scenario, trace: RunTrace) -> RunEnd:
         missing_sites=tuple(missing),
         counts_from_s=float(t_s[0]) if len(t_s) else 0.0,
         quiet_from_s=quiet_from_s,
+        lasts_s=span_s,
     )
     first_site = scenario.sites[scenario.names[0]]
     if first_site.task.space == "position":
@@ -561,9 +581,13 @@ def _find_worst_joint(
         return from_best_to_worst.index(end.behaviour), end.end_speed_rad_s
 
     worst = max(ends, key=rank)
+    farthest = max(ends, key=lambda end: end.end_error_rad)
+    fastest = max(ends, key=lambda end: end.end_speed_rad_s)
     return worst._replace(
-        end_error_rad=max(end.end_error_rad for end in ends),
-        end_speed_rad_s=max(end.end_speed_rad_s for end in ends),
+        end_error_rad=farthest.end_error_rad,
+        end_speed_rad_s=fastest.end_speed_rad_s,
+        end_error_where=farthest.where,
+        end_speed_where=fastest.where,
     )
 
 

@@ -13,6 +13,7 @@ Invariant:
     - Empty logs give empty arrays.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from operator import attrgetter
 from typing import NamedTuple
@@ -23,6 +24,7 @@ from ..core.step.vectors import Array
 from ..log.log_reader import Log
 from ..log.record_columns import Ints
 from ..log.site_log import SiteLog
+from ..scenario.expect import END_WINDOW_S
 
 SETTLED_ERROR_RAD = 1e-2
 """Largest error of a settled site, in rad for joints and in m for axes of end effectors."""
@@ -150,6 +152,74 @@ def largest_magnitude(values: Array) -> Array:
     magnitudes = np.abs(values)
     largest: Array = magnitudes.max(axis=1, initial=0.0)
     return largest
+
+
+class JointError(NamedTuple):
+    """The largest error |e| of some records.
+
+    Attributes:
+        value: The error, in the unit of the shared coordinates.
+        site: Name of the site.
+        joint: Name of the site and of its joint, or of the axis of its end effector.
+        t_s: Time of the record, in s.
+    """
+
+    value: float
+    site: str
+    joint: str
+    t_s: float
+
+
+def find_largest_error(part: SiteLog, from_s: float = -math.inf) -> JointError | None:
+    """Finds the largest error |e| of a site, the first one if it occurs repeatedly.
+
+    Args:
+        part: Log of the site.
+        from_s: Time after which records count, in s.
+
+    Returns:
+        The error. None if no record has a finite error.
+    """
+    first = int(np.searchsorted(part.t_s, from_s, side="right"))
+    errors = np.abs(joint_errors(part)[first:])
+    if not np.isfinite(errors).any():
+        return None
+    row, column = np.unravel_index(int(np.nanargmax(errors)), errors.shape)
+    kind = "axis" if part.layout.task else "joint"
+    return JointError(
+        value=float(errors[row, column]),
+        site=part.name,
+        joint=f"{part.name} {kind} {column + 1}",
+        t_s=float(part.t_s[first + row]),
+    )
+
+
+def find_error_of_last_second(part: SiteLog) -> JointError | None:
+    """Finds the largest error |e| of a site in the last second of its records.
+
+    Args:
+        part: Log of the site.
+
+    Returns:
+        The error. None if no record of that second has a finite error.
+    """
+    if not len(part):
+        return None
+    return find_largest_error(part, from_s=float(part.t_s[-1]) - END_WINDOW_S)
+
+
+def find_last_error(log: Log) -> JointError | None:
+    """Finds the largest error |e| of all sites in the last second of their records.
+
+    Args:
+        log: Log of the run.
+
+    Returns:
+        The error. None if no record of that second has a finite error.
+    """
+    errors = [find_error_of_last_second(log[site]) for site in log.sites]
+    known = [error for error in errors if error is not None]
+    return max(known, key=lambda error: error.value, default=None)
 
 
 def largest_remaining_error(part: SiteLog) -> Array:

@@ -99,11 +99,13 @@ class StabilityDecision(NamedTuple):
         stability: The decision.
         rests_on: What the decision rests on, as a phrase for the user.
         reasons: Sentences that prevent a better decision. Empty if the run is stable.
+        is_too_short: True if only the length of the record prevents a better decision.
     """
 
     stability: Stability
     rests_on: str
     reasons: tuple[str, ...] = ()
+    is_too_short: bool = False
 
 
 class RunFindings(NamedTuple):
@@ -176,7 +178,13 @@ def decide_stability(run: RunFindings) -> StabilityDecision:
         return StabilityDecision(Stability.NOT_STABLE, f"the end of the run: {end_text}")
     if not reasons and _has_settled(run):
         return StabilityDecision(Stability.SETTLED, _describe_pushes(run))
-    return StabilityDecision(Stability.OPEN, "", reasons or (_explain_open(run),))
+    if reasons:
+        return StabilityDecision(Stability.OPEN, "", reasons)
+    needed_s = _estimate_needed_s(run)
+    if run.all_proofs and needed_s is not None and needed_s > end.lasts_s:
+        reason = f"the run is too short to tell; a run of {needed_s:.3g} s would"
+        return StabilityDecision(Stability.OPEN, "", (reason,), is_too_short=True)
+    return StabilityDecision(Stability.OPEN, "", (_explain_open(run),))
 
 
 def is_decided_by_roots(run: RunFindings) -> bool:
@@ -346,9 +354,7 @@ def _describe_pushes(run: RunFindings) -> str:
 def _explain_open(run: RunFindings) -> str:
     """Returns why a run is open although nothing contradicts a stable run."""
     if run.all_proofs:
-        needed_s = _estimate_needed_s(run)
-        text = f"the run is too short to agree with its proof: {run.end.text}"
-        return f"{text}; a run of {needed_s:.3g} s would tell" if needed_s else text
+        return "the end of the run does not agree with its proof"
     if run.twins is None:
         return "no proof exists, and no run with small pushes was made"
     if not run.twins.pushes:
@@ -362,8 +368,15 @@ def _explain_open(run: RunFindings) -> str:
 
 
 def _estimate_needed_s(run: RunFindings) -> float | None:
-    """Returns a duration after which the slowest root has decayed clearly, in s."""
+    """Returns the length of a run in which the slowest root decays clearly, in s.
+
+    The root decays by itself only after the last action of an operator and the last change.
+    """
     roots = run.roots
     if roots is None or roots.rate_per_s is None or not roots.rate_per_s < 0.0:
         return None
-    return 8.0 * math.log(DOUBLES) / -roots.rate_per_s
+    decay_s = 8.0 * math.log(DOUBLES) / -roots.rate_per_s
+    needed_s = run.end.quiet_from_s + decay_s
+    # Pushes that show no clear trend yet may need a longer run.
+    pushes_need_s = None if run.twins is None else run.twins.needs_s
+    return needed_s if pushes_need_s is None else max(needed_s, pushes_need_s)

@@ -348,6 +348,31 @@ class Log(Result, Mapping[str, SiteLog]):
         known_times_s = [time_s for time_s in times_s if time_s is not None]
         return min(known_times_s, default=None)
 
+    def describe_divergence(self, site: str = "") -> str:
+        """Returns which joint exceeded its speed limit, with its speed, the limit and the time.
+
+        Of the joints of an arm, the one counts that exceeds its limit most.
+
+        Args:
+            site: Name of the site whose arm diverged. Empty for the arm that diverged first.
+
+        Returns:
+            A clause such as "m1 joint 2 reached 21.3 rad/s (limit 20 rad/s) at 3.344 s". Empty
+            if the arm did not diverge.
+        """
+        first = [name for name in self if self[name].diverged_s == self.diverged_s]
+        name = site or first[0]
+        diverged_s = self[name].diverged_s
+        if diverged_s is None:
+            return ""
+        limits_rad_s = np.asarray(self.scenario.sites[name].limits.qd_limit_rad_s)
+        speeds_rad_s = np.abs(self[name].qd[-1])
+        limits_rad_s = np.broadcast_to(limits_rad_s, speeds_rad_s.shape)
+        # argmax chooses a NaN, which is a speed beyond every limit too.
+        joint = int(np.argmax(speeds_rad_s / limits_rad_s))
+        speed = f"{speeds_rad_s[joint]:.3g} rad/s (limit {limits_rad_s[joint]:g} rad/s)"
+        return f"{name} joint {joint + 1} reached {speed} at {diverged_s:.3f} s"
+
     def warn_if_diverged(self) -> None:
         """Issues a Python warning if the run diverged.
 
@@ -356,7 +381,7 @@ class Log(Result, Mapping[str, SiteLog]):
         if self.diverged_s is not None:
             warnings.warn(
                 f"the run diverged at {self.diverged_s:.3f} s, and ends there: "
-                "a joint passed its qd_limit_rad_s",
+                f"{self.describe_divergence()}",
                 RuntimeWarning,
                 stacklevel=3,
             )

@@ -6,7 +6,8 @@ run was stable. A subject is what a number describes: the run, a site (the proce
 arm), a link or a wall.
 
 Invariant:
-    - A short text has at most `MOST_LINES` lines, and a further line that names --all.
+    - A short text has at most `MOST_LINES` lines, and a further line that names --all. The
+      meaning of a judgement and remarks about the run are not counted.
     - The lines are among those that --all prints, or the largest of the numbers that it prints.
     - The judgement comes first, and a line that speaks against stability is never left out.
 """
@@ -17,7 +18,12 @@ from ..analysis.certificate.stability_certificate import Certificate
 from ..analysis.metrics.log_metrics import LogMetrics
 from ..analysis.metrics.measures import Metric, Quantity, quantities
 from ..errors import count_nouns
-from .certificate_text import CertificateLine, describe_certificate, select_premises
+from .certificate_text import (
+    CertificateLine,
+    describe_certificate,
+    describe_in_words,
+    select_premises,
+)
 from .result_text import MARKS, Block, MarkedText, TextTable
 from .untrusted_text import sanitize
 
@@ -57,7 +63,8 @@ def compose_key_reasons(certificate: Certificate) -> Iterator[Block]:
         certificate: Judgement whether a run was stable, with its reasons.
     """
     lines = describe_certificate(certificate)
-    for line in _choose_lines(lines):
+    judgement, *chosen = _choose_lines(lines)
+    for line in (judgement, *describe_in_words(certificate), *chosen):
         yield MarkedText(MARKS[line.mark], line.text)
     premises = len(select_premises(certificate))
     counts = {"more line": max(0, len(lines) - MOST_LINES), "premise": premises}

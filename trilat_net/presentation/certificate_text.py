@@ -23,7 +23,7 @@ from ..analysis.certificate.energy_balance import ZERO_ENERGY_J, EnergyBalance
 from ..analysis.certificate.observed_energy import NEGATIVE_ENERGY_MEANING, ObservedFinding
 from ..analysis.certificate.premises import Premise
 from ..analysis.certificate.stability_certificate import Certificate, StabilityFinding
-from ..analysis.run_end import Stability
+from ..analysis.run_end import EndBehaviour, Stability
 from ..analysis.stability_decision import LoopRoots
 from ..analysis.twins.envelope_trend import EnvelopeTrend
 from ..analysis.twins.twin_growth import PushedTwins, TwinGrowth
@@ -56,7 +56,8 @@ def compose_certificate(certificate: Certificate) -> Iterator[Block]:
     Args:
         certificate: Judgement whether a run was stable, with its reasons.
     """
-    for line in describe_certificate(certificate):
+    judgement, *reasons = describe_certificate(certificate)
+    for line in (judgement, *describe_in_words(certificate), *reasons):
         yield MarkedText(MARKS[line.mark], line.text)
 
     observed = certificate.observed
@@ -173,6 +174,61 @@ def describe_certificate(certificate: Certificate) -> list[CertificateLine]:
     return lines
 
 
+def describe_in_words(certificate: Certificate) -> list[CertificateLine]:
+    """Returns the lines that follow the judgement: its meaning and the remarks about the run.
+
+    Args:
+        certificate: Judgement whether a run was stable, with its reasons.
+    """
+    sentences = [explain_judgement(certificate), *certificate.remarks]
+    return [CertificateLine("note", sentence) for sentence in sentences if sentence]
+
+
+def explain_judgement(certificate: Certificate) -> str:
+    """Returns what a judgement means for small disturbances, as a sentence in plain words.
+
+    Args:
+        certificate: Judgement whether a run was stable, with its reasons.
+
+    Returns:
+        The sentence. Empty for a run that diverged or is open, because the judgement itself
+        says why.
+    """
+    stability = certificate.stability
+    if certificate.end.behaviour is EndBehaviour.DIVERGED or stability is Stability.OPEN:
+        return ""
+    if stability is Stability.SETTLED:
+        return "every small push died away and the arms came to rest, but no proof exists"
+    pace = describe_pace(certificate)
+    if stability is Stability.NOT_STABLE:
+        return pace or "the motion of this loop does not come to rest"
+    pace = pace or "small disturbances die away"
+    if not certificate.has_functional:
+        return f"{pace}; the theorem of the paper is about another control law"
+    if certificate.verdict.finding is StabilityFinding.DID_NOT_RISE:
+        return f"{pace}; the theorem of the paper does not apply here and is not needed"
+    return pace
+
+
+def describe_pace(certificate: Certificate) -> str:
+    """Returns how fast a small disturbance of the final pose dies away or grows, as a sentence.
+
+    Args:
+        certificate: Judgement whether a run was stable, with its reasons.
+
+    Returns:
+        The sentence, which is about the slowest or the fastest growing of the characteristic
+        roots. Empty if these roots prove nothing, or if their rate is not known.
+    """
+    roots = certificate.roots
+    if roots is None or not roots.rate_per_s:
+        return ""
+    if not (roots.is_proof or roots.is_refutation):
+        return ""
+    verb = "halves" if roots.rate_per_s < 0.0 else "doubles"
+    return f"a small disturbance {verb} every {math.log(2.0) / abs(roots.rate_per_s):.2g} s"
+
+
 def _describe_verdict(certificate: Certificate) -> list[CertificateLine]:
     """Returns the judgement, the verdict about V, and the end of the run."""
     stability_mark = _JUDGEMENT_MARKS[certificate.stability]
@@ -186,6 +242,8 @@ def _describe_verdict(certificate: Certificate) -> list[CertificateLine]:
     if certificate.has_functional:
         lines.append(CertificateLine(verdict_mark, certificate.verdict.text))
     lines += [CertificateLine("note", text) for text in certificate.law_conditions]
+    if certificate.end.behaviour is EndBehaviour.DIVERGED:
+        return lines  # the judgement says already which joint exceeded its limit
     end_mark = _JUDGEMENT_MARKS[certificate.end.stability]
     lines.append(CertificateLine(end_mark, f"e and qd: {certificate.end.text}"))
     return lines
@@ -262,12 +320,20 @@ def _describe_paper_weights(certificate: Certificate) -> str:
 def describe_judgement(certificate: Certificate) -> str:
     """Returns the judgement whether a run was stable, in one line.
 
-    If the judgement is open, the line states the reasons.
+    If the judgement is open, the line states the reasons. A reason that repeats the end of the
+    run is left out, because another line of the certificate is about the end.
 
     Args:
         certificate: Judgement whether a run was stable, with its reasons.
     """
-    return "; ".join([certificate.headline(), *certificate.reasons])
+    if certificate.decision.is_too_short:
+        return f"{certificate.stability}: {'; '.join(certificate.reasons)}"
+    reasons = []
+    for reason in certificate.reasons:
+        new = reason.removeprefix(certificate.end.text).removeprefix("; ")
+        if new:
+            reasons.append(new)
+    return "; ".join([certificate.headline(), *reasons])
 
 
 _JUDGEMENT_MARKS = {

@@ -200,20 +200,23 @@ class ChartBuilder:
         oldest sample that its controller used.
         """
         log = self._log
+        unit = site_signals.shared_unit(log)
         limit = self._draw_limit(site_signals.SETTLED_ERROR_RAD)
         stated = [line for site in log.sites for line in self._list_stated_delays(site)]
         has_one_delay = len({line.value for line in stated}) == 1
         yield self._make_chart(
             section="overview",
-            title=f"Largest error |e| by site{self._note_floor()}; dashed: {limit.value:g}",
-            unit=site_signals.shared_unit(log),
+            title="Largest error |e| by site",
+            note=f"Dashed: {limit.value:g} {unit}.{self._note_floor(unit)}",
+            unit=unit,
             series=self._add_maxima(lambda site: np.abs(site_signals.joint_errors(log[site]))),
             lines=[limit],
             log=True,
         )
         yield self._make_chart(
             section="overview",
-            title=f"Delay that each controller experienced{'; dashed: stated' * has_one_delay}",
+            title="Delay that each controller experienced",
+            note="Dashed: the stated delay." if has_one_delay else "",
             unit="ms",
             series=self._add_maxima(lambda site: site_signals.sample_ages_ms(log, site)),
             lines=[self._draw_limit(stated[0].value)] if has_one_delay else [],
@@ -221,16 +224,19 @@ class ChartBuilder:
             margin=0.05,
         )
 
-    def _note_floor(self) -> str:
-        """Returns a remark with the smallest drawn error, at which smaller ones are drawn.
+    def _note_floor(self, unit: str) -> str:
+        """Returns a sentence with the smallest drawn error, at which smaller ones are drawn.
+
+        Args:
+            unit: Unit of the errors.
 
         Returns:
-            The remark. Empty if no site has such small errors.
+            The sentence behind a space. Empty if no site has such small errors.
         """
         for site in self._log.sites:
             largest = site_signals.largest_magnitude(site_signals.joint_errors(self._log[site]))
             if (largest < _LEAST_DRAWN).any():
-                return f" (smaller ones at {_LEAST_DRAWN:g})"
+                return f" Errors below {_LEAST_DRAWN:g} {unit} are drawn at this value."
         return ""
 
     def _add_maxima(self, read_values: Callable[[str], Array]) -> list[TableSeries]:

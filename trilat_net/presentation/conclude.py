@@ -14,14 +14,14 @@ Invariant:
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..analysis.judge import certify_run
-from ..analysis.site_signals import shared_unit
+from ..analysis.site_signals import find_error_of_last_second, shared_unit
 from ..errors import CodeWithheld, LawFailed, RunFailed, ScenarioError, join_arguments
 from ..execution.log_checks import check_log_files
 from ..execution.virtual_comparison import simulate_without_operators
@@ -34,7 +34,12 @@ from ..scenario.code_consent import may_run_user_laws
 from ..scenario.imported_code import allowed_code
 from ..workers import worker_pool
 from . import terminal_output
-from .certificate_text import CertificateLine, describe_certificate, describe_theorem
+from .certificate_text import (
+    CertificateLine,
+    describe_certificate,
+    describe_in_words,
+    describe_theorem,
+)
 from .result_text import MARKS, Block, MarkedText, TextTable
 from .summary_text import format_run_lines
 
@@ -47,6 +52,7 @@ class Conclusion(CheckReport):
 
     Attributes:
         verdict: Judgement whether the run was stable.
+        meaning: Lines that say what the judgement means, with remarks about the run.
         table: Table with a row for each arm.
         notes: Lines about notable facts of the run, such as changed settings or messages of a
             user's control law, and about the proof of stability.
@@ -59,14 +65,19 @@ class Conclusion(CheckReport):
     notes: list[str]
     findings: list[Finding]
     paths: list[Path]
+    meaning: list[CertificateLine] = field(default_factory=list)
 
     def blocks(self) -> Iterator[Block]:
         """Yields the parts of the text that `trilat report` prints.
 
-        They are the judgement about stability, the checks of the log, the table of sites, the
-        notes, and the paths of the files.
+        They are the judgement about stability and its meaning, the checks of the log, the table
+        of sites, the notes, and the paths of the files.
         """
-        yield MarkedText(MARKS[self.verdict.mark], f"stability: {self.verdict.text}")
+        # An open judgement begins with the word of its mark.
+        judgement = self.verdict.text.removeprefix("open: ")
+        yield MarkedText(MARKS[self.verdict.mark], f"stability: {judgement}")
+        for line in self.meaning:
+            yield MarkedText(MARKS[line.mark], line.text)
         for finding in self.findings:
             failed = "FAIL" if finding.judged else "open"
             mark = "ok" if finding.passed else failed
@@ -105,6 +116,7 @@ class Conclusion(CheckReport):
         return {
             "passed": self.passed,
             "verdict": self.verdict.text,
+            "meaning": [line.text for line in self.meaning],
             "notes": self.notes,
             "checks": [finding.to_row() for finding in self.findings],
             "paths": [path.as_posix() for path in self.paths],
@@ -192,6 +204,7 @@ def conclude(
     timing_lines = [untimed] if untimed else []
     return Conclusion(
         verdict=describe_certificate(certificate)[0],
+        meaning=describe_in_words(certificate),
         table=_tabulate_sites(log, is_timed=not untimed),
         notes=[*timing_lines, *run_lines, *describe_theorem(certificate)],
         findings=findings,
@@ -222,14 +235,16 @@ _TIMING_HEADERS = ("late p50 us", "p99", "max", "busy p50 us", "p99")
 
 
 def _tabulate_sites(log: Log, *, is_timed: bool) -> TextTable:
-    """Returns a table with a row per site: records, timing of the loop, and last error.
+    """Returns a table with a row per site: records, timing, and largest error at the end.
+
+    The error is the largest one of the last second, of the joint that the table names.
 
     Args:
         log: Log of the run.
         is_timed: False to leave out the timing. Loops in virtual time are never late.
     """
     timing = _TIMING_HEADERS if is_timed else ()
-    headers = (*_HEADERS, *timing, f"max|e| end {shared_unit(log)}")
+    headers = (*_HEADERS, *timing, f"max|e| last s, {shared_unit(log)}", "of")
     rows = []
     for site in log.sites:
         records = log[site]
@@ -240,9 +255,13 @@ def _tabulate_sites(log: Log, *, is_timed: bool) -> TextTable:
         ticks = max(log.last_ticks[site], records.last_tick) + 1
         missing = ticks - len(records) - log.absent_ticks(site)
         times = _list_timing_cells(records) if is_timed else []
-        last_error = np.abs(records.e[-1]).max()
-        rows.append([site, str(len(records)), str(missing), *times, f"{last_error:.2e}"])
-    return TextTable(headers, rows, align="lr")
+        error = find_error_of_last_second(records)
+        cells = ["", ""]
+        if error is not None:
+            cells = [f"{error.value:.3g}", error.joint.removeprefix(f"{site} ")]
+        rows.append([site, str(len(records)), str(missing), *times, *cells])
+    columns = "r" * (len(headers) - 2)
+    return TextTable(headers, rows, align=f"l{columns}l")
 
 
 def _list_timing_cells(records: SiteLog) -> list[str]:

@@ -43,7 +43,7 @@ _LONG_NAMES = {
 """Names of the checks on the page, by their names on a terminal."""
 _BALANCE_NOTE = (
     "V is the energy function of the stability theorem: a weighted sum of the energies of the "
-    "arms, of their errors and of the estimates (docs/certificate-energy.md). What is left of "
+    "arms, of their errors and of the estimates. What is left of "
     "V − V(0) + dissipation − work must vanish, whatever the operators do."
 )
 

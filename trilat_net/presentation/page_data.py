@@ -121,6 +121,7 @@ class TimeChart(msgspec.Struct, frozen=True, kw_only=True, tag="time", tag_field
         log: True for a logarithmic value axis.
         zero: True if the value axis begins at 0.
         margin: Least space above the values, as a fraction of the largest value.
+        note: Sentences below the chart. Empty for none.
     """
 
     section: str
@@ -133,6 +134,7 @@ class TimeChart(msgspec.Struct, frozen=True, kw_only=True, tag="time", tag_field
     log: bool = False
     zero: bool = False
     margin: float = 0.0
+    note: str = ""
 
 
 class HistogramChart(

@@ -114,13 +114,13 @@ def _describe_driver(log: Log) -> str:
 def _find_scenario_argument(scenario: Scenario) -> tuple[str, str]:
     """Returns how a command names the scenario, and where the scenario comes from.
 
-    If the scenario is shipped with this program, its name is enough. Otherwise the reader must
-    save the text of the scenario as a file first.
+    If the scenario is shipped with this program, its name is enough. Otherwise a command saves
+    the text of the scenario as a file first.
     """
     has_shipped_name = scenario.name in list_shipped()
     if has_shipped_name and load_scenario(scenario.name).sha256 == scenario.sha256:
         return scenario.name, "as shipped"
-    return f"./{scenario.name}.toml", f"to be saved as {scenario.name}.toml"
+    return f"./{scenario.name}.toml", "as the log contains it"
 
 
 def _list_commands(log: Log, scenario: str) -> str:
@@ -133,9 +133,11 @@ def _list_commands(log: Log, scenario: str) -> str:
     file_name = Path(log.source).name
     if not file_name.endswith(".mcap"):
         file_name = "FILE"  # the log was not read from a file
-    return (
-        f"trilat verify {file_name}\ntrilat verify --virtual {file_name}\ntrilat sim {scenario}"
-    )
+    commands = [f"trilat verify {file_name}", f"trilat verify --virtual {file_name}"]
+    if scenario.endswith(".toml"):
+        commands.append(f"trilat scenario show {file_name} > {scenario}")
+    commands.append(f"trilat sim {scenario}")
+    return "\n".join(commands)
 
 
 def _list_versions(log: Log) -> list[tuple[str, str]]:

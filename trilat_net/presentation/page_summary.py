@@ -12,7 +12,6 @@ Invariant:
     - Every text that comes from a log is escaped.
 """
 
-import math
 from collections.abc import Sequence
 from html import escape
 from typing import NamedTuple
@@ -23,8 +22,9 @@ from ..analysis.certificate.stability_certificate import Certificate
 from ..analysis.run_end import FORCE_NM, EndBehaviour, Stability
 from ..analysis.site_signals import (
     SETTLED_ERROR_RAD,
-    joint_errors,
-    largest_magnitude,
+    JointError,
+    find_error_of_last_second,
+    find_largest_error,
     shared_unit,
 )
 from ..analysis.timeline import RaisedAlarm, list_alarms
@@ -32,12 +32,11 @@ from ..errors import count_nouns
 from ..log.findings import Finding
 from ..log.log_reader import Log
 from ..results import JsonObject
+from .certificate_text import describe_pace
 from .page_html import NO_NUMBER, format_cell, join_words, render_details
 from .result_text import escape_text
 from .style import typeset
 
-_FAR_SMALLER = 0.1
-"""Share of the largest error below which the errors of other sites are stated too."""
 _MAX_ALARMS = 8
 """Largest number of alarms at the top of the page."""
 _SEVERE_ALARMS = ("FAULT", "STOPPED")
@@ -51,7 +50,7 @@ _MEANINGS = {
 }
 """What each judgement means."""
 _ROOTS_AND_THEOREM = (
-    "This proof is about small motions near the final pose{pace}. The paper's theorem, which "
+    "This proof is about small motions near the final pose. The paper's theorem, which "
     "is examined below, is another proof, and this one does not need it."
 )
 """What readers must know if the loop has stable roots, but not all premises of the theorem."""
@@ -88,28 +87,37 @@ def render_verdict(log: Log, certificate: Certificate, findings: Sequence[Findin
     css_class = _MARKS[certificate.stability]
     sentences = [_explain_end(log, certificate)]
     if certificate.stability is Stability.STABLE and _is_proved_by_roots_alone(certificate):
-        sentences.append(_ROOTS_AND_THEOREM.format(pace=_describe_pace(certificate)))
+        pace = describe_pace(certificate)
+        if pace:
+            sentences.append(f"{_start_sentence(pace)}.")
+        sentences.append(_ROOTS_AND_THEOREM)
     if any(finding.judged and not finding.passed for finding in findings):
         css_class = "bad" if css_class == "bad" else "warn"
         sentences.append("The log failed a check, so that the judgement may be wrong.")
+    remarks = [f"{_start_sentence(remark)}." for remark in certificate.remarks]
     chip = f'<strong class="chip {css_class}">{escape(word.capitalize())}</strong>'
     text = escape(typeset(describe_basis(certificate)))
     more = escape(" ".join(sentences))
-    return f'<div id="verdict" class="{css_class}"><p>{chip} {text}</p><p>{more}</p></div>'
+    html = f"<p>{chip} {text}</p><p>{more}</p>"
+    if remarks:
+        html += f'<p class="remarks">{escape(" ".join(remarks))}</p>'
+    return f'<div id="verdict" class="{css_class}">{html}</div>'
+
+
+def _start_sentence(text: str) -> str:
+    """Returns a clause as the beginning of a sentence.
+
+    Names of sites, which are written as they are, keep their first letter.
+    """
+    first_word = text.split(" ", 1)[0]
+    is_name = any(letter.isdigit() for letter in first_word) or len(first_word) == 1
+    return text if is_name and first_word != "a" else f"{text[:1].upper()}{text[1:]}"
 
 
 def _is_proved_by_roots_alone(certificate: Certificate) -> bool:
     """Returns True if neither the theorem nor a condition of the law is among the proofs."""
     roots = certificate.roots
     return roots is not None and certificate.decision.rests_on == roots.describe_as_basis()
-
-
-def _describe_pace(certificate: Certificate) -> str:
-    """Returns how fast the slowest small motion dies away, as a clause. Empty if not known."""
-    roots = certificate.roots
-    if roots is None or roots.rate_per_s is None or roots.rate_per_s >= 0.0:
-        return ""
-    return f": the slowest of them halves every {math.log(2.0) / -roots.rate_per_s:.2g} s"
 
 
 def describe_basis(certificate: Certificate) -> str:
@@ -206,8 +214,7 @@ def render_key_numbers(log: Log, facts: JsonObject) -> str:
         facts: Numbers of the run, from `summarise_run`.
     """
     numbers = [
-        _find_largest_error(log),
-        _describe_last_error(log, facts),
+        *_list_error_cards(log),
         _describe_settling(log, facts),
         _describe_delay(facts),
     ]
@@ -219,70 +226,60 @@ def render_key_numbers(log: Log, facts: JsonObject) -> str:
     return f'<dl id="numbers">{items}</dl>'
 
 
-class ErrorPeak(NamedTuple):
-    """The largest error of a run.
-
-    Attributes:
-        error: The error, in the unit that the sites share.
-        site: Name of the site.
-        t_s: Time of the record, in s.
-    """
-
-    error: float
-    site: str
-    t_s: float
-
-
-def find_error_peak(log: Log) -> ErrorPeak | None:
-    """Finds the largest |e| of a run, of all sites and joints.
+def find_error_peak(log: Log, sites: Sequence[str] = ()) -> JointError | None:
+    """Finds the largest |e| of a run, of all joints.
 
     Args:
         log: Log of the run.
+        sites: Names of the sites that count. Empty for all sites.
 
     Returns:
         The first record with this error. None if no record has a finite error.
     """
-    peaks = []
-    for site in log.sites:
-        errors = largest_magnitude(joint_errors(log[site]))
-        if np.isfinite(errors).any():
-            row = int(np.nanargmax(errors))
-            peaks.append(ErrorPeak(float(errors[row]), site, float(log[site].t_s[row])))
-    return max(peaks, key=lambda peak: peak.error, default=None)
+    peaks = [find_largest_error(log[site]) for site in sites or log.sites]
+    known = [peak for peak in peaks if peak is not None]
+    return max(known, key=lambda peak: peak.value, default=None)
 
 
-def _find_largest_error(log: Log) -> _KeyNumber:
-    """Returns the largest error of the run, with its site and its time."""
-    peak = find_error_peak(log)
-    if peak is None:
-        return _KeyNumber("Largest error", NO_NUMBER, "no record")
-    value = f"{peak.error:.3g} {shared_unit(log)}"
-    return _KeyNumber("Largest error", value, f"of {peak.site}, at {peak.t_s:.2f} s")
+def _list_error_cards(log: Log) -> list[_KeyNumber]:
+    """Returns the errors of the slaves, and then those of the masters.
 
-
-def _describe_last_error(log: Log, facts: JsonObject) -> _KeyNumber:
-    """Returns the largest error of the last second, with its site.
-
-    If somebody holds this site away from the others, its error says nothing about how well the
-    others follow. Therefore the error of the others is stated if it is far smaller.
+    The error of a slave says how well the remote arm follows the people. The error of a master
+    is large while its operator leads the others, and says nothing about how well they follow.
     """
-    name = "Error at the end"
-    error = facts["max_error_end_rad"]
-    if error is None:
-        return _KeyNumber(name, NO_NUMBER, "no record")
+    slaves = [site for site in log.sites if log.scenario.sites[site].role == "slave"]
+    masters = [site for site in log.sites if site not in slaves]
+    cards = []
+    if slaves:
+        cards.append(_describe_errors(log, slaves, "from where its masters lead it"))
+    if masters:
+        cards.append(_describe_errors(log, masters, "from the others"))
+    return cards
 
-    errors = {}
-    for site, numbers in facts["sites"].items():
-        if numbers["max_error_end_rad"] is not None:
-            errors[site] = numbers["max_error_end_rad"]
-    worst = max(errors, key=lambda site: errors[site])
-    detail = f"of {worst}, in the last second"
-    if worst in _list_pushed_sites(log):
-        detail = f"of {worst}, which a hand or a wall still pushes"
-    largest_other = max((errors[site] for site in errors if site != worst), default=math.inf)
-    if largest_other < _FAR_SMALLER * errors[worst]:
-        detail += f"; of the others at most {largest_other:.2g}"
-    return _KeyNumber(name, f"{error:.3g} {shared_unit(log)}", detail)
+
+def _describe_errors(log: Log, sites: Sequence[str], place: str) -> _KeyNumber:
+    """Returns the largest error of some sites, and their largest one in the last second.
+
+    Args:
+        log: Log of the run.
+        sites: Names of the sites.
+        place: What the error is measured from, as the end of the name of the number.
+    """
+    peak = find_error_peak(log, sites)
+    if peak is None:
+        return _KeyNumber(f"{join_words(sites)} {place}", NO_NUMBER, "no record")
+    unit = shared_unit(log)
+    joint = peak.joint.removeprefix(f"{peak.site} ")
+    detail = f"largest, {joint}, at {peak.t_s:.2f} s"
+
+    last_errors = [find_error_of_last_second(log[site]) for site in sites]
+    known = [error for error in last_errors if error is not None]
+    last = max(known, key=lambda error: error.value, default=None)
+    if last is not None:
+        detail += f"; {last.value:.3g} {unit} in the last second, of {last.joint}"
+        if last.site in _list_pushed_sites(log):
+            detail += ", which a hand or a wall still pushes"
+    return _KeyNumber(f"{peak.site} {place}", f"{peak.value:.3g} {unit}", detail)
 
 
 def _describe_settling(log: Log, facts: JsonObject) -> _KeyNumber:

@@ -232,8 +232,11 @@ def _list_errors(log: Log, facts: JsonObject) -> Iterator[RunMoment]:
     """Yields the largest error, when all errors became small, and when a site diverged."""
     unit = shared_unit(log)
     peak = find_error_peak(log)
-    if peak is not None and peak.error > 0.0:
-        text = f"{peak.site} has the largest error of the run, {peak.error:.3g} {unit}."
+    if peak is not None and peak.value > 0.0:
+        joint = peak.joint.removeprefix(f"{peak.site} ")
+        text = (
+            f"{peak.site} has the largest error of the run, {peak.value:.3g} {unit} at {joint}."
+        )
         yield RunMoment(peak.t_s, text, peak.site)
     if facts["settle_s"]:
         limit = f"{facts['settle_below_rad']:g} {unit}"
@@ -241,5 +244,5 @@ def _list_errors(log: Log, facts: JsonObject) -> Iterator[RunMoment]:
     for name, site in facts["sites"].items():
         diverged_s = site["diverged_at_s"]
         if diverged_s is not None:
-            text = f"{name} diverged: a joint exceeded qd_limit_rad_s."
+            text = f"{name} diverged: {log.describe_divergence(name)}."
             yield RunMoment(diverged_s, text, name, is_bad=True)

@@ -34,6 +34,7 @@ from ...log.accounting import MIN_COVERAGE
 from ...log.log_reader import Log
 from ...results import JsonObject, Result, finite_or_none
 from ..run_end import EndBehaviour, RunEnd, Stability, classify_log_end
+from ..run_remarks import list_remarks
 from ..stability_decision import LoopRoots, RunFindings, StabilityDecision, decide_stability
 from ..twins.twin_growth import TwinGrowth
 from . import energy_terms
@@ -155,6 +156,8 @@ class Certificate(Result):
             every site and prove that small motions die away. Empty if there are none.
         law_conditions: Sentences on the stability conditions of the control laws of the run.
         has_lasting_delays: True if delays that are constant in the run stay so after it.
+        remarks: Conditions that readers of the judgement should know, such as a motor at its
+            torque limit. See `run_remarks`.
     """
 
     premises: list[Premise]
@@ -171,6 +174,7 @@ class Certificate(Result):
     law_proofs: tuple[str, ...] = ()
     law_conditions: tuple[str, ...] = ()
     has_lasting_delays: bool = True
+    remarks: tuple[str, ...] = ()
 
     @property
     def has_functional(self) -> bool:
@@ -267,6 +271,8 @@ class Certificate(Result):
 
     def headline(self) -> str:
         """Returns one line for people: the judgement, and how the run ended."""
+        if self.end.behaviour is EndBehaviour.DIVERGED:
+            return f"{self.stability}: {self.end.text}"
         text = f"{self.stability}: {self.end.phrase}"
         rests_on = self.decision.rests_on
         return f"{text}; rests on: {rests_on}" if rests_on else text
@@ -281,6 +287,7 @@ class Certificate(Result):
             "stability": self.stability.value,
             "rests_on": self.decision.rests_on,
             "reasons": list(self.reasons),
+            "remarks": list(self.remarks),
             "verdict": verdict.finding.name.lower(),
             "text": verdict.text,
             "rise": _rise_to_json(verdict.rise),
@@ -294,7 +301,9 @@ class Certificate(Result):
                 "error_rate_per_s": finite_or_none(end.error.rate_per_s),
                 "speed_rate_per_s": finite_or_none(end.speed.rate_per_s),
                 "end_error_rad": end.end_error_rad,
+                "end_error_where": end.end_error_where or None,
                 "end_speed_rad_s": end.end_speed_rad_s,
+                "end_speed_where": end.end_speed_where or None,
             },
             "evidence": self.evidence.to_json(),
             "roots": None if self.roots is None else self.roots._asdict(),
@@ -374,6 +383,7 @@ def certify(
         end=classify_log_end(log),
         evidence=collect_evidence(run, min_coverage),
         observed=observe_energies(log, own_laws=own_laws),
+        remarks=list_remarks(log),
     )
     if facts is None:
         return certificate

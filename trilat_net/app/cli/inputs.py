@@ -14,7 +14,7 @@ from typing import Annotated
 
 import typer
 
-from ...errors import UsageError, count_nouns
+from ...errors import ScenarioError, UsageError, count_nouns
 from ...files import refuse_existing, write_whole
 from ...presentation import terminal_output as terminal
 from ...presentation.result_text import TextTable
@@ -48,9 +48,20 @@ def scenario_list_command(as_json: options.JsonOption = False) -> None:
     return terminal.print_table(TextTable(columns, rows, align="lrrl"))
 
 
+ShownScenario = Annotated[
+    str,
+    typer.Argument(
+        help="Name of a shipped scenario, path of a TOML file, or a log (.mcap) that contains "
+        "one.",
+        autocompletion=options.complete_scenarios,
+    ),
+]
+"""The scenario or the log whose scenario is printed."""
+
+
 @options.command("paper --set control.Kd=5", page="docs/laws.md")
 def scenario_show_command(
-    name: options.ScenarioArgument,
+    name: ShownScenario,
     duration: options.DurationOption = None,
     seed: options.SeedOption = None,
     overrides: options.SetOption = None,
@@ -58,7 +69,17 @@ def scenario_show_command(
     """Prints a scenario in full: every value of every site and link."""
     from ...scenario.describe import list_arm_notes
 
-    scenario = options.load_chosen_scenario(name, overrides, duration, seed)
+    if name.endswith(".mcap"):
+        from ...log.log_reader import open_log
+
+        if overrides or duration is not None or seed is not None:
+            raise ScenarioError(
+                f"{name}: the scenario of a log is printed as it is; save it by `trilat "
+                f"scenario show {name} > mine.toml`, and change the file"
+            )
+        scenario = open_log(Path(name)).scenario
+    else:
+        scenario = options.load_chosen_scenario(name, overrides, duration, seed)
     sys.stdout.write(scenario.text)
     for note in list_arm_notes(scenario):
         terminal.print_note(note)

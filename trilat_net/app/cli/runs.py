@@ -79,9 +79,9 @@ def sim_command(
         )
         raise typer.Exit(interrupt.exit_code)
 
-    if as_json:
-        from ...log.log_reader import open_log
+    from ...log.log_reader import open_log
 
+    if as_json:
         terminal.print_json(open_log(path).to_dict())
     else:
         terminal.print_text(f"{path}: {chosen.duration_s:g} s of {', '.join(chosen.names)}")
@@ -92,10 +92,10 @@ def sim_command(
     if not stayed_in_limits:
         remedy = ""
         if any(spec.arm.urdf for spec in chosen.sites.values()):
-            remedy = "; a urdf states such limits, and limits.qd_limit_rad_s replaces them"
+            remedy = ", which replaces the limits that a urdf states"
         terminal.print_error(
-            f"{path}: the run diverged: a joint exceeded its qd_limit_rad_s, "
-            f"and the run ended there{remedy}"
+            f"{path}: the run diverged and ended: {open_log(path).describe_divergence()}; "
+            f"the limit is limits.qd_limit_rad_s{remedy}"
         )
         raise typer.Exit(1)
 

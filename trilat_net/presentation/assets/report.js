@@ -254,6 +254,12 @@
     caption.textContent = `${chart.title} (${chart.unit})`;
     const box = document.createElement("div");
     figure.append(caption, box);
+    if (chart.kind === "time" && chart.note) {
+      const note = document.createElement("p");
+      note.className = "note";
+      note.textContent = chart.note;
+      figure.append(note);
+    }
     document.querySelector(`[data-section="${chart.section}"]`).append(figure);
     return box;
   });

@@ -1,0 +1,57 @@
+"""Remarks about a run: motors at their limit, large pushes and late ticks, with their numbers."""
+
+import pytest
+
+from tests.analysis import logs
+from trilat_net.analysis.run_remarks import LARGE_PUSH_SHARE, list_remarks
+from trilat_net.net.messages import State
+
+
+@pytest.mark.parametrize("ticks", [1, 7, 40])
+def test_times_at_the_torque_limit_are_counted_by_site(ticks: int) -> None:
+    log = logs.simulated("paper")  # 200 Hz
+    limits_nm = {site: log.scenario.sites[site].limits.tau_limit_nm for site in log.sites}
+
+    def saturate(row: State) -> State:
+        if row.site == "s" or row.tick >= (ticks if row.site == "m1" else 2 * ticks):
+            return row
+        return logs.replaced(row, tau=[0.0, limits_nm[row.site]])
+
+    found = list_remarks(logs.rewritten(log, change=saturate))
+    times = f"{ticks / 200:.3g} s and {2 * ticks / 200:.3g} s"
+    assert found == (f"m1 and m2 were at their torque limit for {times}",)
+
+
+@pytest.mark.parametrize("share", [0.9, 1.1])
+def test_pushes_above_half_of_the_limit_are_named(share: float) -> None:
+    log = logs.simulated("paper")
+    limit_nm = log.scenario.sites["m2"].limits.tau_limit_nm
+    push_nm = share * LARGE_PUSH_SHARE * limit_nm
+    pushed = logs.rewritten(
+        log,
+        change=lambda row: logs.replaced(
+            row, tau_x=[-push_nm if row.site == "m2" else 0.0, 0.0]
+        ),
+    )
+    limit = f"(torque limit {limit_nm:g} N m)"
+    words = f"hands or walls pushed m2 joint 1 with up to {push_nm:.3g} N m {limit}"
+    assert list_remarks(pushed) == ((words,) if share > 1.0 else ())
+
+
+def test_late_ticks_are_counted() -> None:
+    log = logs.simulated("paper")
+    late = logs.rewritten(
+        log,
+        change=lambda row: logs.replaced(row, late_us=5000 if row.tick in (3, 9) else 4999),
+        keep=lambda row: row.site != "m2",
+        driver="live",
+    )
+    assert list_remarks(late) == (
+        "2 ticks of m1 and 2 ticks of s began late, by a period or more",
+    )
+
+
+def test_calm_and_empty_logs_have_no_remarks() -> None:
+    log = logs.simulated("paper")
+    assert list_remarks(log) == ()
+    assert list_remarks(logs.rewritten(log, lambda _: False)) == ()

@@ -1,0 +1,95 @@
+"""Finds conditions of a run that a reader of its judgement should know.
+
+A site is a process that controls one arm. These conditions do not change the judgement whether
+a run was stable, but they show where the run was at the limits of its arms or of its computers:
+
+- a motor was at its torque limit, so that the control law did not act in full;
+- an operator or a wall pushed with a large share of the torque limit;
+- ticks (periods of the control loop) began late by a whole period or more.
+
+Invariant:
+    - A remark states a number for each site that it names.
+    - A condition that did not occur has no remark.
+"""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from ..errors import count_nouns
+from ..log.log_reader import Log
+from .site_signals import external_torques
+
+LARGE_PUSH_SHARE = 0.5
+"""Least torque of operators and walls that is remarked, as a share of the torque limit."""
+
+
+def list_remarks(log: Log) -> tuple[str, ...]:
+    """Lists the conditions of a run that a reader of its judgement should know.
+
+    Args:
+        log: Log of the run.
+
+    Returns:
+        Sentences without a full stop, for example "m1 and m2 were at their torque limit for
+        0.56 s and 0.43 s".
+    """
+    candidates = (
+        _describe_torque_limits(log),
+        _describe_large_pushes(log),
+        _describe_late_ticks(log),
+    )
+    return tuple(remark for remark in candidates if remark)
+
+
+def _describe_torque_limits(log: Log) -> str:
+    """Returns how long each site was at its torque limit. Empty if none was."""
+    times = {}
+    for site in log.sites:
+        part = log[site]
+        limit_nm = log.scenario.sites[site].limits.tau_limit_nm
+        at_limit = np.any(np.abs(part.tau) >= limit_nm, axis=1)
+        if at_limit.any():
+            times[site] = f"{np.count_nonzero(at_limit) / part.rate_hz:.3g} s"
+    if not times:
+        return ""
+    verb = "was at its" if len(times) == 1 else "were at their"
+    return f"{_join(times)} {verb} torque limit for {_join(times.values())}"
+
+
+def _describe_large_pushes(log: Log) -> str:
+    """Returns how much operators and walls pushed, if it is a large share of the torque limit.
+
+    Returns:
+        The clause. Empty if every push was small at every joint.
+    """
+    pushes = {}
+    for site in log.sites:
+        limit_nm = log.scenario.sites[site].limits.tau_limit_nm
+        torques_nm = np.abs(external_torques(log[site]))
+        peaks_nm = torques_nm.max(axis=0, initial=0.0)
+        limits_nm = np.broadcast_to(limit_nm, peaks_nm.shape)
+        joint = int(np.argmax(peaks_nm / limits_nm))
+        if peaks_nm[joint] > LARGE_PUSH_SHARE * limits_nm[joint]:
+            push = f"up to {peaks_nm[joint]:.3g} N m (torque limit {limits_nm[joint]:g} N m)"
+            pushes[site] = f"{site} joint {joint + 1} with {push}"
+    return f"hands or walls pushed {_join(pushes.values())}" if pushes else ""
+
+
+def _describe_late_ticks(log: Log) -> str:
+    """Returns how many ticks of each site began late by a period or more. Empty if none did."""
+    counts = {}
+    for site in log.sites:
+        part = log[site]
+        late = int(np.count_nonzero(part.late_us >= 1e6 / part.rate_hz))
+        if late:
+            counts[site] = f"{count_nouns(late, 'tick')} of {site}"
+    if not counts:
+        return ""
+    return f"{_join(counts.values())} began late, by a period or more"
+
+
+def _join(words: Iterable[str]) -> str:
+    """Joins words as in "m1, m2 and s"."""
+    *others, last = words
+    return f"{', '.join(others)} and {last}" if others else last
