@@ -642,8 +642,8 @@ def describe_role(member: str) -> list[str]:
     to_others = [_CHANNEL_WORDS[channel] for channel in (*role.publishes_to, *orders)]
     lines = []
     if role.publishes:
-        own = [_CHANNEL_WORDS[channel] for channel in role.publishes]
-        lines.append(f"may send in its own name: {', '.join(own)}")
+        published = [_CHANNEL_WORDS[channel] for channel in role.publishes]
+        lines.append(f"may send in its own name: {', '.join(published)}")
     if to_others:
         lines.append(f"may send to every site: {', '.join(to_others)}")
     return lines

@@ -49,14 +49,14 @@ def sim_command(
 
     chosen = options.load_chosen_scenario(scenario, overrides, duration, seed)
     if chosen.outside:
-        words = ["trilat", "sim", scenario]
+        arguments = ["trilat", "sim", scenario]
         for text in options.list_overrides(overrides, duration):
-            words += ["--set", text]
+            arguments += ["--set", text]
         if seed is not None:
-            words += ["--seed", str(seed)]
+            arguments += ["--seed", str(seed)]
         if output is not None:
-            words += ["-o", str(output)]
-        command = f"{shlex.join(words)} {write_simulated_options(chosen)}"
+            arguments += ["-o", str(output)]
+        command = f"{shlex.join(arguments)} {write_simulated_options(chosen)}"
         raise ScenarioError(
             f"is 'external': {', '.join(chosen.outside)} is a real arm, which only a live "
             f"session can move; to rehearse with a simulated arm, run: {command}",
