@@ -7,6 +7,7 @@ session which process is connected.
 """
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -94,7 +95,7 @@ def scenario_new_command(
     terminal.print_text(f"{file}: a template; check it with: trilat scenario check {file}")
 
 
-def _print_skeleton(kind: str, written: list[Path], key: str, *checks: str) -> None:
+def _print_skeleton(kind: str, written: list[Path], key: str, checks: Sequence[str]) -> None:
     """Prints which files were written for a new law, hand or plant, and how to run it.
 
     Args:
@@ -129,7 +130,7 @@ def new_law_command(
 
     # A law of a user is settled at best, which is exit code 1 unless it is accepted.
     checks = ("certify {log} --law {file} --accept settled", "report {log} --law {file}")
-    _print_skeleton("law", new_law(file, force=force), "control.law={}", *checks)
+    _print_skeleton("law", new_law(file, force=force), "control.law={}", checks)
 
 
 @options.command("myhand.py", page="docs/policies.md")
@@ -141,7 +142,7 @@ def new_hand_command(
     from ...scenario.skeletons import new_hand
 
     key = """'sites.m2.hands=[{{kind="own", class="{}"}}]'"""
-    _print_skeleton("hand", new_hand(file, force=force), key, "report {log}")
+    _print_skeleton("hand", new_hand(file, force=force), key, ["report {log}"])
 
 
 @options.command("myplant.py", page="docs/own-plant.md")
@@ -152,7 +153,7 @@ def new_plant_command(
     """Creates a working plant (a model of an arm) to start from, and its test."""
     from ...scenario.skeletons import new_plant
 
-    _print_skeleton("plant", new_plant(file, force=force), "sites.s.plant={}", "verify {log}")
+    _print_skeleton("plant", new_plant(file, force=force), "sites.s.plant={}", ["verify {log}"])
 
 
 @options.command(
