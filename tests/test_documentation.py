@@ -268,6 +268,7 @@ PYTHON_PAGES = {
     "docs/first-hour.md",
     "docs/law-interface.md",
     "docs/json.md",
+    "docs/lab-answers.md",
     "docs/linear-examples.md",
     "docs/linear.md",
     "docs/live-hands.md",

@@ -19,7 +19,12 @@ def test_the_skeleton_is_a_law_and_replaces_nothing(
     made = trilat("new", "law", "soft_law.py", cwd=tmp_path)
     assert made.code == 0
     assert "--set control.law=soft_law:SoftLaw" in made.out
-    assert "pytest test_soft_law.py" in made.out
+    assert "python -m pytest test_soft_law.py" in made.out
+    assert "trilat report soft_law.mcap --law soft_law.py" in made.out
+    head = (tmp_path / "soft_law.py").read_text().split('"""')[1]
+    printed = [line.strip() for line in made.out.splitlines() if line.startswith("  trilat")]
+    assert len(printed) == 3
+    assert [line for line in head.splitlines() if line.startswith("trilat")] == printed
     monkeypatch.chdir(tmp_path)
     log = tn.simulate("free", {"control.law": "soft_law:SoftLaw"}, duration_s=0.5)
     apart = [np.ptp([log[site].q[at, 0] for site in log.scenario.names]) for at in (0, -1)]
@@ -53,6 +58,9 @@ def test_report_judges_a_permitted_law_as_certify_does(tmp_path: Path) -> None:
     trilat(*run, "-o", "mine.mcap", cwd=tmp_path).succeeds()
     allowed = ["mine.mcap", "--law", "mine.py", "--json"]
     certified = json.loads(trilat("certify", *allowed, cwd=tmp_path).out)
+    (printed,) = (line for line in made.out.splitlines() if "trilat certify" in line)
+    assert trilat(*shlex.split(printed)[1:], cwd=tmp_path).code == 0
+    assert trilat("certify", *allowed, cwd=tmp_path).code == 1, "settled is not stable"
     reported = json.loads(trilat("report", *allowed, cwd=tmp_path).out)
     assert certified["stability"] == "settled"
     assert reported["verdict"].startswith(certified["stability"])

@@ -32,7 +32,9 @@ def test_the_page_does_as_it_says(tmp_path: Path) -> None:
     assert len([line for line in code.splitlines() if line]) <= 30
     (tmp_path / "mylaws.py").write_text(code)
     commands = [shlex.split(line, comments=True)[1:] for line in block("sh").splitlines()]
-    sim, verify, demo = commands
+    sim, certify, report, verify, demo = commands
+    for words in (certify, report):
+        assert words[words.index("--law") + 1] == "mylaws.py"
     trilat(*sim, "--duration", "2", cwd=tmp_path).succeeds()
     log = open_log(tmp_path / "spring.mcap")
     assert {site.control.settings["K"] for site in log.scenario.sites.values()} == {80}
@@ -71,9 +73,16 @@ def test_law_of_page_holds_arms_together_as_it_says(
 @pytest.mark.long
 def test_certificate_of_page_is_printed(tmp_path: Path) -> None:
     (tmp_path / "mylaws.py").write_text(block("python"))
-    sim, *_ = (shlex.split(line, comments=True)[1:] for line in block("sh").splitlines())
+    sim, certify, *_ = (
+        shlex.split(line, comments=True)[1:] for line in block("sh").splitlines()
+    )
     trilat(*sim, cwd=tmp_path).succeeds()
-    done = trilat("certify", "spring.mcap", "--law", "mylaws.py", cwd=tmp_path)
+    done = trilat(*certify, cwd=tmp_path)
+    assert done.code == 0
+    assert (
+        trilat(*[w for w in certify if w not in ("--accept", "settled")], cwd=tmp_path).code
+        == 1
+    )
     assert done.out.startswith(block("text"))
 
 
@@ -93,7 +102,7 @@ def test_units_of_page_are_those_of_the_interface() -> None:
     with INPUTS.open(newline="", encoding="utf-8") as stream:
         units = {row["field"]: row["unit"] for row in csv.DictReader(stream)}
     table = read_input_table()
-    assert len(table) == 10
+    assert len(table) == 11
     assert [(name, unit) for name, _, unit in table] == [(one, units[one]) for one, *_ in table]
 
 

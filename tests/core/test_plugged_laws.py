@@ -1,8 +1,11 @@
 """Laws plugged into a tick: what they see and send; the compiled form gives the bits of the plain one."""
 
+import csv
 import math
 import operator
-from typing import Any
+import re
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -18,6 +21,7 @@ from trilat_net.errors import LawFailed, ScenarioError
 from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import Scenario, load_scenario
 
+ROOT = Path(__file__).parents[2]
 TICKS = 60
 
 
@@ -107,6 +111,69 @@ def test_a_law_sees_peers_external_torque_and_its_past() -> None:
     )
     coriolis = [-h * (2 * v * w + w * w), h * v * v]
     np.testing.assert_allclose(now.bias, np.add(gravity, coriolis), rtol=1e-12)
+
+
+class Torques:
+    """Holds its arm by a spring, and keeps the torques that it sees."""
+
+    seen: ClassVar[dict[str, list[Any]]] = {}
+
+    def __init__(self, facts: trilat_net.LawContext) -> None:
+        self._seen = self.seen.setdefault(facts.site, [])
+
+    def torque(self, now: trilat_net.LawInput) -> Any:
+        self._seen.append(now)
+        return now.gravity - 50.0 * now.q - 20.0 * now.qd
+
+
+def _read_signs() -> dict[str, float]:
+    """Returns the sign that the pages give a torque: -1 if they call it minus a torque ON an arm."""
+    signs = {}
+    with (ROOT / "docs/data/law-inputs.csv").open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            if row["field"] in ("tau_x", "felt"):
+                text = row["meaning"]
+                assert " ON " in text
+                signs[f"{row['object']}.{row['field']}"] = -1.0 if "minus" in text else 1.0
+    page = (ROOT / "docs/own-controller.md").read_text(encoding="utf-8")
+    for field in ("tau_x", "felt"):
+        (text,) = re.findall(rf"^\| `now\.{field}` \|.*", page, re.MULTILINE)
+        assert " ON " in text
+        assert signs[f"LawInput.{field}"] == (-1.0 if "| minus" in text else 1.0)
+    return signs
+
+
+def test_torques_that_a_law_sees_have_the_signs_of_the_pages() -> None:
+    """The operator of m1 pushes with a constant 2 and 3 N m ON its arm; nobody else does."""
+    push = np.array([2.0, 3.0])
+    Torques.seen.clear()
+    run = trilat_net.simulate(
+        "free",
+        {
+            "control.law": Torques,
+            "link.delay_ms": 5.0,
+            "sites.m1.hands": [
+                {"kind": "recorded", "points": [[0.0, 2.0, 3.0], [9.0, 2.0, 3.0]]}
+            ],
+        },
+        duration_s=0.1,
+    )
+    signs = _read_signs()
+    now = Torques.seen["m1"][50]
+    assert now.tau_x == (signs["LawInput.tau_x"] * push).tolist()
+    assert now.felt == [0.0, 0.0]
+    now = Torques.seen["s"][50]
+    assert now.tau_x == [0.0, 0.0]
+    (pusher,) = [peer for peer in now.peers if any(peer.tau_x)]
+    assert pusher.tau_x == (signs["peer.tau_x"] * push).tolist()
+    np.testing.assert_allclose(now.felt, signs["LawInput.felt"] * pusher.alpha * push)
+    # The push is positive: it moves the arm to larger angles than those of a run without it.
+    free = trilat_net.simulate(
+        "free",
+        {"control.law": Torques, "link.delay_ms": 5.0, "sites.m1.hands": []},
+        duration_s=0.1,
+    )
+    assert run["m1"].q[-1].sum() > free["m1"].q[-1].sum()
 
 
 def test_names_of_several_senders_are_joined() -> None:

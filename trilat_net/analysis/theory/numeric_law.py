@@ -9,7 +9,7 @@ The results at tick k are the torque tau_k that the law commands and its memory 
 that it stores for the next tick. The arguments are:
 
 - the joint angles q and velocities qd, and the desired angles q_des and velocities qd_des,
-- `felt`, the received external torques of the other arms, weighted and summed,
+- `felt`, the received torques ON the other arms, weighted and summed,
 - `peers`, the states of these arms one by one,
 - `torque`, the external torque on the law's own arm.
 

@@ -8,6 +8,7 @@ session which process is connected.
 
 import shlex
 import sys
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
@@ -117,14 +118,14 @@ def scenario_new_command(
     terminal.print_text(f"{file}: a template; check it with: trilat scenario check {file}")
 
 
-def _print_skeleton(kind: str, written: list[Path], key: str, check: str) -> None:
+def _print_skeleton(kind: str, written: list[Path], key: str, checks: Sequence[str]) -> None:
     """Prints which files were written for a new law, hand or plant, and how to run it.
 
     Args:
         kind: "law", "hand" or "plant".
         written: Path of the file, and path of its test.
         key: Override that makes a scenario use the class, with {} in place of the class.
-        check: The command that examines the log of the run, as in "certify {log}", with {log}
+        checks: The commands that examine the log of the run, as in "certify {log}", with {log}
             and {file} in place of the names of the log and of the file.
     """
     from ...scenario.skeletons import name_skeleton_class
@@ -137,8 +138,9 @@ def _print_skeleton(kind: str, written: list[Path], key: str, check: str) -> Non
         f"Change the {kind}, {change_folder}run"
     )
     terminal.print_text(f"  trilat sim paper --set {key.format(code)} -o {file.stem}.mcap")
-    terminal.print_text(f"  trilat {check.format(log=f'{file.stem}.mcap', file=file.name)}")
-    terminal.print_text(f"  pytest {test.name}   (pip install pytest)")
+    for check in checks:
+        terminal.print_text(f"  trilat {check.format(log=f'{file.stem}.mcap', file=file.name)}")
+    terminal.print_text(f"  python -m pytest {test.name}   (python -m pip install pytest)")
 
 
 @options.command("mylaw.py", page="docs/own-controller.md")
@@ -149,8 +151,9 @@ def new_law_command(
     """Creates a working, commented control law to start from, and its test."""
     from ...scenario.skeletons import new_law
 
-    check = "certify {log} --law {file}"
-    _print_skeleton("law", new_law(file, force=force), "control.law={}", check)
+    # A law of a user is settled at best, which is exit code 1 unless it is accepted.
+    checks = ("certify {log} --law {file} --accept settled", "report {log} --law {file}")
+    _print_skeleton("law", new_law(file, force=force), "control.law={}", checks)
 
 
 @options.command("myhand.py", page="docs/policies.md")
@@ -162,7 +165,7 @@ def new_hand_command(
     from ...scenario.skeletons import new_hand
 
     key = """'sites.m2.hands=[{{kind="own", class="{}"}}]'"""
-    _print_skeleton("hand", new_hand(file, force=force), key, "report {log}")
+    _print_skeleton("hand", new_hand(file, force=force), key, ["report {log}"])
 
 
 @options.command("myplant.py", page="docs/own-plant.md")
@@ -173,7 +176,7 @@ def new_plant_command(
     """Creates a working plant (a model of an arm) to start from, and its test."""
     from ...scenario.skeletons import new_plant
 
-    _print_skeleton("plant", new_plant(file, force=force), "sites.s.plant={}", "verify {log}")
+    _print_skeleton("plant", new_plant(file, force=force), "sites.s.plant={}", ["verify {log}"])
 
 
 @options.command(

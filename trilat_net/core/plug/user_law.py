@@ -121,7 +121,7 @@ class PeerView(NamedTuple):
         new: 1 if the sample came into use at this tick, else 0.
         q: Joint angles or coordinates of the sample, rad or m.
         qd: Derivative of q, rad/s or m/s.
-        tau_x: Exogenous torque of the peer, N m or N; the torque ON its arm is the negative.
+        tau_x: Minus the torque of hand and environment ON the peer's arm, N m or N.
     """
 
     alpha: float
@@ -152,7 +152,8 @@ class LawInput(NamedTuple):
         qd: Joint velocities, rad/s.
         q_des: Reference of Eq. (6), rad.
         qd_des: Derivative of q_des, rad/s.
-        felt: Torque on the peers' arms as received, weighted by dominance, N m.
+        felt: Torque of hands and environments ON the peers' arms as received, weighted by
+            dominance, N m: the sum of -alpha tau_x of the peers.
         joints: Number of joints.
         coordinates: Count of numbers in the vectors of a peer.
         tau: Torque of each joint, N m, written by the law and then limited.
@@ -162,7 +163,8 @@ class LawInput(NamedTuple):
         sent: Per peer the vectors that go to this peer alone, written by the law; a vector that
             is not written keeps its numbers.
         to_all: Vectors that go to all peers, also written by the law.
-        tau_x: Exogenous torque of this tick, N m; the torque ON the arm is its negative.
+        tau_x: Minus the torque of hand and environment ON this arm in this tick, N m, the sign
+            of Eq. (8).
         tau_before: Torque of the previous tick, within its limits, N m; zeros at tick 0.
         q_before: Joint angles of the previous tick, rad; the start pose at tick 0.
         gravity: Torque that holds the arm, N m; zeros if its parameters are unknown.

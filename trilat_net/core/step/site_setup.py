@@ -49,7 +49,7 @@ class Law(IntEnum):
         tau = G(q) - K e - d qd - Kd ed + k_f felt
 
     Here q and qd are the joint angles and velocities, G is the gravity torque, e and ed are the
-    errors of position and velocity, and felt is the external torque of the other arms. The
+    errors of position and velocity, and felt is the torque that acts ON the other arms. The
     gains are the stiffness K, the damping d, the derivative gain Kd and the force gain k_f. The
     gains decide whether this is P+d, PD+d or direct force reflection. USER is a law in Python,
     either written by a user or from `trilat_net.laws`.

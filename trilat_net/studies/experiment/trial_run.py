@@ -98,7 +98,7 @@ class TrialJudge:
         Args:
             t_s: Time since the start of the session, in s.
             q: Joint positions, in rad or m.
-            tau_x: External torques, in N m or N.
+            tau_x: Minus the torques of hands and environments ON the arms, in N m or N.
 
         Returns:
             The outcome once the trial has ended. None before.
@@ -244,7 +244,7 @@ class ExperimentTrial:
 
         Args:
             q: Joint positions, in rad or m.
-            tau_x: External torques, in N m or N.
+            tau_x: Minus the torques of hands and environments ON the arms, in N m or N.
         """
         forces_n = self._find_forces_n(np.array([q]), np.array([tau_x]))
         return float(forces_n[0])
