@@ -11,6 +11,7 @@ from tests.analysis import logs
 from tests.analysis.certificate import runs
 from trilat_net.analysis.certificate.stability_certificate import Certificate, certify
 from trilat_net.analysis.file_overview import summarise_run
+from trilat_net.analysis.judge import certify_run
 from trilat_net.analysis.run_end import EndBehaviour, Stability
 from trilat_net.analysis.site_signals import SETTLED_ERROR_RAD, find_last_error
 from trilat_net.analysis.stability_decision import LoopRoots
@@ -179,8 +180,8 @@ def test_limits_stand_under_the_judgement() -> None:
         ),
     )
     remark = "m1 was at its torque limit for 0.15 s"
-    assert remark not in certify(log).remarks
-    found = certify(at_limit)
+    assert remark not in certify_run(log, twins=0).remarks
+    found = certify_run(at_limit, twins=0)
     assert found.remarks == (remark,)
     assert f'<p class="remarks">{remark}.</p>' in render_verdict(at_limit, found, ())
     for brief in (True, False):

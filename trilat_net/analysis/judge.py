@@ -23,6 +23,7 @@ from ..scenario import Scenario
 from ..scenario.describe import describe_law_conditions, list_law_proofs
 from .certificate.stability_certificate import Certificate, certify
 from .run_end import RunEnd, RunTrace, Stability, classify_run_end
+from .run_remarks import list_remarks
 from .stability_decision import (
     LoopRoots,
     RunFindings,
@@ -70,6 +71,7 @@ def certify_run(
         law_proofs=tuple(list_law_proofs(final_scenario)),
         law_conditions=tuple(describe_law_conditions(final_scenario)),
         has_lasting_delays=has_lasting_delays(final_scenario),
+        remarks=list_remarks(log),
     )
 
 

@@ -34,7 +34,6 @@ from ...log.accounting import MIN_COVERAGE
 from ...log.log_reader import Log
 from ...results import JsonObject, Result, finite_or_none
 from ..run_end import EndBehaviour, RunEnd, Stability, classify_log_end
-from ..run_remarks import list_remarks
 from ..stability_decision import LoopRoots, RunFindings, StabilityDecision, decide_stability
 from ..twins.twin_growth import TwinGrowth
 from . import energy_terms
@@ -383,7 +382,6 @@ def certify(
         end=classify_log_end(log),
         evidence=collect_evidence(run, min_coverage),
         observed=observe_energies(log, own_laws=own_laws),
-        remarks=list_remarks(log),
     )
     if facts is None:
         return certificate
