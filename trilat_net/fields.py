@@ -258,7 +258,7 @@ def find_count_problem(
         if key not in table or value is None:
             continue
         noun = "coordinates" if per == "shared" else per
-        if not isinstance(value, list):
+        if not isinstance(value, list | tuple):
             if key in expandable:
                 expected = f"a number, or a list with one for each {_SINGULAR[per]}"
             else:

@@ -13,7 +13,12 @@ OUTSIDE = {"sites.s.plant": "external", "sites.s.arm.known": False}
 @pytest.mark.parametrize(
     ("name", "overrides", "path", "fact"),
     [
-        ("paper", {"sites.s.arm.known": False}, "sites.s.arm.known", "plant = 'external'"),
+        (
+            "paper",
+            {"sites.s.arm.known": False},
+            "sites.s.arm.known",
+            "sites.s.plant to 'external'",
+        ),
         ("paper", {"control.law": "p_f"}, "sites.m1.control.law", "the scenario has 3 sites"),
         (
             "two_sites",

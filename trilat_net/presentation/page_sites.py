@@ -72,13 +72,14 @@ def render_sites(log: Log, facts: JsonObject) -> str:
         moved = format_numbers(site["hands_moved_max_rad"])
         angle_rows.append([label, end_angles, moved])
 
-    table = render_table(columns, rows) + render_legend(columns)
+    table = render_table(columns, rows)
     is_open = len(rows) <= _MOST_OPEN_ROWS
     errors = render_details("Errors and torques, by site", table, is_open=is_open)
     angles = render_table(_ANGLE_COLUMNS, angle_rows, text_columns=(1, 2))
     angles += render_legend(_ANGLE_COLUMNS)
     summary = "Where the arms ended, and how far operators moved them"
-    body = render_folds([errors, render_details(summary, angles)])
+    meanings = render_details("What the columns mean", render_legend(columns))
+    body = render_folds([errors, meanings, render_details(summary, angles)])
     intro = "How well each site followed its peers, and how hard its controller worked."
     return render_section("Sites", intro, body, "sites")
 

@@ -889,7 +889,7 @@ def _check_counts(site: TomlTable, counts: VectorCounts, path: str) -> None:
                 describe_wrong_type(value, f"a number, or a list with one for each {each}"),
                 path=f"{path}.limits.{key}",
             )
-        if isinstance(value, list) and len(value) != length:
+        if isinstance(value, list | tuple) and len(value) != length:
             raise ScenarioError(
                 f"has {count_nouns(len(value), 'number')}, and {owner}",
                 path=f"{path}.limits.{key}",
