@@ -1,5 +1,6 @@
 """What comes from ROS 2: what moves an arm, what is refused and how it is said, and when an arm is let go."""
 
+import csv
 import json
 import math
 import re
@@ -46,7 +47,13 @@ from trilat_net.errors import RunFailed, UsageError
 from trilat_net.log.ros2 import cdr
 from trilat_net.log.ros2.published import list_topics
 from trilat_net.log.ros2.robot_model import RobotModel
-from trilat_net.log.ros2.topic_names import RobotTable, read_topic_table
+from trilat_net.log.ros2.topic_names import (
+    DIAGNOSTICS,
+    FRAMES,
+    TOPICS,
+    RobotTable,
+    read_topic_table,
+)
 from trilat_net.net import topics
 from trilat_net.net.arm_client import FRESH_NS, ArmClient
 from trilat_net.net.clock import SystemClock
@@ -194,6 +201,16 @@ PAGES = "".join(
 )
 FILE = "".join(re.findall(r"```\n((?:joint_states = |\[sites\.s\]).*?)```", PAGES, re.DOTALL))
 """The examples of the pages."""
+
+
+def test_the_table_of_topics_has_every_topic() -> None:
+    table = Path(__file__).parents[2] / "docs" / "data" / "ros2-topics.csv"
+    with table.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    listed = {name.rpartition("/")[2] for row in rows for name in row["topic"].split(", ")}
+    accepted = {name for name in TOPICS if name.startswith(("target_", "set_", "robot_"))}
+    published = set(TOPICS) - accepted | {"robot_description", FRAMES, DIAGNOSTICS}
+    assert listed == published | {"events", "log", "sent_..."}
 
 
 def test_topics_are_called_as_a_file_says(tmp_path: Path) -> None:
