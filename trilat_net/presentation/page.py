@@ -42,25 +42,13 @@ from .appearance import SITE_COLOURS
 from .charts import ChartBuilder
 from .page_certificate import render_certificate
 from .page_charts import render_chart_groups, render_overview
-from .page_html import render_details, render_facts, render_section
+from .page_html import render_section
 from .page_links import render_links
 from .page_origin import render_origin, summarise_origin
 from .page_sites import render_loops, render_sites
 from .page_summary import render_alarms, render_checks, render_key_numbers, render_verdict
 from .page_timeline import render_timeline
 
-_SYMBOLS = (
-    ("q, qd", "angle of a joint, in rad, and its speed, in rad/s"),
-    ("q_des", "angle to which the other arms lead a joint: their mean by the shares, in rad"),
-    ("e", "error of a joint, q − q_des"),
-    ("α, share", "dominance factor: the part of one arm in the mean that another follows"),
-    ("τ", "torque of the controller on a joint, in N m"),
-    ("τ_x", "torque of hands and walls on a joint, with the sign of Eq. (8) of the paper"),
-    ("θ, θ̂", "masses of an arm, and the controller's estimates of them"),
-    ("V", "energy function of the paper's stability theorem, in J"),
-    ("β", "weight of an arm in V"),
-)
-"""Symbols of the page with their meanings."""
 _ASSETS = resources.files("trilat_net.presentation") / "assets"
 
 
@@ -186,8 +174,7 @@ def _render_motion(charts: str) -> str:
         "hide its line. Fig. 3 to 6 are those of the paper."
     )
     heading = "Positions, torques and estimates over time"
-    symbols = render_details("Symbols on this page", render_facts(_SYMBOLS))
-    return render_section(heading, intro, charts + symbols, "figures")
+    return render_section(heading, intro, charts, "figures")
 
 
 def _render_site_css(scenario: Scenario) -> str:

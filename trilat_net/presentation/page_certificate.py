@@ -22,6 +22,7 @@ from .figures.certificate_energy import draw_functional, draw_observed_energy
 from .figures.twin_differences import draw_twins
 from .page_html import (
     render_details,
+    render_facts,
     render_folds,
     render_note,
     render_scrolling,
@@ -41,6 +42,18 @@ _LONG_NAMES = {
     "log": "the log itself",
 }
 """Names of the checks on the page, by their names on a terminal."""
+_SYMBOLS = (
+    ("q, qd", "angle of a joint, in rad, and its speed, in rad/s"),
+    ("q_des", "angle to which the other arms lead a joint: their mean by the shares, in rad"),
+    ("e", "error of a joint, q − q_des"),
+    ("α, share", "dominance factor: the part of one arm in the mean that another follows"),
+    ("τ", "torque of the controller on a joint, in N m"),
+    ("τ_x", "torque of hands and walls on a joint, with the sign of Eq. (8) of the paper"),
+    ("θ, θ̂", "masses of an arm, and the controller's estimates of them"),
+    ("V", "energy function of the paper's stability theorem, in J"),
+    ("β", "weight of an arm in V"),
+)
+"""Symbols of the page with their meanings."""
 _BALANCE_NOTE = (
     "V is the energy function of the stability theorem: a weighted sum of the energies of the "
     "arms, of their errors and of the estimates. What is left of "
@@ -80,6 +93,7 @@ def render_certificate(log: Log, certificate: Certificate) -> str:
         pictures = "".join(_render_picture(title, figure) for title, figure in figures)
         names = ", ".join(title for title, _ in figures)
         folds.append(render_details(f"Figures: {names}", pictures))
+    folds.append(render_details("Symbols on this page", render_facts(_SYMBOLS)))
     body += render_folds(folds)
     intro = (
         "✓ speaks for stability, ✗ against it, ? decides nothing, · is a remark or does not "

@@ -32,7 +32,7 @@ from .page_html import join_words, render_details, render_section, render_swatch
 from .page_summary import find_error_peak
 from .style import typeset
 
-MAX_SHOWN = 6
+MAX_SHOWN = 5
 """Largest number of moments that are not folded."""
 _MAX_MOMENTS = 400
 """Largest number of moments on the page. summary.json has all modes and changes."""
