@@ -18,7 +18,7 @@ Invariant:
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -35,13 +35,15 @@ from ...scenario.laws import BUILT_IN
 from ...work.intervals import MeanInterval
 from .candidate import CLASS_MEANINGS, CandidateClass, CandidateScore
 from .search_space import SEARCH_SPACES, weigh_joints
-from .tuning_plan import MAX_BUDGET, CandidateSearch, Objective, TuningPlan, TuningResult
+
+if TYPE_CHECKING:
+    from .tuning_plan import CandidateSearch, TuningPlan, TuningResult
 
 _MAX_FRONT_ROWS = 8
 """Largest number of points of a front that the terminal shows. The files have all points."""
 
 
-def compose_tuning(tuned: TuningResult) -> Iterator[Block]:
+def compose_tuning(tuned: "TuningResult") -> Iterator[Block]:
     """Yields the text that reports a comparison of tuned control laws on the terminal.
 
     The text contains a table of the laws, explanations of the classes of behaviour, and the
@@ -87,7 +89,7 @@ def compose_tuning(tuned: TuningResult) -> Iterator[Block]:
             yield f"  {tuned.candidate(search, last_point).command}"
 
 
-def tabulate_laws(tuned: TuningResult) -> TextTable:
+def tabulate_laws(tuned: "TuningResult") -> TextTable:
     """Returns a table that summarises the search of each law in a row.
 
     A row has the number of candidates (choices of gains), the number of candidates of each
@@ -113,7 +115,7 @@ def tabulate_laws(tuned: TuningResult) -> TextTable:
     return TextTable(heads, rows, align="lr")
 
 
-def _format_front_ends(search: CandidateSearch) -> list[str]:
+def _format_front_ends(search: "CandidateSearch") -> list[str]:
     """Returns the table cells of the two ends of a law's front.
 
     Returns:
@@ -129,7 +131,7 @@ def _format_front_ends(search: CandidateSearch) -> list[str]:
     return [format_number(number) for number in numbers]
 
 
-def _tabulate_search(plan: TuningPlan) -> TextTable:
+def _tabulate_search(plan: "TuningPlan") -> TextTable:
     """Returns a table of the gains that are tuned, with the ranges in which they are searched.
 
     There is a row per gain. The information that a law gets about the model of the arm is named
@@ -152,7 +154,7 @@ def _tabulate_search(plan: TuningPlan) -> TextTable:
 
 
 def tabulate_front(
-    tuned: TuningResult, search: CandidateSearch, most: int = MAX_BUDGET
+    tuned: "TuningResult", search: "CandidateSearch", most: int | None = None
 ) -> TextTable:
     """Returns a table of the candidates on a law's Pareto front, by rising effort.
 
@@ -163,10 +165,11 @@ def tabulate_front(
         tuned: Result of the comparison of control laws.
         search: Search of the law.
         most: Largest number of rows. Of a longer front, evenly spread points are shown, with
-            the first and the last one.
+            the first and the last one. None for all points.
     """
     count = len(search.front)
-    row_indices = {round(n) for n in np.linspace(0, count - 1, min(most, count))}
+    shown = count if most is None else min(most, count)
+    row_indices = {round(n) for n in np.linspace(0, count - 1, shown)}
     overall_front = tuned.list_overall_front(search)
     knobs = search.space.knobs
     rows = []
@@ -181,7 +184,7 @@ def tabulate_front(
     return TextTable(("law", *heads, *_SCORE_HEADS), rows, align="lr")
 
 
-def _tabulate_paper_gains(tuned: TuningResult) -> TextTable:
+def _tabulate_paper_gains(tuned: "TuningResult") -> TextTable:
     """Returns a table of the scores of the adaptive law with its published gains.
 
     The gains are printed in the paper from which the law comes. The scores are the error, the
@@ -226,7 +229,7 @@ def _format_mean(mean: float | None, half: float | None) -> str:
     return str(MeanInterval(mean, half))
 
 
-def describe_procedure(plan: TuningPlan) -> list[str]:
+def describe_procedure(plan: "TuningPlan") -> list[str]:
     """Describes what is the same for all compared laws, as one sentence each.
 
     They are the candidates, the scenario, the model information that laws get, the objectives,
@@ -264,7 +267,7 @@ def describe_procedure(plan: TuningPlan) -> list[str]:
     if plan.others:
         seeds = count_nouns(1 + len(plan.others), "seed")
         lines.append(f"every candidate is the mean of {seeds}, with its 95 % interval")
-    if plan.objective is Objective.SETTLING:
+    if plan.objective == "settling":
         lines.append(
             "minimised: the time from which the largest |e| stays below 0.01 rad, and effort"
         )
@@ -276,7 +279,7 @@ def describe_procedure(plan: TuningPlan) -> list[str]:
     return lines
 
 
-def list_energy_notes(tuned: TuningResult) -> list[str]:
+def list_energy_notes(tuned: "TuningResult") -> list[str]:
     """Returns what a tuning leaves out about laws that keep accounts of energy.
 
     The classes follow from the motion of the arms. A run whose law had overdrawn its accounts
@@ -307,7 +310,7 @@ def _list_class_meanings() -> list[str]:
     return [f"{outcome.word}: {text}" for outcome, text in CLASS_MEANINGS.items()]
 
 
-def _build_tuning_page(tuned: TuningResult) -> str:
+def _build_tuning_page(tuned: "TuningResult") -> str:
     """Composes the Markdown page that reports a comparison of control laws.
 
     The page contains, for each point of a front, the command that repeats its run.
@@ -365,10 +368,10 @@ _SIZE_PT = 8.0
 _MARKS = ("o", "s", "^", "D", "v", "P")
 """Markers of the laws."""
 # Labels of the vertical axis.
-_LABELS = {Objective.ERROR: "error (rad)", Objective.SETTLING: "settling time (s)"}
+_LABELS = {"error": "error (rad)", "settling": "settling time (s)"}
 
 
-def _draw_front(tuned: TuningResult) -> Figure:
+def _draw_front(tuned: "TuningResult") -> Figure:
     """Draws the Pareto fronts of all laws in one panel, with error against effort.
 
     The Pareto front of a law contains the best compromises between both. The axes are
@@ -404,7 +407,7 @@ def _draw_front(tuned: TuningResult) -> Figure:
     return figure
 
 
-def _draw_law(axes: Axes, search: CandidateSearch) -> Line2D:
+def _draw_law(axes: Axes, search: "CandidateSearch") -> Line2D:
     """Draws all stable runs of a law faintly, and its front as a line of steps on top.
 
     Returns:
@@ -443,7 +446,7 @@ def _draw_law(axes: Axes, search: CandidateSearch) -> Line2D:
     return Line2D([], [], label=f"{law} ({stable}/{len(search.scores)})", **look)
 
 
-def _draw_paper_gains(axes: Axes, tuned: TuningResult) -> list[Line2D]:
+def _draw_paper_gains(axes: Axes, tuned: "TuningResult") -> list[Line2D]:
     """Draws the gains that the paper prints as stars.
 
     Returns:
@@ -472,7 +475,7 @@ def _draw_paper_gains(axes: Axes, tuned: TuningResult) -> list[Line2D]:
     return entries
 
 
-def write_tuning(tuned: TuningResult, folder: Path) -> list[Path]:
+def write_tuning(tuned: "TuningResult", folder: Path) -> list[Path]:
     """Writes the results of a comparison into an existing folder.
 
     The files are the results as JSON, a page in Markdown, and the figure of the fronts as PNG
