@@ -4,7 +4,10 @@ import csv
 import re
 from collections import defaultdict
 
+import grimp
 import pytest
+from scipy.sparse import lil_matrix
+from scipy.sparse.csgraph import connected_components
 
 from . import house, line_figures, reading_walk
 
@@ -115,6 +118,22 @@ def test_every_import_between_rooms_has_its_reason() -> None:
     told = {(row["package"], row["imports"]) for row in rows}
     assert told == house.room_imports()
     assert len(told) <= 84
+
+
+@pytest.mark.push
+def test_no_modules_import_each_other_in_a_circle() -> None:
+    graph = grimp.build_graph(*house.TOPS, cache_dir=None, exclude_type_checking_imports=True)
+    modules = sorted(graph.modules)
+    indices = {module: n for n, module in enumerate(modules)}
+    imports = lil_matrix((len(modules), len(modules)), dtype=bool)
+    for module in modules:
+        for other in graph.find_modules_directly_imported_by(module):
+            imports[indices[module], indices[other]] = True
+    _, circles = connected_components(imports, directed=True, connection="strong")
+    members = defaultdict(list)
+    for module, circle in zip(modules, circles, strict=True):
+        members[circle].append(module)
+    assert [names for names in members.values() if len(names) > 1] == []
 
 
 def test_the_tour_names_what_exists() -> None:
