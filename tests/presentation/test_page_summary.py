@@ -135,7 +135,8 @@ def test_key_numbers_say_where_and_when() -> None:
     log = logs.simulated("paper")
     facts = summarise_run(log)
     html = render_key_numbers(log, facts)
-    for sites, place in ((["s"], "from where its masters lead it"), (["m1", "m2"], "from the")):
+    names = {"s from where the masters lead": ["s"], "m1 and m2 from the others": ["m1", "m2"]}
+    for name, sites in names.items():
         peak = find_error_peak(log, sites)
         assert peak is not None
         assert peak.value == max(facts["sites"][site]["max_error_rad"] for site in sites)
@@ -143,9 +144,9 @@ def test_key_numbers_say_where_and_when() -> None:
         row = int(np.searchsorted(log[peak.site].t_s, peak.t_s))
         assert abs(log[peak.site].e[row, joint]) == peak.value
         last = max(facts["sites"][site]["max_error_end_rad"] for site in sites)
-        assert f"<dt>{peak.site} {place}" in html
+        assert f"<dt>{name}" in html
         assert f"joint {joint + 1}, at {peak.t_s:.2f} s; {last:.3g} rad in the last" in html
-    assert html.index("<dt>s from") < html.index("<dt>m1 from")  # the remote arm is first
+    assert html.index("<dt>s from") < html.index("<dt>m1 and m2 from")  # the remote arm is first
     assert "<dd>200 ms</dd>" in html
     assert "a measure of following, not of stability" in html
 

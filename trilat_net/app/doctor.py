@@ -696,7 +696,7 @@ def examine_room(folder: Path) -> Iterator[DoctorFinding]:
 
     cores = workers.count_cores()
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
-    text = f"{count_nouns(cores, 'processor')}, of which {load:.1f} are busy"
+    text = f"{count_nouns(cores, 'processor')}, on which {load:.1f} programs want to run"
     warning = describe_load(measure_busy_share(SystemClock()))
     if warning:
         text = f"{text}; {warning}"

@@ -251,7 +251,7 @@ def _list_error_cards(log: Log) -> list[_KeyNumber]:
     masters = [site for site in log.sites if site not in slaves]
     cards = []
     if slaves:
-        cards.append(_describe_errors(log, slaves, "from where its masters lead it"))
+        cards.append(_describe_errors(log, slaves, "from where the masters lead"))
     if masters:
         cards.append(_describe_errors(log, masters, "from the others"))
     return cards
@@ -269,8 +269,7 @@ def _describe_errors(log: Log, sites: Sequence[str], place: str) -> _KeyNumber:
     if peak is None:
         return _KeyNumber(f"{join_words(sites)} {place}", NO_NUMBER, "no record")
     unit = shared_unit(log)
-    joint = peak.joint.removeprefix(f"{peak.site} ")
-    detail = f"largest, {joint}, at {peak.t_s:.2f} s"
+    detail = f"largest, of {peak.joint}, at {peak.t_s:.2f} s"
 
     last_errors = [find_error_of_last_second(log[site]) for site in sites]
     known = [error for error in last_errors if error is not None]
@@ -279,7 +278,7 @@ def _describe_errors(log: Log, sites: Sequence[str], place: str) -> _KeyNumber:
         detail += f"; {last.value:.3g} {unit} in the last second, of {last.joint}"
         if last.site in _list_pushed_sites(log):
             detail += ", which a hand or a wall still pushes"
-    return _KeyNumber(f"{peak.site} {place}", f"{peak.value:.3g} {unit}", detail)
+    return _KeyNumber(f"{join_words(sites)} {place}", f"{peak.value:.3g} {unit}", detail)
 
 
 def _describe_settling(log: Log, facts: JsonObject) -> _KeyNumber:
