@@ -146,7 +146,8 @@ def test_key_numbers_say_where_and_when() -> None:
         last = max(facts["sites"][site]["max_error_end_rad"] for site in sites)
         assert f"<dt>{name}" in html
         assert f"joint {joint + 1}, at {peak.t_s:.2f} s; {last:.3g} rad in the last" in html
-    assert html.index("<dt>s from") < html.index("<dt>m1 and m2 from")  # the remote arm is first
+    # the remote arm is first
+    assert html.index("<dt>s from") < html.index("<dt>m1 and m2 from")
     assert "<dd>200 ms</dd>" in html
     assert "a measure of following, not of stability" in html
 
