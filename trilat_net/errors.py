@@ -16,12 +16,17 @@ Invariant:
 import os
 import re
 import shlex
-import traceback
 from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
+_PROGRAM = Path(__file__).parents[1]
+_OTHER_CODE = (
+    *(_PROGRAM / package for package in ("trilat_net", "sites", "recorder", "live")),
+    Path(os.__file__).parent,
+)
+"""Folders of this program and of Python's standard library."""
 _OPTION = re.compile(
     r"(trilat [a-z][^;:,)]*)|(?<![\w-])(--[a-z][a-z-]*|-o\b)( [\d*'\[{]\S*| [A-Z]{2,}\b)?"
 )
@@ -343,6 +348,14 @@ def find_nearest(word: str, valid: Sequence[str], elsewhere: Sequence[str] = ())
     return ""
 
 
+def join_words(words: Iterable[str]) -> str:
+    """Joins words as in "m1, m2 and s"."""
+    texts = list(words)
+    if len(texts) < 2:
+        return "".join(texts)
+    return f"{', '.join(texts[:-1])} and {texts[-1]}"
+
+
 def join_arguments(arguments: Iterable[str]) -> str:
     """Returns a command as a user would type it into a shell of this operating system.
 
@@ -375,6 +388,9 @@ def describe_exception(error: BaseException) -> str:
     # The message of a syntax error names the place itself.
     if isinstance(error, SyntaxError):
         return text
+    # Imported here, because `trilat stop` imports this module and describes no exception.
+    import traceback
+
     frames = traceback.extract_tb(error.__traceback__)
     places = [frame for frame in frames if _is_users_file(frame.filename)]
     if not places:
@@ -392,11 +408,3 @@ def _is_users_file(name: str) -> bool:
     if name.startswith("<") or "site-packages" in file.parts:
         return False
     return not any(file.is_relative_to(folder) for folder in _OTHER_CODE)
-
-
-_PROGRAM = Path(__file__).parents[1]
-_OTHER_CODE = (
-    *(_PROGRAM / package for package in ("trilat_net", "sites", "recorder", "live")),
-    Path(traceback.__file__).parent,
-)
-"""Folders of this program and of Python's standard library."""

@@ -12,11 +12,9 @@ Invariant:
     - A condition that did not occur has no remark.
 """
 
-from collections.abc import Iterable
-
 import numpy as np
 
-from ..errors import count_nouns
+from ..errors import count_nouns, join_words
 from ..log.log_reader import Log
 from .site_signals import external_torques
 
@@ -54,7 +52,7 @@ def _describe_torque_limits(log: Log) -> str:
     if not times:
         return ""
     verb = "was at its" if len(times) == 1 else "were at their"
-    return f"{_join(times)} {verb} torque limit for {_join(times.values())}"
+    return f"{join_words(times)} {verb} torque limit for {join_words(times.values())}"
 
 
 def _describe_large_pushes(log: Log) -> str:
@@ -73,7 +71,7 @@ def _describe_large_pushes(log: Log) -> str:
         if peaks_nm[joint] > LARGE_PUSH_SHARE * limits_nm[joint]:
             push = f"up to {peaks_nm[joint]:.3g} N m (torque limit {limits_nm[joint]:g} N m)"
             pushes[site] = f"{site} joint {joint + 1} with {push}"
-    return f"hands or walls pushed {_join(pushes.values())}" if pushes else ""
+    return f"hands or walls pushed {join_words(pushes.values())}" if pushes else ""
 
 
 def _describe_late_ticks(log: Log) -> str:
@@ -86,10 +84,4 @@ def _describe_late_ticks(log: Log) -> str:
             counts[site] = f"{count_nouns(late, 'tick')} of {site}"
     if not counts:
         return ""
-    return f"{_join(counts.values())} began late, by a period or more"
-
-
-def _join(words: Iterable[str]) -> str:
-    """Joins words as in "m1, m2 and s"."""
-    *others, last = words
-    return f"{', '.join(others)} and {last}" if others else last
+    return f"{join_words(counts.values())} began late, by a period or more"

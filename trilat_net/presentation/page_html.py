@@ -173,10 +173,3 @@ def format_numbers(values: Iterable[float] | None) -> str:
 def to_percent(share: float | None) -> float | None:
     """Returns a share between 0 and 1 in percent. Returns None for None."""
     return None if share is None else 100.0 * share
-
-
-def join_words(words: Sequence[str]) -> str:
-    """Joins words as in "m1, m2 and s"."""
-    if len(words) < 2:
-        return "".join(words)
-    return f"{', '.join(words[:-1])} and {words[-1]}"

@@ -19,10 +19,11 @@ import numpy as np
 from ..analysis.dominance_history import list_ramps, trace_dominance
 from ..analysis.timeline import recorded_end_s
 from ..core.step.vectors import Array
+from ..errors import join_words
 from ..log.log_reader import Log
 from ..scenario import Scenario
 from .page_data import LeadBar
-from .page_html import join_words, render_swatch
+from .page_html import render_swatch
 
 _MAX_BARS = 4
 """Largest number of slaves with a bar or a sentence."""

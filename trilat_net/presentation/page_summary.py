@@ -28,12 +28,12 @@ from ..analysis.site_signals import (
     shared_unit,
 )
 from ..analysis.timeline import RaisedAlarm, list_alarms
-from ..errors import count_nouns
+from ..errors import count_nouns, join_words
 from ..log.findings import Finding
 from ..log.log_reader import Log
 from ..results import JsonObject
 from .certificate_text import describe_pace
-from .page_html import NO_NUMBER, format_cell, join_words, render_details
+from .page_html import NO_NUMBER, format_cell, render_details
 from .result_text import escape_text
 from .style import typeset
 

@@ -24,11 +24,11 @@ from ..analysis.timeline import (
     recorded_end_s,
 )
 from ..core.step.vectors import Array
-from ..errors import count_nouns
+from ..errors import count_nouns, join_words
 from ..log.log_reader import Log
 from ..results import JsonObject
 from ..scenario import Scenario
-from .page_html import join_words, render_details, render_section, render_swatch
+from .page_html import render_details, render_section, render_swatch
 from .page_summary import find_error_peak
 from .style import typeset
 
