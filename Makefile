@@ -83,6 +83,7 @@ push-set: $(VENV)/dev.stamp
 
 test-long: platforms $(VENV)/long.stamp $(VENV)/docs.stamp
 	TRILAT_TEST_RUN=all-tests $(BIN)/python -m pytest -q -p tests.progress -n auto --dist worksteal -m "not live"
+	TRILAT_TEST_RUN=dealt-tests $(BIN)/python -m pytest -q -p tests.progress -p tests.dealt -n auto -m "not live and not long" --ignore tests/live
 	TRILAT_TEST_RUN=all-sessions $(BIN)/python -m pytest -q -p tests.progress -m live
 
 containers: setup
