@@ -27,7 +27,7 @@ SETTINGS = {
     "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False",
     "DASK_DISTRIBUTED__ADMIN__TICK__INTERVAL": "1s",
 }
-"""As docs/sweep.md recommends."""
+"""As docs/studies/sweep.md recommends."""
 OVER = f"control.Kd=2:{2 + 0.001 * (CELLS - 1):g}:0.001"
 
 

@@ -6,7 +6,8 @@ Smoothing prevents the device from vibrating when the arm touches a stiff wall.
     python examples/haply_hand.py play m1
 
 The first button of the grip takes hold of the arm and is the clutch. The second button releases
-the arm. The scenario of the session defines how the device moves the arm (docs/devices.md).
+the arm. The scenario of the session defines how the device moves the arm
+(docs/sessions/devices.md).
 """
 
 import argparse

@@ -6,7 +6,7 @@ The axis is the one along which the cap is pushed furthest.
     python examples/spacemouse_hand.py play m1
 
 Hold the first button and push the cap to move the arm; the second button releases the arm.
-Works on Linux, if your user may read the device (docs/devices.md).
+Works on Linux, if your user may read the device (docs/sessions/devices.md).
 """
 
 import argparse

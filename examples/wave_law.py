@@ -14,7 +14,7 @@ line, the incoming wave v gives a force on the arm, and an outgoing wave u is se
 - A site with a spring K and a damper B moves the far end of the spring, q_sd, so that
   c v = b qd_sd + F. It sends u = v - (c / b) F.
 
-docs/laws.md derives these equations.
+docs/reference/laws.md derives these equations.
 """
 
 import math

@@ -4,7 +4,7 @@ A site is a process that runs one arm, and publishes its state in every period o
 loop. A recorder is a process that writes these messages to the log. Messages may be lost on the
 network. The recorder notices gaps in their numbers, and queries the site for the missing ones.
 
-Invariant (law L6 of docs/design.md):
+Invariant (law L6 of docs/develop/design.md):
     - The memory is bounded and allocated at the start. It holds at most a minute of every
       channel.
     - The computing time is bounded. The control loop answers one query at a time, with a

@@ -5,7 +5,7 @@ sleeps until the tick is due, takes the samples that the peers have sent meanwhi
 torque, and publishes the state of its own arm: a sample for the peers, and a record of the tick
 for the recorder.
 
-Invariant (law L1 of docs/design.md):
+Invariant (law L1 of docs/develop/design.md):
     - Tick k is due k periods after the epoch, the common start time of the session. The periods
       are those of the leader, the first site of the scenario. Sites on one machine wake up one
       after another within the period.

@@ -96,7 +96,7 @@ def unused_methods() -> set[str]:
     """
     references = set(
         re.findall(
-            r"\w+", "".join(path.read_text("utf-8") for path in (ROOT / "docs").glob("*.md"))
+            r"\w+", "".join(path.read_text("utf-8") for path in (ROOT / "docs").rglob("*.md"))
         )
     )
     methods = set()

@@ -60,7 +60,7 @@ def test_the_paper_is_a_reference() -> None:
 def test_the_list_of_works_has_the_paper_and_as_many_works_as_the_page_says() -> None:
     with (ROOT / "docs/data/references.csv").open(encoding="utf-8", newline="") as file:
         works = list(csv.DictReader(file))
-    page = (ROOT / "docs/references.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs/reference/references.md").read_text(encoding="utf-8")
     assert re.findall(r"lists all (\d+) works", page) == [str(len(works))]
     (paper,) = (work for work in works if work["title"].lower() == PAPER_TITLE.lower())
     assert [name.split()[-1] for name in paper["authors"].split(", ")] == PAPER_AUTHORS

@@ -38,6 +38,7 @@ from trilat_net.core.links import delay, link
 from trilat_net.core.plug import user_law
 from trilat_net.core.step import site_arrays, ticks
 from trilat_net.execution import twins, verify
+from trilat_net.files import find_page
 from trilat_net.log import accounting, log_file, mcap_reader, mcap_records, site_log
 from trilat_net.net import arm_client, offset, requests, session, timing, zenoh_config
 from trilat_net.scenario import delay_period, laws, operators, resolve
@@ -335,7 +336,7 @@ def flat(text: str) -> str:
 def test_a_limit_on_a_page_is_the_program_s(
     page: str, words: str, number: float, own: float
 ) -> None:
-    assert words in flat((ROOT / "docs" / page).read_text(encoding="utf-8"))
+    assert words in flat(find_page(page).read_text(encoding="utf-8"))
     assert number == pytest.approx(own, rel=1e-12)
 
 
@@ -376,7 +377,7 @@ def test_a_test_that_a_page_names_exists(page: Path) -> None:
 
 
 def test_every_operator_environment_and_law_stands_in_a_table() -> None:
-    pages = ("docs/laws.md", "docs/operators.md")
+    pages = ("docs/reference/laws.md", "docs/reference/operators.md")
     text = "".join((ROOT / page).read_text(encoding="utf-8") for page in pages)
     kinds = [
         str(one.__struct_config__.tag)

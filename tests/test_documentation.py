@@ -79,20 +79,20 @@ def test_command_in_sentence_is_one_and_has_these_options(page: str) -> None:
 # --- settings ---------------------------------------------------------------------------------------------
 
 SCENARIO_OF = {
-    "docs/experiment-protocol.md": "paper",
-    "docs/arm-keys.md": "six_joints",
-    "docs/arms.md": "six_joints",
-    "docs/devices.md": "play",
-    "docs/external-arm.md": "two_sites",
-    "docs/links.md": "paper",
-    "docs/measured-hands.md": "two_sites",
-    "docs/silent-peers.md": "paper",
-    "docs/live-hands.md": "play",
-    "docs/felt-forces.md": "free",
-    "docs/own-controller.md": "paper",
-    "docs/own-plant.md": "paper",
-    "docs/policies.md": "paper",
-    "docs/seeds.md": "free",
+    "docs/reference/experiment-protocol.md": "paper",
+    "docs/reference/arm-keys.md": "six_joints",
+    "docs/extend/arms.md": "six_joints",
+    "docs/sessions/devices.md": "play",
+    "docs/sessions/external-arm.md": "two_sites",
+    "docs/reference/links.md": "paper",
+    "docs/studies/measured-hands.md": "two_sites",
+    "docs/reference/silent-peers.md": "paper",
+    "docs/sessions/live-hands.md": "play",
+    "docs/logs/felt-forces.md": "free",
+    "docs/extend/own-controller.md": "paper",
+    "docs/extend/own-plant.md": "paper",
+    "docs/studies/policies.md": "paper",
+    "docs/studies/seeds.md": "free",
 }
 """By page the scenario into which its settings are put."""
 
@@ -113,14 +113,14 @@ def test_settings_make_a_scenario(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     text = block.text
-    if block.page == "docs/felt-forces.md":  # each line is one way to push
+    if block.page == "docs/logs/felt-forces.md":  # each line is one way to push
         for line in text.splitlines():
             hands = tomllib.loads(line)
             assert (
                 tn.load_scenario("free", {"sites.m1.hands": hands["hands"]}).sites["m1"].hands
             )
         return
-    if block.page == "docs/experiment-protocol.md":
+    if block.page == "docs/reference/experiment-protocol.md":
         written = tn.new_experiment("p.toml").read_text(encoding="utf-8")
         (tmp_path / "p.toml").write_text(
             written.replace("[set]", text + "[set]", 1), encoding="utf-8"
@@ -132,9 +132,12 @@ def test_settings_make_a_scenario(
         (tmp_path / "mine.toml").write_text(write_own_arm(tmp_path, text))
         assert tn.load_scenario(tmp_path / "mine.toml").names == ("m", "s")
         return
-    if block.page == "docs/own-controller.md":
+    if block.page == "docs/extend/own-controller.md":
         (tmp_path / "mylaws.py").write_text(find_blocks(block.page)[0].text)
-    for code in (*find_blocks("docs/policies.md"), *find_blocks("docs/own-plant.md")):
+    for code in (
+        *find_blocks("docs/studies/policies.md"),
+        *find_blocks("docs/extend/own-plant.md"),
+    ):
         if named := re.match(r"# (my_\w+\.py)\n", code.text):
             (tmp_path / named[1]).write_text(code.text)
     base = tomllib.loads(
@@ -157,12 +160,12 @@ def write_own_arm(folder: Path, text: str) -> str:
 
 # --- commands ---------------------------------------------------------------------------------------------
 
-PUSHED_COMMAND_PAGES = {"docs/delay-traces.md"}
+PUSHED_COMMAND_PAGES = {"docs/extend/delay-traces.md"}
 PUSHED_PYTHON_PAGES = {
-    "docs/observed-energy.md",
-    "docs/own-plant.md",
-    "docs/policies.md",
-    "docs/train-policies.md",
+    "docs/reference/observed-energy.md",
+    "docs/extend/own-plant.md",
+    "docs/studies/policies.md",
+    "docs/studies/train-policies.md",
 }
 """Pages whose blocks run on every push; those of the others run in `make test-long`."""
 
@@ -178,36 +181,36 @@ def list_pages(pages: set[str], pushed: set[str]) -> list[Any]:
 
 
 COMMAND_PAGES = {
-    "docs/arm-gains.md",
-    "docs/arms.md",
-    "docs/damping-conditions.md",
-    "docs/delay-traces.md",
-    "docs/fair-comparison.md",
-    "docs/first-hour.md",
-    "docs/first-result.md",
-    "docs/lab.md",
-    "docs/laws.md",
-    "docs/linear.md",
-    "docs/metrics.md",
-    "docs/ports.md",
-    "docs/log-checks.md",
-    "docs/log-tools.md",
-    "docs/rerun.md",
-    "docs/signatures.md",
-    "docs/verify.md",
-    "docs/seeds.md",
+    "docs/extend/arm-gains.md",
+    "docs/extend/arms.md",
+    "docs/theory/damping-conditions.md",
+    "docs/extend/delay-traces.md",
+    "docs/studies/fair-comparison.md",
+    "docs/tutorials/first-hour.md",
+    "docs/tutorials/first-result.md",
+    "docs/tutorials/lab.md",
+    "docs/reference/laws.md",
+    "docs/studies/linear.md",
+    "docs/reference/metrics.md",
+    "docs/studies/ports.md",
+    "docs/logs/log-checks.md",
+    "docs/logs/log-tools.md",
+    "docs/logs/rerun.md",
+    "docs/logs/signatures.md",
+    "docs/logs/verify.md",
+    "docs/studies/seeds.md",
 }
 SHORTER = ["--law", "p_d,adaptive", "--budget", "4", "--duration", "2", "--jobs", "1"]
 """What is added to a command that tunes, which else would take minutes."""
 OF_RUNS = {
-    "docs/metrics.md": "paper",
-    "docs/json.md": "free",
-    "docs/log.md": "free",
-    "docs/log-checks.md": "paper",
-    "docs/log-tools.md": "paper",
-    "docs/rerun.md": "paper",
-    "docs/signatures.md": "free",
-    "docs/verify.md": "paper",
+    "docs/reference/metrics.md": "paper",
+    "docs/reference/json.md": "free",
+    "docs/reference/log.md": "free",
+    "docs/logs/log-checks.md": "paper",
+    "docs/logs/log-tools.md": "paper",
+    "docs/logs/rerun.md": "paper",
+    "docs/logs/signatures.md": "free",
+    "docs/logs/verify.md": "paper",
 }
 """Pages whose blocks are about run.mcap, and its scenario."""
 
@@ -216,19 +219,19 @@ def prepare(page: str, folder: Path) -> None:
     """Makes the files that a page takes for granted."""
     if page in OF_RUNS:
         trilat("sim", OF_RUNS[page], "-o", "run.mcap", cwd=folder).succeeds()
-    if page == "docs/first-hour.md":  # the log of the reader's session
+    if page == "docs/tutorials/first-hour.md":  # the log of the reader's session
         session = folder / "runs" / "play-001"
         session.mkdir(parents=True)
         trilat("sim", "play", "--duration", "3", "-o", "run.mcap", cwd=session).succeeds()
-    if page == "docs/delay-traces.md":
+    if page == "docs/extend/delay-traces.md":
         irtt(folder, zipped=True)
-    if page == "docs/arms.md":
+    if page == "docs/extend/arms.md":
         (own,) = (block for block in find_blocks(page) if block.text.startswith("name"))
         (folder / "mine.toml").write_text(write_own_arm(folder, own.text))
 
 
 @pytest.mark.parametrize(
-    "page", list_pages(COMMAND_PAGES - {"docs/lab.md"}, PUSHED_COMMAND_PAGES)
+    "page", list_pages(COMMAND_PAGES - {"docs/tutorials/lab.md"}, PUSHED_COMMAND_PAGES)
 )
 def test_commands_of_page_run_and_print_what_stands_there(page: str, tmp_path: Path) -> None:
     prepare(page, tmp_path)
@@ -255,7 +258,7 @@ def test_code_of_hand_takes_hold_of_arm_and_lets_go(tmp_path: Path) -> None:
     try:
         sites[0].prints(BEGUN)
         names: dict[str, Any] = {"__name__": "page"}
-        run_python("docs/live-hands.md", tmp_path, names)
+        run_python("docs/sessions/live-hands.md", tmp_path, names)
         assert len(names["hand"].pose) == 2
     finally:
         for site in sites:
@@ -265,30 +268,30 @@ def test_code_of_hand_takes_hold_of_arm_and_lets_go(tmp_path: Path) -> None:
 # --- Python -----------------------------------------------------------------------------------------------
 
 PYTHON_PAGES = {
-    "docs/first-hour.md",
-    "docs/law-interface.md",
-    "docs/json.md",
-    "docs/lab-answers.md",
-    "docs/linear-examples.md",
-    "docs/linear.md",
-    "docs/live-hands.md",
-    "docs/log.md",
-    "docs/log-tools.md",
-    "docs/observed-energy.md",
-    "docs/own-controller.md",
-    "docs/own-plant.md",
-    "docs/policies.md",
-    "docs/port-results.md",
-    "docs/python.md",
-    "docs/rerun.md",
-    "docs/train-policies.md",
-    "docs/sweep-results.md",
+    "docs/tutorials/first-hour.md",
+    "docs/extend/law-interface.md",
+    "docs/reference/json.md",
+    "docs/tutorials/lab-answers.md",
+    "docs/theory/linear-examples.md",
+    "docs/studies/linear.md",
+    "docs/sessions/live-hands.md",
+    "docs/reference/log.md",
+    "docs/logs/log-tools.md",
+    "docs/reference/observed-energy.md",
+    "docs/extend/own-controller.md",
+    "docs/extend/own-plant.md",
+    "docs/studies/policies.md",
+    "docs/theory/port-results.md",
+    "docs/studies/python.md",
+    "docs/logs/rerun.md",
+    "docs/studies/train-policies.md",
+    "docs/reference/sweep-results.md",
 }
-OF_THEIR_OWN = {"docs/live-hands.md", "docs/sweep-results.md"}
+OF_THEIR_OWN = {"docs/sessions/live-hands.md", "docs/reference/sweep-results.md"}
 """Pages whose code needs a session or a sweep, which a test of their own makes."""
 AT_HAND = {
-    "docs/observed-energy.md": "import numpy as np\nfrom trilat_net.core.plug.law_energy import *\n",
-    "docs/rerun.md": "import trilat_net\n",
+    "docs/reference/observed-energy.md": "import numpy as np\nfrom trilat_net.core.plug.law_energy import *\n",
+    "docs/logs/rerun.md": "import trilat_net\n",
 }
 """What a page takes for granted in its code."""
 
@@ -316,15 +319,15 @@ def check_linear(printed: str, _: dict[str, Any]) -> None:
 
 
 def check_linear_examples(printed: str, _: dict[str, Any]) -> None:
-    page = (ROOT / "docs/linear-examples.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs/theory/linear-examples.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| roots \| (.+) \|$", page, re.MULTILINE)
     table = [cell for row in rows for cell in row.split(" | ")]
     assert [line.split()[3] for line in printed.splitlines()] == table
 
 
 def check_ports(_: str, names: dict[str, Any]) -> None:
-    """The lines of the command on docs/ports.md are those of this page's function."""
-    (block,) = (one for one in find_blocks("docs/ports.md") if one.language == "sh")
+    """The lines of the command on docs/studies/ports.md are those of this page's function."""
+    (block,) = (one for one in find_blocks("docs/studies/ports.md") if one.language == "sh")
     ((_, shown),) = read_commands(block.text)
     made = names["describe_ports"](names["ports"]("p_d_margin_two", control__d=1.96))
     assert shown == [" ".join(line.split()) for line in made[:2]]
@@ -341,16 +344,16 @@ def check_energies(_: str, names: dict[str, Any]) -> None:
 
 def check_rerun(_: str, names: dict[str, Any]) -> None:
     error = names["again"].sites["s"].error_rms_rad
-    page = (ROOT / "docs/rerun.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs/logs/rerun.md").read_text(encoding="utf-8")
     assert f"(before={error.before:.4f}, after={error.after:.4f})" in page
 
 
 CHECKS: dict[str, Callable[[str, dict[str, Any]], None]] = {
-    "docs/linear.md": check_linear,
-    "docs/port-results.md": check_ports,
-    "docs/linear-examples.md": check_linear_examples,
-    "docs/observed-energy.md": check_energies,
-    "docs/rerun.md": check_rerun,
+    "docs/studies/linear.md": check_linear,
+    "docs/theory/port-results.md": check_ports,
+    "docs/theory/linear-examples.md": check_linear_examples,
+    "docs/reference/observed-energy.md": check_energies,
+    "docs/logs/rerun.md": check_rerun,
 }
 """By page what it says of the results of its code."""
 
@@ -396,7 +399,7 @@ def test_the_code_about_sweeps_reads_what_a_sweep_left(tmp_path: Path) -> None:
     ]
     trilat("sweep", "p_d_margin", *over, cwd=tmp_path).succeeds()
     names: dict[str, Any] = {"__name__": "page"}
-    run_python("docs/sweep-results.md", tmp_path, names)
+    run_python("docs/reference/sweep-results.md", tmp_path, names)
     assert len(names["results"].rows) == names["plan"].cells == 135
     assert names["least"].keys() <= {0.0, 100.0}
 
@@ -405,6 +408,8 @@ def test_the_code_about_sweeps_reads_what_a_sweep_left(tmp_path: Path) -> None:
 def test_what_certificate_says_first_is_what_stands_on_its_page(tmp_path: Path) -> None:
     trilat("sim", "paper", "-o", "run.mcap", cwd=tmp_path).succeeds()
     (shown,) = (
-        b.text for b in find_blocks("docs/certificate.md") if b.text.startswith("ok   stable")
+        b.text
+        for b in find_blocks("docs/logs/certificate.md")
+        if b.text.startswith("ok   stable")
     )
     assert trilat("certify", "run.mcap", cwd=tmp_path).out.startswith(shown.rstrip())

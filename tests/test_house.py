@@ -1,4 +1,4 @@
-"""How the house is built: names, rooms (docs/packages.md), and the tour through it."""
+"""How the house is built: names, rooms (docs/develop/packages.md), and the tour through it."""
 
 import csv
 import re
@@ -31,7 +31,7 @@ LINE_LIMITS = {  # part: tokens per line, parallel assignments, unpacked tuples 
     "lerobot": (8.0, 0.1, 0, 1.0),
 }
 """A number here only falls, until each part has 8.5, 2, 0 and 4; `python -m tests.line_figures` prints them."""
-TOUR = (house.ROOT / "docs" / "tour.md").read_text(encoding="utf-8")
+TOUR = (house.ROOT / "docs" / "develop" / "tour.md").read_text(encoding="utf-8")
 
 
 CALLED_BY_LIBRARIES = {
@@ -111,7 +111,7 @@ def test_no_test_imports_another() -> None:
 
 @pytest.mark.push
 def test_every_import_between_rooms_has_its_reason() -> None:
-    """The table that docs/packages.md links to has each pair, and no pair that is not there."""
+    """The table that docs/develop/packages.md links to has each pair, and no pair that is not there."""
     with IMPORTS.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     assert all(row["what for"] for row in rows)
@@ -158,8 +158,8 @@ def test_the_readme_is_short() -> None:
     assert len(text.split()) <= 1100
     assert len(re.findall(r"(?<!`)`[^`\n]+`", text)) <= 20
     assert first_screen.partition("![")[0].split() == ["#", "trilat-net"]
-    assert {"docs/references.md", "make demo", "make play"} <= set(
-        re.findall(r"docs/references\.md|make demo|make play", first_screen)
+    assert {"docs/reference/references.md", "make demo", "make play"} <= set(
+        re.findall(r"docs/reference/references\.md|make demo|make play", first_screen)
     )
 
 

@@ -14,7 +14,7 @@ import trilat_net
 from tests.cli.running import trilat
 from trilat_net.analysis.theory import iterate_linear_edges
 
-SHEET = (Path(__file__).parents[1] / "docs" / "lab.md").read_text()
+SHEET = (Path(__file__).parents[1] / "docs" / "tutorials" / "lab.md").read_text()
 BLOCKS = re.findall(r"^```sh\n(.*?)^```", SHEET, re.S | re.M)
 COMMANDS = [
     shlex.split(line)
@@ -51,7 +51,7 @@ def test_no_command_of_the_sheet_tells_results_before_they_are_predicted() -> No
     assert not {("scenario", "show"), ("scenario", "list")} & named
 
 
-ANSWERS = (Path(__file__).parents[1] / "docs" / "lab-answers.md").read_text()
+ANSWERS = (Path(__file__).parents[1] / "docs" / "tutorials" / "lab-answers.md").read_text()
 
 
 def read_groups() -> list[list[float]]:

@@ -250,7 +250,7 @@ def certified(folder: Path) -> str:
 
 
 def uniform_age(order: Any, low_ms: float, high_ms: float) -> float:
-    """The mean age in use by the sums of docs/definitions.md, at 1 kHz, ms."""
+    """The mean age in use by the sums of docs/reference/definitions.md, at 1 kHz, ms."""
     return float(order(uniform(low_ms, high_ms - low_ms).cdf, 1.0)[0])
 
 
@@ -397,30 +397,30 @@ LAB: dict[str, Make] = {
     "from the link, {} and {} J at 6.2 s": energy_of_healing,
 }
 PAGES: dict[str, dict[str, Make]] = {
-    "docs/errata-proof.md": ERRATA,
-    "docs/damping-conditions.md": DAMPING,
-    "docs/port-conditions.md": PORT_CONDITIONS,
-    "docs/lab-answers.md": LAB,
-    "docs/port-results.md": PORTS,
-    "docs/ports.md": {
+    "docs/theory/errata-proof.md": ERRATA,
+    "docs/theory/damping-conditions.md": DAMPING,
+    "docs/theory/port-conditions.md": PORT_CONDITIONS,
+    "docs/tutorials/lab-answers.md": LAB,
+    "docs/theory/port-results.md": PORTS,
+    "docs/studies/ports.md": {
         "not passive at {}-{} Hz; least eigenvalue {} at {} Hz; {} N m s/rad more": lacking,
     },
-    "docs/laws-adaptive.md": {"towards one pose: {} N m/rad": lambda: [G**2 * 1.2]},
-    "docs/linear-method.md": LINEAR_METHOD,
-    "docs/linear-examples.md": LINEAR,
-    "docs/definitions.md": {
+    "docs/reference/laws-adaptive.md": {"towards one pose: {} N m/rad": lambda: [G**2 * 1.2]},
+    "docs/theory/linear-method.md": LINEAR_METHOD,
+    "docs/theory/linear-examples.md": LINEAR,
+    "docs/reference/definitions.md": {
         "± 50 ms gives {} ms and {} ms, uniform 0 to 400 ms gives {} ms and {} ms": lambda: [
             uniform_age(order, *ends)
             for ends in ((150, 250), (0, 400))
             for order in (newest_wins, in_order)
         ]
     },
-    "docs/certificate-premises.md": {
+    "docs/reference/certificate-premises.md": {
         "prints its edge, {} kN/m": lambda: [
             1e-3 * edge("windup", f"{WALL}.stiffness_n_m", 1e3, 4e4, {f"{WALL}.sampled": True})
         ],
     },
-    "docs/stability.md": {
+    "docs/reference/stability.md": {
         "ever more for 200 s, to {} rad/s": lambda: [
             fused("free", 200.0, **keys(DIGITAL)).maxima[0][-2400:, 1].max()
         ],
@@ -437,7 +437,7 @@ PAGES: dict[str, dict[str, Make]] = {
             for T in (50, 100, 150, 200, 250, 300, 350, 400)
         },
     },
-    "docs/benchmarks.md": {
+    "docs/theory/benchmarks.md": {
         "at 500 / 1000 / 2000 Hz | {} / {} / {} rad: orders {} and {}": lambda: distances(
             "second_order"
         ),
@@ -484,8 +484,15 @@ LONG = (
 )
 """Beginnings of words whose numbers take more than 3 s; other tests have their facts."""
 PUSHED = 12
-PUSHED_PAGES = ("docs/linear.md", "docs/port-results.md", "docs/damping-conditions.md")
-PUSHED, PUSHED_PAGES = 12, ("docs/linear-examples.md", "docs/ports.md", "docs/errata.md")
+PUSHED_PAGES = (
+    "docs/studies/linear.md",
+    "docs/theory/port-results.md",
+    "docs/theory/damping-conditions.md",
+)
+PUSHED, PUSHED_PAGES = (
+    12,
+    ("docs/theory/linear-examples.md", "docs/studies/ports.md", "docs/theory/errata.md"),
+)
 """Of so many numbers of these pages one is made on a push; the long tests make all numbers of all pages."""
 ROWS = [
     pytest.param(
@@ -532,12 +539,12 @@ def test_a_number_on_a_page_is_what_is_made(page: str, words: str, make: Make) -
 @pytest.mark.long
 def test_the_example_of_a_certificate_is_what_is_printed(tmp_path: Path) -> None:
     for words in CERTIFIED:
-        check("docs/certificate.md", words, certified(tmp_path))
+        check("docs/logs/certificate.md", words, certified(tmp_path))
 
 
 TUNED = re.findall(
     r"^\| `(\w+)` \| ([\d.]+) \| ([\d.]+) \| (\w+ \d.*) \|$",
-    (ROOT / "docs/fair-comparison-results.md").read_text(encoding="utf-8"),
+    (ROOT / "docs/theory/fair-comparison-results.md").read_text(encoding="utf-8"),
     re.MULTILINE,
 )
 AS_PRINTED = {"": [0.0, 0.0, 0.0, 2.0, 1.0], ", told nothing": 0.0}
@@ -565,7 +572,7 @@ def test_the_table_of_tuned_gains_has_every_range() -> None:
 
 @pytest.mark.parametrize("row", ENDS)
 def test_the_end_of_a_front_is_what_its_gains_make(row: int) -> None:
-    """Of the tables of docs/fair-comparison-results.md with gains: four of the error, then four of settling."""
+    """Of the tables of docs/theory/fair-comparison-results.md with gains: four of the error, then four of settling."""
     assert len(TUNED) == 8
     law, reached, effort_nm, gains = TUNED[row]
     (space,) = select_search_spaces([law], load_scenario("free"))
@@ -590,7 +597,7 @@ def test_the_end_of_a_front_is_what_its_gains_make(row: int) -> None:
 def test_the_gains_as_printed_make_what_the_page_says(told: str) -> None:
     made = tuned(30.0, {"control.theta_hat0": AS_PRINTED[told]})
     check(
-        "docs/fair-comparison-results.md",
+        "docs/theory/fair-comparison-results.md",
         f"| as printed{told} | {{}} | {{}} |",
         [made.error_rad, made.effort_nm],
     )

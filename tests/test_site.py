@@ -16,6 +16,7 @@ import pytest
 import trilat_net as tn
 from tests.golden.surface import all_options
 from tests.live.browsers import browser_page, needs_browser
+from trilat_net.files import find_page
 
 ROOT = Path(__file__).resolve().parents[1]
 HTML = ROOT / "build" / "site" / "html"
@@ -57,7 +58,20 @@ def test_the_menu_has_nine_entries_at_most_and_every_page_once() -> None:
     docs = ROOT / "docs"
     pages = {page.relative_to(docs).as_posix() for page in docs.rglob("*.md")}
     made = {"index.md", "SECURITY.md", "CHANGELOG.md", "LICENSE.md"}
-    assert pages | made == {page for page in named if not page.startswith("reference/")}
+    made |= {f"reference/{name}.md" for name in ("commands", "python", "scenario", "scenarios")}
+    assert pages | made == set(named)
+
+
+def test_a_page_is_found_by_its_name_and_lies_in_the_folder_of_its_menu() -> None:
+    settings = tomllib.loads((ROOT / "docs/site/zensical.toml").read_text(encoding="utf-8"))
+    names: list[str] = []
+    for entry in settings["project"]["nav"]:
+        for pages in entry.values():
+            inside = [Path(page) for page in pages if "/" in page and "maps/" not in page]
+            assert len({page.parent for page in inside}) <= 1
+            names += [page.name for page in inside if (ROOT / "docs" / page).is_file()]
+    assert len(set(names)) == len(names)
+    assert find_page("sweep.md") == ROOT / "docs" / "studies" / "sweep.md"
 
 
 def test_pages_are_short() -> None:

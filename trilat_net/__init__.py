@@ -12,7 +12,7 @@ loop of its own, and the loops exchange their states over a network with delay.
 The control loop of an arm is the function `Site.step`. The same function runs live over a
 network, in virtual time, and again from the log of a run, so the numbers are the same to the
 last bit. Functions of this package return objects with `summary()`, `to_frame()` and
-`to_dict()`. docs/python.md lists them all.
+`to_dict()`. docs/studies/python.md lists them all.
 """
 
 from importlib import import_module as _import_module

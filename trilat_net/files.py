@@ -153,19 +153,20 @@ def find_version() -> str:
 def find_page(name: str) -> Path:
     """Returns the path of a documentation page.
 
-    In a clone of the repository the page is in its folder docs. Otherwise it is where the
+    In a clone of the repository the page is in a folder of docs. Otherwise it is where the
     installation put it.
 
     Args:
-        name: File name of the page, as in "json.md".
+        name: File name of the page, as in "json.md". No two pages have the same name.
 
     Returns:
-        The path. It is not checked whether the file exists.
+        The path. If there is no such page, the path that it would have in the installation.
     """
-    beside_sources = Path(__file__).parents[1] / "docs" / name
-    if beside_sources.is_file():
-        return beside_sources
-    return Path(sys.prefix) / "share" / "doc" / "trilat-net" / name
+    installed = Path(sys.prefix) / "share" / "doc" / "trilat-net"
+    for folder in (Path(__file__).parents[1] / "docs", installed):
+        for page in folder.rglob(name):
+            return page
+    return installed / name
 
 
 def open_regular(path: Path, **options: Any) -> Any:

@@ -30,10 +30,8 @@ def main() -> None:
     for name in BESIDE:
         write(name if name.endswith(".md") else f"{name}.md", read_beside_docs(name))
     write("index.md", read_beside_docs("README.md"))
-    for page in PAGES.glob("*.md"):
-        page.write_text(
-            page.read_text(encoding="utf-8").replace("](../", "]("), encoding="utf-8"
-        )
+    for page in PAGES.rglob("*.md"):
+        lift_links_beside_docs(page)
     write("reference/commands.md", list_commands())
     write("reference/python.md", list_functions())
     write("reference/scenario.md", show_template())
@@ -55,6 +53,13 @@ def read_beside_docs(name: str) -> str:
     """Returns a page that stands beside docs with its links and pictures as docs has them."""
     page = (ROOT / name).read_text(encoding="utf-8")
     return re.sub(r'(\]\(|src=")docs/', r"\1", page)
+
+
+def lift_links_beside_docs(page: Path) -> None:
+    """Rewrites a page's links to what stands beside docs in the repository: here it stands in docs."""
+    ups = "../" * len(page.relative_to(PAGES).parts)
+    text = page.read_text(encoding="utf-8")
+    page.write_text(text.replace(f"]({ups}", f"]({ups.removesuffix('../')}"), encoding="utf-8")
 
 
 def list_commands() -> str:
@@ -79,7 +84,7 @@ def list_functions() -> str:
     """Returns a place for the docstring of every public name."""
     text = [
         "# Python",
-        "[From Python](../python.md) says what there is; here is each function with its arguments.",
+        "[From Python](../studies/python.md) says what there is; here is each function with its arguments.",
     ]
     for name in tn.__all__:
         if name != "__version__":

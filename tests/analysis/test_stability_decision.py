@@ -1,4 +1,4 @@
-"""What the words stable, settled, not stable and open rest on (docs/stability.md)."""
+"""What the words stable, settled, not stable and open rest on (docs/reference/stability.md)."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Code from a log: none is imported unless somebody names its file (docs/code-that-runs.md)."""
+"""Code from a log: none is imported unless somebody names its file (docs/sessions/code-that-runs.md)."""
 
 import hashlib
 import json
@@ -248,8 +248,8 @@ RUN_NONE = {
 
 @pytest.mark.push
 def test_the_page_lists_every_command() -> None:
-    """A row of `docs/code-that-runs.md` says of each command whose code it runs; the others run none."""
-    page = Path(__file__).parents[2] / "docs" / "code-that-runs.md"
+    """A row of `docs/sessions/code-that-runs.md` says of each command whose code it runs; the others run none."""
+    page = Path(__file__).parents[2] / "docs" / "sessions" / "code-that-runs.md"
     rows = [
         line
         for line in page.read_text(encoding="utf-8").splitlines()

@@ -92,10 +92,10 @@ def test_a_figure_that_exists_is_kept(tmp_path: Path) -> None:
 
 
 def test_a_hand_that_was_identified_holds_the_ports(tmp_path: Path) -> None:
-    """As docs/measured-hands.md has it, with the sines of its page."""
+    """As docs/studies/measured-hands.md has it, with the sines of its page."""
     (sines,) = (
         block.text
-        for block in find_blocks("docs/measured-hands.md")
+        for block in find_blocks("docs/studies/measured-hands.md")
         if block.language == "toml"
     )
     shipped = (files("trilat_net") / "scenarios" / "p_d_margin_two.toml").read_text(

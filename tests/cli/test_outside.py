@@ -14,7 +14,7 @@ from tests.execution.logs import external_log
 from trilat_net.log.log_reader import open_log
 
 LAWS = Path(__file__).parents[1] / "laws.py"
-DOC = Path(__file__).parents[2] / "docs" / "own-controller.md"
+DOC = Path(__file__).parents[2] / "docs" / "extend" / "own-controller.md"
 INTERFACE = DOC.with_name("law-interface.md")
 INPUTS = DOC.parent / "data" / "law-inputs.csv"
 FAILING = ("--set", "sites.s.control.law=tests.laws:Failing", "--set", "sites.s.control.at=40")

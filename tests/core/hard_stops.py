@@ -1,4 +1,4 @@
-"""Stops and faults of fast arms, drawn by a seed, against the bounds of docs/coming-to-rest.md.
+"""Stops and faults of fast arms, drawn by a seed, against the bounds of docs/theory/coming-to-rest.md.
 
     python -m tests.core.hard_stops --stops 3000 --faults 500
 

@@ -17,7 +17,7 @@ def gravity_of(theta: Array, q: Array) -> Array:
 def reference(gains: RestGains, part: SiteLog, first: int, rows: int) -> tuple[Array, Array]:
     """q_ref and qd_ref of an arm that comes to rest from its record `first` on, with no torque at its limit.
 
-    Eq. (1) of docs/coming-to-rest.md, joint by joint; q_ref is the integral of qd_ref.
+    Eq. (1) of docs/theory/coming-to-rest.md, joint by joint; q_ref is the integral of qd_ref.
     """
     h_s = 1.0 / part.rate_hz
     q_ref, qd_ref = [part.q[first].copy()], [part.qd[first].copy()]
@@ -39,7 +39,7 @@ def rest_torque(
 ) -> tuple[Array, Array]:
     """Law + w - B s from a record on, and w, of a slow arm whose law does not learn.
 
-    Eq. (2) to (4) of docs/coming-to-rest.md, for rows of its law's torque; w is that with which a tick begins.
+    Eq. (2) to (4) of docs/theory/coming-to-rest.md, for rows of its law's torque; w is that with which a tick begins.
     """
     rows = slice(first, first + len(law))
     q_ref, qd_ref = reference(gains, part, first, len(law))

@@ -1,4 +1,4 @@
-"""Stops and faults of fast arms, against the equations of docs/coming-to-rest.md."""
+"""Stops and faults of fast arms, against the equations of docs/theory/coming-to-rest.md."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ def assert_all_hold(stops: list[Stop]) -> None:
 
 @pytest.mark.long
 def test_drawn_stops_keep_their_bounds() -> None:
-    """`python -m tests.core.hard_stops` measures 3000; the numbers are in docs/coming-to-rest.md."""
+    """`python -m tests.core.hard_stops` measures 3000; the numbers are in docs/theory/coming-to-rest.md."""
     assert_all_hold(list(draw_stops(7, 300)))
 
 

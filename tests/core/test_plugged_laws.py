@@ -135,7 +135,7 @@ def _read_signs() -> dict[str, float]:
                 text = row["meaning"]
                 assert " ON " in text
                 signs[f"{row['object']}.{row['field']}"] = -1.0 if "minus" in text else 1.0
-    page = (ROOT / "docs/own-controller.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs/extend/own-controller.md").read_text(encoding="utf-8")
     for field in ("tau_x", "felt"):
         (text,) = re.findall(rf"^\| `now\.{field}` \|.*", page, re.MULTILINE)
         assert " ON " in text

@@ -40,7 +40,7 @@ AT_REST_RAD_S, REST_WITHIN_S = 0.05, 1.5
 
 @pytest.mark.parametrize("law", ["adaptive", "pd_d"])
 def test_the_reference_comes_to_rest_from_the_own_motion(law: str) -> None:
-    """Eq. (1) of docs/coming-to-rest.md; never faster than the joint, and in its direction."""
+    """Eq. (1) of docs/theory/coming-to-rest.md; never faster than the joint, and in its direction."""
     log = stopped_log(adaptive_text() if law == "adaptive" else TEXT)
     part, gains = log["s"], log.scenario.setup("s").rest
     assert set(part.mode[2000:3500]) == {"stopped"}
@@ -54,7 +54,7 @@ def test_the_reference_comes_to_rest_from_the_own_motion(law: str) -> None:
 
 
 def test_torque_of_stop_is_law_and_what_rests() -> None:
-    """tau = G - K e - d qd - Kd ed + w - B s, w' = -k B s: Eq. (2) to (4) of docs/coming-to-rest.md."""
+    """tau = G - K e - d qd - Kd ed + w - B s, w' = -k B s: Eq. (2) to (4) of docs/theory/coming-to-rest.md."""
     log = stopped_log(TEXT)
     part, rows = log["s"], slice(2000, 3500)
     q, qd = part.q[rows], part.qd[rows]

@@ -1,6 +1,6 @@
 """Judges seeds on all cores: `python -m tests.faults`.
 
-With --write the matrix of docs/faults.md is made, and its evidence: sessions and tests of each fault
+With --write the matrix of docs/reference/faults.md is made, and its evidence: sessions and tests of each fault
 (docs/data/faults.csv), and how often each event came about (docs/data/fault-counts.csv).
 """
 
@@ -22,7 +22,7 @@ from .invariants import allowed_step
 from .judged_seed import Judged, find_undisturbed_step, time_seed
 
 ROOT = Path(__file__).parents[2]
-PAGE = ROOT / "docs" / "faults.md"
+PAGE = ROOT / "docs" / "reference" / "faults.md"
 TESTS = ROOT / "docs" / "data" / "faults.csv"
 COUNTS = ROOT / "docs" / "data" / "fault-counts.csv"
 BEGIN, END = "<!-- made by python -m tests.faults --write -->", "<!-- end -->"
@@ -189,7 +189,7 @@ def main() -> int:
     parser.add_argument(
         "--write",
         action="store_true",
-        help="run the matrix's tests too, and write docs/faults.md",
+        help="run the matrix's tests too, and write docs/reference/faults.md",
     )
     parser.add_argument("--jobs", type=int, help="processes at a time; all cores if left out")
     asked = parser.parse_args()

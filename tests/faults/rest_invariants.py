@@ -6,7 +6,7 @@ its first 0.15 s, in which w takes on what nobody knew of gravity (its motion is
 tick: a torque that begins at zero cannot hold what hangs until it has grown to it.
 
 In its blend as afterwards an arm may have no more energy than at the beginning but for two works, both stated
-in docs/coming-to-rest.md: that of gravity which the law does not know, and that of the last torque, Eq. (5).
+in docs/theory/coming-to-rest.md: that of gravity which the law does not know, and that of the last torque, Eq. (5).
 """
 
 from collections.abc import Iterator, Sequence

@@ -146,7 +146,7 @@ def test_with_keys_all_stop_an_arm_only_the_operator_enables(stage: Stage) -> No
 
 
 class Joined(Keyed):
-    """Every computer has a router of its own, as on docs/two-operators.md; all of them know the public one."""
+    """Every computer has a router of its own, as on docs/sessions/two-operators.md; all of them know the public one."""
 
     def __init__(self, stage: Stage, duration: str) -> None:
         super().__init__(stage, duration)

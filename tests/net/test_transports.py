@@ -1,4 +1,4 @@
-"""The table of transports on docs/network.md: what arrives over each, and which ones are refused."""
+"""The table of transports on docs/sessions/network.md: what arrives over each, and which ones are refused."""
 
 from contextlib import closing
 from pathlib import Path

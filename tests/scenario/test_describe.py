@@ -133,7 +133,7 @@ def test_check_states_the_time_to_rest() -> None:
 
 @pytest.mark.parametrize("name", ["free", "paper_rods", "play", "six_joints", "unlike_arms"])
 def test_motors_bear_the_speeds_of_shipped_scenarios(name: str) -> None:
-    """Eq. (7) of docs/coming-to-rest.md: the limits of torque hold gravity and Coriolis torques."""
+    """Eq. (7) of docs/theory/coming-to-rest.md: the limits of torque hold gravity and Coriolis torques."""
     scenario = load_scenario(name, {"on_stale.action": "glide"})
     for site in scenario.names:
         bounds = find_rest_bounds(scenario, site)

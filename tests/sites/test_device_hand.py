@@ -253,10 +253,12 @@ def test_record_that_is_old_is_felt_no_more(tmp_path: Path) -> None:
 
 
 def test_device_of_the_page_leads_an_arm(tmp_path: Path) -> None:
-    """The class of docs/devices.md, which moves to the right at 5 cm/s and presses its clutch after 1 cm."""
+    """The class of docs/sessions/devices.md, which moves to the right at 5 cm/s and presses its clutch after 1 cm."""
     names: dict[str, Any] = {}
     (code,) = [
-        block.text for block in find_blocks("docs/devices.md") if block.language == "python"
+        block.text
+        for block in find_blocks("docs/sessions/devices.md")
+        if block.language == "python"
     ]
     exec(code, names)
     pushed, felt_n = names["Pushed"](), list[float]()

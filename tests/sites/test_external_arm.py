@@ -655,8 +655,8 @@ def test_the_example_of_a_message_is_one() -> None:
 
 def test_the_page_names_every_field_of_a_message() -> None:
     docs = Path(__file__).parents[2] / "docs"
-    how_to = (docs / "external-arm.md").read_text(encoding="utf-8")
-    page = (docs / "external-arm-messages.md").read_text(encoding="utf-8")
+    how_to = (docs / "sessions" / "external-arm.md").read_text(encoding="utf-8")
+    page = (docs / "reference" / "external-arm-messages.md").read_text(encoding="utf-8")
     table = page[page.index("| key |") : page.index("The torque stands")]
     assert set(re.findall(r"`(\w+)`", table)) == set(ArmMeasurement.__struct_fields__)
     assert f"| {VERSION}, the version of the messages |" in table

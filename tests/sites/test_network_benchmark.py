@@ -89,7 +89,7 @@ def row(needs, p99_ms: float, lost: int = 0) -> dict:
 
 @pytest.mark.long
 def test_a_network_is_judged_by_the_delay_margin_of_linear() -> None:
-    """P+d at 200 ms holds up to 229.8 ms, docs/linear.md, and its links hide what is shorter than theirs."""
+    """P+d at 200 ms holds up to 229.8 ms, docs/studies/linear.md, and its links hide what is shorter than theirs."""
     needs = find_needs(tn.load_scenario("p_d_margin"))
     margin = tn.linear("p_d_margin", ports=False).to_dict()["margin"]["stable"]
     assert needs.stable_ms == [[1e3 * one["from_s"], 1e3 * one["to_s"]] for one in margin]

@@ -44,6 +44,7 @@ from trilat_net.app.ros2_topics import BridgeEnds, SiteTopics
 from trilat_net.app.running_session import ShareHistory
 from trilat_net.core.step.ticks import Mode, TickRecord
 from trilat_net.errors import RunFailed, UsageError
+from trilat_net.files import find_page
 from trilat_net.log.ros2 import cdr
 from trilat_net.log.ros2.published import list_topics
 from trilat_net.log.ros2.robot_model import RobotModel
@@ -196,8 +197,7 @@ def test_joints_that_are_missing_or_not_finite_are_named(
 
 
 PAGES = "".join(
-    (Path(__file__).parents[2] / "docs" / page).read_text(encoding="utf-8")
-    for page in ("ros2-topics.md", "ros2.md")
+    find_page(page).read_text(encoding="utf-8") for page in ("ros2-topics.md", "ros2.md")
 )
 FILE = "".join(re.findall(r"```\n((?:joint_states = |\[sites\.s\]).*?)```", PAGES, re.DOTALL))
 """The examples of the pages."""

@@ -1,4 +1,4 @@
-"""The corrections of docs/errata-proof.md, 5 and 8: the derivative of V by the chain rule, in symbols."""
+"""The corrections of docs/theory/errata-proof.md, 5 and 8: the derivative of V by the chain rule, in symbols."""
 
 from functools import cache
 from typing import Any, NamedTuple

@@ -1,4 +1,4 @@
-"""The corrections of docs/errata-arm.md, 1-4: the arm, derived from its energies, and its parameters."""
+"""The corrections of docs/theory/errata-arm.md, 1-4: the arm, derived from its energies, and its parameters."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""The corrections of docs/errata-proof.md, continued: weights, hands, convergence, and what dominance means."""
+"""The corrections of docs/theory/errata-proof.md, continued: weights, hands, convergence, and what dominance means."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""The final loop of a run and its roots (docs/linear.md; docs/stability.md, "Exact roots")."""
+"""The final loop of a run and its roots (docs/studies/linear.md; docs/reference/stability.md, "Exact roots")."""
 
 from fractions import Fraction
 from pathlib import Path

@@ -290,7 +290,7 @@ def test_below_its_margin_p_d_grows(name: str, d: float) -> None:
 
 @pytest.mark.long
 def test_margin_with_unequal_shares_is_that_of_their_smallest_eigenvalue() -> None:
-    """-0.8, so 1.6: as `docs/lab.md` asks."""
+    """-0.8, so 1.6: as `docs/tutorials/lab.md` asks."""
     row = {
         "m1": {"m2": 0.1, "s": 0.9},
         "m2": {"m1": 0.8, "s": 0.2},

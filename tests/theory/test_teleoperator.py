@@ -121,7 +121,7 @@ def test_what_acted_at_the_rest_goes_on_acting() -> None:
 @pytest.mark.parametrize("delay_ms", [0.0, 50.0, 200.0, 800.0])
 @pytest.mark.parametrize("name", ["free", "two_sites"])
 def test_the_papers_law_is_passive_in_r_not_qd(name: str, delay_ms: float) -> None:
-    """What its theorem states of the nonlinear loop with hands, docs/errata-proof.md."""
+    """What its theorem states of the nonlinear loop with hands, docs/theory/errata-proof.md."""
     _, now, _, loop = at_pose(name, {"link.delay_ms": delay_ms, **ALONE[name]})
     assert in_r(now, loop).passive
     assert not check_passivity(build_admittance(loop), grid(loop)).passive

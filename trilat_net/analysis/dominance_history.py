@@ -9,7 +9,7 @@ The stability proof uses the sum of the energies of all sites, in which site i h
 
 Here pi is the left eigenvector of the matrix alpha for the eigenvalue 1 (the Perron vector),
 and c_i is the factor by which the damping gain of site i differs from that of the first site.
-Without these weights the proof does not hold (docs/errata-proof.md).
+Without these weights the proof does not hold (docs/theory/errata-proof.md).
 
 Invariant:
     - The factors depend only on time and on the changes that were carried out.

@@ -7,7 +7,7 @@ follows. From e the classes compute the reference velocity of the joints, which 
 `TaskFollowing` uses an inverse of the Jacobian J that is damped near singular poses.
 
 Invariant:
-    - All functions are written with NumPy from the equations of docs/task-space.md,
+    - All functions are written with NumPy from the equations of docs/reference/task-space.md,
       independently of the simulation.
     - Directions of space in which the end effector does not follow have no effect.
     - Near a singular pose the end effector does not reach the velocity -Lambda e, where Lambda

@@ -15,7 +15,7 @@ steadily for a while, because it receives energy from a faster joint. If the fas
 decays, the joint is undecided.
 
 Invariant:
-    - All commands use the judgement of this module (docs/stability.md).
+    - All commands use the judgement of this module (docs/reference/stability.md).
     - Each joint of each site is judged separately, and the worst joint decides.
     - A judgement describes the record and predicts nothing.
     - Further knowledge, such as the energy function V of the stability proof or the

@@ -514,8 +514,8 @@ class WallEnergy(NamedTuple):
     systems", J. Robotic Systems 14 (1997).
 
     The condition is sufficient, if B acts on the speed at the tick, and the motion is straight
-    within a tick (docs/certificate-premises.md). `trilat linear` shows whether the loop is
-    stable in contact.
+    within a tick (docs/reference/certificate-premises.md). `trilat linear` shows whether the
+    loop is stable in contact.
 
     Attributes:
         site: Site of the wall.

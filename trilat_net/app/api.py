@@ -119,7 +119,7 @@ def export(
         out: Path of the file, or of the folder for parquet, csv and lerobot.
         force: True to replace an existing file or folder.
         settings: Settings of the format, as `fps=30`, `observations="plugin"` and
-            `task="grasp"` of lerobot (docs/lerobot.md).
+            `task="grasp"` of lerobot (docs/studies/lerobot.md).
 
     Raises:
         UsageError: There is no such format or setting, a package is missing, or the path
@@ -208,7 +208,7 @@ def certify(
 def metrics(log: AnyLog) -> LogMetrics:
     """Measures the tracking, effort, energies, force sharing and network of a run.
 
-    The command is `trilat metrics`. docs/metrics.md has the formula of every metric.
+    The command is `trilat metrics`. docs/reference/metrics.md has the formula of every metric.
 
     >>> found = tn.metrics(tn.simulate("two_sites", duration_s=0.1))
     >>> found.sites["m"]["rms_error_rad"].value > 0.0
@@ -361,8 +361,8 @@ def sweep(
         judge: "verdict" or "twins". Twins are two runs that differ by a small disturbance. With
             "twins", the exponent with which the disturbance grows is measured in each cell, in
             addition to its verdict.
-        metrics: Keys of docs/metrics.md that are measured in each run. They become columns of
-            the rows.
+        metrics: Keys of docs/reference/metrics.md that are measured in each run. They become
+            columns of the rows.
         out: Folder of the results. A sweep in it is continued. By default the next free
             runs/sweep-NAME-N.
         jobs: Number of processes. None uses one per core.

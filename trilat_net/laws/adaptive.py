@@ -40,8 +40,8 @@ class Adaptive(ControlLaw):
 
     The loop is stable for any constant delays without external torque, if the dominance matrix
     is irreducible and the matrices Kd of all sites differ by scalar factors only (the paper's
-    theorem, with the weights of docs/errata-proof.md). This condition is sufficient and does
-    not cover delays that vary.
+    theorem, with the weights of docs/theory/errata-proof.md). This condition is sufficient and
+    does not cover delays that vary.
 
     Gamma = 0 and theta_hat0 = theta make the law with known parameters; Kd = 0 removes the
     damping of the error.

@@ -23,10 +23,10 @@ Symbols:
     - Lambda, Kp, Kd, Gamma, Gamma_l: gains.
 
 The functional V of the law `adaptive` does not rise, because the adaptation of l_hat cancels
-the term that wrong lengths add. The end of its proof does not carry over. docs/laws-lengths.md
-proves instead that e and qd go to zero, because an end effector of finite reach cannot move at
-one velocity for ever. Source of the adaptive Jacobian: Cheah, Liu and Slotine, Int. J. Robotics
-Research 25 (2006).
+the term that wrong lengths add. The end of its proof does not carry over.
+docs/theory/laws-lengths.md proves instead that e and qd go to zero, because an end effector of
+finite reach cannot move at one velocity for ever. Source of the adaptive Jacobian: Cheah, Liu
+and Slotine, Int. J. Robotics Research 25 (2006).
 
 Invariant:
     - Both estimates are integrated by the trapezoid rule, like the estimate of `adaptive`.
@@ -318,10 +318,10 @@ class AdaptiveKinematics(ControlLaw):
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
         """Evaluates whether this control law is known to be stable in a scenario.
 
-        The proof in docs/laws-lengths.md that e and qd go to zero requires that all delays are
-        constant, that the dominance matrix is irreducible, that the elbow of each arm stays
-        bent, and that the true lengths of the links lie between the bounds `least_m` and
-        `most_m`.
+        The proof in docs/theory/laws-lengths.md that e and qd go to zero requires that all
+        delays are constant, that the dominance matrix is irreducible, that the elbow of each
+        arm stays bent, and that the true lengths of the links lie between the bounds `least_m`
+        and `most_m`.
 
         Args:
             situation: The site, its peers (the other sites) and the delays between them.

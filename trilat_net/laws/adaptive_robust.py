@@ -29,7 +29,7 @@ class AdaptiveRobust(AdaptiveBox):
     Premises: constant delays, no operator, theta in its box, and a disturbance of at most rho
     at each joint. Then the mean over time of the power that V, the energy function of the
     stability proof, dissipates is at most 0.3003 sum_i beta_i sum rho width, and no stronger
-    statement is proved; docs/laws-adaptive.md derives the bound.
+    statement is proved; docs/reference/laws-adaptive.md derives the bound.
 
     Source: Slotine and Li, "Applied Nonlinear Control" (1991), 7.1, for the smooth term.
 

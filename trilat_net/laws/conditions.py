@@ -152,11 +152,11 @@ def judge_position_exchange(
     The condition holds for arms of any mass. For two sites, it is due to Nuno, Basanez, Ortega
     and Spong, IJRR 28, 2009. More than two sites need reversible dominance factors, see
     `find_least_reversible`, and the same stiffness K, damping d and delay T at all sites
-    (docs/damping-conditions.md, 13).
+    (docs/theory/damping-conditions.md, 13).
 
     A torque that is held for the period h acts h / 2 later. Therefore d is reduced by K h / 2
     and T increased by h / 2, for arms whose least inertia is above d h / 2
-    (docs/laws-springs.md).
+    (docs/reference/laws-springs.md).
 
     Args:
         situation: The situation of the site.

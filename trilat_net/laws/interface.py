@@ -331,7 +331,7 @@ class ControlLaw:
 
     A law may also define the methods of `LawSettings`. When Python creates the class of a law,
     it derives a second class, `Settings`, which has the gains and these methods.
-    docs/law-interface.md describes the other class variables of a law.
+    docs/extend/law-interface.md describes the other class variables of a law.
 
     Attributes:
         Settings: Class that stores the gains of the law in a scenario, the description of an

@@ -29,7 +29,7 @@ class PD(ControlLaw):
     max(abs(lambda_min(alpha)), 0.2172) K T. For some masses this bound is also necessary. Two
     sites need 4 d_1 d_2 > (T_1 + T_2)^2 K_1 K_2. For other dominance factors some heavy arms
     are unstable at any d. These bounds hold in continuous time: torques that are held over a
-    period need more damping (docs/laws-springs.md).
+    period need more damping (docs/reference/laws-springs.md).
 
     Attributes:
         K: Stiffness per joint, N m/rad.

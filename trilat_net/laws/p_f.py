@@ -39,7 +39,7 @@ class PF(ControlLaw):
     K and d_s are the slave's gains. This is the edge for a light slave, whose inertia M_s per
     joint is at most d_s^2 / (4 K). For a heavier slave the edge is higher and has no closed
     form; the larger one of this value and k_f K (2 M_s + T d_s)^2 / (4 M_s d_s) is sufficient
-    (docs/port-conditions.md, 15).
+    (docs/theory/port-conditions.md, 15).
 
     Attributes:
         K: Stiffness per joint, N m/rad.

@@ -108,7 +108,7 @@ class SaturatedPd(ControlLaw):
         The condition of a linear spring of stiffness K with a damper applies at any pose at
         rest, also where sites are held apart. That the spring is nowhere stiffer than K is not
         the reason: the slopes of a hyperbolic tangent form a positive semidefinite matrix, and
-        the Schur product theorem gives the bound (docs/damping-conditions.md, 13).
+        the Schur product theorem gives the bound (docs/theory/damping-conditions.md, 13).
 
         If the gravity torque of the arm is known, the torque limit of each joint must be above
         the sum of the gravity torque and the largest spring torque P. The text then states up

@@ -54,7 +54,8 @@ class SixChannel(FourChannel):
         expected_shares = complementary_shares(a)
         if not np.allclose(situation.alpha, expected_shares):
             text = (
-                "the shares are not those of one factor: see six_channel in docs/laws-forces.md"
+                "the shares are not those of one factor: see six_channel in "
+                "docs/reference/laws-forces.md"
             )
             return StabilityCondition(False, text)
 

@@ -898,7 +898,7 @@ def open_log(
         progress: Function that is called now and then with the number of bytes read and their
             total.
         law: Files of control laws that the log names and that may run when the log is executed,
-            see docs/code-that-runs.md. Laws that this process has run itself need no
+            see docs/sessions/code-that-runs.md. Laws that this process has run itself need no
             permission.
         other_version: True if these files may have other hashes than the log names.
         remember: True if these laws may also run for other logs that name their hashes, with

@@ -13,7 +13,7 @@ The wire format has three elements:
   of the sender.
 - A liveliness token per node and per endpoint, from which other programs learn what exists.
 
-Source: ros2/rmw_zenoh, docs/design.md and rmw_zenoh_cpp/src/detail (at 99a6a2bd).
+Source: ros2/rmw_zenoh, docs/develop/design.md and rmw_zenoh_cpp/src/detail (at 99a6a2bd).
 
 Invariant:
     - Every message has an attachment, and its number is at least 1. A ROS program aborts if it

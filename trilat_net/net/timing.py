@@ -19,8 +19,8 @@ was sent. Therefore the offset of the peer's clock (peer minus local) is at most
 least t3 - t4. `offset` computes an estimate from the tightest of these limits.
 
 Invariant:
-    - Ticks are due on the leader's clock, to the nanosecond (law L1 of docs/design.md). The
-      leader is the first site of the scenario.
+    - Ticks are due on the leader's clock, to the nanosecond (law L1 of docs/develop/design.md).
+      The leader is the first site of the scenario.
     - A site on another machine follows the leader's clock by running its own schedule slightly
       faster or slower, by at most SLEW_LIMIT, and never by a step, so that no tick is skipped
       or repeated. If the leader disconnects, the site continues with the last estimate.

@@ -314,7 +314,7 @@ def _describe_paper_weights(certificate: Certificate) -> str:
         return ""
     largest_j = balance.V.max()
     sentence = f"V would have risen by {rise.amount:.3g} J of {largest_j:.4g} J"
-    return f"with the paper's weights, ones, {sentence} (docs/errata-proof.md, 6)"
+    return f"with the paper's weights, ones, {sentence} (docs/theory/errata-proof.md, 6)"
 
 
 def describe_judgement(certificate: Certificate) -> str:

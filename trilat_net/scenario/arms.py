@@ -86,7 +86,7 @@ class Arm(fields.Frozen, frozen=True):
         known: False if the masses and inertias are unknown, as those of a robot that has not
             been identified. They then enter no formula. Only for a real robot.
         dead_man: True if the arm moves only while somebody holds its dead-man switch
-            (`docs/external-arm.md`). Only for a real robot.
+            (`docs/sessions/external-arm.md`). Only for a real robot.
         urdf: Name of the URDF file of the arm, in `Scenario.urdf`. Empty for the planar arm.
         base_xyz_m: Position of the base in the frame that all sites share, in m. Walls and
             operators are described in this frame as well.

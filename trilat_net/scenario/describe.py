@@ -53,7 +53,7 @@ COUPLED_OPERATORS = (
 IRREVERSIBLE_SHARES = (
     "the shares are not reversible (alpha_ij alpha_jk alpha_ki is not alpha_ik alpha_kj "
     "alpha_ji): some passive operators make the loop unstable, whatever its damping "
-    "(docs/port-conditions.md, 14)"
+    "(docs/theory/port-conditions.md, 14)"
 )
 
 

@@ -6,8 +6,8 @@ they rest. Each joint is damped in proportion to its speed, within the limits of
 how long this takes, how fast the joints may become, and whether the motors are strong enough
 for the arm's gravity and Coriolis torques.
 
-The formulas are derived in docs/coming-to-rest.md, and the numbers of equations in comments
-refer to it.
+The formulas are derived in docs/theory/coming-to-rest.md, and the numbers of equations in
+comments refer to it.
 
 Invariant:
     - The bounds of a scenario, the description of an experiment, are always the same. The poses

@@ -266,7 +266,7 @@ class ActedHand(HandPlayer):
 class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
     """An environment in which a policy operates one arm; also called `tn.make_env`.
 
-    See docs/train-policies.md.
+    See docs/studies/train-policies.md.
 
     >>> bent = {f"sites.{name}.q0_rad": [0.4, 1.0] for name in ("m", "s")}
     >>> env = tn.make_env("two_sites", bent, user="m", duration_s=1)

@@ -341,7 +341,7 @@ def _find_sines(scenario: Scenario) -> _Sines:
         raise UsageError(
             "no operator of kind 'multisine' in the scenario moves an arm, so the "
             "reaction of a hand cannot be distinguished from its own movements "
-            "(docs/measured-hands.md)"
+            "(docs/studies/measured-hands.md)"
         )
     frequencies_hz: list[float] = []
     for multisine in multisines:

@@ -666,7 +666,8 @@ class RunMetrics(msgspec.Struct, frozen=True, kw_only=True):
         missing: Number of ticks (control periods) without a record, over all sites.
         windows: Ranges of the quantities within each window, a part of the run with limits of
             its own. Empty for a window that ends after the run.
-        metrics: Those metrics of `docs/metrics.md` for which the scenario states a limit.
+        metrics: Those metrics of `docs/reference/metrics.md` for which the scenario states a
+            limit.
     """
 
     simulated_s: float
@@ -862,8 +863,8 @@ def measure_virtual_run(scenario: Scenario) -> RunMetrics:
     """Runs a scenario in virtual time and returns the metrics of the run.
 
     The records are discarded as soon as their statistics are known, so that long runs need
-    little memory. Only if the scenario limits a metric of `docs/metrics.md`, which is computed
-    from a complete log, all records are kept.
+    little memory. Only if the scenario limits a metric of `docs/reference/metrics.md`, which is
+    computed from a complete log, all records are kept.
 
     Args:
         scenario: Scenario to run: arms, control laws, links and duration.
@@ -1116,7 +1117,7 @@ def _evaluate_windows(expect: Expect, metrics: RunMetrics) -> Iterator[Expectati
 
 
 def _evaluate_metrics(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
-    """Yields the outcome of each limited metric of docs/metrics.md."""
+    """Yields the outcome of each limited metric of docs/reference/metrics.md."""
     for key, limits in expect.metrics.items():
         value, reason, _ = metrics.metrics[key]
         measured = None if value is None else Range(value, value)

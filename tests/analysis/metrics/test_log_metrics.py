@@ -141,7 +141,7 @@ def test_loops_are_told_of_where_a_clock_was_read() -> None:
 
 
 def test_the_docs_have_a_line_for_every_quantity() -> None:
-    page = (Path(__file__).parents[3] / "docs" / "metrics.md").read_text()
+    page = (Path(__file__).parents[3] / "docs" / "reference" / "metrics.md").read_text()
     for quantity in quantities():
         assert f"`{quantity.key}`" in page, quantity.key
 

@@ -158,7 +158,7 @@ def test_a_run_that_diverges_says_when() -> None:
 
 
 def test_a_trial_sees_no_roots_but_a_cell_and_a_certificate_do() -> None:
-    """Arms that start at one pose stay there, however unstable it is (docs/stability.md)."""
+    """Arms that start at one pose stay there, however unstable it is (docs/reference/stability.md)."""
     together = {f"sites.{name}.q0_rad": [0.2, 0.3] for name in ("m1", "m2", "s")}
     scenario = load_scenario(
         "p_d_margin", {**together, "control.d": 0.5, "rate_hz": 100, "duration_s": 5.0}

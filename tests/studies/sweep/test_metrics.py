@@ -1,4 +1,4 @@
-"""Metrics of a sweep: asked for by the keys of docs/metrics.md, they are those of a log of the same run."""
+"""Metrics of a sweep: asked for by the keys of docs/reference/metrics.md, they are those of a log of the same run."""
 
 from pathlib import Path
 
@@ -83,7 +83,7 @@ def test_a_metric_that_is_none_is_refused_with_the_nearest(tmp_path: Path) -> No
         "settle",
         cwd=tmp_path,
     )
-    done.refuses("--metric", "settle", "settle_s", "docs/metrics.md")
+    done.refuses("--metric", "settle", "settle_s", "docs/reference/metrics.md")
     done = trilat(
         "sweep",
         "two_sites",

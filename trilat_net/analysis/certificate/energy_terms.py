@@ -20,7 +20,7 @@ With |x|^2 = x'Kd x and the delay T from peer j, the derivative without external
 
 The first line dissipates energy. The second line transfers energy between sites, and cancels in
 a suitably weighted sum over all sites. In task space, e and qd_j concern the end effectors.
-docs/certificate-energy.md explains the derivation.
+docs/theory/certificate-energy.md explains the derivation.
 
 Each term is integrated over a tick period by the trapezoid rule. At the end of the period e
 jumps to the value of the next sample. The energy of this jump is computed exactly.

@@ -2,7 +2,7 @@
 
 A site is the process that runs one arm, and the sites follow each other's motion. The theorem
 says that an energy function V of all arms never rises, unless an operator supplies energy. Its
-proof is in docs/theorem.md. The theorem has conditions, called premises:
+proof is in docs/theory/theorem.md. The theorem has conditions, called premises:
 
 - The delays of the links are constant.
 - The dominance factors, the weights with which the sites follow each other, are constant. Every

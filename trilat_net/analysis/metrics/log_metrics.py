@@ -356,7 +356,7 @@ def find_quantity(key: str) -> Quantity:
     if key not in known:
         nearest = suggest_nearest(key, list(known))
         raise KeyError(
-            f"there is no metric {key!r}{nearest}; docs/metrics.md lists all metrics"
+            f"there is no metric {key!r}{nearest}; docs/reference/metrics.md lists all metrics"
         )
     return known[key]
 

@@ -6,8 +6,8 @@ which the environment pushes another arm.
 
 In a closed loop, each of the two signals x and y depends on the other. Therefore a third signal
 d, the drive, is needed, which depends on nothing else, such as the operator's planned torque.
-The ratio y / x at a frequency is S_dy / S_dx, where S is a cross-spectrum. docs/metrics.md
-names the drives and the sources.
+The ratio y / x at a frequency is S_dy / S_dx, where S is a cross-spectrum.
+docs/reference/metrics.md names the drives and the sources.
 
 Invariant:
     - A ratio is given at the frequency with the strongest drive, and at all frequencies whose

@@ -7,8 +7,9 @@ describes: the run, a site (the process that runs one arm), a link or a wall.
 
 Invariant:
     - A value is a finite number, or None with a reason.
-    - A quantity is defined beside its function in this folder and explained in docs/metrics.md.
-      Everything that shows, compares or requests a metric uses this definition.
+    - A quantity is defined beside its function in this folder and explained in
+      docs/reference/metrics.md. Everything that shows, compares or requests a metric uses this
+      definition.
 """
 
 import math

@@ -13,8 +13,8 @@ energy of this term is
     E_ij = int qd_i' S_i ( p_j(t - T_ij) - p_j(t) ) dt
 
 Here qd_i is the joint velocity of site i, p_j the signal that the law uses from site j, such as
-its position, and S_i the gain of the law for this signal. docs/metrics.md lists p_j and S_i for
-each law, and the sources.
+its position, and S_i the gain of the law for this signal. docs/reference/metrics.md lists p_j
+and S_i for each law, and the sources.
 """
 
 import numpy as np

@@ -13,7 +13,7 @@ tau_i on the arms satisfy
 Here pi is the left eigenvector of the matrix of dominance factors for the eigenvalue 1 (Perron
 vector). K_i is the stiffness, in N m/rad, with which the controller of site i pulls its arm to
 the position that it follows. The equation predicts the torque that the operator feels.
-docs/metrics.md derives each metric.
+docs/reference/metrics.md derives each metric.
 
 Invariant:
     - A stiffness is reported only if nothing but a single operator changed between the two

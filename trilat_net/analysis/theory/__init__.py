@@ -1,8 +1,8 @@
 """Predicts stability, delay margins and haptic properties of the arms by linear analysis.
 
 The control loop of all arms, with its delays and ticks, is linearised about a pose in which all
-arms rest. Its characteristic roots tell whether small motions die away. docs/linear.md and
-docs/ports.md have the definitions, equations and sources.
+arms rest. Its characteristic roots tell whether small motions die away. docs/studies/linear.md
+and docs/studies/ports.md have the definitions, equations and sources.
 
 Invariant:
     - The equations are written a second time in plain NumPy and share nothing with the compiled

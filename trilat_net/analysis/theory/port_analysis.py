@@ -147,7 +147,7 @@ def compute_proof_weights(conditions: OperatingConditions) -> Array:
     A site is a process that runs one arm. The weight of site i is beta_i = pi_i / c_i. pi is
     the left eigenvector of the matrix of dominance factors, the weights with which sites follow
     each other. c_i is the gain of site i relative to gains that are common to all sites. The
-    proof is in docs/errata-proof.md.
+    proof is in docs/theory/errata-proof.md.
 
     Args:
         conditions: The sites, gains and dominance factors.

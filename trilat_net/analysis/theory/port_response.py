@@ -20,7 +20,7 @@ Sources:
     - The difference of the free and the clamped impedance (Z-width): Hashtrudi-Zaad and
       Salcudean, "Analysis and evaluation of stability and performance robustness for
       teleoperation control architectures", ICRA (2000). The ratio of the two impedances is our
-      own measure (docs/ports.md).
+      own measure (docs/studies/ports.md).
 
 Invariant:
     - Torques act on the joint, so that torque times velocity is the power that the operator

@@ -226,7 +226,7 @@ def evaluate_site_rates(site: SiteSetup, x: Numbers) -> SiteRates:
     A site is a process that runs one arm. Its states are joint angles, joint velocities and
     parameter estimates. Operators and environments, such as walls, act as they do in the setup.
     The equations are those of the site's control law and of the dynamics of its arm
-    (docs/laws.md).
+    (docs/reference/laws.md).
 
     Args:
         site: Setup of the site.

@@ -129,7 +129,9 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
     help="Two people, one remote arm, and a network with delays: live, simulated, or again "
     "from the log.",
-    epilog="Start with: trilat live play\n\nDocs: docs/first-hour.md, docs/commands.md",
+    epilog=(
+        "Start with: trilat live play\n\nDocs: docs/tutorials/first-hour.md, docs/commands.md"
+    ),
 )
 
 
@@ -174,7 +176,7 @@ _PANEL_OF = {name: panel for panel, names in _PANELS.items() for name in names}
 _GROUPS: dict[str, dict[str, Any]] = {
     "log": {
         "help": "Inspects, checks, signs, recovers, exports or views a log.",
-        "epilog": "Example: trilat log info run.mcap\n\nDocs: docs/log-tools.md",
+        "epilog": "Example: trilat log info run.mcap\n\nDocs: docs/logs/log-tools.md",
     },
     "scenario": {
         "help": "Lists, shows, checks and creates scenarios.",
@@ -182,30 +184,35 @@ _GROUPS: dict[str, dict[str, Any]] = {
     },
     "new": {
         "help": "Creates your own control law, hand or plant, with a test.",
-        "epilog": "Example: trilat new law mylaw.py\n\nDocs: docs/own-controller.md",
+        "epilog": "Example: trilat new law mylaw.py\n\nDocs: docs/extend/own-controller.md",
     },
     "identify": {
         "help": "Identifies the dynamics of the hand that holds an arm.",
         "epilog": (
-            "Example: trilat identify hand run.mcap --site m1\n\nDocs: docs/measured-hands.md"
+            "Example: trilat identify hand run.mcap --site m1\n\n"
+            "Docs: docs/studies/measured-hands.md"
         ),
     },
     "trace": {
         "help": "Imports delays that another program measured.",
-        "epilog": "Example: trilat trace import irtt run.json.gz\n\nDocs: docs/delay-traces.md",
+        "epilog": (
+            "Example: trilat trace import irtt run.json.gz\n\nDocs: docs/extend/delay-traces.md"
+        ),
     },
     "experiment": {
         "help": "Runs studies with people, from the protocol to the tables.",
-        "epilog": "Example: trilat experiment new reaching.toml\n\nDocs: docs/experiments.md",
+        "epilog": (
+            "Example: trilat experiment new reaching.toml\n\nDocs: docs/studies/experiments.md"
+        ),
     },
     "set": {
         "callback": options.expand_option_tuples(sessions.set_command),
         "epilog": "Example: trilat set --session paper link 'm1->s' --delay 350ms\n\n"
-        "Docs: docs/links.md",
+        "Docs: docs/reference/links.md",
     },
     "keys": {
         "help": "Creates keys that encrypt a session or sign logs.",
-        "epilog": "Example: trilat keys pair lab\n\nDocs: docs/keys.md",
+        "epilog": "Example: trilat keys pair lab\n\nDocs: docs/sessions/keys.md",
     },
 }
 _GROUP_OPTIONS = {"set": "--session paper "}

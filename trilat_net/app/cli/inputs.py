@@ -60,7 +60,7 @@ ShownScenario = Annotated[
 """The scenario or the log whose scenario is printed."""
 
 
-@options.command("paper --set control.Kd=5", page="docs/laws.md")
+@options.command("paper --set control.Kd=5", page="docs/reference/laws.md")
 def scenario_show_command(
     name: ShownScenario,
     duration: options.DurationOption = None,
@@ -86,7 +86,7 @@ def scenario_show_command(
         terminal.print_note(note)
 
 
-@options.command("mine.toml", page="docs/arms.md")
+@options.command("mine.toml", page="docs/extend/arms.md")
 def scenario_check_command(
     file: options.ScenarioArgument,
     overrides: options.SetOption = None,
@@ -106,7 +106,7 @@ def scenario_check_command(
     return None
 
 
-@options.command("mine.toml", page="docs/links.md")
+@options.command("mine.toml", page="docs/reference/links.md")
 def scenario_new_command(
     file: Annotated[Path, typer.Argument(help="File to write.")],
     force: options.ForceOption = False,
@@ -143,7 +143,7 @@ def _print_skeleton(kind: str, written: list[Path], key: str, checks: Sequence[s
     terminal.print_text(f"  python -m pytest {test.name}   (python -m pip install pytest)")
 
 
-@options.command("mylaw.py", page="docs/own-controller.md")
+@options.command("mylaw.py", page="docs/extend/own-controller.md")
 def new_law_command(
     file: Annotated[Path, typer.Argument(help="File to write, for example mylaw.py.")],
     force: options.ForceOption = False,
@@ -156,7 +156,7 @@ def new_law_command(
     _print_skeleton("law", new_law(file, force=force), "control.law={}", checks)
 
 
-@options.command("myhand.py", page="docs/policies.md")
+@options.command("myhand.py", page="docs/studies/policies.md")
 def new_hand_command(
     file: Annotated[Path, typer.Argument(help="File to write, for example myhand.py.")],
     force: options.ForceOption = False,
@@ -168,7 +168,7 @@ def new_hand_command(
     _print_skeleton("hand", new_hand(file, force=force), key, ["report {log}"])
 
 
-@options.command("myplant.py", page="docs/own-plant.md")
+@options.command("myplant.py", page="docs/extend/own-plant.md")
 def new_plant_command(
     file: Annotated[Path, typer.Argument(help="File to write, for example myplant.py.")],
     force: options.ForceOption = False,
@@ -180,7 +180,9 @@ def new_plant_command(
 
 
 @options.command(
-    "irtt run.json.gz", "csv drive.txt --way half -o drive.csv", page="docs/delay-traces.md"
+    "irtt run.json.gz",
+    "csv drive.txt --way half -o drive.csv",
+    page="docs/extend/delay-traces.md",
 )
 def trace_import_command(
     form: Annotated[
@@ -226,7 +228,9 @@ def trace_import_command(
     terminal.print_line(f"{path}: use it with --set link.model=trace --set link.file={path}")
 
 
-@options.command("keys m1 m2 s recorder operator --host 192.0.2.1", page="docs/keys.md")
+@options.command(
+    "keys m1 m2 s recorder operator --host 192.0.2.1", page="docs/sessions/keys.md"
+)
 def keys_new_command(
     folder: Annotated[
         Path, typer.Argument(help="Folder to create for the keys.", metavar="DIR")
@@ -264,7 +268,7 @@ def keys_new_command(
     )
 
 
-@options.command("keys s2 bridge --host 192.0.2.9", page="docs/network.md")
+@options.command("keys s2 bridge --host 192.0.2.9", page="docs/sessions/network.md")
 def keys_add_command(
     folder: Annotated[
         Path, typer.Argument(help="Folder that `trilat keys new` created.", metavar="DIR")
@@ -305,7 +309,7 @@ def keys_add_command(
     terminal.print_line(f"the new keys are valid for {count_nouns(days, 'day')}")
 
 
-@options.command("keys", "keys m1 recorder --days 90", page="docs/network.md")
+@options.command("keys", "keys m1 recorder --days 90", page="docs/sessions/network.md")
 def keys_renew_command(
     folder: Annotated[
         Path, typer.Argument(help="Folder that `trilat keys new` created.", metavar="DIR")
@@ -331,7 +335,7 @@ def keys_renew_command(
         terminal.print_line(f"{member_folder}: valid for {count_nouns(days, 'day')} from now")
 
 
-@options.command("lab", page="docs/signatures.md")
+@options.command("lab", page="docs/logs/signatures.md")
 def keys_pair_command(
     name: Annotated[
         Path,
@@ -352,7 +356,7 @@ def keys_pair_command(
     terminal.print_text(f"{public}: checks, as in: trilat log check run.mcap --key {public}")
 
 
-@options.command("keys/m1", page="docs/keys.md")
+@options.command("keys/m1", page="docs/sessions/keys.md")
 def keys_info_command(
     folder: Annotated[Path, typer.Argument(help="Folder of one member's keys.", metavar="DIR")],
     rules: Annotated[bool, flag("--rules", "Print the Zenoh settings with all rules.")] = False,

@@ -24,7 +24,7 @@ _LOSSY_EXIT_CODE = 3
 """Exit code of `trilat log recover` if a part of the log was lost."""
 
 
-@options.command("run.mcap", page="docs/log-tools.md")
+@options.command("run.mcap", page="docs/logs/log-tools.md")
 def log_info_command(files: options.LogsArgument, as_json: options.JsonOption = False) -> None:
     """Prints the contents of a log: session, sites, links and channels, and missing records."""
     from ...analysis.file_overview import info
@@ -37,7 +37,7 @@ def log_info_command(files: options.LogsArgument, as_json: options.JsonOption = 
             terminal.warn_if_unfinished(path)
 
 
-@options.command("run.mcap", "run.mcap --key lab.pub", page="docs/log-checks.md")
+@options.command("run.mcap", "run.mcap --key lab.pub", page="docs/logs/log-checks.md")
 def log_check_command(
     files: options.LogsArgument,
     key: Annotated[
@@ -70,7 +70,7 @@ def log_check_command(
     raise typer.Exit(check.exit_code)
 
 
-@options.command("run.mcap --key lab.key", page="docs/signatures.md")
+@options.command("run.mcap --key lab.key", page="docs/logs/signatures.md")
 def log_sign_command(
     file: options.LogArgument,
     key: Annotated[
@@ -94,7 +94,7 @@ def log_sign_command(
         terminal.print_text(f"{signature}: signs {file}")
 
 
-@options.command("run.mcap.active", page="docs/log-damage.md")
+@options.command("run.mcap.active", page="docs/logs/log-damage.md")
 def log_recover_command(
     file: options.LogArgument,
     output: Annotated[
@@ -126,7 +126,7 @@ def log_recover_command(
 @options.command(
     "run.mcap --to parquet",
     "runs/ --to lerobot -o grasps --set observations=plugin --set task=grasp",
-    page="docs/log-tools.md",
+    page="docs/logs/log-tools.md",
 )
 def log_export_command(
     files: options.LogsOrFoldersArgument,
@@ -143,7 +143,7 @@ def log_export_command(
         form: Format. ros2: an MCAP file of standard messages at full rate; parquet or csv: a
             folder with a file for each site and kind of record; npz or mat: one file with an
             array for each column; lerobot: a LeRobot dataset with an episode for each log in
-            FILE (docs/lerobot.md).
+            FILE (docs/studies/lerobot.md).
         settings: Setting of the format; repeatable. For lerobot: fps=30; observations=plugin
             for a policy that the LeRobot plugin runs; task=TEXT; episodes=marks for the
             episodes that session.episode marked; program=m2 if the user m2 is a program, or
@@ -181,7 +181,7 @@ def log_export_command(
         terminal.print_text(f"{exporter.path}: {summary}")
 
 
-@options.command("run.mcap", "run.mcap --foxglove", page="docs/log-tools.md")
+@options.command("run.mcap", "run.mcap --foxglove", page="docs/logs/log-tools.md")
 def log_view_command(
     files: options.LogsArgument,
     full: Annotated[

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from ...scenario import Scenario
 
 
-@options.command("m1 --scenario paper", page="docs/network.md")
+@options.command("m1 --scenario paper", page="docs/sessions/network.md")
 def site_command(
     name: Annotated[str, typer.Argument(autocompletion=options.complete_sites)],
     scenario: Annotated[
@@ -109,7 +109,7 @@ def site_command(
 @options.command(
     "m2 --scenario my_run.toml",
     "m1 --session play --device haply_inverse3",
-    page="docs/devices.md",
+    page="docs/sessions/devices.md",
 )
 def hand_command(
     context: typer.Context,
@@ -246,7 +246,9 @@ def _check_without(scenario: "Scenario", name: str, without: list[str]) -> tuple
     return tuple(without)
 
 
-@options.command("--session paper -o run.mcap --split-duration 600", page="docs/recording.md")
+@options.command(
+    "--session paper -o run.mcap --split-duration 600", page="docs/sessions/recording.md"
+)
 def record_command(
     session: Annotated[str, value("--session", "ID", "Session to record.")],
     *,
@@ -396,7 +398,7 @@ def _conclude(parts: list[Path], *, png: bool) -> None:
             raise RunFailed(f"{parts[0]}: {event.text}")
 
 
-@options.command("run.mcap --rate 2 --start 5", page="docs/replay.md")
+@options.command("run.mcap --rate 2 --start 5", page="docs/logs/replay.md")
 def replay_command(
     files: Annotated[list[Path], typer.Argument(metavar="FILE...")],
     rate: Annotated[str, value("--rate", "X")] = "1",
@@ -703,7 +705,7 @@ ANY_ADDRESS = "tls/0.0.0.0:7447"
 """Default endpoint of a router with keys, whose connections are encrypted."""
 
 
-@options.command("--keys keys/router", page="docs/network.md")
+@options.command("--keys keys/router", page="docs/sessions/network.md")
 def router_command(
     listen: Annotated[
         list[str] | None,
@@ -791,7 +793,7 @@ def _print_router_line(text: str) -> None:
 @options.command(
     "--session paper",
     "--session paper --ros tcp/192.0.2.7:7447 --domain 3",
-    page="docs/ros2.md",
+    page="docs/sessions/ros2.md",
 )
 def ros2_command(
     session: Annotated[str, value("--session", "ID", "Session to bridge.")],
@@ -814,7 +816,7 @@ def ros2_command(
     machine needs no ROS installation. The bridge waits for the router of ROS without a limit,
     and for the session for the time of --timeout. It ends with the session. It was tested
     against programs that speak the protocol of rmw_zenoh, but not with ROS itself and not with
-    a robot. docs/ros2.md lists all topics and services.
+    a robot. docs/sessions/ros2.md lists all topics and services.
 
     Options:
         distro: ROS 2 distribution whose message format the bridge writes.

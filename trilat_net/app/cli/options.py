@@ -108,7 +108,7 @@ def command(*examples: str, page: str = "docs/commands.md") -> Callable[[Runs], 
 
     Args:
         examples: Arguments of the examples that the help shows.
-        page: Page of the documentation that the help names, as in "docs/links.md".
+        page: Page of the documentation that the help names, as in "docs/reference/links.md".
     """
 
     def declare(run: Runs) -> Runs:

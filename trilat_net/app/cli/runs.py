@@ -25,7 +25,9 @@ if TYPE_CHECKING:
     from ...log.log_reader import Log
 
 
-@options.command("free -o free.mcap --set link.delay_ms=400", page="docs/first-hour.md")
+@options.command(
+    "free -o free.mcap --set link.delay_ms=400", page="docs/tutorials/first-hour.md"
+)
 def sim_command(
     scenario: options.ScenarioArgument,
     output: Annotated[
@@ -100,7 +102,7 @@ def sim_command(
         raise typer.Exit(1)
 
 
-@options.command("run.mcap", page="docs/verify.md")
+@options.command("run.mcap", page="docs/logs/verify.md")
 def verify_command(
     files: options.LogsArgument,
     virtual: Annotated[bool, flag("--virtual")] = False,
@@ -145,7 +147,7 @@ Accepted = StrEnum("Accepted", ["SETTLED", "BOUNDED", "OPEN"])
 """Results besides a stable run for which `--accept` gives the exit code 0."""
 
 
-@options.command("run.mcap", page="docs/certificate.md")
+@options.command("run.mcap", page="docs/logs/certificate.md")
 def certify_command(
     files: options.LogsArgument,
     accept: Annotated[
@@ -195,8 +197,8 @@ def certify_command(
     roots of the linearised loop at the final pose. With --all it also prints the conditions of
     the proof (premises) and the energies. It executes the run again together with twins, which
     are repetitions with a small push. The code of imported control laws runs only with --law,
-    or with --own-laws if it was remembered. docs/certificate.md explains the verdicts and leads
-    to every term and key.
+    or with --own-laws if it was remembered. docs/logs/certificate.md explains the verdicts and
+    leads to every term and key.
 
     Stable: a proof exists for this loop. Settled: the run came to rest and every push died
     away, but nothing proves more. Exit code 0: stable. 1: settled, not stable (bounded
@@ -231,7 +233,7 @@ _PUSH_HELP = (
 @options.command(
     "run.mcap --at 12 --push m1.q1=1e-6 -o twin.png",
     "run.mcap --delta 1e-9:1e-3",
-    page="docs/twins.md",
+    page="docs/logs/twins.md",
 )
 def twin_command(
     files: options.LogsArgument,
@@ -260,8 +262,8 @@ def twin_command(
 
     A repetition with a push is called a twin. Each twin uses the recorded arrivals of messages,
     delays, hands and changes of the run. The difference from the run is simulated in full,
-    without a linear model (docs/twins.md). The exit code is 0 whether or not the disturbances
-    grow.
+    without a linear model (docs/logs/twins.md). The exit code is 0 whether or not the
+    disturbances grow.
     """
     from ...analysis.twins.twin_growth import twin
 
@@ -274,7 +276,7 @@ def twin_command(
     )
 
 
-@options.command("run.mcap --site m1 --json > m1.json", page="docs/measured-hands.md")
+@options.command("run.mcap --site m1 --json > m1.json", page="docs/studies/measured-hands.md")
 def identify_hand_command(
     file: options.LogsArgument,
     site: Annotated[
@@ -286,8 +288,8 @@ def identify_hand_command(
     """Identifies the mass, damping and stiffness of the hand that holds an arm.
 
     A sum of sines must move the arm during the run, so the scenario needs an operator of kind
-    "multisine" at any site (docs/measured-hands.md). `trilat linear --operators` reads the
-    result that --json prints.
+    "multisine" at any site (docs/studies/measured-hands.md). `trilat linear
+    --operators` reads the JSON of the result.
     """
     from ...studies.hand_impedance import identify_hand
 
@@ -297,7 +299,7 @@ def identify_hand_command(
     terminal.print_result(identified, as_json=as_json)
 
 
-@options.command("run.mcap", page="docs/metrics.md")
+@options.command("run.mcap", page="docs/reference/metrics.md")
 def metrics_command(
     file: options.LogsArgument,
     everything: options.AllOption = False,
@@ -308,8 +310,8 @@ def metrics_command(
     The ten most important numbers are printed, each with the site, link or wall that has the
     largest. With --all, tables cover tracking, effort, energies, force sharing, impedance,
     walls, learning and the network, with a column for each site, link and wall. A dash marks a
-    missing value; if the run could have the value, the reason is given. docs/metrics.md has
-    every formula.
+    missing value; if the run could have the value, the reason is given.
+    docs/reference/metrics.md has every formula.
     """
     from ...analysis.metrics.log_metrics import compute_log_metrics
 
@@ -418,7 +420,7 @@ def _list_figures(log: "Log", *, as_json: bool) -> None:
             )
 
 
-@options.command("run.mcap -o report", page="docs/first-hour.md")
+@options.command("run.mcap -o report", page="docs/tutorials/first-hour.md")
 def report_command(
     files: options.LogsArgument,
     folder: Annotated[
@@ -453,7 +455,9 @@ def report_command(
     raise typer.Exit(conclusion.exit_code)
 
 
-@options.command("run.mcap --replace s --set control.Kd=5 -o kd5.mcap", page="docs/rerun.md")
+@options.command(
+    "run.mcap --replace s --set control.Kd=5 -o kd5.mcap", page="docs/logs/rerun.md"
+)
 def rerun_command(
     files: options.LogsArgument,
     replace: Annotated[
@@ -518,7 +522,9 @@ LinearFigure = StrEnum("LinearFigure", ["ROOTS", "IMPEDANCE", "PASSIVITY"])
 """Figures that `trilat linear` can draw."""
 
 
-@options.command("p_d_margin --set control.d=0.9 --over control.d=0.1:3", page="docs/linear.md")
+@options.command(
+    "p_d_margin --set control.d=0.9 --over control.d=0.1:3", page="docs/studies/linear.md"
+)
 def linear_command(
     scenario: options.ScenarioArgument,
     overrides: options.SetOption = None,
@@ -563,9 +569,10 @@ def linear_command(
 
     The loop is linearised about its equilibrium. The command computes the characteristic roots,
     the largest delay for which the loop is stable, and the stability limits along scenario keys
-    (edges of stability, docs/linear.md). For the arms without operators and environments, it
-    computes passivity, Llewellyn's criterion of absolute stability, and the impedances that
-    operators feel (docs/ports.md). The exit code is 0 for every verdict.
+    (edges of stability, docs/studies/linear.md). For the arms without operators and
+    environments, it computes passivity, Llewellyn's criterion of absolute stability, and the
+    impedances that operators feel (docs/studies/ports.md). The exit code is 0 for every
+    verdict.
     """
     options.check_picture(picture, force=force)
     from ...analysis.theory.linear_analysis import analyse_linear_loop

@@ -108,7 +108,7 @@ def _run_and_report(
         raise typer.Exit(outcome.exit_code)
 
 
-@options.command("play", "--session paper", page="docs/live-page.md")
+@options.command("play", "--session paper", page="docs/sessions/live-page.md")
 def live_command(
     context: typer.Context,
     scenario: options.ScenarioArgument = "play",
@@ -179,7 +179,7 @@ _START_OPTIONS = {
 _check_count = options.check_range(5, 10_000, "a number")
 
 
-@options.command("--session paper", page="docs/network-check.md")
+@options.command("--session paper", page="docs/sessions/network-check.md")
 def ping_command(
     context: typer.Context,
     session: Annotated[str, value("--session", "ID", "Session to measure.")] = "paper",
@@ -226,7 +226,7 @@ def ping_command(
     enough.
 
     With --ros2 no session is needed either: the command listens over Zenoh to a ROS 2 topic of
-    any message type (docs/ros2.md).
+    any message type (docs/sessions/ros2.md).
 
     Options:
         benchmark: Measure the network to --connect EP for this scenario instead, for several
@@ -441,7 +441,7 @@ def _run_far_end(
         raise typer.Exit(interrupt.exit_code)
 
 
-@options.command("--session paper", page="docs/live-page.md")
+@options.command("--session paper", page="docs/sessions/live-page.md")
 def watch_command(
     session: Annotated[str, value("--session", "ID", "Session to watch.")],
     *,
@@ -497,7 +497,9 @@ def _connect(session: str, reach: options.Reach, *, stops: bool = False) -> "Run
     return RunningSession(options.check_session_name(session), connection)
 
 
-@options.command("--session paper s", "--session paper --end", page="docs/live-page.md")
+@options.command(
+    "--session paper s", "--session paper --end", page="docs/sessions/live-page.md"
+)
 def stop_command(
     session: SessionOption,
     sites: SitesArgument = None,
@@ -521,7 +523,7 @@ def stop_command(
     terminal.print_texts(replies)
 
 
-@options.command("--session paper s", page="docs/live-page.md")
+@options.command("--session paper s", page="docs/sessions/live-page.md")
 def enable_command(
     session: SessionOption, sites: SitesArgument = None, *, reach: options.Reach
 ) -> None:
@@ -532,7 +534,7 @@ def enable_command(
     terminal.print_texts(_connect(session, reach).enable(*(sites or ())))
 
 
-@options.command("--session paper s", page="docs/external-arm.md")
+@options.command("--session paper s", page="docs/sessions/external-arm.md")
 def reset_command(
     session: SessionOption,
     sites: Annotated[
@@ -633,7 +635,7 @@ def set_command(
     context.obj = name, reach.resolve()
 
 
-@options.command("'m1->s' --delay 350ms --loss 5%", page="docs/links.md")
+@options.command("'m1->s' --delay 350ms --loss 5%", page="docs/reference/links.md")
 def set_link_command(
     context: typer.Context,
     name: Annotated[
@@ -675,7 +677,7 @@ def set_link_command(
     _send_change(context, receiver, {"link": name, "to": table})
 
 
-@options.command("s m1=0.9 m2=0.1", page="docs/first-hour.md")
+@options.command("s m1=0.9 m2=0.1", page="docs/tutorials/first-hour.md")
 def set_dominance_command(
     context: typer.Context,
     site: Annotated[str, typer.Argument(help="Site whose dominance row changes.")],
@@ -725,7 +727,9 @@ def _send_change(context: typer.Context, site: str, change: dict[str, Any]) -> N
 
 
 @options.command(
-    "--keys keys/m1 --listen tls/0.0.0.0:7447", "--session paper", page="docs/network-check.md"
+    "--keys keys/m1 --listen tls/0.0.0.0:7447",
+    "--session paper",
+    page="docs/sessions/network-check.md",
 )
 def doctor_command(
     *,

@@ -42,7 +42,7 @@ MAX_SEEDS = 100_000
 """Largest number of seeds that --seeds may name."""
 
 
-@options.command("jitter --seeds 1..20 --junit out.xml", page="docs/lab.md")
+@options.command("jitter --seeds 1..20 --junit out.xml", page="docs/tutorials/lab.md")
 def test_command(
     scenarios: Annotated[
         list[str] | None,
@@ -347,7 +347,7 @@ _option = partial(value, rich_help_panel="Tune laws")
 
 
 @options.command(
-    "a.mcap b.mcap", "--tune free --law adaptive,p_d", page="docs/fair-comparison.md"
+    "a.mcap b.mcap", "--tune free --law adaptive,p_d", page="docs/studies/fair-comparison.md"
 )
 def compare_command(
     context: typer.Context,
@@ -427,7 +427,7 @@ def compare_command(
 @options.command(
     "--arm arm6.urdf --delay 40ms --figure gains.png",
     "--arm my.urdf --delay measured:run.mcap",
-    page="docs/arm-gains.md",
+    page="docs/extend/arm-gains.md",
 )
 def tune_command(
     arm: Annotated[
@@ -468,8 +468,8 @@ def tune_command(
 
     The gains keep a margin to the stability limit, and are tested in simulation. Two or three
     such arms follow one another over links with that delay in both directions
-    (docs/arm-gains.md). Paste the last line of the output into a scenario. Exit code 0: all
-    simulated runs behave as the linear loop predicts. 1: at least one run does not.
+    (docs/extend/arm-gains.md). Paste the last line of the output into a scenario. Exit code 0:
+    all simulated runs behave as the linear loop predicts. 1: at least one run does not.
 
     Options:
         delay: One-way delay of the links, for example 40ms. The delays can also come from a
@@ -610,7 +610,9 @@ def _run_bench(
         raise
 
 
-@options.command("--small", "--study round-trips --law wave,smith", page="docs/bench.md")
+@options.command(
+    "--small", "--study round-trips --law wave,smith", page="docs/studies/bench.md"
+)
 def bench_command(
     study: Annotated[
         str, value("--study", "full|small|round-trips", "Part of the suite to run.")
@@ -712,7 +714,9 @@ ProtocolArgument = Annotated[
 FolderArgument = Annotated[Path, typer.Argument(help="Folder of an experiment.", metavar="DIR")]
 
 
-@options.command("reaching.toml", "two-people.toml --pair", page="docs/experiment-protocol.md")
+@options.command(
+    "reaching.toml", "two-people.toml --pair", page="docs/reference/experiment-protocol.md"
+)
 def experiment_new_command(
     file: Annotated[
         Path, typer.Argument(help="Protocol to write (a TOML file).", metavar="FILE")
@@ -734,7 +738,7 @@ def experiment_new_command(
     )
 
 
-@options.command("reaching.toml", page="docs/experiment-protocol.md")
+@options.command("reaching.toml", page="docs/reference/experiment-protocol.md")
 def experiment_check_command(
     file: ProtocolArgument, as_json: options.JsonOption = False
 ) -> None:
@@ -748,7 +752,7 @@ def experiment_check_command(
     "reaching.toml",
     "two-people.toml --live",
     "runs/experiment-reaching-001",
-    page="docs/experiments.md",
+    page="docs/studies/experiments.md",
 )
 def experiment_run_command(
     file: Annotated[
@@ -799,7 +803,7 @@ def experiment_run_command(
         raise typer.Exit(exit_code)
 
 
-@options.command("runs/experiment-reaching-001", page="docs/experiment-analysis.md")
+@options.command("runs/experiment-reaching-001", page="docs/reference/experiment-analysis.md")
 def experiment_analyse_command(
     folder: FolderArgument,
     out: Annotated[Path | None, value("--out -o", "DIR")] = None,
@@ -823,7 +827,7 @@ def experiment_analyse_command(
     terminal.print_paths([] if as_json else analysis.paths)
 
 
-@options.command("0.8 --participants 16", page="docs/experiment-analysis.md")
+@options.command("0.8 --participants 16", page="docs/reference/experiment-analysis.md")
 def experiment_power_command(
     effect: Annotated[
         float, typer.Argument(help="Cohen's d_z of a paired comparison.", min=0.01, max=10.0)
@@ -851,7 +855,7 @@ def experiment_power_command(
     terminal.print_result(power, as_json=as_json)
 
 
-@options.command("runs/experiment-reaching-001", page="docs/experiments.md")
+@options.command("runs/experiment-reaching-001", page="docs/studies/experiments.md")
 def experiment_status_command(
     folder: FolderArgument, as_json: options.JsonOption = False
 ) -> None:

@@ -307,7 +307,7 @@ def _print_cell_commands(path: Path, number: int, *, as_json: bool) -> None:
     "p_d_margin --over link.delay_ms=0:1600:50 --over control.d=0.2:3:0.1",
     "p_d_margin --over link.delay_ms=100,200,400 --margin control.d=0.2:3",
     "runs/sweep-p_d_margin-001 --cell 17",
-    page="docs/sweep.md",
+    page="docs/studies/sweep.md",
 )
 def sweep_command(
     context: typer.Context,
@@ -358,7 +358,8 @@ def sweep_command(
             times the duration, or the duration with --judge twins.
         judge: Quantity in the map: stability classes (verdict), or growth exponents of runs
             with a small push (twins), for which short runs suffice.
-        metric: Measure this metric of every run as well (docs/metrics.md); repeatable.
+        metric: Measure this metric of every run as well (docs/reference/metrics.md);
+            repeatable.
         output: Folder for the results; a sweep that the folder already contains is continued.
             Default: runs/sweep-NAME-N, or runs/margin-NAME-N with --margin.
         cell: For an earlier sweep: print the commands that write the logs of this cell.

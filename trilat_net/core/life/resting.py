@@ -33,7 +33,7 @@ more per period.
 Invariant:
     - The reference of a joint keeps its direction and never becomes faster.
     - While an arm brakes, no term but w acts in the direction of motion, and w adds at most the
-      energy h w^2 / 2 B per period. docs/coming-to-rest.md derives this.
+      energy h w^2 / 2 B per period. docs/theory/coming-to-rest.md derives this.
     - Once the reference rests and no torque is limited, the energy function of the adaptive law
       in joint space plus 1/2 w' (k B)^-1 w never rises.
 """

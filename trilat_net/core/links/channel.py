@@ -4,7 +4,7 @@ A link is the directed connection between two sites, the processes that run one 
 sample is the state that a site sends in one tick (period of its control loop), and its stamp is
 the number of this tick. A link delays each sample, and may lose or duplicate it.
 
-Invariant (law L4 of docs/design.md):
+Invariant (law L4 of docs/develop/design.md):
 
 - What happens to sample m depends only on the key of the link (the seed of its random numbers),
   on m, and on the network model in force at the stamp of m.

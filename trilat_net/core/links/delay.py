@@ -6,7 +6,7 @@ are numbered, and this number is the index of the sample. The stamp of the sampl
 which it was sent. A delay model is a distribution of delays, a function of time, or a recorded
 trace.
 
-Invariant (law L4 of docs/design.md):
+Invariant (law L4 of docs/develop/design.md):
     - A delay depends only on the seed of the link and on the index and the stamp of the sample.
       Therefore a run can be repeated exactly. Delays are rounded to whole microseconds.
     - Only the model AR1, with correlated delays, also depends on the previous sample. It

@@ -15,10 +15,10 @@ Invariant:
     - If samples from another site stay away, the reference stops. It later returns smoothly
       from the held pose along the polynomial 3 x^2 - 2 x^3, with x from 0 to 1.
 
-Source: Eq. (6), (7), (20) of the paper on which this project is based (docs/references.md). The
-paper uses beta = (1, 1, 1). This is the right null vector of Upsilon, and a left null vector
-only if the columns sum to 1 as well. The left null vector of an irreducible matrix is its
-Perron vector, which is positive and unique up to its length.
+Source: Eq. (6), (7), (20) of the paper on which this project is based
+(docs/reference/references.md). The paper uses beta = (1, 1, 1). This is the right null vector
+of Upsilon, and a left null vector only if the columns sum to 1 as well. The left null vector of
+an irreducible matrix is its Perron vector, which is positive and unique up to its length.
 """
 
 import numpy as np

@@ -11,7 +11,7 @@ that will use it, unless this page holds a newer sample. `release_sample` reads 
 present tick. Both take the same time for any delay. Due times are kept longer than samples, for
 as long as a late sample or a duplicate may arrive.
 
-Invariant (law L2 of docs/design.md):
+Invariant (law L2 of docs/develop/design.md):
     - The due time of a sample is an integer in ns. It follows from the time at which the sample
       was sent, and from the link's model of delay and loss. The sample is used from the
       receiver's first tick at or after its due time, but never at the time when it was sent.

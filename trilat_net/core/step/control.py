@@ -15,11 +15,11 @@ Invariant:
       depend on the new estimate. Therefore the second-order update of the estimate needs no
       equation to be solved.
 
-Source: Eq. (9)-(13) and (15) of the paper on which this project is based (docs/references.md);
-P+d and PD+d after Nuno, Basanez, Ortega and Spong, "Position Tracking for Non-linear
-Teleoperators with Variable Time Delay", Int. J. Robotics Research 28 (2009); direct force
-reflection after Lawrence, "Stability and transparency in bilateral teleoperation", IEEE Trans.
-Robotics and Automation 9 (1993).
+Source: Eq. (9)-(13) and (15) of the paper on which this project is based
+(docs/reference/references.md); P+d and PD+d after Nuno, Basanez, Ortega and Spong, "Position
+Tracking for Non-linear Teleoperators with Variable Time Delay", Int. J. Robotics Research 28
+(2009); direct force reflection after Lawrence, "Stability and transparency in bilateral
+teleoperation", IEEE Trans. Robotics and Automation 9 (1993).
 """
 
 from math import sqrt

@@ -7,7 +7,7 @@ with random delays.
 
 A log of a run contains the fingerprint of the platform that wrote it. When a log is verified,
 the run is computed again. The results must be equal to the last bit only if the fingerprint of
-the present platform is the same (law L5 of docs/design.md).
+the present platform is the same (law L5 of docs/develop/design.md).
 """
 
 import hashlib

@@ -262,7 +262,7 @@ class LinkRow(Protocol):
 
     It contains the sample in use, which is the newest state of the peer whose simulated delay
     has passed, and the state of the random models of loss and delay. Before the first sample, q
-    and qd are the start pose of the peer and zero (law L7 of docs/design.md).
+    and qd are the start pose of the peer and zero (law L7 of docs/develop/design.md).
     """
 
     alpha: Annotated[

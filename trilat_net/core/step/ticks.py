@@ -4,7 +4,7 @@ A site is a process that runs one arm, and a tick is one period of its control l
 of a tick are the samples (states) that arrived from other sites, and commands. Its record is
 the stored result. This module also defines the modes in which a site can be.
 
-Invariant (laws L1 and L3 of docs/design.md):
+Invariant (laws L1 and L3 of docs/develop/design.md):
     - The nominal time of tick k is `k * 10^9 // rate_hz` nanoseconds after the start of the
       session, where `rate_hz` is the rate of the loop. It is computed from k anew in each tick,
       so that rounding errors do not add up.

@@ -2,7 +2,8 @@
 
 V is the energy function with which the stability of the coupled arms is proved. It contains the
 energy of motion, of position errors, of errors of the parameter estimates, and of delayed
-signals (docs/certificate-energy.md). A site is a process that runs one arm. There are two
+signals (docs/theory/certificate-energy.md). A site is a process that runs one arm. There are
+two
 figures:
 
 - `draw_functional` draws V, its parts, and the contribution of each site. It also draws the

@@ -67,7 +67,7 @@ class BenchRun(msgspec.Struct, frozen=True):
         random: True if another seed would give another run.
         sha256: Digest of the scenario of the run.
         stability: Judgement of the run by its end and by its twins, which are repeated runs
-            with a small disturbance (docs/stability.md).
+            with a small disturbance (docs/reference/stability.md).
         behaviour: How the run ended, for example at rest or diverged.
         text: Explanation of the judgement.
         length_s: Duration of the judged run, in s.
@@ -783,7 +783,8 @@ def encode_runs(results: BenchResults) -> str:
 _FORMER_KEYS = ("reflected", "reflected_half", "observed", "least_j")
 """Keys of quantities that are no longer measured.
 
-They stay in the JSON with the value null, because keys are never removed (docs/json.md).
+They stay in the JSON with the value null, because keys are never removed
+(docs/reference/json.md).
 """
 _CELL_COLUMNS = ("task", "law", "link", "form")
 

@@ -295,7 +295,8 @@ def find_internal_force(first: ArrayLike, second: ArrayLike) -> Array:
 
     If the two users' forces along an axis have opposite signs, the smaller force cancels an
     equal part of the larger force. Otherwise no force cancels. The second user's part is the
-    negative of the first user's. `internal_rms_n` in docs/metrics.md is the RMS of this force.
+    negative of the first user's. `internal_rms_n` in docs/reference/metrics.md is the RMS of
+    this force.
 
     Args:
         first: Force of the first user on the object, in N, shape (K, D).

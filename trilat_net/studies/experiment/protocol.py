@@ -118,7 +118,7 @@ class Protocol(Frozen, frozen=True):
         users: Names of the sites whose arms participants hold. Two sites are held by a pair.
         participants: Number of participants, or their pseudonyms.
         design: How the order of conditions is balanced over participants, see
-            docs/experiment-protocol.md.
+            docs/reference/experiment-protocol.md.
         trials: Number of counted trials of a block. A block has all trials of a condition.
         practice: Number of practice trials before the counted trials of a block.
         foreperiod_s: Shortest and longest time from the start of a trial until its target

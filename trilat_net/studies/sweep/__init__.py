@@ -1,7 +1,7 @@
 """Computes stability maps: for which parameters of a scenario the arms are stable.
 
-A sweep runs a scenario over a grid of its keys, in virtual time and on all cores. docs/sweep.md
-describes the commands.
+A sweep runs a scenario over a grid of its keys, in virtual time and on all cores.
+docs/studies/sweep.md describes the commands.
 """
 
 from .sweep_plan import plan_sweep

@@ -437,7 +437,7 @@ def _evaluate_damping_criterion(scenario: Scenario) -> StabilityCriterion | None
 
     Under these conditions the loop has no root on the unit circle for all masses down to d h,
     where h is the period of a tick. No damping stabilises lighter arms at this tick rate
-    (docs/damping-conditions.md, 13).
+    (docs/theory/damping-conditions.md, 13).
 
     Returns:
         The condition. None if it does not cover the scenario.
@@ -530,7 +530,7 @@ def _sample_unit_circle(delay_ticks: float) -> tuple[Array, Array, Array]:
     The loop is sampled with the tick period h. At its limit of stability, a root lies at
     z = exp(i phi) on the unit circle, where phi = w h for the frequency w. For the integration
     scheme "second_order", the equation of such a root contains two functions of t = tan(phi/2)
-    (docs/damping-conditions.md, 13):
+    (docs/theory/damping-conditions.md, 13):
 
     - the discrete frequency v = 2 t, in units of 1/h. For small phi it equals phi;
     - the lag 2 t^3 / (1 + 3 t^2), by which the scheme reduces the damping.
@@ -564,7 +564,7 @@ def _compute_required_ratio(least_eigenvalue: float, delay_ticks: int) -> float:
     be a number between the least eigenvalue of the matrix of dominance factors (how strongly
     the sites follow each other) and the largest one, 1. A root on the unit circle at the angle
     phi, with the discrete frequency v and the lag of `_sample_unit_circle`, requires
-    (docs/damping-conditions.md, 13):
+    (docs/theory/damping-conditions.md, 13):
 
         d / (K T) = (lag (1 - a cos(n phi)) - a sin(n phi)) / (v n)
 
@@ -598,8 +598,9 @@ def _compute_pair_excess(
 
     In continuous time, the loop is stable if 2 sqrt(d1 d2) > (T1 + T2) sqrt(K1 K2), with
     stiffnesses K, dampings d and delays T. In the sampled loop, two quantities depend on the
-    frequency (docs/damping-conditions.md, 13). With the angle phi, the discrete frequency v in
-    1/s, the lag of `_sample_unit_circle` and the mean delay of n ticks, they are:
+    frequency (docs/theory/damping-conditions.md, 13). With the angle phi, the discrete
+    frequency v in 1/s, the lag of `_sample_unit_circle` and the mean delay of n ticks, they
+    are:
 
         effective damping of a site = d - K lag / v, at least 0
         effective mean delay = abs(sin(n phi) + lag cos(n phi)) / v

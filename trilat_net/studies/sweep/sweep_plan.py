@@ -344,7 +344,8 @@ class SweepPlan(NamedTuple):
             s.
         judge: How a run is judged, a name of `JUDGES`: by its end, or by repeated runs with a
             small push.
-        metrics: Keys of further metrics from `docs/metrics.md` that are measured in each run.
+        metrics: Keys of further metrics from `docs/reference/metrics.md` that are measured in
+            each run.
     """
 
     written: ExperimentText

@@ -2,7 +2,8 @@
 
 The gains of each law are tuned with the same number of attempts. Each law is then shown as a
 Pareto front of error against effort: the gains for which no other gains of the law are better
-in both. docs/tuning-procedure.md has the procedure, the formulas and the search ranges.
+in both. docs/reference/tuning-procedure.md has the procedure, the formulas and the search
+ranges.
 
 Invariant:
     - Every law gets the same number of candidates, the same torque limit, duration, seeds,

@@ -280,7 +280,7 @@ CLASS_MEANINGS = {
     CandidateClass.OPEN: "it hardly decays, or is undecided: a longer run may decide",
     CandidateClass.SETTLED: "it converged or decays, and no other class applies",
 }
-"""Meanings of the classes. docs/stability.md defines the judgement of a run."""
+"""Meanings of the classes. docs/reference/stability.md defines the judgement of a run."""
 
 
 def classify_candidate(
@@ -403,7 +403,7 @@ def _warn_fallen(log: Log, end_poses_rad: dict[str, Array]) -> list[str]:
 
 
 class CandidateScore(msgspec.Struct, frozen=True):
-    """Measured score of a candidate. docs/tuning-procedure.md has the formulas.
+    """Measured score of a candidate. docs/reference/tuning-procedure.md has the formulas.
 
     Attributes:
         outcome: Class of the candidate.
