@@ -1,6 +1,7 @@
 """The suite: its runs are the program's runs, interruptions leave no trace, and its intervals are SciPy's."""
 
 import shlex
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -46,7 +47,6 @@ from trilat_net.studies.bench.bench_plan import (
     fingerprint_tuning,
     format_settings,
     read_gains,
-    read_law_code,
     tune_laws,
     write_gains,
 )
@@ -594,12 +594,35 @@ def test_an_interrupted_tuning_goes_on(monkeypatch: pytest.MonkeyPatch, tmp_path
     assert made == [TUNED_ROUND_TRIPS_MS[-1]]
 
 
-def test_texts_of_a_law_do_not_outdate_its_gains() -> None:
-    code = read_law_code(BUILT_IN["four_channel"])
-    assert "def torque" in code
-    assert "Lawrence" not in code  # its docstring
-    assert "def condition" not in code
-    assert read_law_code(BUILT_IN["six_channel"]).endswith(code.split("\0")[-1])
+class Damped(BUILT_IN["p_d"]):
+    """P+d with twice the damping that it is given."""
+
+    @classmethod
+    def write_control(cls, gains: Any, site: Any) -> dict[str, Any]:
+        return super().write_control({**gains, "d": 2.0 * gains["d"]}, site)
+
+
+def test_gains_are_outdated_by_another_motion_alone() -> None:
+    """Neither texts nor names of a law's code matter, but how it moves the arms does."""
+    space = SEARCH_SPACES["p_d"]
+    task = bench_plan.load_tuning_task("level", "p_d", 68)
+    same = space._replace(kind=type("Renamed", (BUILT_IN["p_d"],), {}))
+    assert bench_plan._probe_law(task, same) == bench_plan._probe_law(task, space)
+    other = space._replace(kind=Damped)
+    assert bench_plan._probe_law(task, other) != bench_plan._probe_law(task, space)
+
+
+def list_shipped_gains() -> Iterator[Any]:
+    """Yields all gains that are shipped; every ninth is tried on a push."""
+    for place, gains in enumerate(read_gains().values()):
+        yield pytest.param(
+            gains, id=str(gains), marks=() if place % 9 == 0 else pytest.mark.long
+        )
+
+
+@pytest.mark.parametrize("gains", list(list_shipped_gains()))
+def test_shipped_gains_are_up_to_date(gains: TunedGains) -> None:
+    assert find_stale([gains]) == []
 
 
 def test_gains_are_those_of_the_next_longer_round_trip() -> None:

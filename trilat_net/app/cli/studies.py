@@ -686,7 +686,7 @@ def bench_command(
     stale = find_stale(tuned_gains.values())
     if stale:
         terminal.print_note(
-            f"tuned for another text of law or task, see --tune: {', '.join(stale)}"
+            f"tuned for another version of the law or the task, see --tune: {', '.join(stale)}"
         )
 
     folder = prepare_bench_folder(plan, output)

@@ -14,17 +14,16 @@ interrupted tuning continues.
 
 Invariant:
     - Gains are never set by hand. They come from `trilat bench --tune` only.
-    - Gains carry a fingerprint of the scenario and of the source code of the law for which they
-      were tuned. If the fingerprint differs today, the user is told so.
+    - Gains carry a fingerprint of the scenario for which they were tuned, and of the motion of
+      the arms under the law. If the fingerprint differs today, the user is told so.
     - If no tried gains of a law stay stable with longer delays, the law gets no gains and does
       not run.
     - A selection that cannot run is refused before the first run.
 """
 
-import ast
 import hashlib
-import inspect
 import json
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from importlib import resources
@@ -33,10 +32,8 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from ...core.step import control
 from ...errors import UsageError, suggest_nearest
 from ...files import write_whole
-from ...laws.interface import ControlLaw
 from ...laws.six_channel import complementary_shares
 from ...scenario.laws import BUILT_IN
 from ...scenario.resolve import GRID_LOSSES_PERCENT, GRID_ROUND_TRIPS_MS
@@ -48,7 +45,7 @@ from ..tuning.candidate import (
     load_tuning_scenario,
     measure_candidate,
 )
-from ..tuning.search_space import SEARCH_SPACES, ModelInformation
+from ..tuning.search_space import SEARCH_SPACES, ModelInformation, SearchSpace
 from ..tuning.tuning_plan import CandidateSearch, plan_tuning
 
 Settings = Mapping[str, Any]
@@ -450,51 +447,36 @@ TUNING_VERSION = 2
 
 Since the second procedure, a law may define its own objective.
 """
-_TEXTS_OF_LAWS = ("condition", "explain_idle_shares", "explain_no_linear_form")
-"""Methods of a law that compute texts for the user, and have no influence on its motion."""
 
 
-def read_law_code(kind: type[ControlLaw]) -> str:
-    """Returns the code that determines the motion of a law, without comments and docstrings.
+def _probe_law(task: TuningScenario, space: SearchSpace) -> str:
+    """Returns the error and the effort of a law in a tuning task, with gains that never change.
 
-    A correction of a sentence therefore makes no gains out of date.
+    They tell whether the law still moves the arms as it did when its gains were tuned. The text
+    of its source code would not do: it also changes when a sentence, a name or an import does.
 
     Args:
-        kind: The class of the law.
+        task: The task in which the law was tuned.
+        space: The law and the ranges of its gains. Each gain has the middle of its range, on a
+            logarithmic scale if the range does not begin at zero.
     """
-    modules = [control]
-    for base in kind.__mro__:
-        module = inspect.getmodule(base)
-        is_law = issubclass(base, ControlLaw) and module is not inspect.getmodule(ControlLaw)
-        if is_law and module is not None and module not in modules:
-            modules.append(module)
-
-    codes = []
-    for module in modules:
-        tree = ast.parse(inspect.getsource(module))
-        for node in ast.walk(tree):
-            body = getattr(node, "body", None)
-            if not isinstance(body, list):
-                continue
-            node.body = [statement for statement in body if not _is_text(statement)]  # type: ignore[attr-defined]
-        codes.append(ast.unparse(tree))
-    return "\0".join(codes)
-
-
-def _is_text(statement: ast.stmt) -> bool:
-    """Returns True for a docstring, and for a method that only computes texts for the user."""
-    if isinstance(statement, ast.FunctionDef):
-        return statement.name in _TEXTS_OF_LAWS
-    return isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
+    gains = {
+        knob.name: math.sqrt(knob.low * knob.high) if knob.low > 0 else 0.5 * knob.high
+        for knob in space.knobs
+    }
+    score = measure_candidate(*task.with_gains(space, KNOWLEDGE, gains).texts)
+    if score.error_rad is None or score.effort_nm is None:  # the run diverged
+        return f"{score.outcome.name} at {score.diverged_s} s"
+    return f"{score.outcome.name}: {score.error_rad:.9g} rad, {score.effort_nm:.9g} N m"
 
 
 @cache
 def fingerprint_tuning(form: str, law: str, round_trip_ms: int) -> str:
     """Returns a digest of everything on which tuned gains depend.
 
-    These are the scenario, the code of the law without its texts, the ranges in which its gains
-    are searched, and the procedure. If stored gains have another fingerprint, they were tuned
-    for another experiment or another version of the law.
+    These are the scenario, the motion under the law, the ranges in which its gains are
+    searched, and the procedure. If stored gains have another fingerprint, they were tuned for
+    another experiment or another version of the law.
 
     Args:
         form: Kind of scenario in which the law runs, a key of `BASES`.
@@ -502,12 +484,10 @@ def fingerprint_tuning(form: str, law: str, round_trip_ms: int) -> str:
         round_trip_ms: Round trip of the tuning, in ms.
     """
     space = SEARCH_SPACES[law]
-    assert space.kind is not None
-    code = read_law_code(space.kind)
+    task = load_tuning_task(form, law, round_trip_ms)
     ranges = json.dumps([knob._asdict() for knob in space.knobs])
-    scenario_text = load_tuning_task(form, law, round_trip_ms).scenario.text
     procedure = f"{TUNING_VERSION} {TUNING_BUDGET} {TUNING_MARGIN} {MARGIN_LENGTHS}"
-    content = "\0".join([scenario_text, code, ranges, procedure])
+    content = "\0".join([task.scenario.text, _probe_law(task, space), ranges, procedure])
     return hashlib.sha256(content.encode()).hexdigest()[:16]
 
 
