@@ -21,6 +21,8 @@ from ..log.accounting import MIN_COVERAGE
 from ..log.log_reader import Log
 from ..scenario import Scenario
 from ..scenario.describe import describe_law_conditions, list_law_proofs
+from .certificate.observed_energy import find_energy_laws
+from .certificate.premises import explain_no_functional
 from .certificate.stability_certificate import Certificate, certify
 from .run_end import RunEnd, RunTrace, Stability, classify_run_end
 from .run_remarks import list_remarks
@@ -97,8 +99,9 @@ def judge_virtual_run(
     """Judges a simulated run as its certificate would, without a log.
 
     Twins, one for every joint, are executed only if they may change the decision. The run is
-    repeated with all its records only if it has settled or is open. The energy function V,
-    which needs them, may then prove that the run is stable, or contradict that it settled.
+    repeated with all its records only if it has settled or is open, and if its laws have an
+    energy function V or declare energies. These need the records, and may prove that the run is
+    stable, or contradict that it settled.
 
     Args:
         scenario: Scenario of the run. Its duration may be shorter than that of the run.
@@ -121,7 +124,8 @@ def judge_virtual_run(
         twins = measure_virtual_twins(ended, end, run.ran_s)
         findings = findings._replace(twins=twins)
     decision = decide_stability(findings)
-    if decision.stability in (Stability.SETTLED, Stability.OPEN):
+    is_weak = decision.stability in (Stability.SETTLED, Stability.OPEN)
+    if is_weak and _has_energies(ended):
         recorded = certify(simulate_scenario(ended), own_laws=True)
         certificate = replace(
             recorded,
@@ -133,3 +137,9 @@ def judge_virtual_run(
         decision = certificate.decision
     assert findings.roots is not None
     return VirtualJudgement(end, findings.roots, twins, decision)
+
+
+def _has_energies(scenario: Scenario) -> bool:
+    """Returns True if a run has energies, V or those that its laws declare, besides a motion."""
+    has_functional = not explain_no_functional(scenario)
+    return has_functional or bool(find_energy_laws(scenario, own_laws=True))
