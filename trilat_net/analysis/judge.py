@@ -140,6 +140,6 @@ def judge_virtual_run(
 
 
 def _has_energies(scenario: Scenario) -> bool:
-    """Returns True if a run has energies, V or those that its laws declare, besides a motion."""
+    """Returns True if a run has the energy function V, or energies that its laws declare."""
     has_functional = not explain_no_functional(scenario)
     return has_functional or bool(find_energy_laws(scenario, own_laws=True))
