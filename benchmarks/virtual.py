@@ -6,6 +6,7 @@ from trilat_net.execution import virtual
 from trilat_net.execution.verify import verify
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.log_writer import LogWriter
+from trilat_net.log.provenance import collect_provenance
 from trilat_net.log.ros2.viz_channels import VIZ_HZ
 from trilat_net.net import topics
 from trilat_net.net.wire import encode_state
@@ -54,7 +55,9 @@ def time_writing(scenario: Scenario) -> tuple[float, float]:
     payloads = encode()
 
     def write() -> None:
-        writer = LogWriter(io.BytesIO(), scenario, scenario.name, "virtual", 0)
+        writer = LogWriter(
+            io.BytesIO(), scenario, scenario.name, "virtual", 0, collect_provenance()
+        )
         keys = {name: topics.key(scenario.name, name, topics.STATE) for name in scenario.names}
         for name, payload, t_ns, tick in payloads:
             writer.add(keys[name], payload, t_ns, t_ns, tick)

@@ -11,6 +11,7 @@ from trilat_net.core.step.ticks import Arrival
 from trilat_net.execution import virtual
 from trilat_net.log.log_writer import LogWriter
 from trilat_net.log.mcap_writer import McapWriter
+from trilat_net.log.provenance import collect_provenance
 from trilat_net.net import topics
 from trilat_net.net.wire import encode_state
 from trilat_net.scenario import load_scenario
@@ -56,7 +57,7 @@ def _messages(duration_s: float) -> list[Message]:
 def _ours(messages: list[Message]) -> bytes:
     stream = io.BytesIO()
     scenario = load_scenario("paper")
-    writer = LogWriter(stream, scenario, scenario.name, "virtual", 0)
+    writer = LogWriter(stream, scenario, scenario.name, "virtual", 0, collect_provenance())
     for n, (key, payload, t_ns, tick) in enumerate(messages, 1):
         writer.add(key, payload, t_ns, t_ns, tick)
         if n % FLUSH_EVERY == 0:

@@ -17,11 +17,13 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 from trilat_net import process
 from trilat_net.errors import LogRefused, RunFailed, SessionError
-from trilat_net.log.log_writer import LogParts, LogStorage, LogWriter
+from trilat_net.log.log_writer import LogParts, LogStorage, LogWriter, MakeViews
 from trilat_net.log.mcap_writer import Sink
+from trilat_net.log.session_scenario import SessionScenario
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock
@@ -31,7 +33,6 @@ from trilat_net.net.membership import Epoch, EventPublisher, describe_member, ne
 from trilat_net.net.pinging import describe_clocks
 from trilat_net.net.session import SessionJoin
 from trilat_net.net.zenoh_bus import share_threads
-from trilat_net.scenario import Scenario, embedded_names_reader, parse_embedded
 from trilat_net.signals import Interrupt
 
 from .session_recording import RecorderReport, Recording
@@ -62,6 +63,27 @@ A longer period costs less computing time.
 """
 
 
+class RecordedScenario(NamedTuple):
+    """Scenario of a session, as far as the recorder needs it.
+
+    Attributes:
+        scenario: Facts about the scenario from which the messages of the session follow.
+        make_views: Creates the messages for viewers. With None, the log contains none.
+    """
+
+    scenario: SessionScenario
+    make_views: MakeViews | None = None
+
+
+ReadScenario = Callable[[str, str], RecordedScenario]
+"""Function that reads the text of a resolved scenario, which another process has sent.
+
+Its second argument is the name of the text, for error messages. The text is not trusted.
+"""
+CollectProvenance = Callable[[], Mapping[str, str]]
+"""Function that returns the facts about this program that a log contains, see `provenance`."""
+
+
 class Recorder:
     """Recorder of one session, from the search for its members to the end mark of the file.
 
@@ -71,6 +93,8 @@ class Recorder:
         session: Name of the session.
         boot: Random number that identifies this start of the recorder.
         storage: Place where the log is written.
+        read_scenario: Function that reads the text of the session's scenario.
+        provenance: Facts about this program that the log contains.
         stopped: Function that returns True if the recorder must end at once.
         say: Function that prints a line for the user.
         is_ending: Function that returns True if the recorder must end when it has the messages
@@ -84,6 +108,8 @@ class Recorder:
         session: str,
         boot: int,
         storage: LogStorage,
+        read_scenario: ReadScenario,
+        provenance: Mapping[str, str],
         stopped: Callable[[], bool],
         say: Callable[[str], None],
         is_ending: Callable[[], bool] = lambda: False,
@@ -92,6 +118,8 @@ class Recorder:
         self._clock = clock
         self._session = session
         self._storage = storage
+        self._read_scenario = read_scenario
+        self._provenance = provenance
         self._stopped = stopped
         self._say = say
         self._is_ending = is_ending
@@ -99,7 +127,7 @@ class Recorder:
         for channel in (topics.STATE, topics.LINK, topics.EVENT):
             bus.tap(topics.key(session, "*", channel), self._queue.receive)
         self._presence = bus.presence(topics.presence_key(session, "*"))
-        info = describe_member(topics.RECORDER, boot, clock)
+        info = describe_member(topics.RECORDER, boot, clock, provenance["fingerprint"])
         keep = partial(self._queue.receive, topics.key(session, topics.RECORDER, topics.EVENT))
         self._publisher = EventPublisher(bus, session, info, keep)
         self._joining = SessionJoin(
@@ -148,7 +176,7 @@ class Recorder:
             UsageError: The file cannot be created.
             LogRefused: The disk refused the data. The error states which part is saved.
         """
-        scenario = self._find_scenario(epoch)
+        scenario, make_views = self._find_scenario(epoch)
 
         def open_part(stream: Sink, part: Mapping[str, str]) -> LogWriter:
             """Creates the writer for one of the files into which a long log is divided.
@@ -163,9 +191,10 @@ class Recorder:
                 session=self._session,
                 driver="live",
                 epoch_unix_ns=epoch.unix_ns,
+                provenance=self._provenance,
                 part=part,
                 choice=self._storage.choice,
-                views_hz=self._storage.views_hz,
+                make_views=make_views,
             )
 
         with LogParts(self._storage, open_part) as log:
@@ -202,10 +231,10 @@ class Recorder:
                     raise
         return recording
 
-    def _find_scenario(self, epoch: Epoch) -> Scenario:
+    def _find_scenario(self, epoch: Epoch) -> RecordedScenario:
         """Returns the scenario that a member of the session has sent with its identity."""
         return next(
-            parse_embedded(info.scenario, info.member)
+            self._read_scenario(info.scenario, info.member)
             for info in self._joining.membership.others.values()
             if info.scenario and epoch.boots.get(info.member) == info.boot
         )
@@ -292,6 +321,8 @@ def record_session(
     session: str,
     storage: LogStorage,
     connection: Connection,
+    read_scenario: ReadScenario,
+    collect_provenance: CollectProvenance,
     join_timeout_s: float | None,
     clock: Clock,
     say: Callable[[str], None],
@@ -304,6 +335,9 @@ def record_session(
         session: Name of the session.
         storage: Place where the log is written.
         connection: How to connect to the session, see `connect_to_session`.
+        read_scenario: Function that reads the text of the session's scenario.
+        collect_provenance: Function that returns the facts about this program that the log
+            contains. It is called once the recorder is connected.
         join_timeout_s: Longest time to wait until the session begins, in s. None means no
             limit.
         clock: Clock of the recorder.
@@ -330,7 +364,7 @@ def record_session(
                 connection,
                 clock,
                 session,
-                embedded_names_reader(session),
+                lambda text: read_scenario(text, session).scenario.names,
                 stopped=interrupt.is_requested,
                 timeout_s=join_timeout_s,
                 say=lambda text: say(f"recorder: {text}"),
@@ -346,6 +380,8 @@ def record_session(
             session=session,
             boot=boot,
             storage=storage,
+            read_scenario=read_scenario,
+            provenance=collect_provenance(),
             stopped=interrupt.is_repeated,
             say=say,
             is_ending=interrupt.is_requested,

@@ -21,13 +21,13 @@ from collections.abc import Callable
 from trilat_net.errors import WireError, count_nouns
 from trilat_net.log.accounting import LAST, Account
 from trilat_net.log.log_writer import LogParts, LogWriter
+from trilat_net.log.session_scenario import SessionScenario
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock
 from trilat_net.net.membership import Epoch, EventPublisher
 from trilat_net.net.messages import Event, RecorderStats
 from trilat_net.net.wire import decode, encode, split_states
-from trilat_net.scenario import Scenario
 
 from .backfill import GapRepair
 from .site_reception import AWAY_NS, InboundQueue, SiteMessage, SiteReception
@@ -74,7 +74,7 @@ class Recording:
     def __init__(
         self,
         writer: LogWriter | LogParts,
-        scenario: Scenario,
+        scenario: SessionScenario,
         session: str,
         epoch: Epoch,
         bus: Bus,

@@ -26,6 +26,7 @@ from typing import NamedTuple
 from trilat_net.errors import WireError, count_nouns
 from trilat_net.log.accounting import Account, StartGap
 from trilat_net.log.log_layout import CHANNEL_TYPES, SITE_CHANNELS
+from trilat_net.log.session_scenario import SessionScenario
 from trilat_net.net import topics
 from trilat_net.net.clock import Clock
 from trilat_net.net.messages import Event, LinkStats, State
@@ -37,8 +38,7 @@ from trilat_net.net.topics import (
     skipped_numbers,
 )
 from trilat_net.net.wire import make_decoder
-from trilat_net.scenario import Scenario
-from trilat_net.scenario.run_changes import count_skipped_ticks
+from trilat_net.recorded_change import count_skipped_ticks
 
 AWAY_NS = 15_000_000_000
 """Time to wait for a site that disappeared without an "end" event, in ns.
@@ -213,7 +213,7 @@ class SiteReception:
 
     def __init__(
         self,
-        scenario: Scenario,
+        scenario: SessionScenario,
         name: str,
         boot: int | None,
         before: "SiteReception | None" = None,

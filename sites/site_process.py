@@ -26,6 +26,7 @@ import numpy as np
 from msgspec.structs import asdict
 
 from sites.line_printer import LinePrinter
+from trilat_net.core.step.fingerprint import compute_fingerprint
 from trilat_net.core.step.site_setup import StaleAction
 from trilat_net.core.step.ticks import (
     NS_PER_S,
@@ -54,8 +55,9 @@ from trilat_net.net.session import SessionJoin
 from trilat_net.net.timing import ClockNotice, PeerClock, SiteTiming, find_turn_ns
 from trilat_net.net.wire import encode
 from trilat_net.net.zenoh_bus import share_threads
+from trilat_net.recorded_change import count_skipped_ticks
 from trilat_net.scenario import Scenario
-from trilat_net.scenario.run_changes import count_skipped_ticks, describe_change
+from trilat_net.scenario.run_changes import describe_change
 from trilat_net.scenario.scenario_types import Change
 from trilat_net.scenario.validate import check_outside_arms
 from trilat_net.signals import Interrupt
@@ -198,6 +200,7 @@ def _join_session(parts: SiteParts, give_up_ns: int) -> "RunningSite | None":
         parts.name,
         parts.boot,
         parts.clock,
+        compute_fingerprint(),
         scenario.text,
         needs_recorder=options.needs_recorder,
     )

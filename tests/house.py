@@ -8,7 +8,17 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 TOPS = ("trilat_net", "sites", "recorder", "live")
-BELOW_ALL = {"errors", "process", "signals", "workers", "files", "results", "fields"}
+BELOW_ALL = {
+    "errors",
+    "process",
+    "signals",
+    "workers",
+    "files",
+    "results",
+    "fields",
+    "records",
+    "recorded_change",
+}
 
 
 def files() -> list[Path]:

@@ -68,6 +68,7 @@ def _run() -> None:
             # Loaded once here, these modules need not be loaded in each forked process.
             from recorder import record_process  # noqa: F401
             from sites import site_process  # noqa: F401
+            from trilat_net.app import recorded_session  # noqa: F401
             from trilat_net.app.demo_session import run_starter
 
             arguments = run_starter(int(number), scenario_file)

@@ -14,6 +14,7 @@ from trilat_net.execution import virtual
 from trilat_net.execution.virtual_network import RecordedNetwork
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.log.log_writer import LogWriter
+from trilat_net.log.provenance import collect_provenance
 from trilat_net.log.site_log import SiteLog
 from trilat_net.net import topics
 from trilat_net.net.messages import Event, LinkStats, State
@@ -165,7 +166,7 @@ def driven(
         if site in scenario.sites
     }
     stream = io.BytesIO()
-    writer = LogWriter(stream, scenario, scenario.name, "virtual", 0)
+    writer = LogWriter(stream, scenario, scenario.name, "virtual", 0, collect_provenance())
     counts = {}
     for site, arrivals, output in virtual.execute_virtual(scenario, network, ordered):
         payload = encode_state(site.name, 1, site.peers, output, arrivals, 0, 0)
@@ -207,7 +208,9 @@ def rewritten(
 ) -> Log:
     """The log with some of its records, changed, and other messages, in a file of its own."""
     stream = io.BytesIO()
-    writer = LogWriter(stream, log.scenario, "again", driver, 1_700_000_000 * 10**9)
+    writer = LogWriter(
+        stream, log.scenario, "again", driver, 1_700_000_000 * 10**9, collect_provenance()
+    )
     for site in log.sites:
         for state in filter(keep, log[site].states):
             payload = encode(change(state))

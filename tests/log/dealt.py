@@ -13,6 +13,7 @@ from tests.log_editing import opened, recorded
 from trilat_net.log.accounting import Account
 from trilat_net.log.log_writer import LogParts, LogStorage, LogWriter
 from trilat_net.log.mcap_reader import McapReader
+from trilat_net.log.provenance import collect_provenance
 
 
 class Message(NamedTuple):
@@ -128,7 +129,9 @@ def split(folder: Path, *, refilled: range) -> list[Path]:
     now_ns = 0
     with LogParts(
         place,
-        lambda stream, part: LogWriter(stream, scenario, "paper", "virtual", 0, part=part),
+        lambda stream, part: LogWriter(
+            stream, scenario, "paper", "virtual", 0, collect_provenance(), part=part
+        ),
     ) as log:
         log.current_accounts = told
         for item in items:

@@ -8,7 +8,9 @@ from trilat_net.execution import virtual
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.log_writer import LogParts, LogStorage, LogWriter
 from trilat_net.log.mcap_writer import Sink
+from trilat_net.log.provenance import collect_provenance
 from trilat_net.log.recover import recover
+from trilat_net.log.ros2.viz_channels import offer_views
 from trilat_net.net.messages import Event, LinkStats, State
 from trilat_net.net.wire import decode, encode, encode_state
 from trilat_net.presentation.exports.ros2 import export_ros2
@@ -38,9 +40,10 @@ def live(storage: LogStorage) -> None:
             "lab",
             "live",
             EPOCH_NS,
+            collect_provenance(),
             part=part,
             choice=storage.choice,
-            views_hz=VIEWS_HZ,
+            make_views=offer_views(SCENARIO, VIEWS_HZ),
         )
 
     with LogParts(storage, begin) as log:

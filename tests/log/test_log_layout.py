@@ -16,6 +16,7 @@ from trilat_net.log.log_layout import (
     parse_channel_filter,
 )
 from trilat_net.log.log_writer import LogWriter
+from trilat_net.log.provenance import collect_provenance
 from trilat_net.net.bus import matches_key
 from trilat_net.scenario import load_scenario
 
@@ -59,7 +60,9 @@ def test_a_leading_slash_is_fine() -> None:
 def test_an_unchosen_channel_is_absent_and_the_file_says_so() -> None:
     stream = io.BytesIO()
     chosen = ChannelFilter(("trilat/*/m$*/**",), ("**/link",))
-    writer = LogWriter(stream, load_scenario("paper"), "lab", "live", 0, choice=chosen)
+    writer = LogWriter(
+        stream, load_scenario("paper"), "lab", "live", 0, collect_provenance(), choice=chosen
+    )
     kept = [
         f"trilat/lab/{site}/{channel}"
         for site in ("m1", "m2")

@@ -18,6 +18,7 @@ from trilat_net.errors import LogError
 from trilat_net.execution import virtual
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.log_writer import LogWriter
+from trilat_net.log.provenance import collect_provenance
 from trilat_net.net.messages import VERSION
 from trilat_net.net.wire import encode_state
 from trilat_net.scenario import list_shipped, load_scenario
@@ -147,7 +148,7 @@ def test_session_scenario_and_accounts_stand_in_the_file() -> None:
 def test_session_and_scenario_stand_before_the_first_message() -> None:
     """So that they survive a crash right after the start."""
     stream = io.BytesIO()
-    LogWriter(stream, load_scenario("free"), "lab", "live", 10**18)
+    LogWriter(stream, load_scenario("free"), "lab", "live", 10**18, collect_provenance())
     log = opened(stream.getvalue())
     assert log.scenario == load_scenario("free")
     assert (log.driver, log.complete, log.accounts) == ("live", False, {})
@@ -156,7 +157,15 @@ def test_session_and_scenario_stand_before_the_first_message() -> None:
 
 def test_a_live_log_counts_from_its_epoch() -> None:
     stream = io.BytesIO()
-    writer = LogWriter(stream, load_scenario("free"), "lab", "live", 10**18, {"mood": "calm"})
+    writer = LogWriter(
+        stream,
+        load_scenario("free"),
+        "lab",
+        "live",
+        10**18,
+        collect_provenance(),
+        {"mood": "calm"},
+    )
     for k in (0, 2):
         writer.add("trilat/lab/m1/state", b"\x80", k * 1_000_000, 10**18 + 5, k)
     writer.finish({"dropped": "1"})

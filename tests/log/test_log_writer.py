@@ -15,6 +15,7 @@ from trilat_net.log.log_layout import find_parts, part_path
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.log_writer import LogParts, LogStorage, LogWriter, parse_split
 from trilat_net.log.mcap_writer import Sink
+from trilat_net.log.provenance import collect_provenance
 from trilat_net.net import topics
 from trilat_net.scenario import load_scenario
 
@@ -30,7 +31,7 @@ pytestmark = pytest.mark.usefixtures("unsynced")
 
 
 def begin(stream: Sink, part: Mapping[str, str]) -> LogWriter:
-    return LogWriter(stream, SCENARIO, "t", "live", 10**18, part=part)
+    return LogWriter(stream, SCENARIO, "t", "live", 10**18, collect_provenance(), part=part)
 
 
 def read(path: Path) -> tuple[list[Message], dict[str, Mapping[str, str]]]:

@@ -15,6 +15,7 @@ from trilat_net.errors import LogError
 from trilat_net.execution.verify import verify
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.log.log_writer import LogWriter
+from trilat_net.log.provenance import collect_provenance
 from trilat_net.net import topics
 from trilat_net.net.messages import Event, RecorderStats
 from trilat_net.net.wire import encode
@@ -153,7 +154,13 @@ def by(recorder: int, *, at_ns: int, dropped: int, part: int) -> bytes:
     stream = io.BytesIO()
     scenario = load_scenario("free")
     writer = LogWriter(
-        stream, scenario, "lab", "live", 10**18, part={"index": str(part), "previous": ""}
+        stream,
+        scenario,
+        "lab",
+        "live",
+        10**18,
+        collect_provenance(),
+        part={"index": str(part), "previous": ""},
     )
     stats = RecorderStats(boot=recorder, t_ns=at_ns, expected={}, received={}, missing={})
     event = Event(member="recorder", boot=recorder, kind="late", text="late", n=0)

@@ -26,6 +26,7 @@ from trilat_net.execution.verify import verify
 from trilat_net.log.log_layout import active_path
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.log_writer import LogWriter
+from trilat_net.log.provenance import collect_provenance
 from trilat_net.log.recover import Recovery, recover, recovered_path
 
 anywhere = settings(
@@ -67,7 +68,7 @@ def chunks(data: bytes) -> list[Chunk]:
 def log() -> bytes:
     """A log of twenty chunks, as it is written today."""
     whole, stream = opened(recorded("paper")), io.BytesIO()
-    writer = LogWriter(stream, whole.scenario, "paper", "virtual", 0)
+    writer = LogWriter(stream, whole.scenario, "paper", "virtual", 0, collect_provenance())
     for n, message in enumerate(messages(recorded("paper"))):
         topic, payload, log_ns, publish_ns, sequence = message
         writer.add(topic[1:], payload, publish_ns, log_ns, sequence)

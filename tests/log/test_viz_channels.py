@@ -20,8 +20,14 @@ from tests.log.dealt import messages
 from trilat_net.core.step.ticks import Mode, TickRecord
 from trilat_net.execution import virtual
 from trilat_net.log.log_writer import LogWriter
+from trilat_net.log.provenance import collect_provenance
 from trilat_net.log.ros2.ros2_messages import stack_signals
-from trilat_net.log.ros2.viz_channels import FULL_RATE_HZ, VizChannels, decimate_min_max
+from trilat_net.log.ros2.viz_channels import (
+    FULL_RATE_HZ,
+    VizChannels,
+    decimate_min_max,
+    offer_views,
+)
 from trilat_net.net.messages import Event, LinkStats, State
 from trilat_net.net.wire import decode, encode_state
 from trilat_net.scenario import Scenario, load_scenario
@@ -350,7 +356,15 @@ def test_a_part_ends_with_all_that_it_has_seen() -> None:
     shown = []
     for part in (outputs[:77], outputs[77:]):
         stream = io.BytesIO()
-        writer = LogWriter(stream, scenario, "lab", "live", EPOCH_NS, views_hz=100.0)
+        writer = LogWriter(
+            stream,
+            scenario,
+            "lab",
+            "live",
+            EPOCH_NS,
+            collect_provenance(),
+            make_views=offer_views(scenario, 100.0),
+        )
         for one in part:
             payload = encode_state("m", 1, ["s"], one, [], 0, 0)
             state = decode(payload, State)

@@ -16,6 +16,7 @@ from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import TickInput
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.log.log_writer import LogWriter
+from trilat_net.log.provenance import collect_provenance
 from trilat_net.net import topics
 from trilat_net.net.bus import Inbox
 from trilat_net.net.membership import Epoch, EventPublisher, read_messages
@@ -126,7 +127,9 @@ class Desk:
         publisher = EventPublisher(
             self.bus, SESSION, info, lambda payload: self.tap.receive(own, payload)
         )
-        writer = LogWriter(self.stream, scenario, SESSION, "live", epoch.unix_ns)
+        writer = LogWriter(
+            self.stream, scenario, SESSION, "live", epoch.unix_ns, collect_provenance()
+        )
         self.recording = Recording(writer, scenario, SESSION, epoch, self.bus, publisher)
         self.report = RecorderReport(
             self.bus, self.clock, self.recording, self.tap, self.stream.tell

@@ -8,9 +8,11 @@ from recorder.record_process import Recorder
 from tests.sites.relay import RelayClock
 from tests.sites.sessions import SESSION as REAL
 from tests.sites.sessions import Session, in_log, in_virtual_time
+from trilat_net.app.recorded_session import make_scenario_reader
 from trilat_net.execution.verify import verify
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.log_writer import LogStorage
+from trilat_net.log.provenance import collect_provenance
 from trilat_net.net import topics
 from trilat_net.scenario import load_scenario
 
@@ -100,7 +102,15 @@ def test_a_recorder_takes_over_from_one_that_ended(tmp_path: Path, ahead_ns: int
         own = session._own("later", clock)
         said = session.said.append
         recorder = Recorder(
-            session.network.join(), own, REAL, 99, LogStorage(later), lambda: False, said
+            session.network.join(),
+            own,
+            REAL,
+            99,
+            LogStorage(later),
+            make_scenario_reader(),
+            collect_provenance(),
+            lambda: False,
+            said,
         )
         epoch = recorder.join(30.0)
         assert epoch is not None

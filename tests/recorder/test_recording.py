@@ -13,11 +13,13 @@ from recorder.session_recording import LAST_NS, RECONNECT_NS, SETTLE_NS
 from recorder.site_reception import AWAY_NS, EVENT_BYTES
 from tests.net.local_bus import LocalNetwork
 from tests.sites.relay import Relay, RelayClock
+from trilat_net.app.recorded_session import make_scenario_reader
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import TickInput
 from trilat_net.execution.verify import verify
 from trilat_net.log.log_reader import open_log
 from trilat_net.log.log_writer import LogStorage
+from trilat_net.log.provenance import collect_provenance
 from trilat_net.net import topics
 from trilat_net.net.messages import Event
 from trilat_net.net.wire import encode, encode_state
@@ -343,6 +345,8 @@ def start_recorder(
         session=SESSION,
         boot=BOOTS[topics.RECORDER],
         storage=LogStorage(folder / "run.mcap"),
+        read_scenario=make_scenario_reader(),
+        provenance=collect_provenance(),
         stopped=lambda: clock.monotonic_ns() > stop_ns,
         say=str,
     )

@@ -13,11 +13,13 @@ from sites import realtime
 from sites.site_parts import SiteOptions, SiteParts
 from sites.site_process import join_and_run
 from tests.net.local_bus import LocalNetwork
+from trilat_net.app.recorded_session import make_scenario_reader
 from trilat_net.app.running_session import RunningSession
 from trilat_net.errors import LogRefused, RunFailed, SessionError
 from trilat_net.execution import virtual
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.log.log_writer import LogStorage
+from trilat_net.log.provenance import collect_provenance
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock, SkewedClock
 from trilat_net.net.connection import Connection
@@ -138,6 +140,8 @@ class Session:
                 own = self._own("recorder", clock)
                 recorder = Recorder(
                     *(bus, own, SESSION, boot, self.storage or LogStorage(self.path)),
+                    make_scenario_reader(),
+                    collect_provenance(),
                     stopped,
                     self.said.append,
                 )

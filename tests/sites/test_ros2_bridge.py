@@ -649,7 +649,7 @@ class Sites:
     def begin(self, epoch_unix_ns: int) -> None:
         about = {"running": True, "epoch_unix_ns": epoch_unix_ns}
         self._info = encode(
-            describe_member("s", 1, SystemClock(), self._scenario.text, **about)
+            describe_member("s", 1, SystemClock(), "0", self._scenario.text, **about)
         )
         self._event(encode(event("epoch", epoch_unix_ns=epoch_unix_ns)))
 

@@ -38,8 +38,9 @@ from ..log.log_reader import Log, open_log
 from ..log.log_writer import LogWriter
 from ..log.mcap_reader import Progress
 from ..log.mcap_writer import Sink
+from ..log.provenance import collect_provenance
 from ..log.record_columns import Ints
-from ..log.ros2.viz_channels import VIZ_HZ
+from ..log.ros2.viz_channels import VIZ_HZ, offer_views
 from ..log.site_log import SiteLog
 from ..net.messages import READABLE, State
 from ..net.wire import decode
@@ -356,8 +357,8 @@ class Rerun(Result):
 
         Args:
             stream: Stream to which the log is written. It is not closed.
-            views_hz: Rate of the additional channels for viewers, in Hz, see `LogWriter`. 0
-                means none.
+            views_hz: Rate of the additional channels for viewers, in Hz, see
+                `offer_views`. 0 means none.
 
         Raises:
             LogError: The start time that the log states is not a time.
@@ -373,8 +374,9 @@ class Rerun(Result):
             session=session,
             driver=RERUN_DRIVER,
             epoch_unix_ns=epoch_unix_ns,
+            provenance=collect_provenance(),
             facts=_collect_rerun_metadata(log, request),
-            views_hz=views_hz,
+            make_views=offer_views(request.scenario, views_hz),
         )
 
         channels: dict[str, SiteChannels] = {}

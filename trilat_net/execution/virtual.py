@@ -43,17 +43,18 @@ from ..log.log_writer import LogWriter
 from ..log.mcap_reader import read_contents
 from ..log.mcap_writer import Sink
 from ..log.message_identity import compute_virtual_boot
-from ..log.ros2.viz_channels import VIZ_HZ
+from ..log.provenance import collect_provenance
+from ..log.ros2.viz_channels import VIZ_HZ, offer_views
 from ..net import topics
 from ..net.messages import SENT_TIME_SINCE, VERSION, Event, LinkStats, State
 from ..net.timing import LoopStats
 from ..net.topics import number_message, skipped_numbers
 from ..net.wire import encode, encode_state
+from ..recorded_change import count_skipped_ticks
 from ..scenario import Scenario
 from ..scenario.imported_code import ImportedLaw
 from ..scenario.operators.program_hand import make_hand_players
 from ..scenario.own_plant import PlantPlayer, make_plant_players
-from ..scenario.run_changes import count_skipped_ticks
 from ..scenario.validate import refuse_external_arms
 from .resumption import read_output, select_peer_channels
 from .virtual_network import Network, PromptNetwork
@@ -598,7 +599,8 @@ def write_virtual_log(
         session=scenario.name,
         driver="virtual",
         epoch_unix_ns=0,
-        views_hz=views_hz,
+        provenance=collect_provenance(),
+        make_views=offer_views(scenario, views_hz),
     )
     members: dict[str, _VirtualChannels] = {}
     within_limits = True

@@ -30,8 +30,8 @@ from ..errors import WireError
 from ..net import messages, topics
 from ..net.topics import number_message
 from ..net.wire import decode
+from ..recorded_change import count_skipped_ticks
 from ..scenario import Scenario
-from ..scenario.run_changes import count_skipped_ticks
 from .log_layout import CHANNEL_TYPES, MAX_TIME_NS, RECORDER_CHANNELS, SITE_CHANNELS, VIZ_ROOT
 from .mcap_records import MESSAGE_HEAD, OP_MESSAGE, UnreadableRecord, iterate_records
 from .message_identity import (

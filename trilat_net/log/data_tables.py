@@ -34,10 +34,10 @@ from numpy.typing import NDArray
 
 from ..core.arms.chain import LINK_PARAMETERS
 from ..core.arms.task_space import POSE, POSITION
-from ..core.step.ticks import NS_PER_S
 from ..errors import LogError
 from ..files import import_extra
 from ..net.messages import Event, LinkStats, State, json_schema
+from ..records import NS_PER_S
 from ..scenario import Scenario
 from ..scenario.arms import TASK_AXES, ArmModel
 from .orientations import QUATERNION_AXES, align_signs, compute_quaternions

@@ -58,7 +58,7 @@ from ..scenario import Scenario, parse_core_change, parse_embedded
 from ..scenario.code_consent import LawFiles, allow_logged_code
 from ..scenario.delay_traces import TracePoint
 from ..scenario.sample_uses import PictureDelay
-from .accounting import LAST, SessionAccounts, describe_unknown_ends
+from .accounting import LAST, describe_unknown_ends
 from .data_tables import (
     EVENTS_TABLE,
     SITE_TABLE_KINDS,
@@ -81,6 +81,7 @@ from .log_layout import (
 from .mcap_reader import ChannelMessages, LogContents, Progress, read_contents, shift_progress
 from .merge import identify_session, merge_parts
 from .record_columns import Ints
+from .session_accounts import SessionAccounts
 from .site_log import SiteLog, TimedMessages
 
 if TYPE_CHECKING:

@@ -18,29 +18,78 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Protocol
 
-from ..core.step.ticks import TickRecord
 from ..errors import LogRefused, UsageError
 from ..files import refuse_existing
 from ..net import topics
 from ..net.messages import VERSION, Event, LinkStats, State, json_schema
-from ..scenario import Scenario
+from ..records import TickRecord
 from . import log_layout
 from .log_file import LogFile
 from .mcap_writer import McapWriter, Sink
-from .ros2.ros2_messages import StandardChannels
-from .ros2.viz_channels import ReceiveMessage, VizChannels
 from .running_digest import ALGORITHM, DIGESTS_KEY, PREVIOUS_DIGEST_KEY
+from .session_scenario import SessionScenario
 
 Decoded = State | TickRecord | LinkStats | Event | None
 """Decoded message, from which messages for viewers are derived. None if there are none."""
+ReceiveMessage = Callable[[Any, int], None]
+"""Function that receives one message of the session, and its arrival time in Unix ns."""
+PutMessage = Callable[[str, bytes, int, int], None]
+"""Function that writes one message: topic, bytes, sending and arrival time in Unix ns."""
+
+
+class ViewChannels(Protocol):
+    """Numbers of the channels for viewers in a file, by topic."""
+
+    def __getitem__(self, topic: str) -> int:
+        """Returns the number of a topic's channel, and registers the channel if necessary."""
+
+
+class LogViews(Protocol):
+    """Derives messages for general viewers from the messages of a session.
+
+    `ros2.viz_channels.VizChannels` derives standard messages of ROS 2.
+
+    Attributes:
+        receivers: Functions that receive the messages of the session, by the key of the
+            messages.
+    """
+
+    receivers: dict[str, ReceiveMessage]
+
+    @property
+    def most_bytes(self) -> int:
+        """Upper bound for the size of the messages that are not written yet, in bytes."""
+
+    def open_channels(self, file: McapWriter) -> ViewChannels:
+        """Returns the channels for viewers of a file, which are registered when needed.
+
+        Args:
+            file: The file.
+        """
+
+    def finish(self, log_ns: int) -> None:
+        """Writes the remaining messages, at the end of the log.
+
+        Args:
+            log_ns: Arrival time of the last message of the session, in Unix time, in ns.
+        """
+
+
+MakeViews = Callable[[str, int, PutMessage], LogViews]
+"""Function that creates the views of one file.
+
+Its arguments are the name of the session, the Unix time of tick 0 in ns, and the function that
+writes a message.
+"""
 
 
 class LogWriter:
     """Writer of one log file.
 
-    Besides the messages as they were published, it can write the same data as standard messages
-    of ROS 2 for viewers (`VizChannels`).
+    Besides the messages as they were published, it can write messages for viewers, which are
+    derived from them.
 
     Args:
         stream: File or buffer that receives the bytes.
@@ -48,11 +97,11 @@ class LogWriter:
         session: Name of the session.
         driver: "live" or "virtual", the session's kind of time.
         epoch_unix_ns: Unix time of tick 0, in ns. It is 0 in virtual time.
+        provenance: Facts about the program that writes the log, see `provenance`.
         facts: Further metadata of the session.
         part: Metadata of the part, if the log has several files.
         choice: Filter of the channels that the log contains.
-        views_hz: Rate of the messages for viewers, in Hz, see `VizChannels`. With 0, the log
-            contains none.
+        make_views: Creates the messages for viewers. With None, the log contains none.
 
     Attributes:
         records_digest: Digest of the messages of a finished log. Empty before the end.
@@ -64,38 +113,31 @@ class LogWriter:
     def __init__(
         self,
         stream: Sink,
-        scenario: Scenario,
+        scenario: SessionScenario,
         session: str,
         driver: str,
         epoch_unix_ns: int,
+        provenance: Mapping[str, str],
         facts: Mapping[str, str] | None = None,
         *,
         part: Mapping[str, str] | None = None,
         choice: log_layout.ChannelFilter = log_layout.ALL_CHANNELS,
-        views_hz: float = 0.0,
+        make_views: MakeViews | None = None,
     ) -> None:
         self._epoch_unix_ns = epoch_unix_ns
         self.records_digest = ""
         # Reason why no message can be added any more. Empty while the log is open.
         self._end_reason = ""
-        self._views = None
-        if views_hz:
-            self._views = VizChannels(
-                scenario=scenario,
-                session=session,
-                epoch_unix_ns=epoch_unix_ns,
-                views_hz=views_hz,
-                put=self._add_view_message,
-            )
-        self._view_receivers: dict[str, ReceiveMessage] = (
-            self._views.receivers if self._views else {}
-        )
+        self._views: LogViews | None = None
+        self._view_receivers: dict[str, ReceiveMessage] = {}
+        if make_views is not None:
+            self._views = make_views(session, epoch_unix_ns, self._add_view_message)
+            self._view_receivers = self._views.receivers
         self._last_log_ns = 0
-        provenance = log_layout.collect_provenance()
         self._file = McapWriter(stream, f"trilat-net {provenance['version_trilat-net']}")
-        self._view_channels = StandardChannels(
-            self._file, self._views.channels if self._views else {}
-        )
+        self._view_channels: ViewChannels = {}
+        if self._views is not None:
+            self._view_channels = self._views.open_channels(self._file)
         about = {
             "schema_version": str(VERSION),
             "session": session,
@@ -123,7 +165,7 @@ class LogWriter:
             self._file.flush()
 
     def _register_channels(
-        self, scenario: Scenario, session: str, choice: log_layout.ChannelFilter
+        self, scenario: SessionScenario, session: str, choice: log_layout.ChannelFilter
     ) -> dict[str, int | None]:
         """Registers the schemas and channels of the session.
 
@@ -317,8 +359,6 @@ class LogStorage:
         carry_on: True to continue an existing log of this name with a new part. The existing
             log may be finished or not.
         choice: Filter of the channels that the log contains.
-        views_hz: Rate of the additional messages for viewers, in Hz, see `VizChannels`. With 0,
-            the log contains none.
     """
 
     path: Path
@@ -328,7 +368,6 @@ class LogStorage:
     split_ns: int | None = None
     carry_on: bool = False
     choice: log_layout.ChannelFilter = log_layout.ALL_CHANNELS
-    views_hz: float = 0.0
 
     @property
     def splits(self) -> bool:

@@ -21,11 +21,11 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.step.site_setup import Layout
 from ..core.step.vectors import Array
 from ..errors import WireError
 from ..net.messages import MODES, READABLE, Stamp, State, TickNumber
 from ..net.wire import MAX_BYTES, decode
+from ..records import Layout
 
 Ints = NDArray[np.int64]
 

@@ -33,7 +33,7 @@ from ..net.messages import VERSION, json_schema
 from ..results import Result
 from ..scenario import parse_embedded
 from . import mcap_records
-from .accounting import Coverage, SessionAccounts, open_session_accounts, parse_counts
+from .accounting import Coverage, parse_counts
 from .content_check import ContentCheck
 from .log_file import LogFile
 from .log_layout import (
@@ -43,14 +43,15 @@ from .log_layout import (
     PART,
     SCENARIO,
     SESSION,
-    collect_provenance,
     describe_unfinished,
 )
 from .mcap_reader import McapReader, Progress, check_log
 from .mcap_records import UnreadableRecord
 from .mcap_writer import McapWriter
+from .provenance import collect_provenance
 from .recovery_survey import RecoverySurvey
 from .running_digest import DIGESTS, RECOVERED, DigestState
+from .session_accounts import SessionAccounts, open_session_accounts
 from .torn_chunk import TornChunk
 
 _UNOPENED = "other MCAP programs open the new file, commands of trilat-net do not"

@@ -22,14 +22,14 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from ..core.step.ticks import NS_PER_S
 from ..errors import LogError, ScenarioError, WireError, count_nouns
 from ..files import open_regular
 from ..net import messages, topics
 from ..net.wire import decode
+from ..recorded_change import count_skipped_ticks
+from ..records import NS_PER_S
 from ..scenario import Scenario, parse_embedded
-from ..scenario.run_changes import count_skipped_ticks
-from .accounting import Account, SessionAccounts, describe_unknown_ends, parse_counts
+from .accounting import Account, describe_unknown_ends, parse_counts
 from .findings import CheckReport, Finding, Findings
 from .log_layout import (
     ACCOUNTS,
@@ -48,6 +48,7 @@ from .mcap_reader import ChannelInfo, McapMessage, McapReader, Progress, shift_p
 from .message_identity import AnyMessage, identify_message
 from .ros2 import cdr
 from .running_digest import DigestState, Integrity
+from .session_accounts import SessionAccounts
 
 MAX_AHEAD_NS = 10 * NS_PER_S
 """Largest time by which the sending may be later than the arrival, because of wrong clocks."""

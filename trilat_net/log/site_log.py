@@ -22,13 +22,12 @@ import numpy as np
 from .. import process
 from ..core.arms.task_space import POSE, POSITION
 from ..core.plug.law_channel import LawChannel
-from ..core.step.site_setup import Layout
-from ..core.step.ticks import NS_PER_S
 from ..core.step.vectors import Array
 from ..errors import LogError, WireError, count_nouns
 from ..net.messages import READABLE, State
 from ..net.wire import decode
-from ..scenario.run_changes import count_skipped_ticks
+from ..recorded_change import count_skipped_ticks
+from ..records import NS_PER_S, Layout
 from . import record_columns
 from .orientations import align_signs, compute_quaternion_parts, compute_quaternions
 from .record_columns import Ints

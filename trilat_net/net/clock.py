@@ -11,8 +11,7 @@ import time
 from pathlib import Path
 from typing import Protocol
 
-# Also in `core.ticks`, which loads the compiler; a router does not need the compiler.
-NS_PER_S = 1_000_000_000
+from ..records import NS_PER_S
 
 
 class Clock(Protocol):

@@ -32,9 +32,8 @@ from typing import NamedTuple
 
 import msgspec
 
-from ..core.step.fingerprint import compute_fingerprint
-from ..core.step.site_setup import Layout
 from ..errors import SessionError, WireError
+from ..records import Layout
 from . import topics
 from .bus import Bus, Inbox
 from .clock import Clock
@@ -56,6 +55,7 @@ def describe_member(
     member: str,
     boot: int,
     clock: Clock,
+    fingerprint: str,
     scenario: str = "",
     **fields: object,
 ) -> Info:
@@ -67,6 +67,7 @@ def describe_member(
         member: Name of the member.
         boot: Random number that identifies this start of the process.
         clock: Clock of the member.
+        fingerprint: Fingerprint of the floating-point arithmetic on the member's platform.
         scenario: Text of the scenario file. Empty if the member does not know the scenario.
         **fields: Further fields of `Info`.
 
@@ -82,7 +83,7 @@ def describe_member(
         "scenario": scenario,
         "host": platform.node(),
         "clock": clock.identity(),
-        "fingerprint": compute_fingerprint(),
+        "fingerprint": fingerprint,
     }
     return msgspec.convert({**basic_fields, **fields}, Info)
 

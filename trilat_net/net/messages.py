@@ -23,10 +23,7 @@ from typing import Annotated, Any, NamedTuple
 import msgspec
 from msgspec import Meta
 
-from ..core.arms.chain import MAX_JOINTS
-from ..core.plug.user_law import MAX_LAW_MEMORY
-from ..core.step.site_setup import Layout
-from ..core.step.ticks import Mode
+from ..records import MAX_JOINTS, MAX_LAW_MEMORY, Layout, Mode
 
 VERSION = 4
 """Version of the schema of sent messages. Messages of other versions are not accepted."""

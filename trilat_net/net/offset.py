@@ -38,9 +38,11 @@ from collections import deque
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..core.step.ticks import NS_PER_S
-from ..core.step.vectors import Array
+from ..records import NS_PER_S
+
+_Array = NDArray[np.float64]
 
 WINDOWS_KEPT = 60
 """Number of windows whose limits are stored."""
@@ -283,7 +285,7 @@ class _AdmissibleLines:
         simultaneous_gap = np.min(gaps, where=intervals_s == 0.0, initial=0.0)
         self.exist = bool(simultaneous_gap >= 0.0 and self.flattest <= self.steepest)
 
-    def _read_columns(self, limits: deque[OffsetLimit]) -> tuple[Array, Array]:
+    def _read_columns(self, limits: deque[OffsetLimit]) -> tuple[_Array, _Array]:
         """Returns the times of limits in s relative to the present, and their offsets in ns."""
         times_ns = [min(0, limit.local_ns - self._now_ns) for limit in limits]
         offsets_ns = [limit.offset_ns - self._base_ns for limit in limits]

@@ -12,8 +12,8 @@ a query is repeated, and replies to the last QUERIES_KEPT copies are accepted.
 from collections import deque
 from collections.abc import Callable, Collection, Mapping
 
-from ..core.step.ticks import NS_PER_S
 from ..errors import WireError
+from ..records import NS_PER_S
 from . import topics
 from .bus import Bus, Inbox, Query
 from .clock import Clock

@@ -30,8 +30,8 @@ Invariant:
 
 from collections.abc import Mapping, Sequence
 
-from ..core.step.ticks import first_tick_at, tick_ns
 from ..errors import SessionError
+from ..records import NS_PER_S
 from . import topics
 from .bus import Bus
 from .clock import Clock
@@ -311,7 +311,7 @@ class SessionJoin:
         slowest_ns = self.pinger.slowest_ns()
         if self._coming is not None:
             coming, requested_epoch = self._coming
-            first_tick_ns = requested_epoch.mono_ns + tick_ns(coming.ticks, rate_hz)
+            first_tick_ns = requested_epoch.mono_ns + coming.ticks * NS_PER_S // rate_hz
             if now_ns < first_tick_ns - DECIDE_NS:
                 running_names = {site.member for site in running}
                 if not self._admitted_by >= running_names:
@@ -320,7 +320,8 @@ class SessionJoin:
 
         since_epoch_ns = now_ns - epoch.mono_ns
         first_tick_after_ns = since_epoch_ns + EPOCH_AHEAD_NS + 2 * slowest_ns
-        first = first_tick_at(first_tick_after_ns, rate_hz)
+        # The division of the negative number rounds up: no tick before that time is chosen.
+        first = -(-first_tick_after_ns * rate_hz // NS_PER_S)
         self._attempt += 1
         self._admitted_by = set()
         coming = self._publisher.publish(

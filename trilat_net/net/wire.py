@@ -26,10 +26,8 @@ from typing import Any, TypeVar
 import msgpack
 import msgspec
 
-from ..core.arms.chain import MAX_JOINTS
-from ..core.step.site_setup import Layout
-from ..core.step.ticks import Arrival, TickRecord
 from ..errors import WireError, count_nouns
+from ..records import MAX_JOINTS, Arrival, Layout, TickRecord
 from .messages import (
     MODE_WORDS,
     STATE_VECTORS,

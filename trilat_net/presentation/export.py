@@ -24,9 +24,10 @@ from numpy.typing import NDArray
 from ..errors import UsageError
 from ..files import import_extra, refuse_existing, stage_output
 from ..log.data_tables import Column, Table
-from ..log.log_layout import SCENARIO, collect_provenance
+from ..log.log_layout import SCENARIO
 from ..log.log_reader import Log
 from ..log.mcap_reader import Progress
+from ..log.provenance import collect_provenance
 from ..results import JsonObject
 from . import exports
 

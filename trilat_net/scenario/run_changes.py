@@ -18,7 +18,6 @@ Invariant:
 import re
 from collections import deque
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from typing import Any
 
 import msgspec
@@ -204,22 +203,6 @@ def find_requester(sentence: str) -> str:
     """
     match = re.fullmatch(r"\S+ was stopped by (.+) at [\d.]+ s", sentence)
     return "" if match is None else match[1]
-
-
-def count_skipped_ticks(texts: Sequence[str]) -> int:
-    """Returns how many ticks a site missed just before a record, because it was too late.
-
-    A record lists the changes of its tick, among them those that report missed ticks.
-
-    Args:
-        texts: JSON texts of the changes in the record. Texts that cannot be read are ignored.
-    """
-    skipped = 0
-    for text in texts:
-        if "overrun" in text:
-            with suppress(msgspec.MsgspecError):
-                skipped += msgspec.json.decode(text, type=Change).ticks
-    return skipped
 
 
 def to_core_change(scenario: Scenario, change: Change) -> CoreChange:

@@ -38,6 +38,9 @@ from ..core.step.vectors import Array
 from ..errors import ScenarioError
 from ..fields import Frozen, Joints, Positive, PositiveJoints, RateHz, Real
 from ..laws.sent_vectors import SentVectorSpecs, build_channel
+from ..recorded_change import RecordedChange
+from ..recorded_change import SiteOrder as SiteOrder
+from ..records import Layout
 from .arms import (
     START_MARGIN_RAD,
     Arm,
@@ -240,55 +243,17 @@ SITE_GROUPS: dict[str, type[Frozen]] = {
 """Groups of keys that may be written once for all sites and again for one site, by table."""
 
 
-SiteOrder = Literal[
-    "",
-    "stop",
-    "enable",
-    "reset",
-    "overrun",
-    "arm_silent",
-    "arm_lost",
-    "arm_back",
-    "released",
-    "held",
-]
-"""Commands that change the mode of a site. The empty text means that there is no command.
-
-Users send "stop", "enable" and "reset". The site itself causes the others, for example
-"arm_lost" if no measurement has arrived from its robot.
-"""
 TIMELINE_KEYS = ("at_s", "link", "dominance", "to", "ramp_s")
 """Keys of a planned change in a scenario file."""
 
 
-class Change(Frozen, frozen=True, omit_defaults=True):
+class Change(RecordedChange, frozen=True, omit_defaults=True):
     """Change of a link or of dominance factors, or a command to a site.
 
     A scenario plans changes in its timeline; users request further ones during a run. Exactly
     one of `link`, `dominance` and `site` is not empty. Only the changes in records of a run
     have `site`.
-
-    Attributes:
-        at_s: Time at which the change takes effect, in s after the epoch, the common start
-            time. A link changes for samples that are sent at this time or later.
-        link: Name of the link that changes, for example "m1->s".
-        dominance: Name of the site whose dominance factors change. A dominance factor is the
-            weight with which the site follows a peer.
-        to: State after the change: all keys of the link, or the factors of all peers.
-        ramp_s: Duration of the linear transition to the new factors, in s.
-        site: Name of the site that receives a command.
-        order: The command, see `core.ticks.LifeOrder`.
-        ticks: For the command "overrun": number of ticks that the site missed.
     """
-
-    at_s: Annotated[float, Meta(ge=0.0, le=1e6)]
-    link: str = ""
-    dominance: str = ""
-    to: dict[str, Any] = msgspec.field(default_factory=dict)
-    ramp_s: Annotated[float, Meta(ge=0.0, le=1e6)] = 0.0
-    site: str = ""
-    order: SiteOrder = ""
-    ticks: Annotated[int, Meta(ge=0, lt=2**40)] = 0
 
     @property
     def start_ns(self) -> int:
@@ -661,10 +626,10 @@ class Scenario(Frozen, frozen=True, dict=True):
             site: Name of the site.
         """
         sends: SentVectorSpecs = getattr(self.sites[site].control, "sends", {})
-        layout = site_setup.Layout.of_arm(self.arms[site].chain)
+        layout = site_setup.make_layout(self.arms[site].chain)
         return build_channel(sends, layout, len(self.names) - 1)
 
-    def layout(self, site: str) -> site_setup.Layout:
+    def layout(self, site: str) -> Layout:
         """Returns the lengths of all vectors in the log of a site.
 
         The log of a site, the process that runs one arm, has one entry for each control period.
@@ -675,7 +640,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         """
         live_hand = self.sites[site].find_live_hand()
         actors = () if live_hand is None else (live_hand.actor,)
-        layout = site_setup.Layout.of_arm(
+        layout = site_setup.make_layout(
             self.arms[site].chain, self.channel(site).record_size, actors
         )
         return layout._replace(bodies=_POSE_NUMBERS * len(self.bodies_m(site)))

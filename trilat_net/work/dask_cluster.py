@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 from ..core.step.fingerprint import compute_fingerprint
 from ..errors import RunFailed, ScenarioError, UsageError
 from ..files import import_extra
-from ..log.log_layout import collect_provenance
+from ..log.provenance import collect_provenance
 from ..net.clock import SystemClock
 from ..net.host_names import UnknownHost, check_hosts
 from ..scenario.code_consent import ImportedCode

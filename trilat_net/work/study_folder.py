@@ -27,7 +27,7 @@ import tomli_w
 from ..core.step.fingerprint import compute_fingerprint
 from ..errors import ScenarioError, join_arguments
 from ..files import describe_write_error, extend_file
-from ..log.log_layout import collect_provenance
+from ..log.provenance import collect_provenance
 from ..scenario.imported_code import name_law_classes
 from .executor import Progress, WorkerPool
 

@@ -12,6 +12,7 @@ from tests.analysis.certificate import runs
 from tests.analysis.logs import rewritten
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.log.log_writer import LogWriter
+from trilat_net.log.provenance import collect_provenance
 from trilat_net.net import topics
 from trilat_net.net.wire import encode
 from trilat_net.scenario import parse_scenario
@@ -63,7 +64,7 @@ def under(log: Log, overrides: Mapping[str, Any]) -> Log:
     """The records of a log under a scenario that says something else."""
     scenario = parse_scenario(log.scenario_text, "changed", dict(overrides))
     stream = io.BytesIO()
-    writer = LogWriter(stream, scenario, scenario.name, "virtual", 0)
+    writer = LogWriter(stream, scenario, scenario.name, "virtual", 0, collect_provenance())
     for site in log.sites:
         key = topics.key(scenario.name, site, topics.STATE)
         for state in log[site].states:

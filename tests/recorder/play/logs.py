@@ -9,6 +9,7 @@ from mcap.reader import make_reader
 from trilat_net.app.play.batch import MessageBatch
 from trilat_net.app.play.session_reader import PlaySelection, SessionHeader, preload_messages
 from trilat_net.log.log_writer import LogWriter
+from trilat_net.log.provenance import collect_provenance
 from trilat_net.net import topics
 from trilat_net.net.messages import Event
 from trilat_net.net.wire import encode
@@ -51,7 +52,9 @@ def write(
         session: its name.
     """
     with path.open("wb") as stream:
-        writer = LogWriter(stream, load_scenario("paper"), session, "live", EPOCH_UNIX_NS)
+        writer = LogWriter(
+            stream, load_scenario("paper"), session, "live", EPOCH_UNIX_NS, collect_provenance()
+        )
         for site, n, sent_ms, came_ms in messages:
             key = topics.key(session, site, topics.EVENT)
             came_ns = EPOCH_UNIX_NS + came_ms * 1_000_000

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from trilat_net.core.step.fingerprint import compute_fingerprint
 from trilat_net.errors import LogRefused, UsageError
-from trilat_net.log.log_layout import collect_provenance
+from trilat_net.log.provenance import collect_provenance
 from trilat_net.studies.sweep.sweep_cell import CellRun
 from trilat_net.studies.sweep.sweep_run import (
     PLAN_FILE,

@@ -294,8 +294,10 @@ def record_command(
     from ...files import refuse_existing
     from ...log.log_layout import find_parts, parse_channel_filter
     from ...log.log_writer import LogStorage, parse_split
+    from ...log.provenance import collect_provenance
     from ...log.ros2.viz_channels import parse_viz_rate
     from ...net.topics import RECORDER
+    from ..recorded_session import make_scenario_reader
 
     options.check_session_name(session)
     connection = ways.resolve().require(RECORDER)
@@ -308,8 +310,8 @@ def record_command(
         split_ns=parse_split("--split-duration", "seconds", split_duration, 10**9),
         carry_on=carry_on,
         choice=parse_channel_filter(include or [], exclude or []),
-        views_hz=parse_viz_rate(views),
     )
+    read_scenario = make_scenario_reader(parse_viz_rate(views))
 
     # Problems of the output are reported now, before the recorder waits for the session.
     storage.find_first_part()
@@ -336,6 +338,8 @@ def record_command(
             session=session,
             storage=storage,
             connection=connection,
+            read_scenario=read_scenario,
+            collect_provenance=collect_provenance,
             join_timeout_s=join_timeout,
             clock=clock,
             say=terminal.print_line,

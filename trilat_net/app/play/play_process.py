@@ -20,9 +20,10 @@ from typing import NamedTuple
 from trilat_net import process
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
-from trilat_net.net.clock import NS_PER_S, Clock
+from trilat_net.net.clock import Clock
 from trilat_net.net.connection import Connection
 from trilat_net.net.discovery import open_playback_bus, refuse_running_session
+from trilat_net.records import NS_PER_S
 
 from .batch import MessageBatch
 from .message_source import MessageSource

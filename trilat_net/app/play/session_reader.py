@@ -34,8 +34,8 @@ from trilat_net.log.log_layout import (
 )
 from trilat_net.log.mcap_reader import McapMessage, McapReader, Progress
 from trilat_net.net import topics
-from trilat_net.net.clock import NS_PER_S
 from trilat_net.net.topics import number_message
+from trilat_net.records import NS_PER_S
 from trilat_net.scenario import Scenario, parse_embedded
 
 from .batch import BatchBuilder, MessageBatch, PlayedMessage

@@ -230,7 +230,7 @@ class SiteStandIns:
         self._infos = {}
         for site, boot in header.boots.items():
             self._infos[site] = describe_member(
-                site, boot, clock, header.scenario_text, fingerprint=header.fingerprint
+                site, boot, clock, header.fingerprint, header.scenario_text
             )
         self._identity_queries = {}
         self._backfill_queries = {}

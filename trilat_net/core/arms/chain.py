@@ -51,12 +51,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ...records import MAX_JOINTS as MAX_JOINTS
 from ..step.jit import leaf
 from ..step.vectors import Array, Row, RowArray, Vector
 from .elementary import sincos
 
 LINK_PARAMETERS = 10
-MAX_JOINTS = 12
 COULOMB_SPEED = 0.01
 """Speed at which the smoothed Coulomb friction has 71 % of its full value, rad/s or m/s."""
 

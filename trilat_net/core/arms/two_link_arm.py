@@ -20,12 +20,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ...records import JOINTS as JOINTS
+from ...records import PARAMETERS as PARAMETERS
 from ..step.jit import leaf
 from ..step.vectors import Array, Five, Pair, Vector
 from .elementary import sincos
-
-JOINTS = 2
-PARAMETERS = 5
 
 
 class ArmLinks(NamedTuple):

@@ -19,10 +19,8 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from ...errors import LawFailed, count_nouns, describe_exception
+from ...records import MAX_LAW_MEMORY as MAX_LAW_MEMORY
 from ..step.vectors import Vector
-
-MAX_LAW_MEMORY = 1024
-"""Largest count of numbers in a law's memory, which each record contains."""
 
 
 class LawContext(NamedTuple):

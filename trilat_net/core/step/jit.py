@@ -6,8 +6,9 @@ function is called a leaf.
 
 Where the code is stored:
     - The machine code is in the user's cache directory, in a folder named after a hash of all
-      source files of this package. Numba alone notices a change of the file that holds a
-      function, but not of the functions that it calls.
+      source files of this package and of `records.py`, whose constants it contains. Numba alone
+      notices a change of the file that holds a function, but not of the functions that it
+      calls.
     - A binary wheel contains the same kind of folder, with code for any processor of its
       platform. This code is used if the cache directory has no code for the present processor.
 
@@ -73,9 +74,12 @@ def _cache_root() -> Path:
 
 
 def _core_digest() -> str:
-    """Returns a hash of all source files of the core and of Numba's version."""
+    """Returns a hash of all sources of the machine code, and of Numba's version.
+
+    The sources are the files of the core, and the constants that it imports from `records`.
+    """
     digest = hashlib.sha256(numba.__version__.encode())
-    for source in sorted(_CORE.rglob("*.py")):
+    for source in (*sorted(_CORE.rglob("*.py")), _CORE.with_name("records.py")):
         digest.update(source.read_bytes())
     return digest.hexdigest()[:16]
 

@@ -12,14 +12,14 @@ Invariant:
 import math
 from collections.abc import Sequence
 from enum import IntEnum
-from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
 
+from ...records import Layout as Layout
 from ..arms.chain import LINK_PARAMETERS, ChainJoint, Matrix, Three
 from ..arms.exogenous import LIVE_KINDS, TorqueKind, TorqueSource
-from ..arms.two_link_arm import JOINTS, PARAMETERS
+from ..arms.two_link_arm import JOINTS
 from ..life.live_hand import count_hand_numbers
 from ..links.delay import LinkModel
 from ..plug.law_channel import LawChannel, SentVector, join_received
@@ -210,169 +210,39 @@ class LinkSetup(NamedTuple):
     dispensable: bool = False
 
 
-class Layout(NamedTuple):
-    """Lengths of the vectors that describe an arm and its control law.
+def make_layout(
+    chain: "ChainSetup | None", sent: int = 0, actors: Sequence[TorqueSource] = ()
+) -> Layout:
+    """Computes the lengths of the vectors of an arm.
 
-    Attributes:
-        joints: Number of joints of the arm.
-        shared: Number of coordinates that the arms send each other.
-        parameters: Number of dynamic parameters of the arm.
-        chain: True if the arm is a chain of joints. False for the planar two-link arm.
-        task: True if the coordinates are the pose of the end effector. False if they are joint
-            angles.
+    Args:
+        chain: The arm if it is a chain of joints. None for the planar two-link arm.
         sent: Number of values that the control law sends to other arms in each period.
-        hand: Number of values that describe the person or program who moves the arm during the
-            run, see `live_hand`. 0 if there is none.
-        bodies: Number of values in the poses of other bodies in the scene, see
-            `TickRecord.bodies`.
+        actors: Operators and environments of the arm. At most one of them is a person or
+            program that moves the arm during the run.
     """
+    joints = JOINTS if chain is None else len(chain.joints)
 
-    joints: int = JOINTS
-    shared: int = JOINTS
-    parameters: int = PARAMETERS
-    chain: bool = False
-    task: bool = False
-    sent: int = 0
-    hand: int = 0
-    bodies: int = 0
+    live = next((actor.kind for actor in actors if actor.kind in LIVE_KINDS), None)
+    if live is None:
+        hand = 0
+    elif live is TorqueKind.LIVE_JOINT:
+        hand = count_hand_numbers(joints)
+    else:
+        hand = count_hand_numbers(2 if chain is None else 3)
 
-    @classmethod
-    def of_arm(
-        cls, chain: "ChainSetup | None", sent: int = 0, actors: Sequence[TorqueSource] = ()
-    ) -> "Layout":
-        """Computes the lengths of the vectors of an arm.
-
-        Args:
-            chain: The arm if it is a chain of joints. None for the planar two-link arm.
-            sent: Number of values that the control law sends to other arms in each period.
-            actors: Operators and environments of the arm. At most one of them is a person or
-                program that moves the arm during the run.
-        """
-        joints = JOINTS if chain is None else len(chain.joints)
-
-        live = next((actor.kind for actor in actors if actor.kind in LIVE_KINDS), None)
-        if live is None:
-            hand = 0
-        elif live is TorqueKind.LIVE_JOINT:
-            hand = count_hand_numbers(joints)
-        else:
-            hand = count_hand_numbers(2 if chain is None else 3)
-
-        if chain is None:
-            return cls(sent=sent, hand=hand)
-        task = chain.task
-        return cls(
-            joints=joints,
-            shared=joints if task is None else len(task.axes),
-            parameters=LINK_PARAMETERS * joints,
-            chain=True,
-            task=task is not None,
-            sent=sent,
-            hand=hand,
-        )
-
-    def axes(self) -> dict[str, int]:
-        """Returns the lengths of the named axes that fields of the state arrays have.
-
-        The names are "joints", "shared" and "parameters", see `row_fields`.
-        """
-        return {"joints": self.joints, "shared": self.shared, "parameters": self.parameters}
-
-    def lengths(self) -> dict[str, int]:
-        """Returns the lengths of the vectors of a record by name, in their order.
-
-        A record is the result of one tick. Vectors that the site does not have are left out.
-        """
-        n = self.joints
-        m = self.shared
-        lengths = {"q": n, "qd": n, "q_des": m, "qd_des": m, "tau": n, "tau_x": n}
-        lengths["theta_hat"] = self.parameters
-        if self.task:
-            lengths |= {"x": m, "xd": m, "wrench": m}
-        optional = {"ch": self.sent, "hand": self.hand, "bodies": self.bodies}
-        lengths |= {name: count for name, count in optional.items() if count}
-        return lengths
-
-    def columns(self) -> dict[str, slice]:
-        """Finds each vector of a record among the values that a control period computes.
-
-        Returns:
-            A slice for each vector, by name. Vectors that are inputs of the period are left
-            out.
-        """
-        lengths = self.lengths()
-        for name in ("hand", "bodies"):  # inputs of the tick
-            lengths.pop(name, None)
-        ends = accumulate(lengths.values())
-        return {
-            name: slice(end - length, end)
-            for (name, length), end in zip(lengths.items(), ends, strict=True)
-        }
-
-    def count_life_memory(self, peers: int, *, degrades: bool = False) -> int:
-        """Counts the values that the rule `glide` stores in the field `mem` of a record.
-
-        A site is the process that runs one arm. By the rule `glide`, its arm comes to rest
-        while another site is silent, see `session_life`. The values are the state of this rule,
-        from which a run can be continued. They come first in `mem`:
-
-        - the values that every such site stores, for example when each peer was heard last,
-        - in task space, the reference that brings the joints to rest (`rest_columns`),
-        - if the site continues without a lost site, a value for each peer: whether it is lost.
-
-        Args:
-            peers: Number of the other sites from which this site receives data.
-            degrades: True if the site continues without a lost site.
-        """
-        end_of_reference: int = self.rest_columns(peers).stop
-        lost_peer_values = peers * degrades  # none if it does not
-        return end_of_reference + lost_peer_values
-
-    def rest_columns(self, peers: int) -> slice:
-        """Finds the reference that brings the joints to rest, in the field `mem` of a record.
-
-        `mem` contains numbers from which a run can be continued. For a site (the process that
-        runs one arm) with n joints, m coordinates that the sites share, and P peers (the other
-        sites), it starts with the numbers that `Site` stores under the rule `glide`:
-
-            q_held (m), return_from_ns (1), qd_held (m), reason (1), used_ns (P), tau_held (n),
-            q_rest (n), qd_rest (n)                                       only in task space
-
-        `q_rest` and `qd_rest` are the positions and velocities of the reference, for each
-        joint. In joint space, `q_held` and `qd_held` contain them while the arm rests.
-
-        Args:
-            peers: Number P of the other sites from which this site receives data.
-
-        Returns:
-            The slice of `q_rest` and `qd_rest`. Empty in joint space.
-        """
-        held_and_start = self.shared + 1  # q_held and return_from_ns
-        rate_and_reason = self.shared + 1  # qd_held and reason
-        first = held_and_start + rate_and_reason + peers + self.joints
-        length = 2 * self.joints * self.task  # zero in joint space, where `task` is False
-        return slice(first, first + length)
-
-    def list_lost_peers(self, mem: Sequence[float], peers: Sequence[str]) -> list[str]:
-        """Returns the names of the peers without which a site goes on, from its record.
-
-        Args:
-            mem: Field `mem` of the record, the numbers that the site keeps from tick to tick.
-            peers: Names of the site's peers, in scenario order.
-        """
-        end = self.count_life_memory(len(peers), degrades=True)
-        all_gone = mem[end - len(peers) : end]
-        # A record of another rule has a shorter memory, and then no lost peers.
-        return [peer for peer, gone in zip(peers, all_gone, strict=False) if gone]
-
-    @property
-    def floats(self) -> int:
-        """Number of floating-point values in a record, without the values that are inputs.
-
-        A record contains the inputs and results of one period of the control loop.
-        """
-        shared_vectors = 5 if self.task else 2
-        return 4 * self.joints + shared_vectors * self.shared + self.parameters + self.sent
+    if chain is None:
+        return Layout(sent=sent, hand=hand)
+    task = chain.task
+    return Layout(
+        joints=joints,
+        shared=joints if task is None else len(task.axes),
+        parameters=LINK_PARAMETERS * joints,
+        chain=True,
+        task=task is not None,
+        sent=sent,
+        hand=hand,
+    )
 
 
 class TaskSetup(NamedTuple):
@@ -516,7 +386,7 @@ class SiteSetup(NamedTuple):
     @property
     def layout(self) -> Layout:
         """Lengths of the site's vectors."""
-        layout = Layout.of_arm(self.chain, self.channel.record_size, self.actors)
+        layout = make_layout(self.chain, self.channel.record_size, self.actors)
         return layout._replace(bodies=7 * self.bodies)
 
     @property

@@ -15,10 +15,13 @@ from collections.abc import Sequence
 from enum import IntEnum
 from typing import NamedTuple
 
+from ...records import NS_PER_S as NS_PER_S
+from ...records import Arrival as Arrival
+from ...records import Mode as Mode
+from ...records import TickRecord as TickRecord
 from ..links.delay import LinkModel
 from .jit import leaf
 
-NS_PER_S = 1_000_000_000
 BUCKETS_PER_S = 20
 """Equal parts of a second for which a run that is reduced to peaks keeps the peaks."""
 
@@ -51,29 +54,6 @@ def first_tick_at(due_ns: int, rate_hz: int) -> int:
 
 MAX_ARRIVALS = 4096
 """Largest number of arrivals of one tick; a driver keeps further ones for the next tick."""
-
-
-class Mode(IntEnum):
-    """What a site, the process that runs one arm, does in a period of its control loop.
-
-    RUN: the arm follows the other arms. If no samples (states) come from one of them, the mode
-    becomes HOLD (the arm keeps its last reference) or BRAKE (the arm keeps its pose). When
-    samples come again, it becomes RETURN (the arm moves smoothly back to the others), and then
-    RUN. DIVERGED: a joint was too fast, or a number was not finite. This mode is final.
-
-    Under the rule `glide`, explained in `session_life`, there are further modes, and the arm is
-    at rest in all of them. WAITING: not all other arms are heard yet. FAULT: a limit was
-    exceeded; it replaces DIVERGED. STOPPED: the arm was stopped by order.
-    """
-
-    RUN = 1
-    DIVERGED = 2
-    HOLD = 3
-    BRAKE = 4
-    RETURN = 5
-    WAITING = 6
-    FAULT = 7
-    STOPPED = 8
 
 
 class LifeReason(IntEnum):
@@ -138,33 +118,6 @@ class LifeOrder(IntEnum):
     STOP = 7
     ARM_LOST = 8
     OVERRUN = 9
-
-
-class Arrival(NamedTuple):
-    """Sample that arrived at a site from one of its peers.
-
-    A site is a process that runs one arm, and its peers are the other sites. A sample is the
-    state that a peer sends in each period of its control loop.
-
-    Attributes:
-        peer: Index of the peer.
-        tick: Number of the peer's control period in which it sent the sample.
-        q: Joint angles of the peer, rad.
-        qd: Joint velocities of the peer, rad/s.
-        latency_us: Measured latency of the network, us. It is only recorded, and has no effect.
-        tau_x: External torque of the peer, N m, for control laws that reflect force. The torque
-            ON its arm is the negative.
-        ch: Further numbers that the control law of the peer sent, see
-            `LawChannel.select_for_peer`.
-    """
-
-    peer: int
-    tick: int
-    q: Sequence[float]
-    qd: Sequence[float]
-    latency_us: int = 0
-    tau_x: Sequence[float] = ()
-    ch: Sequence[float] = ()
 
 
 class DominanceRamp(NamedTuple):
@@ -239,75 +192,6 @@ class TickInput(NamedTuple):
     commands: Sequence[CoreChange] = ()
     measured: PlantState | None = None
     hand: Sequence[float] = ()
-
-
-class TickRecord(NamedTuple):
-    """The record of one tick: the state AT t_k and its consequences, never the advanced state.
-
-    Attributes:
-        tick: k.
-        t_ns: Nominal time, ns since the epoch.
-        mode: The site's mode.
-        q: Joint angles, rad.
-        qd: Joint velocities, rad/s.
-        q_des: Reference q_id, Eq. (6), rad.
-        qd_des: Its derivative, rad/s.
-        tau: Control torque, Eq. (13), N m.
-        tau_x: Exogenous torque in the sign of Eq. (8), N m; the torque ON the arm is its
-            negative.
-        theta_hat: Estimate of the parameters.
-        used: Tick of the sample in use, per peer in scenario order; -1 before the first.
-        rx_crc: CRC-32 of the arrivals of this tick as the step received them, so that a changed
-            input shows at its own tick. Each arrival is little-endian (peer i64, tick i64, q
-            f64s, qd f64s), followed by its tau_x if the law reflects force.
-        cmd: Texts of the changes that this tick applied.
-        mem: The memory of the site that no other field holds. In RUN and DIVERGED it is empty;
-            otherwise it is the held pose, rad, and the time at which the return began, ns since
-            the epoch (0 before). A site with a user's law always has these numbers, followed
-            by the memory of the law. Under the rule `glide` a site always has the memory of
-            `session_life` instead, see `Layout.count_life_memory`.
-        x: in task space the shared pose of the end effector: position, m, and orientation;
-            otherwise empty.
-        xd: Derivative of x, m/s and rad/s.
-        wrench: tau_x expressed at the end effector, N and N m.
-        ch: The numbers that the site's law sends, see `LawChannel`.
-        hand: The action of a live hand in this tick, see `live_hand`; empty without a hand.
-        bodies: Poses of the bodies of the plant, seven numbers each: x, y, z in the arm's base
-            frame, m, and the unit quaternion w, x, y, z; empty without bodies.
-    """
-
-    tick: int
-    t_ns: int
-    mode: Mode
-    q: list[float]
-    qd: list[float]
-    q_des: list[float]
-    qd_des: list[float]
-    tau: list[float]
-    tau_x: list[float]
-    theta_hat: list[float]
-    used: list[int]
-    rx_crc: int
-    cmd: list[str]
-    mem: list[float]
-    x: Sequence[float] = ()
-    xd: Sequence[float] = ()
-    wrench: Sequence[float] = ()
-    ch: Sequence[float] = ()
-    hand: Sequence[float] = ()
-    bodies: Sequence[float] = ()
-
-    def shared(self) -> tuple[Sequence[float], Sequence[float], Sequence[float]]:
-        """Returns the part of the record that peers receive: their view of this site's arm.
-
-        In task space it refers to the end effector, otherwise to the joints.
-
-        Returns:
-            The position, the velocity and the exogenous torque, a number per coordinate each.
-        """
-        if self.x:
-            return self.x, self.xd, self.wrench
-        return self.q, self.qd, self.tau_x
 
 
 class LinkCounts(NamedTuple):

@@ -18,7 +18,7 @@ from enum import IntEnum
 from importlib import resources
 from typing import Any, NamedTuple
 
-from ...core.step.ticks import NS_PER_S
+from ...records import NS_PER_S
 
 ENCODING = "cdr"
 """Encoding of the messages, as MCAP calls it."""

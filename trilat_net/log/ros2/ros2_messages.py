@@ -23,9 +23,9 @@ from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
 from ...core.arms.task_space import POSITION
-from ...core.step.ticks import Mode, TickRecord
 from ...files import reading
 from ...net.messages import MODE_WORDS, Event, LinkStats, State
+from ...records import Mode, TickRecord
 from ...scenario import Scenario
 from ...scenario.arms import TASK_AXES
 from ...scenario.event_text import describe_event

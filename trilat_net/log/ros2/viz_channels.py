@@ -20,14 +20,15 @@ Invariant:
 import math
 from collections.abc import Callable, Iterable, Sequence
 from operator import attrgetter
-from typing import Any
 
-from ...core.step.ticks import NS_PER_S
 from ...errors import UsageError
 from ...net import topics
 from ...net.messages import Event, LinkStats
+from ...records import NS_PER_S
 from ...scenario import Scenario
 from ..log_layout import VIZ_ROOT
+from ..log_writer import MakeViews, PutMessage, ReceiveMessage
+from ..mcap_writer import McapWriter
 from . import ros2_messages
 from .cdr import JointStatePacker, pack_string
 from .ros2_messages import Record, Ros2Channel, SignalRow
@@ -49,10 +50,6 @@ SENT_PENDING_BYTES = 512
 array of its own.
 """
 
-PutMessage = Callable[[str, bytes, int, int], None]
-"""Function that writes one message: topic, bytes, sending and arrival time in Unix ns."""
-ReceiveMessage = Callable[[Any, int], None]
-"""Function that receives one message of the log, and its arrival time in Unix ns."""
 StampedRow = tuple[int, SignalRow]
 """Time in Unix ns, and the values of all curves at this time."""
 WriteRow = Callable[[int, SignalRow, int], None]
@@ -525,10 +522,36 @@ class VizChannels:
         for buckets in self._buckets:
             buckets.finish(log_ns)
 
+    def open_channels(self, file: McapWriter) -> ros2_messages.StandardChannels:
+        """Returns the channels for viewers of a file, which are registered when needed.
+
+        Args:
+            file: The file.
+        """
+        return ros2_messages.StandardChannels(file, self.channels)
+
     @property
     def most_bytes(self) -> int:
         """Upper bound for the size of the messages that are not written yet, in bytes."""
         return sum(buckets.max_pending_bytes for buckets in self._buckets)
+
+
+def offer_views(scenario: Scenario, views_hz: float) -> MakeViews | None:
+    """Returns the function with which a `LogWriter` creates its messages for viewers.
+
+    Args:
+        scenario: Scenario of the session.
+        views_hz: Rate of the messages with the joints, in Hz, see `VizChannels`. With 0, the
+            log contains no messages for viewers.
+    """
+    if not views_hz:
+        return None
+
+    def make_views(session: str, epoch_unix_ns: int, put: PutMessage) -> VizChannels:
+        """Creates the messages for viewers of one file."""
+        return VizChannels(scenario, session, epoch_unix_ns, views_hz, put)
+
+    return make_views
 
 
 def decimate_min_max(curves: Iterable[SignalRow]) -> tuple[list[float], list[float]]:

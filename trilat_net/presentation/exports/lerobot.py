@@ -37,9 +37,9 @@ from ...core.step.ticks import NS_PER_S
 from ...core.step.vectors import Array
 from ...errors import LogError, UsageError, count_nouns
 from ...files import import_extra
-from ...log.log_layout import collect_provenance
 from ...log.log_reader import Log
 from ...log.orientations import MATRIX_ENTRIES, expand_poses
+from ...log.provenance import collect_provenance
 from ...log.record_columns import Ints
 from ...scenario.arms import TASK_AXES
 from ...scenario.operators.program_hand import ProgramHand

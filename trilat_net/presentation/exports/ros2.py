@@ -21,9 +21,10 @@ import numpy as np
 
 from ...analysis.dominance_history import trace_dominance
 from ...core.step.ticks import NS_PER_S
-from ...log.log_layout import SCENARIO, collect_provenance
+from ...log.log_layout import SCENARIO
 from ...log.log_reader import Log
 from ...log.mcap_writer import McapWriter
+from ...log.provenance import collect_provenance
 from ...log.ros2 import cdr, ros2_messages
 from ...log.ros2.published import SiteMessages, list_full_topics, pack_session_diagnostics
 from ...log.ros2.topic_names import (

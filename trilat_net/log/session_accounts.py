@@ -1,0 +1,462 @@
+"""Counts the received and missing messages of all channels of a session.
+
+`SessionAccounts` contains an `Account` for each channel whose messages have numbers. The events
+of the sites state which ticks exist: when a site began, which ticks it skipped, and when it
+ended.
+
+Invariant:
+    - To count the messages of a file, only the events are decoded.
+    - If a log is divided into several files, a later file is counted from its first message on.
+"""
+
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+
+from ..errors import ScenarioError, WireError, count_nouns
+from ..net import topics
+from ..net.messages import READABLE, Event
+from ..net.topics import count_messages, count_under_way, number_message, skipped_numbers
+from ..net.wire import decode
+from ..scenario import Scenario, parse_embedded
+from .accounting import LAST, SHOWN_GAPS, Account, Coverage, StartGap
+from .log_layout import PART, SCENARIO, SESSION, SITE_CHANNELS
+
+_OVERRUN = "overrun"
+"""Kind of the event in which a site lists the ticks that it skipped because it was late."""
+_MAX_STARTS = 64
+"""Largest number of starts of a member whose events are counted separately."""
+_EVENTS_NUMBERED_SINCE = 3
+"""First version of the schema whose events have numbers."""
+
+
+class SessionAccounts:
+    """Counts the received and missing messages of all numbered channels of a session.
+
+    A recorder uses this class while it records, and the tools use it to count the messages of a
+    log. The caller passes every message. From the events, the class learns how many ticks the
+    sites executed.
+
+    Args:
+        session: Name of the session.
+        scenario: Scenario of the session. None if it cannot be read.
+        continued: True for a later part of a log, which is counted from its first message on.
+        events: True if events have numbers, which they lack in the oldest logs.
+    """
+
+    def __init__(
+        self,
+        session: str,
+        scenario: Scenario | None,
+        *,
+        continued: bool = False,
+        events: bool = True,
+    ) -> None:
+        self._session = session
+        self._continued = continued
+        self._rates_hz: dict[str, int] = {}
+        self._ticks: dict[str, int] = {}
+        if scenario:
+            self._rates_hz = {name: site.rate_hz for name, site in scenario.sites.items()}
+            self._ticks = {name: scenario.ticks(name) for name in scenario.names}
+        self._end_ticks: dict[str, int] = {}
+        self._numbered_channels = SITE_CHANNELS if events else (topics.STATE, topics.LINK)
+        self._accounts: dict[str, Account] = {}
+        # Accounts of events, by topic and by the boot, a random number that identifies a start
+        # of the member. Every start numbers its events from 0.
+        self._starts: dict[str, dict[int, Account]] = {}
+        # Number of the first message of a later part, by topic. The account counts it as 0.
+        self._bases: dict[str, int] = {}
+        # Gap before a start of a site, by topic and boot.
+        self._start_gaps: dict[tuple[str, int], StartGap] = {}
+
+    def _topic(self, member: str, channel: str) -> str:
+        """Returns the topic of a member's channel."""
+        return "/" + topics.key(self._session, member, channel)
+
+    def open_channel(self, topic: str) -> None:
+        """Starts to count the messages of a channel, before its first message has arrived.
+
+        If no message ever arrives, the losses are noticed nevertheless. Nothing happens if the
+        topic does not belong to the session, or if the messages of its channel are not
+        numbered.
+
+        Args:
+            topic: Topic of the channel, such as "/trilat/paper/m1/state".
+        """
+        key = topics.parse_key(topic.removeprefix("/"))
+        if key is None or key.session != self._session:
+            return
+        if key.channel in self._numbered_channels:
+            self._accounts.setdefault(topic, Account())
+
+    def receive(self, topic: str, sequence: int, payload: bytes = b"") -> None:
+        """Counts one message of a log file.
+
+        The message is ignored if its topic is not counted, because `open_channel` was not
+        called for the topic or the topic does not belong to the session.
+
+        Args:
+            topic: Topic of the message.
+            sequence: Sequence number of the message in the file. For records and statistics, it
+                is the number of their tick, the period of the control loop.
+            payload: Bytes of the message. Only the bytes of events are used, because events
+                state how many ticks a site executed or skipped.
+        """
+        if topic not in self._accounts:
+            return
+
+        member, channel = topic.split("/")[-2:]
+        event: Event | None = None
+        if channel == topics.EVENT and payload:
+            with suppress(WireError):  # an unreadable event counts like any other message
+                event = decode(payload, Event, READABLE)
+        number = number_message(channel, sequence, self._rates_hz.get(member, 0))
+        if event is None:
+            self.count_message(topic, number)
+        else:
+            self.receive_event(topic, number, event)
+        if channel == topics.LINK:
+            # The statistics of a tick show that the record of this tick exists.
+            self._add_expected(member, topics.STATE, sequence + 1)
+
+    def receive_event(self, topic: str, number: int, event: Event) -> bool:
+        """Counts an event, and evaluates what it states about the ticks of a site.
+
+        Each start of a site numbers its events from 0. Therefore each start has an account of
+        its own, the object that counts its events. The boot in the event, a random number,
+        identifies the start. The first start uses the account that `open_channel` created, and
+        `_accounts` refers to that of the newest start. If there are more than `_MAX_STARTS`
+        starts, which only a faulty sender causes, the newest account counts the events of all
+        further ones.
+
+        Args:
+            topic: Topic of the event.
+            number: Number of the event.
+            event: The event.
+
+        Returns:
+            False if the event had been received before.
+        """
+        starts = self._starts.setdefault(topic, {})
+        is_new_start = event.boot not in starts
+        if is_new_start and len(starts) < _MAX_STARTS:
+            is_first_start = not starts
+            new_account = self._accounts[topic] if is_first_start else Account()
+            starts[event.boot] = new_account
+            self._accounts[topic] = new_account
+        account = starts.get(event.boot, self._accounts[topic])
+
+        # In a later part of a log, only the first start can have events in an earlier part. It
+        # is counted from its first event in this part, which `count_message` notes. Any further
+        # start is counted from 0.
+        first_account = next(iter(starts.values()))
+        if account is first_account:
+            is_new = self.count_message(topic, number, account)
+        else:
+            is_new = account.receive(number)
+        self.apply_event(event)
+        return is_new
+
+    def apply_event(self, event: Event) -> None:
+        """Learns from an event how many ticks the sites executed or skipped.
+
+        These kinds of events state something about ticks, the periods of the control loop:
+
+        - "end": number of ticks that the sender executed until it ended. A number beyond the
+          duration of the scenario is reduced to it, because the site has ended in any case.
+        - "join": first tick of the sender when it joins the running session. An impossible tick
+          is ignored, because it would leave a gap up to that tick.
+        - `_OVERRUN`: ticks that the sender skipped because it was late.
+        - `LAST`: number of ticks of another site that the sender received before that site was
+          started again.
+
+        Other events are ignored, and so are events of members that are not sites.
+
+        Args:
+            event: The event.
+        """
+        sender = event.member
+        if sender not in self._rates_hz or event.ticks < 0:
+            return
+        if event.kind == "end":
+            self._end_ticks[sender] = min(event.ticks, self._ticks[sender])
+            self.add_expected_ticks(sender, self._end_ticks[sender])
+        elif event.kind == "join" and event.ticks <= self._ticks[sender]:
+            self._apply_join(event)
+        elif event.kind == _OVERRUN:
+            self._apply_overrun(event)
+        elif event.kind == LAST and event.about in self._rates_hz:
+            self._apply_last(event)
+
+    def _apply_join(self, event: Event) -> None:
+        """Handles the event of a site that joins the running session at a stated tick."""
+        site = event.member
+        published_ticks = self._end_ticks.pop(site, 0)
+        rate_hz = self._rates_hz[site]
+        for channel, gap in self._find_start_gaps(site, event.boot):
+            base = self._bases.get(self._topic(site, channel), 0)
+            first = count_messages(channel, event.ticks, rate_hz) - base
+            published = count_messages(channel, published_ticks, rate_hz) - base
+            gap.begin_next_start(first, published)
+
+    def _apply_overrun(self, event: Event) -> None:
+        """Counts the ticks that a site skipped as unpublished, as its event lists them.
+
+        Args:
+            event: Event of the kind `_OVERRUN`. Its command contains ranges of skipped ticks in
+                the form "first-last", and its ticks are the number of ticks that have passed.
+                Ranges that are not below this number are not valid, and are ignored.
+        """
+        # More than 12 digits are no number of a tick.
+        ranges = re.findall(r"(\d{1,12})-(\d{1,12})", event.command)
+        for first_digits, last_digits in ranges:
+            first = int(first_digits)
+            last = int(last_digits)
+            is_valid = first <= last < event.ticks
+            if is_valid:
+                next_tick = last + 1
+                self.mark_skipped_ticks(event.member, next_tick, next_tick - first)
+
+    def _apply_last(self, event: Event) -> None:
+        """Handles the event that states how many ticks of a peer's earlier start arrived."""
+        site = event.about
+        for channel, gap in self._find_start_gaps(site, event.boots.get(site, 0)):
+            base = self._bases.get(self._topic(site, channel), 0)
+            number = number_message(channel, event.ticks, self._rates_hz[site])
+            gap.note_published(number - base)
+
+    def mark_skipped_ticks(self, site: str, tick: int, skipped: int) -> None:
+        """Counts the messages of skipped ticks as unpublished, so that they are not missing.
+
+        A tick is one period of the control loop. A site that is late skips ticks. It does not
+        execute the skipped ticks, and publishes no messages for them.
+
+        Args:
+            site: Name of the site, the process that runs one arm.
+            tick: First tick after the skipped ticks.
+            skipped: Number of skipped ticks.
+        """
+        for channel in (topics.STATE, topics.LINK):
+            topic = self._topic(site, channel)
+            account = self._accounts.get(topic)
+            if account is None:
+                continue
+            base = self._bases.get(topic, 0)
+            first, published = skipped_numbers(channel, tick, skipped, self._rates_hz[site])
+            account.mark_unpublished(first - base, published - base)
+
+    def count_message(self, topic: str, number: int, account: Account | None = None) -> bool:
+        """Counts a message as received, by its number in its channel.
+
+        If the log is divided into several files, a later file is counted from its first message
+        on. Messages with lower numbers than that message are ignored.
+
+        Args:
+            topic: Topic of the message.
+            number: Number of the message in its channel.
+            account: Object that counts the message. None uses the object that counts the
+                messages of the topic.
+
+        Returns:
+            False if a message with this number had been received before. True otherwise, also
+            for a message that is ignored.
+        """
+        base = self._bases.setdefault(topic, number if self._continued else 0)
+        if number < base:
+            return True
+        account = account or self._accounts[topic]
+        return account.receive(number - base)
+
+    def _find_start_gaps(self, site: str, boot: int) -> Iterator[tuple[str, StartGap]]:
+        """Yields the numbered channels of a site, with the gap before one of its starts.
+
+        The gaps are created when they are needed first. Their number is limited, so that events
+        with invented boots cannot fill the memory.
+
+        Args:
+            site: Name of the site.
+            boot: Random number that identifies the start.
+        """
+        for channel in (topics.STATE, topics.LINK):
+            topic = self._topic(site, channel)
+            if topic not in self._accounts:
+                continue
+            gap = self._start_gaps.get((topic, boot))
+            has_room = len(self._start_gaps) < _MAX_STARTS * len(self._rates_hz)
+            if gap is None and has_room:
+                under_way = count_under_way(channel, self._rates_hz[site])
+                gap = StartGap(self._accounts[topic], under_way)
+                self._start_gaps[topic, boot] = gap
+            if gap is not None:
+                yield channel, gap
+
+    def add_expected_ticks(self, site: str, ticks: int) -> None:
+        """Takes into account that a site executed at least a given number of ticks.
+
+        Records and statistics of these ticks that have not been received count as missing from
+        now on.
+
+        Args:
+            site: Name of the site.
+            ticks: Number of executed ticks, counted from the start of the session.
+        """
+        for channel in (topics.STATE, topics.LINK):
+            published = count_messages(channel, ticks, self._rates_hz[site])
+            self._add_expected(site, channel, published)
+
+    def _add_expected(self, member: str, channel: str, published: int) -> None:
+        """States that at least `published` messages of a channel exist."""
+        topic = self._topic(member, channel)
+        account = self._accounts.get(topic)
+        if account is not None:
+            base = self._bases.get(topic, 0)
+            account.add_expected(published - base)
+
+    def format_accounts(self) -> dict[str, str]:
+        """Formats the numbers of received and missing messages, as they are stored in a log.
+
+        A line is, for example, "expected 1000, received 998, missing 2, ...". If the log is a
+        later part of a recording, the messages are counted from the first one in this part. The
+        line then begins with the number of that message, such as "from 5000 on: ".
+
+        Returns:
+            A line of text for each topic, such as "/trilat/paper/m1/state", whose last two
+            parts are the member and the channel. A member that is not a site, such as a
+            recorder, has no line if no message is expected of it.
+        """
+        texts = {}
+        for topic, account in self._accounts.items():
+            member, _channel = topic.split("/")[-2:]
+            is_site = member in self._rates_hz
+            if not account.expected and not is_site:
+                continue
+            # Whenever a member is started again, it numbers its events from 0 again, and they
+            # get a new account. `account` is the last one, that of the newest start.
+            accounts_of_starts = list(self._starts.get(topic, {}).values())
+            earlier_accounts = accounts_of_starts[:-1]
+            first_number = self._bases.get(topic, 0)
+            prefix = f"from {first_number} on: " if first_number else ""
+            texts[topic] = prefix + account.describe(*earlier_accounts)
+        return texts
+
+    def list_starts(self, topic: str) -> list[Account]:
+        """Lists the message counts of a topic, separately for each start of its sender.
+
+        An `Account` holds the numbers of received and missing messages. Events are numbered
+        from 0 again whenever their sender is started. Therefore each start has its own account.
+        All other messages continue their numbers. Therefore the topic of such messages has a
+        single account.
+
+        Args:
+            topic: Topic of the channel. It must be counted, see `open_channel`.
+        """
+        return list(self._starts.get(topic, {}).values()) or [self._accounts[topic]]
+
+    def list_gaps(self, topic: str) -> list[tuple[int, int]]:
+        """Lists the ranges of missing numbers of a topic, over all starts of its sender.
+
+        Args:
+            topic: Topic of the channel.
+
+        Returns:
+            The first and the last number of each range. Empty if no message is missing.
+        """
+        base = self._bases.get(topic, 0)
+        gaps = []
+        for account in self.list_starts(topic):
+            gaps += [(base + first, base + last) for first, last in account.gaps]
+        return gaps
+
+    def coverage(self) -> Coverage:
+        """Computes how many ticks of every site were executed, and how many were recorded.
+
+        If it is unknown when a site ended, all ticks of the scenario count as executed.
+
+        Returns:
+            Both numbers for every site.
+        """
+        records = {}
+        ticks = {}
+        for site, scenario_ticks in self._ticks.items():
+            account = self._accounts.get(self._topic(site, topics.STATE))
+            end_ticks = self._end_ticks.get(site, scenario_ticks)
+            unpublished = 0
+            if account is not None:
+                records[site] = account.received
+                unpublished = account.unpublished
+            ticks[site] = min(scenario_ticks, end_ticks) - unpublished
+        return Coverage(records, ticks)
+
+    def describe_missing(self) -> Iterator[str]:
+        """Describes the missing records for the user.
+
+        Yields:
+            A line for every site that lacks records, with the first ranges of missing ticks.
+        """
+        for site in self._rates_hz:
+            topic = self._topic(site, topics.STATE)
+            account = self._accounts.get(topic)
+            if account is None or not account.missing:
+                continue
+            gaps = account.format_gaps(SHOWN_GAPS, self._bases.get(topic, 0))
+            more = " ..." if len(account.gaps) > len(gaps) else ""
+            records = count_nouns(account.expected, "record")
+            yield f"{site}: {account.missing} of {records}: {' '.join(gaps)}{more}"
+
+    @property
+    def unknown_ends(self) -> list[str]:
+        """Names of the sites of which the end is unknown.
+
+        A site publishes an "end" event when it ends, which states how many ticks (periods of
+        the control loop) it executed. For these sites, no such event has been received.
+        """
+        return [site for site in self._rates_hz if site not in self._end_ticks]
+
+    def describe_unfinished_sites(self) -> Iterator[str]:
+        """Describes for the user which sites may have executed more ticks than were recorded.
+
+        These are the sites that never published the event "end", and whose last recorded tick
+        is not the last tick of the scenario.
+
+        Yields:
+            A line for each of these sites.
+        """
+        for site in self.unknown_ends:
+            topic = self._topic(site, topics.STATE)
+            account = self._accounts.get(topic)
+            count = 0
+            if account is not None:
+                count = self._bases.get(topic, 0) + account.expected
+            if count < self._ticks[site]:
+                last = f"tick {count - 1}" if count else "none"
+                ticks = count_nouns(self._ticks[site], "tick")
+                yield f"{site}: its end is unknown; its last record is {last}, of {ticks}"
+
+
+def open_session_accounts(
+    metadata: Mapping[str, Mapping[str, str]], attachments: Mapping[str, bytes]
+) -> SessionAccounts | None:
+    """Creates the object that counts the messages of a file, before they are read.
+
+    Args:
+        metadata: Metadata of the file, by name. They state the session.
+        attachments: Attachments of the file, by name. One of them is the scenario.
+
+    Returns:
+        The object, which has counted no message yet. None if the file is not a log of
+        trilat-net.
+    """
+    session_facts = metadata.get(SESSION, {})
+    try:
+        scenario = parse_embedded(attachments[SCENARIO].decode(), SCENARIO)
+        session = session_facts["session"]
+        version = int(session_facts["schema_version"])
+    except (KeyError, ValueError, ScenarioError):
+        return None
+    return SessionAccounts(
+        session,
+        scenario,
+        continued=metadata.get(PART, {}).get("index", "1") != "1",
+        events=version >= _EVENTS_NUMBERED_SINCE,
+    )

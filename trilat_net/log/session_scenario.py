@@ -1,0 +1,69 @@
+"""Describes which facts about a scenario a log and its recorder need.
+
+A recorder stores the messages of a session without understanding the experiment. Therefore it
+depends on these few facts, and not on the program that reads scenarios. `scenario.Scenario` has
+all of them.
+"""
+
+from collections.abc import Mapping
+from typing import Protocol
+
+from ..records import Layout
+
+
+class SiteRate(Protocol):
+    """A site of a scenario, which runs one arm."""
+
+    @property
+    def rate_hz(self) -> int:
+        """Rate of the site's control loop, in Hz."""
+
+
+class SessionScenario(Protocol):
+    """A resolved scenario, with the facts from which the messages of its session follow."""
+
+    @property
+    def name(self) -> str:
+        """Name of the scenario."""
+
+    @property
+    def seed(self) -> int:
+        """Seed of the scenario's random numbers."""
+
+    @property
+    def duration_s(self) -> float:
+        """Duration of the run, in s."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the sites, in the order of the scenario file."""
+
+    @property
+    def sites(self) -> Mapping[str, SiteRate]:
+        """The sites by name."""
+
+    @property
+    def text(self) -> str:
+        """The scenario as a TOML text in its canonical form."""
+
+    @property
+    def sha256(self) -> str:
+        """SHA-256 hash of `text`."""
+
+    @property
+    def sites_may_return(self) -> bool:
+        """True if sites may leave the session and return while it runs."""
+
+    def ticks(self, site: str) -> int:
+        """Returns how many ticks a site executes in the whole run.
+
+        Args:
+            site: Name of the site.
+        """
+
+    def layout(self, site: str) -> Layout:
+        """Returns the lengths of the vectors in the records of a site.
+
+        Args:
+            site: Name of the site.
+        """

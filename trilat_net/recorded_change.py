@@ -1,0 +1,78 @@
+"""Describes the changes of a run as its records state them.
+
+A record is the result of one tick, a period of a site's control loop. It contains the JSON text
+of every change that the site applied in the tick. Programs that only forward or store records
+read these texts without the scenario.
+"""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta
+
+SiteOrder = Literal[
+    "",
+    "stop",
+    "enable",
+    "reset",
+    "overrun",
+    "arm_silent",
+    "arm_lost",
+    "arm_back",
+    "released",
+    "held",
+]
+"""Commands that change the mode of a site. The empty text means that there is no command.
+
+Users send "stop", "enable" and "reset". The site itself causes the others, for example
+"arm_lost" if no measurement has arrived from its robot.
+"""
+
+
+class RecordedChange(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True
+):
+    """Change of a link or of dominance factors, or a command to a site, without its checks.
+
+    Exactly one of `link`, `dominance` and `site` is not empty. `scenario_types.Change` is the
+    change that a scenario has checked.
+
+    Attributes:
+        at_s: Time at which the change takes effect, in s after the epoch, the common start
+            time. A link changes for samples that are sent at this time or later.
+        link: Name of the link that changes, for example "m1->s".
+        dominance: Name of the site whose dominance factors change. A dominance factor is the
+            weight with which the site follows a peer.
+        to: State after the change: all keys of the link, or the factors of all peers.
+        ramp_s: Duration of the linear transition to the new factors, in s.
+        site: Name of the site that receives a command.
+        order: The command, see `core.step.ticks.LifeOrder`.
+        ticks: For the command "overrun": number of ticks that the site missed.
+    """
+
+    at_s: Annotated[float, Meta(ge=0.0, le=1e6)]
+    link: str = ""
+    dominance: str = ""
+    to: dict[str, Any] = msgspec.field(default_factory=dict)
+    ramp_s: Annotated[float, Meta(ge=0.0, le=1e6)] = 0.0
+    site: str = ""
+    order: SiteOrder = ""
+    ticks: Annotated[int, Meta(ge=0, lt=2**40)] = 0
+
+
+def count_skipped_ticks(texts: Sequence[str]) -> int:
+    """Returns how many ticks a site missed just before a record, because it was too late.
+
+    A record lists the changes of its tick, among them those that report missed ticks.
+
+    Args:
+        texts: JSON texts of the changes in the record. Texts that cannot be read are ignored.
+    """
+    skipped = 0
+    for text in texts:
+        if "overrun" in text:
+            with suppress(msgspec.MsgspecError):
+                skipped += msgspec.json.decode(text, type=RecordedChange).ticks
+    return skipped

@@ -1,0 +1,275 @@
+"""Describes the records and samples of a tick, which the kernel, the network and the log share.
+
+A site is a process that runs one arm, and a tick is one period of its control loop. The kernel
+computes the record of a tick, the network sends it, and the log stores it. The modules that
+send and store records import these types from here. Therefore they need neither the kernel nor
+its compiler.
+
+Invariant:
+    - This module imports nothing of the program.
+"""
+
+from collections.abc import Sequence
+from enum import IntEnum
+from itertools import accumulate
+from typing import NamedTuple
+
+NS_PER_S = 1_000_000_000
+JOINTS = 2
+"""Number of joints of the planar two-link arm."""
+PARAMETERS = 5
+"""Number of dynamic parameters of the planar two-link arm."""
+MAX_JOINTS = 12
+"""Largest number of joints of an arm."""
+MAX_LAW_MEMORY = 1024
+"""Largest count of numbers in a law's memory, which each record contains."""
+
+
+class Mode(IntEnum):
+    """What a site, the process that runs one arm, does in a period of its control loop.
+
+    RUN: the arm follows the other arms. If no samples (states) come from one of them, the mode
+    becomes HOLD (the arm keeps its last reference) or BRAKE (the arm keeps its pose). When
+    samples come again, it becomes RETURN (the arm moves smoothly back to the others), and then
+    RUN. DIVERGED: a joint was too fast, or a number was not finite. This mode is final.
+
+    Under the rule `glide`, explained in `core.life.session_life`, there are further modes, and
+    the arm is at rest in all of them. WAITING: not all other arms are heard yet. FAULT: a limit
+    was exceeded; it replaces DIVERGED. STOPPED: the arm was stopped by order.
+    """
+
+    RUN = 1
+    DIVERGED = 2
+    HOLD = 3
+    BRAKE = 4
+    RETURN = 5
+    WAITING = 6
+    FAULT = 7
+    STOPPED = 8
+
+
+class Arrival(NamedTuple):
+    """Sample that arrived at a site from one of its peers.
+
+    A site is a process that runs one arm, and its peers are the other sites. A sample is the
+    state that a peer sends in each period of its control loop.
+
+    Attributes:
+        peer: Index of the peer.
+        tick: Number of the peer's control period in which it sent the sample.
+        q: Joint angles of the peer, rad.
+        qd: Joint velocities of the peer, rad/s.
+        latency_us: Measured latency of the network, us. It is only recorded, and has no effect.
+        tau_x: External torque of the peer, N m, for control laws that reflect force. The torque
+            ON its arm is the negative.
+        ch: Further numbers that the control law of the peer sent, see
+            `core.plug.law_channel`.
+    """
+
+    peer: int
+    tick: int
+    q: Sequence[float]
+    qd: Sequence[float]
+    latency_us: int = 0
+    tau_x: Sequence[float] = ()
+    ch: Sequence[float] = ()
+
+
+class TickRecord(NamedTuple):
+    """The record of one tick: the state AT t_k and its consequences, never the advanced state.
+
+    Attributes:
+        tick: k.
+        t_ns: Nominal time, ns since the epoch.
+        mode: The site's mode.
+        q: Joint angles, rad.
+        qd: Joint velocities, rad/s.
+        q_des: Reference q_id, Eq. (6), rad.
+        qd_des: Its derivative, rad/s.
+        tau: Control torque, Eq. (13), N m.
+        tau_x: Exogenous torque in the sign of Eq. (8), N m; the torque ON the arm is its
+            negative.
+        theta_hat: Estimate of the parameters.
+        used: Tick of the sample in use, per peer in scenario order; -1 before the first.
+        rx_crc: CRC-32 of the arrivals of this tick as the step received them, so that a changed
+            input shows at its own tick. Each arrival is little-endian (peer i64, tick i64, q
+            f64s, qd f64s), followed by its tau_x if the law reflects force.
+        cmd: Texts of the changes that this tick applied.
+        mem: The memory of the site that no other field holds. In RUN and DIVERGED it is empty;
+            otherwise it is the held pose, rad, and the time at which the return began, ns since
+            the epoch (0 before). A site with a user's law always has these numbers, followed
+            by the memory of the law. Under the rule `glide` a site always has the memory of
+            `core.life.session_life` instead, see `Layout.count_life_memory`.
+        x: in task space the shared pose of the end effector: position, m, and orientation;
+            otherwise empty.
+        xd: Derivative of x, m/s and rad/s.
+        wrench: tau_x expressed at the end effector, N and N m.
+        ch: The numbers that the site's law sends, see `core.plug.law_channel`.
+        hand: The action of a live hand in this tick, see `core.life.live_hand`; empty without
+            a hand.
+        bodies: Poses of the bodies of the plant, seven numbers each: x, y, z in the arm's base
+            frame, m, and the unit quaternion w, x, y, z; empty without bodies.
+    """
+
+    tick: int
+    t_ns: int
+    mode: Mode
+    q: list[float]
+    qd: list[float]
+    q_des: list[float]
+    qd_des: list[float]
+    tau: list[float]
+    tau_x: list[float]
+    theta_hat: list[float]
+    used: list[int]
+    rx_crc: int
+    cmd: list[str]
+    mem: list[float]
+    x: Sequence[float] = ()
+    xd: Sequence[float] = ()
+    wrench: Sequence[float] = ()
+    ch: Sequence[float] = ()
+    hand: Sequence[float] = ()
+    bodies: Sequence[float] = ()
+
+    def shared(self) -> tuple[Sequence[float], Sequence[float], Sequence[float]]:
+        """Returns the part of the record that peers receive: their view of this site's arm.
+
+        In task space it refers to the end effector, otherwise to the joints.
+
+        Returns:
+            The position, the velocity and the exogenous torque, a number per coordinate each.
+        """
+        if self.x:
+            return self.x, self.xd, self.wrench
+        return self.q, self.qd, self.tau_x
+
+
+class Layout(NamedTuple):
+    """Lengths of the vectors that describe an arm and its control law.
+
+    Attributes:
+        joints: Number of joints of the arm.
+        shared: Number of coordinates that the arms send each other.
+        parameters: Number of dynamic parameters of the arm.
+        chain: True if the arm is a chain of joints. False for the planar two-link arm.
+        task: True if the coordinates are the pose of the end effector. False if they are joint
+            angles.
+        sent: Number of values that the control law sends to other arms in each period.
+        hand: Number of values that describe the person or program who moves the arm during the
+            run, see `core.life.live_hand`. 0 if there is none.
+        bodies: Number of values in the poses of other bodies in the scene, see
+            `TickRecord.bodies`.
+    """
+
+    joints: int = JOINTS
+    shared: int = JOINTS
+    parameters: int = PARAMETERS
+    chain: bool = False
+    task: bool = False
+    sent: int = 0
+    hand: int = 0
+    bodies: int = 0
+
+    def axes(self) -> dict[str, int]:
+        """Returns the lengths of the named axes that fields of the state arrays have.
+
+        The names are "joints", "shared" and "parameters", see `core.step.row_fields`.
+        """
+        return {"joints": self.joints, "shared": self.shared, "parameters": self.parameters}
+
+    def lengths(self) -> dict[str, int]:
+        """Returns the lengths of the vectors of a record by name, in their order.
+
+        A record is the result of one tick. Vectors that the site does not have are left out.
+        """
+        n = self.joints
+        m = self.shared
+        lengths = {"q": n, "qd": n, "q_des": m, "qd_des": m, "tau": n, "tau_x": n}
+        lengths["theta_hat"] = self.parameters
+        if self.task:
+            lengths |= {"x": m, "xd": m, "wrench": m}
+        optional = {"ch": self.sent, "hand": self.hand, "bodies": self.bodies}
+        lengths |= {name: count for name, count in optional.items() if count}
+        return lengths
+
+    def columns(self) -> dict[str, slice]:
+        """Finds each vector of a record among the values that a control period computes.
+
+        Returns:
+            A slice for each vector, by name. Vectors that are inputs of the period are left
+            out.
+        """
+        lengths = self.lengths()
+        for name in ("hand", "bodies"):  # inputs of the tick
+            lengths.pop(name, None)
+        ends = accumulate(lengths.values())
+        return {
+            name: slice(end - length, end)
+            for (name, length), end in zip(lengths.items(), ends, strict=True)
+        }
+
+    def count_life_memory(self, peers: int, *, degrades: bool = False) -> int:
+        """Counts the values that the rule `glide` stores in the field `mem` of a record.
+
+        A site is the process that runs one arm. By the rule `glide`, its arm comes to rest
+        while another site is silent, see `core.life.session_life`. The values are the state of
+        this rule, from which a run can be continued. They come first in `mem`:
+
+        - the values that every such site stores, for example when each peer was heard last,
+        - in task space, the reference that brings the joints to rest (`rest_columns`),
+        - if the site continues without a lost site, a value for each peer: whether it is lost.
+
+        Args:
+            peers: Number of the other sites from which this site receives data.
+            degrades: True if the site continues without a lost site.
+        """
+        end_of_reference: int = self.rest_columns(peers).stop
+        lost_peer_values = peers * degrades  # none if it does not
+        return end_of_reference + lost_peer_values
+
+    def rest_columns(self, peers: int) -> slice:
+        """Finds the reference that brings the joints to rest, in the field `mem` of a record.
+
+        `mem` contains numbers from which a run can be continued. For a site (the process that
+        runs one arm) with n joints, m coordinates that the sites share, and P peers (the other
+        sites), it starts with the numbers that `Site` stores under the rule `glide`:
+
+            q_held (m), return_from_ns (1), qd_held (m), reason (1), used_ns (P), tau_held (n),
+            q_rest (n), qd_rest (n)                                       only in task space
+
+        `q_rest` and `qd_rest` are the positions and velocities of the reference, for each
+        joint. In joint space, `q_held` and `qd_held` contain them while the arm rests.
+
+        Args:
+            peers: Number P of the other sites from which this site receives data.
+
+        Returns:
+            The slice of `q_rest` and `qd_rest`. Empty in joint space.
+        """
+        held_and_start = self.shared + 1  # q_held and return_from_ns
+        rate_and_reason = self.shared + 1  # qd_held and reason
+        first = held_and_start + rate_and_reason + peers + self.joints
+        length = 2 * self.joints * self.task  # zero in joint space, where `task` is False
+        return slice(first, first + length)
+
+    def list_lost_peers(self, mem: Sequence[float], peers: Sequence[str]) -> list[str]:
+        """Returns the names of the peers without which a site goes on, from its record.
+
+        Args:
+            mem: Field `mem` of the record, the numbers that the site keeps from tick to tick.
+            peers: Names of the site's peers, in scenario order.
+        """
+        end = self.count_life_memory(len(peers), degrades=True)
+        all_gone = mem[end - len(peers) : end]
+        # A record of another rule has a shorter memory, and then no lost peers.
+        return [peer for peer, gone in zip(peers, all_gone, strict=False) if gone]
+
+    @property
+    def floats(self) -> int:
+        """Number of floating-point values in a record, without the values that are inputs.
+
+        A record contains the inputs and results of one period of the control loop.
+        """
+        shared_vectors = 5 if self.task else 2
+        return 4 * self.joints + shared_vectors * self.shared + self.parameters + self.sent
