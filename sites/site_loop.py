@@ -23,7 +23,7 @@ from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from trilat_net.core.life.live_hand import HandInForce
 from trilat_net.core.links.delay import DelayKind
@@ -45,9 +45,6 @@ from trilat_net.net.messages import PeerSample
 from trilat_net.net.timing import LinkTimingMonitor, LoopStats, SiteTiming
 from trilat_net.net.wire import encode, encode_sample, encode_state, make_reader
 from trilat_net.scenario import Scenario
-
-if TYPE_CHECKING:
-    from .site_process import RunningSite
 
 
 def make_sample_readers(setup: SiteSetup) -> list[Callable[[bytes], PeerSample | WireError]]:
@@ -298,7 +295,7 @@ def may_hold_samples(scenario: Scenario, name: str) -> bool:
     late then has no effect on the run.
 
     The result holds for the delays of the scenario. If the user shortens a delay during the
-    run, the site stops holding samples, see `RunningSite._watch_members`.
+    run, the site stops holding samples, see `PeerAdmission.watch_members`.
 
     Args:
         scenario: The scenario, which describes the arms, their links and the run.
@@ -436,12 +433,56 @@ class StateBlock:
             )
 
 
+class LoopSite(Protocol):
+    """The site whose ticks the loop executes, as far as the loop knows it.
+
+    `RunningSite` is the site of a session. The loop ignores the results that are `object`.
+    """
+
+    def should_stop(self) -> bool:
+        """Returns True if the run ends before the present tick."""
+
+    def step(self, k: int, arrivals: Sequence[Arrival]) -> TickRecord | None:
+        """Executes one tick.
+
+        Args:
+            k: Number of the tick.
+            arrivals: Samples of the peers that have arrived since the previous tick.
+
+        Returns:
+            The record of the tick. None if the run ends because the tick failed.
+        """
+
+    def publish_sample(self, payload: bytes, /) -> object:
+        """Publishes an encoded sample to the peers."""
+
+    def publish_link(self, payload: bytes, /) -> object:
+        """Publishes encoded statistics."""
+
+    def run_housekeeping(self, output: TickRecord, /) -> object:
+        """Executes the work that need not be done in every tick.
+
+        Args:
+            output: Record of the newest tick.
+        """
+
+    def report_tick(self, output: TickRecord, /) -> object:
+        """Publishes what has changed in a tick.
+
+        Args:
+            output: Record of the tick.
+        """
+
+    def use_slack(self) -> bool:
+        """Does work that can wait, and returns True if more of it may wait."""
+
+
 def _publish_sample(
     name: str,
     boot: int,
     clock: Clock,
     timing: SiteTiming,
-    io: "RunningSite",
+    io: LoopSite,
     output: TickRecord,
 ) -> tuple[Any, ...]:
     """Publishes the sample of a tick to the peers.
@@ -474,7 +515,7 @@ def run_loop(
     timing: SiteTiming,
     stats: LoopStats,
     states: StateBlock,
-    io: "RunningSite",
+    io: LoopSite,
     first: int = 0,
     *,
     catches_up: bool = True,
@@ -545,7 +586,7 @@ def run_loop(
         if stats_due:
             measurements = timing.pop_measurements(woke_ns)
             io.publish_link(encode(stats.pop_stats(output, measurements)))
-            io.run_housekeeping(k, output.t_ns)
+            io.run_housekeeping(output)
         if output.mode is Mode.DIVERGED:
             break
         if output.cmd or output.mode is not mode:

@@ -16,7 +16,7 @@ from sites import (
     external_arm,
     machine_load,
     retransmit_buffer,
-    site_process,
+    site_end,
 )
 from sites.devices import haply_inverse3, spacemouse
 from trilat_net.analysis import arm_rows, run_end, site_signals, stability_decision
@@ -102,9 +102,9 @@ STATED: list[tuple[str, str, float, float]] = [
         "session-protocol.md",
         "at most 10 s from the last question",
         10,
-        site_process.LINGER_NS / 1e9,
+        site_end.LINGER_NS / 1e9,
     ),
-    ("session-protocol.md", "and 2 s more", 2, site_process.LEAVE_TIMEOUT_NS / 1e9),
+    ("session-protocol.md", "and 2 s more", 2, site_end.LEAVE_TIMEOUT_NS / 1e9),
     ("session-protocol.md", "takes effect 100 ms later", 100, change_server.AHEAD_MS),
     ("session-protocol.md", "The lease is 5 s", 5, zenoh_config.LEASE_MS / 1e3),
     ("session-protocol.md", "silent for 0.2 s", 0.2, external_arm.SILENCE_LIMIT_NS / 1e9),
@@ -249,7 +249,7 @@ STATED: list[tuple[str, str, float, float]] = [
     ),
     ("session-protocol.md", "queue of 16 batches", 16, zenoh_config.BATCHES),
     ("session-protocol.md", "waits 15 s for them", 15, site_reception.AWAY_NS / 1e9),
-    ("recording.md", "for 10 s after its last question", 10, site_process.LINGER_NS / 1e9),
+    ("recording.md", "for 10 s after its last question", 10, site_end.LINGER_NS / 1e9),
     ("recording.md", "until nothing comes for 10 s", 10, record_process.END_NS / 1e9),
     ("recording.md", "or 60 s after the signal", 60, record_process.LONGEST_END_NS / 1e9),
     ("recording.md", "busy for 80 % of the time", 80, 100 * machine_load.BUSY_SHARE),

@@ -8,8 +8,8 @@ from typing import Any
 from unittest import mock
 
 from sites.peer_monitor import PeerMonitor
+from sites.running_site import RunningSite
 from sites.site_loop import PeerInbox
-from sites.site_process import RunningSite
 from trilat_net.core.step.site_setup import RestGains, SiteSetup, StaleAction
 from trilat_net.core.step.site_step import Site
 from trilat_net.core.step.ticks import Arrival, TickRecord

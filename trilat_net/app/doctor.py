@@ -492,7 +492,7 @@ class Rehearsal(LoopStats):
 
     The loop does the same work as in a session, except that no messages are exchanged. This
     object takes the place of two objects of the loop: of its statistics, so that the lateness
-    of each tick can be stored, and of the `RunningSite`, whose methods do nothing here.
+    of each tick can be stored, and of the `LoopSite`, whose methods do nothing here.
 
     A tick is one period of the control loop. It is late if it begins after the time at which it
     was due.
@@ -529,8 +529,6 @@ class Rehearsal(LoopStats):
         timing = SiteTiming(first_tick_ns, self._site.rate_hz, peers=(), leader="")
         discarded_records = StateBlock(self._site, boot, send=lambda _: None)
 
-        # This object has the methods of a `RunningSite` that the loop calls, without its type.
-        replacement_of_running_site: Any = self
         run_loop(
             site=self._site,
             boot=boot,
@@ -540,7 +538,7 @@ class Rehearsal(LoopStats):
             timing=timing,
             stats=self,
             states=discarded_records,
-            io=replacement_of_running_site,
+            io=self,
         )
         return self._late_us
 
@@ -562,7 +560,7 @@ class Rehearsal(LoopStats):
         """Computes one tick of the site without samples from other sites, to test its timing.
 
         A tick is one period of the control loop. The loop calls this method in place of
-        `RunningSite.step`.
+        `LoopSite.step`.
 
         Args:
             k: Number of the tick.
@@ -585,7 +583,7 @@ class Rehearsal(LoopStats):
         """
         return False
 
-    # The other methods of `RunningSite` that the loop calls.
+    # The other methods of `LoopSite`.
     publish_sample = run_housekeeping
     publish_link = run_housekeeping
     report_tick = run_housekeeping

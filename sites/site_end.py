@@ -1,0 +1,244 @@
+"""Leaves a session: publishes how a run ended, and waits until the recorders have stored it.
+
+Invariant:
+    - After its last tick, the process continues until every recorder that is present has
+      stored all messages of the site, or until a time limit. Otherwise the end of the log
+      could be lost.
+    - The exit code of the process is determined by the run. A signal during the wait for the
+      recorders only ends the wait.
+"""
+
+import signal
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from trilat_net.core.step.ticks import NS_PER_S, Mode, TickRecord, describe_divergence
+from trilat_net.errors import PeerLeft, RunFailed, count_nouns
+from trilat_net.net import topics
+from trilat_net.net.membership import EventPublisher
+from trilat_net.net.timing import LinkTimingMonitor
+
+from .site_parts import SiteParts
+
+LINGER_NS = 10 * NS_PER_S
+"""Longest time that a site waits at its end after the last query of a recorder, in ns.
+
+A recorder whose process was suspended, or whose connection broke, needs seconds to connect
+again: the lease of Zenoh, 5 s, and one attempt after that.
+"""
+_ANNOUNCE_AFTER_NS = NS_PER_S
+"""Time after which a site tells the user that it is waiting for a recorder, in ns."""
+LEAVE_TIMEOUT_NS = 2 * NS_PER_S
+"""Time that a site waits after the last recorder has stored everything and left, in ns."""
+_QUERIED_NS = NS_PER_S
+"""A recorder counts as present for this time after its last query, even without a token."""
+_POLL_NS = 5_000_000
+"""Longest pause between two polls while the site waits for the recorders, in ns."""
+
+
+class RunOutcome(NamedTuple):
+    """Result of the control loop of a site.
+
+    Attributes:
+        output: Record of the last tick. None if no tick was executed.
+        failure: Error that ended the run. None if there was none.
+    """
+
+    output: TickRecord | None
+    failure: RunFailed | None = None
+
+    @property
+    def ticks(self) -> int:
+        """Number of the last tick plus 1. It is 0 if no tick was executed."""
+        return 0 if self.output is None else self.output.tick + 1
+
+    @property
+    def t_ns(self) -> int:
+        """Nominal time of the last tick, in ns since the epoch. It is -1 if there is none."""
+        return -1 if self.output is None else self.output.t_ns
+
+
+class SiteEnd:
+    """The end of a site, from the last tick of its control loop to the end of its process.
+
+    Args:
+        parts: Parts of the site.
+        publisher: Publishes the events of the site.
+        link_monitors: Timing monitors of the links, which know whether the peers have received
+            the last samples of this site.
+        outcome: Result of the control loop.
+    """
+
+    def __init__(
+        self,
+        parts: SiteParts,
+        publisher: EventPublisher,
+        link_monitors: Sequence[LinkTimingMonitor],
+        outcome: RunOutcome,
+    ) -> None:
+        self._parts = parts
+        self._publisher = publisher
+        self._link_monitors = link_monitors
+        self._outcome = outcome
+
+    def leave_session(self) -> int:
+        """Publishes how the run ended, waits for the recorders, and tells the user the result.
+
+        Returns:
+            Exit code of the process: 0, or 128 plus the number of the signal that ended the
+            run.
+
+        Raises:
+            PeerLeft: A peer left before the end and did not return.
+            RunFailed: The run failed, at this site or at a peer.
+        """
+        parts = self._parts
+        interrupt = parts.interrupt
+        monitor = parts.monitor
+        self._publish_end()
+
+        # The exit code is read before the wait: a later signal only ends the wait.
+        code = interrupt.exit_code if interrupt.is_requested() else 0
+        monitor.watch(self._publisher, self._outcome.t_ns)
+        if topics.RECORDER in monitor.boots or monitor.recorders:
+            self._await_recorders()
+        ticks = count_nouns(self._outcome.ticks, "tick")
+        summary = f"{ticks}, {parts.stats.overruns} of them late by a period or more"
+        dropped_counts = parts.stats.dropped.items()
+        if dropped_counts:
+            dropped = ", ".join(f"{count} {reason}" for reason, count in dropped_counts)
+            summary += f"; dropped: {dropped}"
+        parts.say(summary)
+
+        if self._outcome.failure is not None:
+            raise self._outcome.failure
+        if monitor.ended_by:
+            raise RunFailed(f"{parts.name} ended because {monitor.ended_by}")
+        if not code and self._departures:
+            names = " and ".join(monitor.departed)
+            raise PeerLeft(
+                f"{parts.name} executed {ticks}; {self._departures}; {names} did not rejoin "
+                "the session"
+            )
+        return code
+
+    def _publish_end(self) -> None:
+        """Publishes the events at the end of a run.
+
+        They are the failure if there was one, delays of the user's own code, and the event
+        `end`, whose sentence says how many ticks were executed and why the run ended early.
+        """
+        parts = self._parts
+        output = self._outcome.output
+        failure_kind = "failed"
+        if output is not None and output.mode is Mode.DIVERGED:
+            failure_kind = "diverged"
+            failure = RunFailed(describe_divergence(parts.name, output))
+            self._outcome = self._outcome._replace(failure=failure)
+        if self._outcome.failure is not None:
+            self._publish_end_event(failure_kind, str(self._outcome.failure))
+
+        for code in parts.watchdog.codes:
+            hiccups = code.describe_hiccups()
+            if hiccups:
+                self._publish_end_event("law", hiccups)
+                parts.say(hiccups)
+
+        about, cause = self._find_cause()
+        meters = self._link_monitors
+        unheard = [meter.peer.name for meter in meters if meter.is_unacknowledged]
+        if unheard:
+            cause += f"; {', '.join(unheard)} did not hear it at the end"
+        text = f"{parts.name} made {count_nouns(self._outcome.ticks, 'tick')}{cause}"
+        self._publish_end_event("end", text, about=about)
+
+    @property
+    def _departures(self) -> str:
+        """Sentences about the sites that have left. Empty if all sites are present."""
+        return "; ".join(text for _, text in self._parts.monitor.departed.values())
+
+    def _find_cause(self) -> tuple[str, str]:
+        """Determines why the run ended before the last tick of the scenario.
+
+        Returns:
+            member: Name of the member that ended the run. Empty if the run was completed, or
+                was ended by a request to all sites.
+            cause: Text that names the cause, to be appended to the sentence "m1 made 500
+                ticks". Empty if the run was completed.
+        """
+        parts = self._parts
+        monitor = parts.monitor
+        if self._outcome.failure is not None:  # of this site
+            return parts.name, f": {self._outcome.failure}"
+        if monitor.ended_by:  # another member ended it, or has replaced this site
+            return monitor.ended_member, f": {monitor.ended_by}"
+        if parts.changes.stopped:  # users requested that all sites end at the same tick
+            return "", ", as many as it was asked for"
+        scenario_ticks = parts.scenario.ticks(parts.name)
+        if self._outcome.ticks == scenario_ticks:
+            return "", ""
+        if parts.interrupt.is_requested():
+            signal_name = signal.Signals(parts.interrupt.number).name
+            return parts.name, f", ended by {signal_name}"
+
+        # The site has waited too long for peers that left.
+        first_departed = next(iter(monitor.departed), "")
+        return first_departed, f": {self._departures}"
+
+    def _publish_end_event(self, kind: str, text: str, about: str = "") -> None:
+        """Publishes an event with the number of executed ticks and the time of the last one."""
+        self._publisher.publish(
+            kind, text, t_ns=self._outcome.t_ns, ticks=self._outcome.ticks, about=about
+        )
+
+    def _await_recorders(self) -> None:
+        """Waits until every recorder has stored the messages of this site and has left.
+
+        Recorders query the site for messages that were lost on the way, and the site must
+        reply. Once all is stored, the site stays for the time that the user's options allow,
+        until the recorders have left.
+
+        A first signal does not shorten the wait for the recorders: records that are not stored
+        would be lost with this process. A second signal ends it.
+        """
+        parts = self._parts
+        clock = parts.clock
+        monitor = parts.monitor
+        begun_ns = clock.monotonic_ns()
+        give_up_ns = begun_ns + LINGER_NS
+        queried_ns = 0
+        is_announced = False
+        while clock.monotonic_ns() < give_up_ns and not self._may_leave():
+            while not parts.interrupt.is_repeated() and parts.buffer.answer_query():
+                queried_ns = clock.monotonic_ns()
+                give_up_ns = max(give_up_ns, queried_ns + LINGER_NS)
+            self._publisher.answer_queries()
+            monitor.watch(self._publisher, self._outcome.t_ns)
+
+            is_gone = not monitor.recorders and clock.monotonic_ns() - queried_ns > _QUERIED_NS
+            # A recorder that has gone, but still lacks messages, may come back: then the limit
+            # stays as it is.
+            if is_gone and monitor.stored:
+                give_up_ns = min(give_up_ns, clock.monotonic_ns() + LEAVE_TIMEOUT_NS)
+            if monitor.read_stored(self._outcome.ticks) and monitor.all_stored:
+                give_up_ns = clock.monotonic_ns() + int(parts.options.stay_s * 1e9)
+
+            waited_ns = clock.monotonic_ns() - begun_ns
+            is_long = not monitor.all_stored and waited_ns > _ANNOUNCE_AFTER_NS
+            if is_long and not is_announced:
+                is_announced = True
+                parts.say(
+                    "keeps its last records until the recorder has them, or has asked for none "
+                    f"for {LINGER_NS // NS_PER_S} s; Ctrl-C a second time ends it at once"
+                )
+            clock.sleep_until(clock.monotonic_ns() + _POLL_NS)
+
+    def _may_leave(self) -> bool:
+        """Returns True if the site need not wait for the recorders any longer.
+
+        This is so after a second signal. After a first signal, it is so once the recorders have
+        stored everything.
+        """
+        interrupt = self._parts.interrupt
+        is_complete = self._parts.monitor.all_stored and interrupt.is_requested()
+        return interrupt.is_repeated() or is_complete

@@ -1,0 +1,250 @@
+"""Reports what happens at a site: events for the log and the other members, lines for the user.
+
+A site is a process that runs one arm. While its control loop runs, a `SiteNews` publishes an
+event for each change that took effect, such as a new delay or a new mode, and prints alarms
+and a status line.
+
+Invariant:
+    - Every event is published after the record of the tick to which it belongs.
+    - An event or alarm that would repeat in every tick is issued at most once a second.
+"""
+
+from collections.abc import Iterable, Sequence
+
+import msgspec
+import numpy as np
+
+from trilat_net.core.step.site_setup import StaleAction
+from trilat_net.core.step.ticks import (
+    NS_PER_S,
+    LifeReason,
+    Mode,
+    TickRecord,
+    describe_mode,
+    find_alarm,
+    find_life_reason,
+    tick_ns,
+)
+from trilat_net.errors import count_nouns
+from trilat_net.log.site_log import compute_task_errors
+from trilat_net.net.membership import EventPublisher
+from trilat_net.net.messages import MODE_WORDS
+from trilat_net.net.timing import ClockNotice
+from trilat_net.recorded_change import count_skipped_ticks
+from trilat_net.scenario.run_changes import describe_change
+from trilat_net.scenario.scenario_types import Change
+
+from .site_parts import SiteParts
+
+STATUS_PERIOD_S = 5
+"""Time between two status lines for the user, in s."""
+
+
+def publish_clocks(
+    publisher: EventPublisher, notices: Iterable[ClockNotice], t_ns: int
+) -> None:
+    """Publishes events about the offsets and faults of the peers' clocks.
+
+    Args:
+        publisher: Publishes the events of the site.
+        notices: Fields of the events.
+        t_ns: Time of the events, in ns since the epoch (the common start of the session).
+    """
+    for notice in notices:
+        publisher.publish(**notice, t_ns=t_ns)
+
+
+class SiteNews:
+    """Publishes the events of a running site, and prints lines for its user.
+
+    The control loop calls `report_tick` after ticks in which something changed, and
+    `publish_news` ten times a second.
+
+    Args:
+        parts: Parts of the site.
+        publisher: Publishes the events of the site.
+    """
+
+    def __init__(self, parts: SiteParts, publisher: EventPublisher) -> None:
+        self._parts = parts
+        self._publisher = publisher
+        self._mode = Mode.RUN
+        # Ranges of skipped ticks that are not published yet.
+        self._skipped: list[str] = []
+        # Seconds of the session in which a status line, a `waiting` event and an alarm were
+        # last issued. They limit how often these are repeated.
+        self._status_s = 0
+        self._waiting_s = 0
+        self._alarm_s = -1
+
+    def report_tick(self, output: TickRecord) -> None:
+        """Publishes an event for each change that took effect in a tick, such as a new delay.
+
+        A new mode of the site, such as "fault", is also a change. Skipped ticks are only stored
+        here, because `publish_news` later publishes them together in one event. A tick is a
+        period of the control loop.
+
+        Args:
+            output: Record of the tick: what the site measured and computed.
+        """
+        parts = self._parts
+        skipped = count_skipped_ticks(output.cmd)
+        if skipped:
+            self._skipped.append(f"{output.tick - skipped}-{output.tick - 1}")
+
+        for change in output.cmd:
+            if count_skipped_ticks([change]):
+                continue
+            source = parts.changes.sources.pop(change, "")
+            sentence = describe_change(msgspec.json.decode(change, type=Change), source)
+            self._publisher.publish(
+                "change", sentence, command=change, t_ns=output.t_ns, ticks=output.tick
+            )
+            parts.say(sentence)
+
+        if output.mode is not self._mode:
+            self._mode = output.mode
+            text = describe_mode(
+                parts.name,
+                output,
+                glides=parts.setup.on_stale.action is StaleAction.GLIDE,
+                law_failure=parts.site.law_failure,
+            )
+            self._publisher.publish("mode", text, t_ns=output.t_ns, ticks=output.tick)
+            self._raise_alarm(output)
+
+    def _raise_alarm(self, output: TickRecord) -> None:
+        """Prints an alarm with a reason and a remedy, if the new mode requires an alarm.
+
+        Alarms exist only under the rule `glide` for interrupted connections. An arm that holds
+        its position may change its mode many times, and raises at most one alarm a second.
+
+        Args:
+            output: Record of the tick in which the mode has changed.
+        """
+        parts = self._parts
+        mode = output.mode
+        rule = parts.setup.on_stale  # what the arm does while samples of a peer are missing
+        if mode is Mode.HOLD:
+            second = output.t_ns // NS_PER_S
+            had_alarm_in_this_second = second <= self._alarm_s
+            if had_alarm_in_this_second:
+                return
+            self._alarm_s = second
+
+        if rule.action is not StaleAction.GLIDE:
+            return
+
+        # Some arms go on without a lost peer. They have an alarm as they return to the others.
+        lost_peers: Sequence[str] = ()
+        if rule.degrades and mode is Mode.RETURN:
+            lost_peers = parts.site.layout.list_lost_peers(output.mem, parts.site.peers)
+
+        alarm = find_alarm(
+            session=parts.options.session,
+            site=parts.name,
+            mode=MODE_WORDS[mode],
+            mem=output.mem,
+            shared=len(output.q_des),
+            lost=lost_peers,
+        )
+        if alarm is not None:
+            parts.say(f"*** {alarm}")
+
+    def publish_news(self, output: TickRecord) -> None:
+        """Publishes what has happened since the last call, and prints the status line when due.
+
+        Args:
+            output: Record of the newest tick.
+        """
+        parts = self._parts
+        if parts.hand is not None:  # who has started or ended to move the arm
+            for _, text in parts.hand.news:
+                # `say` prints the name of the site itself.
+                _, _, text_without_site = text.partition(": ")
+                parts.say(text_without_site)
+            self._publish_entries("hand", parts.hand.news)
+        self._publish_entries("mark", parts.changes.marks)
+        self.publish_skipped(output)
+        self._publish_waiting(output)
+
+        second = output.t_ns // NS_PER_S
+        if second >= self._status_s + STATUS_PERIOD_S:
+            self._status_s = second
+            parts.say(self._describe_status(output))
+
+    def _publish_entries(self, kind: str, news: list[tuple[int, str]]) -> None:
+        """Publishes an event for each entry of a list, and empties the list.
+
+        Args:
+            kind: Kind of the events.
+            news: The entries: the tick in which something happened, and a sentence about it.
+        """
+        rate_hz = self._parts.site.rate_hz
+        for tick, text in news:
+            self._publisher.publish(kind, text, t_ns=tick_ns(tick, rate_hz), ticks=tick)
+        news.clear()
+
+    def publish_skipped(self, output: TickRecord) -> None:
+        """Publishes one event about the ticks that the site has skipped since the last call.
+
+        A site skips ticks only if its arm is external, and the loop was late.
+
+        Args:
+            output: Record of the newest tick.
+        """
+        if self._skipped:
+            ticks = " ".join(self._skipped)
+            self._skipped = []
+            text = f"{self._parts.name} did not make ticks {ticks}"
+            self._publisher.publish(
+                "overrun", text, t_ns=output.t_ns, ticks=output.tick + 1, command=ticks
+            )
+
+    def _publish_waiting(self, output: TickRecord) -> None:
+        """Reports once a second that the arm is too far from its peers to approach them.
+
+        This can only happen if the scenario lets an arm glide back to its peers after an
+        interrupted connection. The arm then waits until its operator moves it closer.
+
+        Args:
+            output: Record of the newest tick.
+        """
+        if output.mode not in (Mode.WAITING, Mode.HOLD):
+            return
+        if self._parts.setup.on_stale.action is not StaleAction.GLIDE:
+            return
+        second = output.t_ns // NS_PER_S
+        is_too_far = find_life_reason(output) is LifeReason.ALIGN_LIMIT
+        if is_too_far and second > self._waiting_s:
+            self._waiting_s = second
+            text = describe_mode(self._parts.name, output, glides=True)
+            self._publisher.publish("waiting", text, t_ns=output.t_ns, ticks=output.tick)
+            self._parts.say(text)
+
+    def _describe_status(self, output: TickRecord) -> str:
+        """Returns the status line that is printed for the user every few seconds.
+
+        It contains the time, the mode, the largest synchronisation error and torque of a joint,
+        and the numbers of late ticks and dropped messages.
+        """
+        parts = self._parts
+        position = np.array([output.shared()[0]])
+        desired = np.array([output.q_des])
+        if output.x:
+            unit = "m or rad"
+            error = compute_task_errors(position, desired, parts.scenario.arms[parts.name].axes)
+        else:
+            unit = "rad"
+            error = position - desired
+
+        largest_error = np.abs(error).max()
+        torque_nm = max(map(abs, output.tau))
+        dropped = sum(parts.stats.dropped.values())
+
+        return (
+            f"t = {output.t_ns / NS_PER_S:.0f} s, {MODE_WORDS[output.mode]}, "
+            f"|e| {largest_error:.3g} {unit}, torque {torque_nm:.3g} N m, "
+            f"{count_nouns(parts.stats.overruns, 'tick')} late, "
+            f"{count_nouns(dropped, 'message')} dropped"
+        )
