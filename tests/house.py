@@ -2,6 +2,7 @@
 
 import ast
 import re
+import tomllib
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -18,6 +19,7 @@ BELOW_ALL = {
     "fields",
     "records",
     "recorded_change",
+    "hooks",
 }
 
 
@@ -94,6 +96,75 @@ def definitions(path: Path) -> set[str]:
                 for below in node.body
                 if isinstance(below, ast.FunctionDef)
             }
+    return found
+
+
+@cache
+def layers() -> dict[str, int]:
+    """Returns the height of each layer that pyproject.toml lists, by its dotted name; the lowest has 0."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
+    rows = project["tool"]["importlinter"]["contracts"][0]["layers"]
+    return {
+        name: height
+        for height, row in enumerate(reversed(rows))
+        for name in re.findall(r"[\w.]+", row)
+    }
+
+
+def _dotted(path: Path) -> str:
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+
+
+@cache
+def heights() -> dict[str, int]:
+    """Returns the height of the layer of each module, by its dotted name; some belong to no layer."""
+    found = {}
+    for path in files():
+        parts = _dotted(path).split(".")
+        names = (".".join(parts[:n]) for n in range(len(parts), 0, -1))
+        layer = next((name for name in names if name in layers()), None)
+        if layer is not None:
+            found[".".join(parts)] = layers()[layer]
+    return found
+
+
+@cache
+def class_heights() -> dict[str, int]:
+    """Returns the height of the lowest layer that defines a class, by the name of the class."""
+    found: dict[str, int] = {}
+    for path in files():
+        height = heights().get(_dotted(path))
+        for node in tree(path).body:
+            if isinstance(node, ast.ClassDef) and height is not None:
+                found[node.name] = min(height, found.get(node.name, height))
+    return found
+
+
+def strings(path: Path) -> Iterator[str]:
+    """Yields the strings of a file, also those in f-strings, but not its docstrings."""
+    statements = {id(node.value) for node in ast.walk(tree(path)) if isinstance(node, ast.Expr)}
+    for node in ast.walk(tree(path)):
+        match node:
+            case ast.Constant(value=str(text)) if id(node) not in statements:
+                yield text
+
+
+def names_from_above(path: Path) -> set[str]:
+    """Returns the strings of a file that name a module or a class of a layer above its own.
+
+    A module is named by its dotted name, or by the end of one, as in f"{__package__}.analysis.judge".
+    """
+    height = heights().get(_dotted(path))
+    if height is None:
+        return set()
+    found = set()
+    for text in strings(path):
+        for name in re.findall(r"\w*(?:\.\w+)+", text):
+            modules = (name, f"trilat_net.{name.strip('.')}")
+            if any(heights().get(module, 0) > height for module in modules):
+                found.add(text)
+        if class_heights().get(text, 0) > height:
+            found.add(text)
     return found
 
 

@@ -19,6 +19,10 @@ from importlib import import_module as _import_module
 from typing import TYPE_CHECKING as _TYPE_CHECKING
 from typing import Any as _Any
 
+# These packages register functions in `hooks` that packages below them call.
+from . import log as _log  # noqa: F401
+from . import presentation as _presentation  # noqa: F401
+
 if _TYPE_CHECKING:
     from sites.devices import Device as Device
     from sites.devices import DeviceState as DeviceState

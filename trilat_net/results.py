@@ -4,21 +4,21 @@ The commands of the terminal and the functions of the Python interface return th
 The terminal prints the text, and programs read the values.
 
 Invariant:
-    - A result contains only values. Its text is composed by the package `presentation`, which
-      is imported when the text is requested. Modules that compute therefore do not depend on
-      modules that format.
+    - A result contains only values. Its text is composed by functions that the package
+      `presentation` registers in `hooks`, and that are imported when the text is requested.
+      Modules that compute therefore do not depend on modules that format.
     - JSON contains no NaN and no infinity. An unknown quantity is null.
 """
 
 import math
 from collections.abc import Mapping, Sequence
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     import pandas
 
 from .files import import_extra
+from .hooks import find_hook
 
 _REPR_LENGTH = 200
 
@@ -53,7 +53,7 @@ class Result:
 
         Commands with the option --all print the whole text only with this option.
         """
-        return str(_texts().summarize(self))
+        return str(find_hook("summarize a result")(self))
 
     def to_frame(self) -> "pandas.DataFrame":
         """Returns the result as a pandas data frame.
@@ -79,12 +79,7 @@ class Result:
         return f"<{type(self).__name__} {short}>"
 
     def _repr_html_(self) -> str:
-        return str(_texts().render_html(self))
-
-
-def _texts() -> Any:
-    """Imports the module that composes the texts of results, and returns it."""
-    return import_module(f"{__package__}.presentation.result_text")
+        return str(find_hook("render a result as HTML")(self))
 
 
 JsonObject = dict[str, Any]

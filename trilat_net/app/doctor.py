@@ -739,6 +739,12 @@ class DoctorReport(Result):
         """Returns the findings as table rows, with the fields of `DoctorFinding` as columns."""
         return [finding._asdict() for finding in self.findings]
 
+    def blocks(self) -> Iterator[Any]:
+        """Returns the lines that `trilat doctor` prints, one per finding."""
+        from ..presentation.summary_text import compose_doctor
+
+        return compose_doctor(self)
+
 
 def doctor(
     *,

@@ -517,6 +517,12 @@ class NetworkBenchmark(Result):
             flat_rows.append(flat)
         return flat_rows
 
+    def blocks(self) -> Iterator[Any]:
+        """Returns the table and the verdicts that `trilat ping --benchmark` prints."""
+        from ..presentation.summary_text import compose_benchmark
+
+        return compose_benchmark(self)
+
 
 def ping_benchmark(
     scenario: str | Path | Mapping[str, Any] | Scenario,

@@ -12,7 +12,7 @@ Invariant:
       member, so that the session does not wait for it.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -66,6 +66,12 @@ class PingReport(Result):
         The links are left out, because they have other columns.
         """
         return self.members
+
+    def blocks(self) -> Iterator[Any]:
+        """Returns the tables of round trips that `trilat ping` prints."""
+        from ..presentation.summary_text import compose_ping
+
+        return compose_ping(self)
 
 
 class SessionPing:
@@ -296,6 +302,12 @@ class TopicDelays(Result):
         A row contains the number of messages of the program, and their delays.
         """
         return self.publishers
+
+    def blocks(self) -> Iterator[Any]:
+        """Returns the table of delays that `trilat ping --ros2` prints."""
+        from ..presentation.summary_text import compose_topic_delays
+
+        return compose_topic_delays(self)
 
 
 def ping_topic(

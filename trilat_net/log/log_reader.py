@@ -30,7 +30,6 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import cached_property, lru_cache
-from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar
@@ -49,6 +48,7 @@ from ..errors import (
     suggest_nearest,
 )
 from ..files import describe_missing_library, open_regular
+from ..hooks import find_hook
 from ..net import topics
 from ..net.messages import READABLE, Event, LinkStats, RecorderStats, State
 from ..net.topics import count_under_way
@@ -90,9 +90,6 @@ if TYPE_CHECKING:
 
 
 M = TypeVar("M", Event, LinkStats, RecorderStats)
-
-_COLUMN_PLOT = "trilat_net.presentation.column_plot"
-"""Module that draws a log. Imported only for a figure, because it needs Matplotlib."""
 
 
 class Log(Result, Mapping[str, SiteLog]):
@@ -260,10 +257,10 @@ class Log(Result, Mapping[str, SiteLog]):
             LogError: The records cannot be read.
         """
         try:
-            column_plot = import_module(_COLUMN_PLOT)
+            plot_log = find_hook("plot a log")
         except ModuleNotFoundError as error:
             raise UsageError(describe_missing_library("plot", error)) from None
-        return column_plot.plot_log(
+        return plot_log(
             self, columns, sites=sites, joints=joints, from_s=from_s, until_s=until_s
         )
 

@@ -14,7 +14,6 @@ Invariant:
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property, lru_cache
-from importlib import import_module
 from typing import Any, Generic, NamedTuple, TypeVar, overload
 
 import numpy as np
@@ -24,6 +23,7 @@ from ..core.arms.task_space import POSE, POSITION
 from ..core.plug.law_channel import LawChannel
 from ..core.step.vectors import Array
 from ..errors import LogError, WireError, count_nouns
+from ..hooks import find_hook
 from ..net.messages import READABLE, State
 from ..net.wire import decode
 from ..recorded_change import count_skipped_ticks
@@ -298,10 +298,6 @@ class _RecordVector(cached_property[Array]):
         self.__doc__ = meaning
 
 
-_HTML = "trilat_net.presentation.site_html"
-"""Module that renders the records of a site as HTML. Imported only when a notebook needs it."""
-
-
 class SiteLog:
     """Records of one site, in the order of their ticks.
 
@@ -382,8 +378,7 @@ class SiteLog:
         return f"<{self.name}: {records}, {span}, {self.missing or 'none'} missing>"
 
     def _repr_html_(self) -> str:
-        html: str = import_module(_HTML).render_site_html(self)
-        return html
+        return str(find_hook("render a site's records as HTML")(self))
 
     def _read(self, decode_column: Callable[..., T], *arguments: Any) -> T:
         """Decodes columns of all records, and makes the arrays read-only.

@@ -4,3 +4,15 @@ Invariant:
     - Matplotlib is imported only in this package and in the figures of `studies`, so that
       programs that draw nothing start fast.
 """
+
+from ..hooks import register_hooks
+
+register_hooks(
+    __name__,
+    {
+        "summarize a result": "result_text:summarize",
+        "render a result as HTML": "result_text:render_html",
+        "render a site's records as HTML": "site_html:render_site_html",
+        "plot a log": "column_plot:plot_log",
+    },
+)

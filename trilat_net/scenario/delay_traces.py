@@ -30,7 +30,6 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -41,6 +40,7 @@ from ..core.links.delay import MAX_DELAY_US
 from ..core.step.vectors import Array, Points
 from ..errors import ScenarioError, UsageError, count_nouns
 from ..files import decode_text, open_regular
+from ..hooks import find_hook
 from ..results import Result
 from .ping_output import read_ping
 
@@ -52,13 +52,6 @@ LONGEST_MS = MAX_DELAY_US / 1e3
 """Longest delay that a link may have, in ms."""
 TracePoint = tuple[float, float]
 """Send time of a message in s, and its delay in ms. The delay of a lost message is infinite."""
-
-_LOG_READER = "trilat_net.log.log_reader", "read_link_delays"
-"""Module and function that read the delays of a link from a log.
-
-They are imported at run time: the package `log` imports this one, so that an import at the top
-would be circular.
-"""
 
 
 def _read_csv(path: Path) -> list[TracePoint]:
@@ -116,8 +109,8 @@ def read_trace(path: Path, link: str) -> str:
     try:
         if path.suffix != ".mcap":
             return format_trace(_read_csv(path))
-        module, name = _LOG_READER
-        return format_trace(getattr(import_module(module), name)(path, link))
+        read_link_delays = find_hook("read the delays of a link")
+        return format_trace(read_link_delays(path, link))
     except OSError as error:
         raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from None
     # UnicodeDecodeError is a ValueError.

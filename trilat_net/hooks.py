@@ -1,0 +1,57 @@
+"""Lets a lower package call functions of an upper package without naming that package.
+
+A package may import only packages below it. A method of a low package may nevertheless need a
+function from above: the records of a run, for example, can draw themselves with `Log.plot`, and
+drawing is the task of the package `presentation`. The upper package registers such a function
+here under the name of its purpose, and the method looks it up by this name.
+
+Invariant:
+    - Registering imports nothing. The module of a function is imported when the function is
+      first looked up, so that commands which do not need it start fast.
+    - `trilat_net/__init__.py` imports every package that registers functions. All hooks are
+      therefore filled before any other module of the program is imported.
+"""
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from importlib import import_module
+from typing import Any
+
+_loaders: dict[str, Callable[[], Any]] = {}
+"""For each hook a function that imports the registered function and returns it."""
+
+
+def register_hooks(package: str, functions: Mapping[str, str]) -> None:
+    """Registers functions of a package for the lower packages that look them up.
+
+    Args:
+        package: Name of the package, `__name__` in its `__init__.py`.
+        functions: Functions as "module:function", by the name of their hook. The modules are
+            those of the package.
+    """
+    for hook, function in functions.items():
+        module, _, name = function.partition(":")
+        _loaders[hook] = partial(_import_function, f"{package}.{module}", name)
+
+
+def find_hook(hook: str) -> Any:
+    """Returns the function that an upper package has registered.
+
+    Args:
+        hook: Name of the hook, as in "plot a log".
+
+    Raises:
+        ModuleNotFoundError: A library that the function needs is not installed.
+        KeyError: No package has registered such a function.
+    """
+    return _loaders[hook]()
+
+
+def list_hooks() -> list[str]:
+    """Returns the names of all hooks for which a function is registered."""
+    return list(_loaders)
+
+
+def _import_function(module: str, name: str) -> Any:
+    """Imports a function from a module."""
+    return getattr(import_module(module), name)
