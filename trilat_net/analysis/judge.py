@@ -20,8 +20,11 @@ from ..execution.virtual import simulate_scenario
 from ..log.accounting import MIN_COVERAGE
 from ..log.log_reader import Log
 from ..scenario import Scenario
-from ..scenario.describe import describe_law_conditions, list_law_proofs
-from .certificate.observed_energy import find_energy_laws
+from ..scenario.describe import (
+    describe_law_conditions,
+    find_energy_laws,
+    list_law_proofs,
+)
 from .certificate.premises import explain_no_functional
 from .certificate.stability_certificate import Certificate, certify
 from .run_end import RunEnd, RunTrace, Stability, classify_run_end

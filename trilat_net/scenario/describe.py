@@ -31,6 +31,7 @@ from ..laws.interface import LawSettings
 from .arms import TASK_AXES, Arm, read_arm
 from .delay_models import LinkBase
 from .delay_period import find_final_link
+from .imported_code import ImportedLaw
 from .operators.kernel_operators import (
     Chirp,
     JointSpring,
@@ -217,6 +218,28 @@ def list_law_proofs(scenario: Scenario) -> list[str]:
             return []
         proofs.append(f"the condition of {law.tag}: {condition.text}")
     return list(dict.fromkeys(proofs))
+
+
+def find_energy_laws(scenario: Scenario, *, own_laws: bool = False) -> dict[str, Any]:
+    """Returns the control laws that declare energies, by site.
+
+    Args:
+        scenario: Scenario of the run.
+        own_laws: True to also create laws that are not part of this program, which runs their
+            code.
+
+    Raises:
+        ScenarioError: The file of a law that is not part of this program is missing.
+    """
+    laws: dict[str, Any] = {}
+    for site, spec in scenario.sites.items():
+        setup = scenario.setup(site)
+        is_allowed = own_laws or not isinstance(spec.control, ImportedLaw)
+        if setup.law_factory is not None and is_allowed:
+            law = setup.law_factory(setup.law_context())
+            if callable(getattr(law, "energies", None)):
+                laws[site] = law
+    return laws
 
 
 def _describe_idle_shares(scenario: Scenario) -> list[str]:
