@@ -77,8 +77,8 @@ class Alone:
     def publish_link(self, payload: bytes) -> None:
         self.links.append(decode(payload, LinkStats))
 
-    def run_housekeeping(self, k: int, t_ns: int) -> None:
-        self.slack.append((k, t_ns))
+    def run_housekeeping(self, output: TickRecord) -> None:
+        self.slack.append((output.tick, output.t_ns))
 
     def report_tick(self, output: TickRecord) -> None: ...
 

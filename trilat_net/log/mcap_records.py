@@ -269,8 +269,63 @@ class Damage(NamedTuple):
         return f"{count_nouns(self.length, 'byte')} from byte {self.offset} on: {self.problem}"
 
 
+class ScannedRecord:
+    """A record at its place in a file, which is read when it is needed.
+
+    Args:
+        scanner: Scanner that has found the record.
+        frame: Kind and place of the record.
+
+    Attributes:
+        frame: Kind and place of the record.
+    """
+
+    __slots__ = ("_content", "_problem", "_scanner", "_unpacked", "frame")
+
+    def __init__(self, scanner: "RecordScanner", frame: RecordFrame) -> None:
+        self.frame = frame
+        self._scanner = scanner
+        self._content: bytes | None = None
+        self._unpacked: bytes | None = None
+        self._problem: UnreadableRecord | None = None
+
+    @property
+    def content(self) -> bytes:
+        """Content of the record, without the fields for its kind and its length."""
+        if self._content is None:
+            self._content = self._scanner.content(self.frame)
+        return self._content
+
+    def head(self) -> "ChunkHead":
+        """Returns the head of a chunk, see `RecordScanner.head`.
+
+        Raises:
+            UnreadableRecord: The head is incomplete, or contains impossible values.
+        """
+        return self._scanner.head(self.frame)
+
+    def unpack(self) -> bytes:
+        """Returns the records in a chunk. It is unpacked once, however often this is called.
+
+        Raises:
+            UnreadableRecord: The chunk cannot be unpacked, or its checksum is wrong.
+        """
+        if self._problem is not None:
+            raise self._problem
+        if self._unpacked is None:
+            try:
+                self._unpacked = unpack_chunk(self.content)
+            except UnreadableRecord as error:
+                self._problem = error
+                raise
+        return self._unpacked
+
+
 class RecordScanner:
     """Scanner that finds the records of a file, and skips damaged parts.
+
+    Every program that reads a file, whether it checks, recovers or verifies it, reads the
+    records that this scanner yields.
 
     Args:
         stream: The file, opened for reading. It begins at the current position of the stream.
@@ -312,10 +367,17 @@ class RecordScanner:
         return self._stream.read(max(0, min(length, self.size - offset)))
 
     def frames(self) -> Iterator[RecordFrame]:
-        """Yields the kind and the position of every record of the file.
+        """Yields the kind and the position of every record that `scan` finds."""
+        for item in self.scan():
+            if isinstance(item, ScannedRecord):
+                yield item.frame
 
-        Bytes that cannot be a record are skipped and added to `damaged`. If the end of the file
-        is missing, `torn` is set. Every call starts at the beginning of the file.
+    def scan(self) -> Iterator[ScannedRecord | Damage]:
+        """Yields the records and the damaged parts of the file in the order of their places.
+
+        Bytes that cannot be a record are skipped, added to `damaged`, and yielded as a damaged
+        part. If the end of the file is missing, `torn` is set. Every call starts at the
+        beginning of the file.
         """
         self.damaged = []
         self.torn = None
@@ -336,14 +398,16 @@ class RecordScanner:
             except UnreadableRecord as error:
                 # The length of the previous record may be wrong, so that the search includes
                 # it.
+                damaged_before = len(self.damaged)
                 resumed_at = self._resume(search_start, offset, str(error))
+                yield from self.damaged[damaged_before:]
                 if resumed_at is None:
                     return
                 offset = resumed_at
                 search_start = resumed_at
                 continue
 
-            yield frame
+            yield ScannedRecord(self, frame)
             if frame.opcode == Opcode.FOOTER:
                 self._end_at(frame.end)
                 return

@@ -45,6 +45,7 @@ from .log_layout import (
 from .log_reader import Log
 from .mcap_check import FileCheck
 from .mcap_reader import ChannelInfo, McapMessage, McapReader, Progress, shift_progress
+from .mcap_records import ScannedRecord
 from .message_identity import AnyMessage, identify_message
 from .ros2 import cdr
 from .running_digest import DigestState, Integrity
@@ -360,6 +361,19 @@ class ChannelCheck:
             self._add("times", offset, text)
 
 
+def _read_checked(reader: McapReader, structure: FileCheck) -> Iterator[McapMessage]:
+    """Yields the messages of a file. Each record is checked before its messages are yielded.
+
+    Args:
+        reader: Reader of the file.
+        structure: Check of the file's bytes.
+    """
+    for item in reader.scan():
+        if isinstance(item, ScannedRecord):
+            structure.check_record(item)
+            yield from reader.read_record(item)
+
+
 def _parse_number(about: Mapping[str, str], key: str) -> int:
     """Returns a number of the metadata. It is 0 if it is missing or is not a number."""
     text = about.get(key, "")
@@ -418,18 +432,18 @@ class SessionCheck:
         """
         reader = McapReader(stream, file, progress, kept=False)
         structure = FileCheck(file, reader.scanner, self._findings)
-        reader.watch = structure.check_record
         if reader.scanner.begins:
-            self._read_messages(file, reader)
+            self._read_messages(file, reader, structure)
         structure.finish()
         self._counts += structure.counts
 
-    def _read_messages(self, file: str, reader: McapReader) -> None:
-        """Checks the messages of a file, and compares the file with its digests.
+    def _read_messages(self, file: str, reader: McapReader, structure: FileCheck) -> None:
+        """Checks the records and the messages of a file, and compares it with its digests.
 
         Args:
             file: Name of the file.
             reader: Reader of the file.
+            structure: Check of the file's bytes.
 
         Raises:
             LogError: The file belongs to another session than the previous files.
@@ -437,7 +451,7 @@ class SessionCheck:
         checks: dict[str, ChannelCheck | None] = {}
         self._file = file
         has_begun = False
-        for message in reader.messages():
+        for message in _read_checked(reader, structure):
             if not has_begun:
                 # The reader has read the metadata when it yields the first message.
                 has_begun = True
