@@ -49,7 +49,7 @@ KEPT_RATIO = 300
 
 The largest ratio of logs that trilat-net writes is about 120, for arms at rest in virtual time.
 """
-CHANNEL_SHARE = 1 / 3
+_CHANNEL_SHARE = 1 / 3
 """Largest fraction of this memory for one channel."""
 _DECODED_BYTES = 3_000
 _LONG_BYTES = 300
@@ -183,7 +183,7 @@ class McapReader:
         self._session_channels: set[int] = set()
         # Memory that may still be used, for all messages and for each channel, in bytes.
         self._memory_left = max(KEPT_BYTES, KEPT_RATIO * self.size) if kept else None
-        share = math.inf if self._memory_left is None else CHANNEL_SHARE * self._memory_left
+        share = math.inf if self._memory_left is None else _CHANNEL_SHARE * self._memory_left
         self._channel_memory_left: defaultdict[int, float] = defaultdict(lambda: share)
         self._more_damage: list[mcap_records.Damage] = []
         # True if the whole file is scanned, however damaged it is.

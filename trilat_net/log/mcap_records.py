@@ -43,7 +43,7 @@ OP_MESSAGE = int(Opcode.MESSAGE)
 """Opcode of a message, as an int, because members of an enumeration compare slowly."""
 DEFINITIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
 """Kinds of the records that define schemas and channels."""
-FOOTER_BYTES = RECORD_HEAD_BYTES + 20 + len(MAGIC)
+_FOOTER_BYTES = RECORD_HEAD_BYTES + 20 + len(MAGIC)
 """Size of a finished file's footer and end mark, in bytes."""
 MAX_DAMAGED_PARTS = 100
 """Number of damaged parts of a file after which reading is given up."""
@@ -54,11 +54,11 @@ MAX_UNPACKED_RATIO = 32
 """Large chunks may unpack to this multiple of their compressed size, if that is more."""
 MAX_WINDOW_BYTES = 32 << 20
 """Largest window that a Zstandard frame may require, in bytes."""
-COMPRESSIONS = (b"zstd", b"lz4")
+_COMPRESSIONS = (b"zstd", b"lz4")
 """Supported compressions of chunks. Chunks may also be uncompressed."""
-COMPRESSION_NAME_OFFSET = 28
+_COMPRESSION_NAME_OFFSET = 28
 """Offset of the compression's name, with its length before it, in the content of a chunk."""
-MAX_HEAD_BYTES = COMPRESSION_NAME_OFFSET + 4 + 32 + 8
+_MAX_HEAD_BYTES = _COMPRESSION_NAME_OFFSET + 4 + 32 + 8
 """Largest size of a chunk's head, with a compression name of at most 32 bytes."""
 
 # Fields of a chunk's head: first log time, last log time, unpacked size, checksum, and the
@@ -69,7 +69,7 @@ _SIZE = struct.Struct("<Q")
 _SCAN_BYTES = 1 << 20
 # Name of a supported compression, preceded by its length.
 _COMPRESSION_NAME = re.compile(
-    b"|".join(re.escape(struct.pack("<I", len(name)) + name) for name in COMPRESSIONS)
+    b"|".join(re.escape(struct.pack("<I", len(name)) + name) for name in _COMPRESSIONS)
 )
 
 
@@ -104,7 +104,7 @@ def parse_chunk_head(content: bytes, length: int) -> ChunkHead:
     """Decodes the head of a chunk, and checks that it agrees with the length of the chunk.
 
     Args:
-        content: Content of the chunk. Its first `MAX_HEAD_BYTES` bytes suffice.
+        content: Content of the chunk. Its first `_MAX_HEAD_BYTES` bytes suffice.
         length: Length of the whole content, in bytes.
 
     Raises:
@@ -346,7 +346,7 @@ class RecordScanner:
         self._base = stream.tell()
         self.size = stream.seek(0, os.SEEK_END) - self._base
         self.begins = self.read(0, len(MAGIC)) == MAGIC
-        end = self.read(max(0, self.size - FOOTER_BYTES), FOOTER_BYTES)
+        end = self.read(max(0, self.size - _FOOTER_BYTES), _FOOTER_BYTES)
         self.ends = end.startswith(RECORD_HEAD.pack(Opcode.FOOTER, 20)) and end.endswith(MAGIC)
         self.finished = False
         self.trailing = 0
@@ -390,7 +390,7 @@ class RecordScanner:
                 frame = self._frame_at(offset)
                 if frame.opcode == Opcode.CHUNK:
                     self.head(frame)
-                elif frame.opcode == Opcode.FOOTER and frame.size + len(MAGIC) != FOOTER_BYTES:
+                elif frame.opcode == Opcode.FOOTER and frame.size + len(MAGIC) != _FOOTER_BYTES:
                     raise UnreadableRecord(
                         f"a footer record has {count_nouns(frame.length, 'byte')}, which is "
                         "not the length of a footer"
@@ -452,7 +452,7 @@ class RecordScanner:
             self.damaged.append(Damage(damage_start, chunk_offset - damage_start, problem))
         elif self.ends:
             self.damaged.append(
-                Damage(offset, max(0, self.size - FOOTER_BYTES - offset), problem)
+                Damage(offset, max(0, self.size - _FOOTER_BYTES - offset), problem)
             )
             self.finished = True
         else:
@@ -504,7 +504,9 @@ class RecordScanner:
         Raises:
             UnreadableRecord: The head is incomplete, or contains impossible values.
         """
-        content = self.read(frame.offset + RECORD_HEAD_BYTES, min(frame.length, MAX_HEAD_BYTES))
+        content = self.read(
+            frame.offset + RECORD_HEAD_BYTES, min(frame.length, _MAX_HEAD_BYTES)
+        )
         return parse_chunk_head(content, frame.length)
 
     def _find_chunk(self, offset: int) -> int | None:
@@ -516,7 +518,7 @@ class RecordScanner:
         Returns:
             The offset of the chunk. None if there is no such chunk.
         """
-        lead_bytes = RECORD_HEAD_BYTES + COMPRESSION_NAME_OFFSET
+        lead_bytes = RECORD_HEAD_BYTES + _COMPRESSION_NAME_OFFSET
         for window_offset in range(offset, self.size, _SCAN_BYTES):
             # The window is so long that it contains the head of a chunk that begins at its end.
             window = self.read(window_offset, _SCAN_BYTES + lead_bytes + 8)
@@ -549,7 +551,7 @@ class RecordScanner:
         Returns:
             The footer. None if the file is not finished and therefore has no footer.
         """
-        content = self.read(max(0, self.size - FOOTER_BYTES) + RECORD_HEAD_BYTES, 20)
+        content = self.read(max(0, self.size - _FOOTER_BYTES) + RECORD_HEAD_BYTES, 20)
         return parse_record(Opcode.FOOTER, content) if self.ends else None
 
     def is_summary_intact(self, footer: records.Footer) -> bool:
@@ -562,7 +564,7 @@ class RecordScanner:
             True if the summary has this checksum.
         """
         summary_start = footer.summary_start
-        footer_start = self.size - FOOTER_BYTES
+        footer_start = self.size - _FOOTER_BYTES
         if not 0 <= summary_start <= footer_start:
             return False
         # The checksum covers the summary and the footer up to the checksum itself, which is the

@@ -59,9 +59,9 @@ _UNPROVEN = "has no checksum, and the log has no scenario by which to check mess
 _NO_SCENARIO = "the log has no scenario, without which no message can be checked"
 _MAX_REASONS = 3
 """Number of losses that the error message lists if nothing can be saved."""
-MAX_LISTED_LOSSES = 20
+_MAX_LISTED_LOSSES = 20
 """Number of losses that the metadata of the new file list one by one."""
-DAMAGED_SUFFIX = ".damaged"
+_DAMAGED_SUFFIX = ".damaged"
 """Suffix of the name of an attachment whose checksum is wrong."""
 _MAX_SCENARIO_BYTES = 64 << 20
 """Largest size of a scenario file beside the log, in bytes."""
@@ -152,7 +152,7 @@ class Recovery(Result):
         The texts state the source file, the losses and the missing records. A reader of the new
         file can thus recognise it as a recovered log.
         """
-        losses = self.lost[:MAX_LISTED_LOSSES]
+        losses = self.lost[:_MAX_LISTED_LOSSES]
         unlisted = len(self.lost) - len(losses)
         if unlisted:
             losses.append(f"and {unlisted} more")
@@ -484,7 +484,7 @@ class _FileCopy:
     def _copy_attachment(self, content: bytes) -> None:
         """Copies an attachment.
 
-        A damaged attachment is renamed with the suffix `DAMAGED_SUFFIX`. If it kept its name,
+        A damaged attachment is renamed with the suffix `_DAMAGED_SUFFIX`. If it kept its name,
         nobody would notice the damage, because the writer adds a valid checksum.
         """
         entry = mcap_records.parse_record(Opcode.ATTACHMENT, content)
@@ -495,7 +495,7 @@ class _FileCopy:
         if name == SCENARIO and entry.data != self._survey.attachments.get(SCENARIO):
             problem = problem or "it belongs to another session"
         if problem:
-            name = f"{name}{DAMAGED_SUFFIX}"
+            name = f"{name}{_DAMAGED_SUFFIX}"
             self._result.add_loss(f"attachment {entry.name}: {problem}; it is kept as {name}")
         self._out.add_attachment(
             create_time=entry.create_time,

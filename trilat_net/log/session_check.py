@@ -51,9 +51,9 @@ from .ros2 import cdr
 from .running_digest import DigestState, Integrity
 from .session_accounts import SessionAccounts
 
-MAX_AHEAD_NS = 10 * NS_PER_S
+_MAX_AHEAD_NS = 10 * NS_PER_S
 """Largest time by which the sending may be later than the arrival, because of wrong clocks."""
-MAX_BOOTS = 64
+_MAX_BOOTS = 64
 """Largest number of starts of a member whose messages are counted separately."""
 _CDR_HEAD = b"\x00\x01"
 """First bytes of a message in plain CDR, the encoding of ROS 2, in little-endian order."""
@@ -299,8 +299,8 @@ class ChannelCheck:
             publish_ns: Sending time of the message, in Unix time, in ns.
             offset: Offset of the message in the file.
         """
-        if message.boot not in self.boots and len(self.boots) >= MAX_BOOTS:
-            self._add("sequence", offset, f"there were more than {MAX_BOOTS} starts")
+        if message.boot not in self.boots and len(self.boots) >= _MAX_BOOTS:
+            self._add("sequence", offset, f"there were more than {_MAX_BOOTS} starts")
             return
         self.boots.add(message.boot)
 
@@ -355,7 +355,7 @@ class ChannelCheck:
                 f"message {number} was sent at {sent_ns} ns, but is stored with {publish_ns} ns"
             )
             self._add("times", offset, text)
-        elif publish_ns > log_ns + MAX_AHEAD_NS:
+        elif publish_ns > log_ns + _MAX_AHEAD_NS:
             ahead_s = (publish_ns - log_ns) / NS_PER_S
             text = f"message {number} arrived {ahead_s:.1f} s before it was sent"
             self._add("times", offset, text)
