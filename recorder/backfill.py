@@ -38,7 +38,7 @@ ANSWER_NS = (300_000_000, 3_000_000_000)
 """Shortest and longest timeout of a request, in ns. It doubles after each request without a
 reply.
 """
-REST_NS = 250_000_000
+_REST_NS = 250_000_000
 """Pause after a reply without any new message, in ns."""
 MAX_VAIN_REQUESTS = 20
 """Number of successive replies without any new message after which the gaps are given up."""
@@ -368,7 +368,7 @@ class GapRepair:
         if is_useful or is_gap_closed:
             self._vain_requests[channel] = 0
         else:
-            self._due_ns = now_ns + REST_NS
+            self._due_ns = now_ns + _REST_NS
             self._count_vain_request(channel)
 
     def _count_vain_request(self, channel: str) -> None:

@@ -47,11 +47,11 @@ POLL_NS = 10_000_000
 """Pause between two polls in ns, while the recorder waits for the session or for missing
 messages.
 """
-END_S = 10
+_END_S = 10
 """Time without any missing message after which the recorder ends, once a signal has told it to,
 in s. Sites keep their messages for that long.
 """
-END_NS = END_S * 1_000_000_000
+END_NS = _END_S * 1_000_000_000
 LONGEST_END_NS = 60_000_000_000
 """Longest time after a signal to get the messages that sites still have, in ns."""
 FLUSH_NS = 65_000_000
@@ -280,7 +280,7 @@ class Recorder:
                 ending_ns = now_ns
                 self._say(
                     "recorder: asks for the records that are missing, until none comes for "
-                    f"{END_S} s; Ctrl-C a second time ends it at once"
+                    f"{_END_S} s; Ctrl-C a second time ends it at once"
                 )
             if ending_ns is not None:
                 unrepaired_ns = now_ns - max(ending_ns, recording.repaired_ns)

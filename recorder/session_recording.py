@@ -38,9 +38,9 @@ RECONNECT_NS = 10_000_000_000
 """Time to wait for a site that has ended but still has missing records, if its connection is
 interrupted, in ns.
 """
-HEARD_NS = 500_000_000
+_HEARD_NS = 500_000_000
 """A site counts as running if one of its messages arrived within this time, in ns."""
-UNDER_WAY_NS = 100_000_000
+_UNDER_WAY_NS = 100_000_000
 """Time for which messages of a site that has disappeared may have been in transit, in ns."""
 STARTS_KEPT = 4096
 """Largest number of starts of sites that are remembered before they are recorded."""
@@ -499,7 +499,7 @@ class Recording:
 
         When a connection is established again, the network may report the return of a site
         first, and its earlier disappearance afterwards. The report "gone" is then wrong, which
-        only the messages of the site reveal: a message that arrives more than `UNDER_WAY_NS`
+        only the messages of the site reveal: a message that arrives more than `_UNDER_WAY_NS`
         after the report cannot have been in transit. In this case, the wait begins anew with
         each message. As long as messages arrive, the site is thus never given up.
 
@@ -517,7 +517,7 @@ class Recording:
             return None
         noticed_ns = self._noticed_gone_ns.setdefault(site, now_ns)
         last_message_ns = self._sites[site].last_received_ns
-        if last_message_ns is None or last_message_ns < noticed_ns + UNDER_WAY_NS:
+        if last_message_ns is None or last_message_ns < noticed_ns + _UNDER_WAY_NS:
             return noticed_ns
         return last_message_ns
 
@@ -597,7 +597,7 @@ class Recording:
             if self._has_left(name, now_ns):
                 continue
             silence_ns = now_ns - (site.last_received_ns or 0)
-            is_running = site.final_ticks is None and silence_ns < HEARD_NS
+            is_running = site.final_ticks is None and silence_ns < _HEARD_NS
             if not is_running:
                 return False
             if site.lacks_messages or may_be_in_transit:
@@ -691,7 +691,7 @@ class Recording:
 
 REPORT_EVERY_NS = 1_000_000_000
 """Period of the statistics, in ns."""
-MAX_GAPS_REPORTED = 20
+_MAX_GAPS_REPORTED = 20
 """Largest number of gaps of a channel that the statistics list."""
 _ALL_GAPS = 600
 """Largest number of gaps of all channels together that the statistics list."""
@@ -773,7 +773,7 @@ class RecorderReport:
             mono_ns=now_ns,
             unix_ns=self._clock.unix_ns(),
         )
-        gap_limit = max(1, min(MAX_GAPS_REPORTED, _ALL_GAPS // len(recording.accounts)))
+        gap_limit = max(1, min(_MAX_GAPS_REPORTED, _ALL_GAPS // len(recording.accounts)))
         for key, account in recording.accounts.items():
             # A key is "trilat/SESSION/MEMBER/CHANNEL". The statistics use "MEMBER/CHANNEL".
             name = "/".join(key.split("/")[2:])

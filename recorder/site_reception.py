@@ -55,7 +55,7 @@ KEY_BYTES = 32 << 20
 """Largest size of the waiting messages of one key, in bytes. A planar arm at 1 kHz sends half a
 megabyte per second.
 """
-OVERHEAD_BYTES = 200
+_OVERHEAD_BYTES = 200
 """Memory of a waiting message besides its payload, in bytes."""
 KEYS = 1_000
 """Largest number of keys that are counted separately. All further keys are counted together."""
@@ -116,7 +116,7 @@ class InboundQueue:
             key: Key under which the message was published.
             payload: Bytes of the message.
         """
-        size = len(payload) + OVERHEAD_BYTES
+        size = len(payload) + _OVERHEAD_BYTES
         with self._receive_lock:
             counted_key = key
             if key not in self._received_bytes and len(self._received_bytes) >= KEYS:
@@ -144,7 +144,7 @@ class InboundQueue:
         queue = self._queue
         while queue and (until_ns is None or queue[0].mono_ns <= until_ns):
             message = queue.popleft()
-            size = len(message.payload) + OVERHEAD_BYTES
+            size = len(message.payload) + _OVERHEAD_BYTES
             is_counted = message.key in self._received_bytes
             counted_key = message.key if is_counted else _OTHER_KEYS
             self._drained_bytes[counted_key] += size
@@ -152,7 +152,7 @@ class InboundQueue:
             yield message
 
 
-CHANNEL_NOUNS = {topics.STATE: "records", topics.LINK: "statistics", topics.EVENT: "events"}
+_CHANNEL_NOUNS = {topics.STATE: "records", topics.LINK: "statistics", topics.EVENT: "events"}
 """Name of the messages of each channel, for texts."""
 _LEAD_NS = 2_000_000_000
 _DRIFT = 1e-3
@@ -160,8 +160,8 @@ _DRIFT = 1e-3
 the time since the start of the session.
 """
 EVENT_BYTES = 512 << 10
-EVENT_BYTES_PER_S = 4 << 10
-"""A log accepts `EVENT_BYTES` of events of a site, and `EVENT_BYTES_PER_S` more per second of
+_EVENT_BYTES_PER_S = 4 << 10
+"""A log accepts `EVENT_BYTES` of events of a site, and `_EVENT_BYTES_PER_S` more per second of
 the scenario, which is about ten events.
 """
 _LEAST_EVENT_BYTES = 128
@@ -243,7 +243,7 @@ class SiteReception:
             channel: StartGap(self.accounts[channel], count_under_way(channel, self._rate_hz))
             for channel in (topics.STATE, topics.LINK)
         }
-        self._event_bytes_left = EVENT_BYTES + round(EVENT_BYTES_PER_S * scenario.duration_s)
+        self._event_bytes_left = EVENT_BYTES + round(_EVENT_BYTES_PER_S * scenario.duration_s)
         self._largest_counts = {
             channel: count_messages(channel, self._ticks, self._rate_hz)
             for channel in SITE_CHANNELS
@@ -399,7 +399,7 @@ class SiteReception:
             WireError: The site has sent too many events.
         """
         is_first_end = event.kind == "end" and self.final_ticks is None
-        is_exempt = is_first_end and size <= EVENT_BYTES_PER_S
+        is_exempt = is_first_end and size <= _EVENT_BYTES_PER_S
         if size > self._event_bytes_left and not is_exempt:
             raise WireError(
                 "flood of events",
@@ -558,6 +558,6 @@ class SiteReception:
         texts = []
         for channel, account in self.accounts.items():
             if account.missing:
-                counts = f"{account.missing} of {account.expected} {CHANNEL_NOUNS[channel]}"
+                counts = f"{account.missing} of {account.expected} {_CHANNEL_NOUNS[channel]}"
                 texts.append(f"{counts} ({' '.join(account.format_gaps(5))})")
         return ", ".join(texts)

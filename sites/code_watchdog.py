@@ -40,7 +40,7 @@ OVERTIME_LIMIT_NS = 500_000_000
 """Overtime above which the code is too slow, in ns."""
 HICCUP_NS = 50_000_000
 """Largest time that one call adds to the overtime, in ns."""
-CHECK_S = 1.0
+_CHECK_S = 1.0
 """Time between two checks of whether the code still hangs in the same call, in s."""
 CHECKS = 3
 """Number of checks in a row that must see the same call before it is interrupted."""
@@ -186,7 +186,7 @@ class WatchedCode:
     def check(self) -> None:
         """Interrupts the code if the same call has been running for several checks in a row.
 
-        The method is called by a signal handler every `CHECK_S`, while the code runs. Checks
+        The method is called by a signal handler every `_CHECK_S`, while the code runs. Checks
         that are missed because the process was suspended do not count. A call is identified by
         the number of finished calls before it.
 
@@ -203,7 +203,7 @@ class WatchedCode:
         checks = FIRST_CHECKS if tick == self._first_tick else CHECKS
         limit = checks - 1
         if self._same_call_checks >= limit:
-            raise self._fail(tick, f"the code did not return within {limit * CHECK_S:g} s")
+            raise self._fail(tick, f"the code did not return within {limit * _CHECK_S:g} s")
 
 
 class CodeWatchdog:
@@ -228,7 +228,7 @@ class CodeWatchdog:
         is_main_thread = threading.current_thread() is threading.main_thread()
         if self.codes and is_main_thread and hasattr(signal, "setitimer"):
             self._handler_before = signal.signal(signal.SIGALRM, self._check)
-            signal.setitimer(signal.ITIMER_REAL, CHECK_S, CHECK_S)
+            signal.setitimer(signal.ITIMER_REAL, _CHECK_S, _CHECK_S)
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -36,14 +36,14 @@ from .devices import Device, DeviceState, Vector
 
 RETRY_NS = 1_000_000_000
 """Time between two attempts to connect to the device, in ns."""
-MIN_STATE_GAP_S = 0.005
+_MIN_STATE_GAP_S = 0.005
 """Shortest time between two states that is assumed when a jump is detected, in s.
 
 The operating system may deliver states late, and several at once.
 """
-MAX_STATE_GAP_S = 0.05
+_MAX_STATE_GAP_S = 0.05
 """Longest time between two states that is assumed when a jump is detected, in s."""
-TRIPS_KEPT = 60_000
+_TRIPS_KEPT = 60_000
 """Number of round trips that are kept for statistics."""
 
 
@@ -86,9 +86,9 @@ class DeviceHand:
         self.states = 0
         self.jumps = 0
         self.unreadable = 0
-        self.trips_ns = deque[int](maxlen=TRIPS_KEPT)
+        self.trips_ns = deque[int](maxlen=_TRIPS_KEPT)
         # Number and sending time of the targets to which the arm has not responded yet.
-        self._sent = deque[tuple[int, int]](maxlen=TRIPS_KEPT)
+        self._sent = deque[tuple[int, int]](maxlen=_TRIPS_KEPT)
 
         self._period_ns = 1_000_000_000 // device.rate_hz
         self._due_ns = 0
@@ -189,7 +189,7 @@ class DeviceHand:
             elapsed_s: Time since the previous state, in s.
         """
         settings = self._settings
-        gap_s = min(max(elapsed_s, MIN_STATE_GAP_S), MAX_STATE_GAP_S)
+        gap_s = min(max(elapsed_s, _MIN_STATE_GAP_S), _MAX_STATE_GAP_S)
         if math.hypot(*step_m) > settings.jump_m_s * gap_s:
             self.jumps += 1
             return

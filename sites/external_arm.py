@@ -47,7 +47,7 @@ STARTS_KEPT = 64
 
 If there are more, one that does not hold the switch is forgotten.
 """
-START_POSE_TOLERANCE_RAD = 0.01
+_START_POSE_TOLERANCE_RAD = 0.01
 """Distance of the arm from its `q0_rad` at the start up to which there is no warning, in rad.
 """
 POLL_NS = 5_000_000
@@ -176,7 +176,7 @@ class ExternalArm:
             f"its arm stands {distance_rad:.3g} rad off q0_rad, "
             "which its peers take for its start: their references will jump"
         )
-        return warning if distance_rad > START_POSE_TOLERANCE_RAD else ""
+        return warning if distance_rad > _START_POSE_TOLERANCE_RAD else ""
 
     def poll(self) -> None:
         """Receives the waiting measurements, and checks how long the arm has been silent.

@@ -46,9 +46,9 @@ from trilat_net.signals import Interrupt
 
 POLL_NS = 500_000
 """Time between two polls for views, in ns."""
-ANNOUNCE_PERIOD_NS = 100_000_000
+_ANNOUNCE_PERIOD_NS = 100_000_000
 """Time between two announcements to the site before the first view has arrived, in ns."""
-VIEWS_KEPT = 64
+_VIEWS_KEPT = 64
 """Number of views that the network queue holds."""
 
 
@@ -86,7 +86,7 @@ class HandProcess(SiteClient):
         self._ticks_per_view = site_rate_hz // hand_site.rate_hz
 
         self._sender = make_hand_sender(bus, clock, session, hand_site.name)
-        self._views = bus.inbox(topics.key(session, hand_site.name, topics.VIEW), VIEWS_KEPT)
+        self._views = bus.inbox(topics.key(session, hand_site.name, topics.VIEW), _VIEWS_KEPT)
         self._announced_ns = 0
         self._waiting_views = deque[HandViewMessage]()
         # A view must be answered within the delay with which decisions act.
@@ -108,7 +108,7 @@ class HandProcess(SiteClient):
         while len(views) > self._max_waiting:
             self.skipped += 1
             views.popleft()
-        due_ns = self._announced_ns + ANNOUNCE_PERIOD_NS
+        due_ns = self._announced_ns + _ANNOUNCE_PERIOD_NS
         if views:
             self._decide(views.popleft())
         elif not self.answered and self._clock.monotonic_ns() > due_ns:

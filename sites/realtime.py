@@ -18,7 +18,7 @@ from collections.abc import Callable
 from trilat_net import process
 from trilat_net.errors import count_nouns
 
-SITES_PER_PROCESSOR = 2
+_SITES_PER_PROCESSOR = 2
 """Largest number of loops per processor that receive priority.
 
 If there were more, the network threads and the recorder would receive too little time, and
@@ -49,7 +49,7 @@ def prepare(cpu: int | None, sites: int = 1) -> dict[str, str]:
         was not obtained.
     """
     cpus = os.cpu_count() or 1
-    has_room = sites <= SITES_PER_PROCESSOR * cpus
+    has_room = sites <= _SITES_PER_PROCESSOR * cpus
 
     def describe_crowded_machine() -> str:
         """Returns why no real-time scheduling is requested."""

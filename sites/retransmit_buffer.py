@@ -26,15 +26,15 @@ KEPT_S = 60
 RECORDS_KEPT = 120_000
 """Largest number of stored records: a minute at tick rates up to 2 kHz, less at higher rates.
 """
-RECORD_BYTES = 640
+_RECORD_BYTES = 640
 """Mean size of a record of a two-joint arm up to which a minute of records fits, in bytes."""
-FLOAT_BYTES = 9
+_FLOAT_BYTES = 9
 """Size of an encoded floating-point number, in bytes."""
-STATISTICS_BYTES = 4_096
+_STATISTICS_BYTES = 4_096
 """Memory for one message with statistics, in bytes."""
 EVENTS_KEPT = 4_096
 """Largest number of stored events."""
-EVENTS_BYTES = 4_000_000
+_EVENTS_BYTES = 4_000_000
 """Memory for events, in bytes."""
 
 
@@ -164,11 +164,11 @@ class RetransmitBuffer:
         records = min(KEPT_S * site.rate_hz, RECORDS_KEPT)
         statistics = KEPT_S * STATS_PER_SECOND
         # A record of an arm with more than two joints contains more numbers.
-        record_bytes = RECORD_BYTES + FLOAT_BYTES * (site.layout.floats - Layout().floats)
+        record_bytes = _RECORD_BYTES + _FLOAT_BYTES * (site.layout.floats - Layout().floats)
         self.channels = {
-            topics.STATE: ChannelBuffer(records, max(records * record_bytes, EVENTS_BYTES)),
-            topics.LINK: ChannelBuffer(statistics, statistics * STATISTICS_BYTES),
-            topics.EVENT: ChannelBuffer(EVENTS_KEPT, EVENTS_BYTES),
+            topics.STATE: ChannelBuffer(records, max(records * record_bytes, _EVENTS_BYTES)),
+            topics.LINK: ChannelBuffer(statistics, statistics * _STATISTICS_BYTES),
+            topics.EVENT: ChannelBuffer(EVENTS_KEPT, _EVENTS_BYTES),
         }
 
     def start_at(self, tick: int) -> None:

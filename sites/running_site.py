@@ -27,7 +27,7 @@ from .site_loop import PeerInbox, run_loop
 from .site_news import SiteNews, publish_clocks
 from .site_parts import SiteParts
 
-NO_BOOT = -1
+_NO_BOOT = -1
 """Used in place of the boot (the number of a process start) of a peer that is not present."""
 
 
@@ -78,7 +78,7 @@ class RunningSite:
         self._inbox = PeerInbox(
             links=parts.setup.links,
             rings=parts.rings,
-            boots=[epoch.boots.get(peer, NO_BOOT) for peer in site.peers],
+            boots=[epoch.boots.get(peer, _NO_BOOT) for peer in site.peers],
             monitors=self._timing.monitors,
             dropped=parts.stats.dropped,
             from_ns=tick_ns(epoch.first, site.rate_hz),
@@ -128,7 +128,7 @@ class RunningSite:
         for name in parts.site.peers:
             # The pings are stored by boot, the number of a process start. A peer that is not
             # present has no pings, and is assumed to have the same epoch on the same clock.
-            boot = epoch.boots.get(name, NO_BOOT)
+            boot = epoch.boots.get(name, _NO_BOOT)
             peer_clock = PeerClock(
                 name=name,
                 epoch_ns=epoch.epochs.get(name, epoch.mono_ns),

@@ -60,7 +60,7 @@ def make_sample_readers(setup: SiteSetup) -> list[Callable[[bytes], PeerSample |
     return [make_reader(PeerSample, layout) for layout in layouts]
 
 
-GLIDE_AHEAD_LIMIT_NS = NS_PER_S
+_GLIDE_AHEAD_LIMIT_NS = NS_PER_S
 """Largest time by which a sample may lie in the future under the rule `glide`, in ns.
 
 Under this rule, arms glide back to their peers after an interrupted connection.
@@ -215,7 +215,7 @@ class PeerInbox:
         if nominal_ns < self._from_ns:
             return None  # from before the first tick of this site
         glides = bool(link.speed_limit)  # only links under the rule `glide` have this limit
-        ahead_limit_ns = GLIDE_AHEAD_LIMIT_NS if glides else AHEAD_LIMIT_NS
+        ahead_limit_ns = _GLIDE_AHEAD_LIMIT_NS if glides else AHEAD_LIMIT_NS
         if nominal_ns - since_epoch_ns > ahead_limit_ns:
             self._dropped["ahead"] += 1
             return None
@@ -277,11 +277,11 @@ class PeerInbox:
         return True
 
 
-BLOCKS_PER_S = 100
+_BLOCKS_PER_S = 100
 """Recorders receive the records of 10 ms in one block."""
-WAKES_PER_S = 200
+_WAKES_PER_S = 200
 """Peers on the same machine receive the samples of 5 ms together, if they need none sooner."""
-MIN_HELD_DELAY_US = 100_000
+_MIN_HELD_DELAY_US = 100_000
 """Smallest delay of a link whose samples may be sent late without an effect, in us."""
 
 
@@ -291,7 +291,7 @@ def may_hold_samples(scenario: Scenario, name: str) -> bool:
     A sample is the state that a site sends to its peers in each tick, a period of its control
     loop. The receiver of a link delays each sample as the scenario prescribes, counted from the
     tick of the sample and not from its arrival. If every link from the site prescribes at least
-    `MIN_HELD_DELAY_US`, no peer uses a sample before that time. Sending it a few milliseconds
+    `_MIN_HELD_DELAY_US`, no peer uses a sample before that time. Sending it a few milliseconds
     late then has no effect on the run.
 
     The result holds for the delays of the scenario. If the user shortens a delay during the
@@ -313,7 +313,7 @@ def may_hold_samples(scenario: Scenario, name: str) -> bool:
                 smallest_network_us = model.location if is_constant else 0.0
                 # The play-out buffer holds each sample until it has at least a given age.
                 smallest_delay_us = max(model.playout_us, smallest_network_us)
-                if smallest_delay_us < MIN_HELD_DELAY_US:
+                if smallest_delay_us < _MIN_HELD_DELAY_US:
                     return False
     return True
 
@@ -352,9 +352,9 @@ class StateBlock:
         self._site = site
         self._boot = boot
         self._send = send
-        self._ticks = 1 if single else max(1, site.rate_hz // BLOCKS_PER_S)
+        self._ticks = 1 if single else max(1, site.rate_hz // _BLOCKS_PER_S)
         self._turn = 3 * turn % self._ticks
-        self._ticks_per_wake = max(1, site.rate_hz // WAKES_PER_S)
+        self._ticks_per_wake = max(1, site.rate_hz // _WAKES_PER_S)
         self.holds_samples = False
         # Records whose samples are not sent yet, and records that wait for their block. The
         # fields of an entry are the arguments of `encode_state` after the peers. A record gets
@@ -393,8 +393,8 @@ class StateBlock:
         """Sends the waiting samples to the peers, unless they are held until a later tick.
 
         If the samples may be held (`holds_samples`), they are sent together in every wake tick.
-        Wake ticks occur `WAKES_PER_S` times a second, in different ticks for sites of different
-        `turn`, so that not all sites of a machine wake their peers at the same time.
+        Wake ticks occur `_WAKES_PER_S` times a second, in different ticks for sites of
+        different `turn`, so that not all sites of a machine wake their peers at the same time.
 
         Args:
             k: Number of the present tick (period of the control loop).

@@ -36,7 +36,7 @@ from trilat_net.scenario.scenario_types import Change
 
 from .site_parts import SiteParts
 
-STATUS_PERIOD_S = 5
+_STATUS_PERIOD_S = 5
 """Time between two status lines for the user, in s."""
 
 
@@ -169,7 +169,7 @@ class SiteNews:
         self._publish_waiting(output)
 
         second = output.t_ns // NS_PER_S
-        if second >= self._status_s + STATUS_PERIOD_S:
+        if second >= self._status_s + _STATUS_PERIOD_S:
             self._status_s = second
             parts.say(self._describe_status(output))
 

@@ -29,7 +29,7 @@ PARTS = {
     "lerobot": r"lerobot",
     "people": r"studies/experiment|^live/|sites/devices|device_hand|hand_impedance",
     "studies": r"^trilat_net/studies/",
-    "kernel": r"^trilat_net/(core|laws)/|^trilat_net/(fields|errors|files|process|signals|workers|results|records|recorded_change|hooks)\.py",
+    "kernel": r"^trilat_net/(core|laws)/|^trilat_net/(fields|errors|files|process|signals|workers|results|hooks|records|recorded_change)\.py",
     "analysis": r"^trilat_net/analysis/",
     "app": r"^trilat_net/(app|presentation|work)/|^trilat_net/(__init__|__main__)\.py",
     "session": r"^trilat_net/(scenario|net|log|execution)/|^sites/|^recorder/",

@@ -27,7 +27,7 @@ from ..scenario.imported_code import CodeConsents, allowed_code
 from .verify import VerifyResult, verify
 from .virtual_comparison import RecordComparison, compare_with_virtual
 
-MAX_GAPS_NAMED = 60
+_MAX_GAPS_NAMED = 60
 """Largest number of gaps that a finding lists."""
 
 
@@ -357,13 +357,13 @@ def _join_names(names: Sequence[str]) -> str:
 def _describe_gaps(gaps: Sequence[tuple[str, int, int]]) -> str:
     """Returns the ranges of ticks of each site as a string, such as "m1 3-7, 12; s 5".
 
-    At most `MAX_GAPS_NAMED` ranges are listed. The others are counted.
+    At most `_MAX_GAPS_NAMED` ranges are listed. The others are counted.
 
     Args:
         gaps: Site, first tick and last tick of each range.
     """
     texts = []
-    remaining = MAX_GAPS_NAMED
+    remaining = _MAX_GAPS_NAMED
     for site, site_gaps in itertools.groupby(gaps, key=lambda gap: gap[0]):
         ranges = []
         for _, first, last in site_gaps:

@@ -629,7 +629,7 @@ class RerunSite:
         )
 
 
-MEMORY_S = 120
+_MEMORY_S = 120
 """Time for which computed samples are kept for delivery, in s.
 
 No sample is in transit for longer.
@@ -751,7 +751,7 @@ class RerunExecution:
         output = site.output
         recent = self._recent[site.name]
         recent[output.tick] = make_arrival(0, output.tick, output)
-        if len(recent) > MEMORY_S * self._request.scenario.sites[site.name].rate_hz:
+        if len(recent) > _MEMORY_S * self._request.scenario.sites[site.name].rate_hz:
             del recent[next(iter(recent))]
 
     def _find_ready(self, pending: Sequence[tuple[int, int, int]]) -> int:

@@ -41,10 +41,10 @@ from .message_identity import (
     identify_message,
 )
 
-CDR_HEAD = b"\x00\x01"
+_CDR_HEAD = b"\x00\x01"
 """First bytes of a message that was written for viewers, in the encoding of ROS 2."""
 
-VIRTUAL_DRIVER = "virtual"
+_VIRTUAL_DRIVER = "virtual"
 """Value of the metadata `driver` for a session in virtual time."""
 _SAMPLED_MESSAGES = 200
 """Number of messages of a chunk that are decoded to find their origins."""
@@ -132,7 +132,7 @@ def has_foreign_boots(about: Mapping[str, str], boots: set[tuple[str, int]]) -> 
         True if no boot agrees with the scenario of the log. False if a boot agrees, if there
         are no messages, or if the log is from a live session.
     """
-    if about.get("driver") != VIRTUAL_DRIVER:
+    if about.get("driver") != _VIRTUAL_DRIVER:
         return False
     digest = about.get("scenario_sha256", "")
     matches = [boot == compute_virtual_boot(digest, sender) for sender, boot in boots]
@@ -261,7 +261,7 @@ class ContentCheck:
                 "chunk, or is earlier than that of a previous message"
             )
         if topic.startswith(VIZ_ROOT):
-            if payload[:2] != CDR_HEAD:
+            if payload[:2] != _CDR_HEAD:
                 raise UnreadableRecord(f"a message of {topic} is not encoded in CDR")
         elif self.owns_channel(topic):
             self._check_session_message(topic, sequence, publish_ns, payload)
@@ -350,7 +350,7 @@ class ContentCheck:
             UnreadableRecord: No examined message comes from the run of this log.
         """
         # The decoding of messages is slow, and the boots of live sessions prove nothing.
-        if self._about.get("driver") != VIRTUAL_DRIVER:
+        if self._about.get("driver") != _VIRTUAL_DRIVER:
             return
         origins = find_origins(data, _CHECKED_MESSAGES)
         if has_foreign_boots(self._about, origins.boots):
@@ -362,7 +362,7 @@ class ContentCheck:
         In virtual time, it follows from the scenario. Otherwise it is that of the latest
         accepted message. None if there is no such message.
         """
-        if self._about.get("driver") == VIRTUAL_DRIVER:
+        if self._about.get("driver") == _VIRTUAL_DRIVER:
             return compute_virtual_boot(self._about.get("scenario_sha256", ""), member)
         channels = RECORDER_CHANNELS if member == topics.RECORDER else SITE_CHANNELS
         for channel in channels:

@@ -5,7 +5,7 @@ that no message is missing. Its result is called a finding.
 
 Invariant:
     - A check with a problem has not passed.
-    - At most `MAX_LISTED_PROBLEMS` problems of a check are stored. Further ones are counted.
+    - At most `_MAX_LISTED_PROBLEMS` problems of a check are stored. Further ones are counted.
 """
 
 from dataclasses import dataclass, field
@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from ..errors import CodeWithheld
 from ..results import Result
 
-MAX_LISTED_PROBLEMS = 1000
+_MAX_LISTED_PROBLEMS = 1000
 """Largest number of problems that a finding stores. Further problems are only counted."""
 
 
@@ -49,7 +49,7 @@ class Finding:
         passed: True if the check passed.
         judged: True if the check could be made. It is False if the check would run code from
             outside that the user has not permitted. The check has not passed then.
-        places: The problems, at most `MAX_LISTED_PROBLEMS`.
+        places: The problems, at most `_MAX_LISTED_PROBLEMS`.
         wrong: Number of problems, including those that are not stored.
     """
 
@@ -71,7 +71,7 @@ class Finding:
         """
         self.passed = False
         self.wrong += 1
-        if len(self.places) < MAX_LISTED_PROBLEMS:
+        if len(self.places) < _MAX_LISTED_PROBLEMS:
             self.places.append(ProblemPlace(file, offset, text))
 
     def summary(self) -> str:

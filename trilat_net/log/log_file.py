@@ -29,7 +29,7 @@ from ..net.clock import SystemClock
 from .log_layout import active_path
 from .mcap_records import MAGIC
 
-DISK_FULL_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+_DISK_FULL_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 """Error numbers of a disk that accepts no more data."""
 RESERVE_STEP_BYTES = 1 << 19
 """Step by which the reserved space grows, in bytes."""
@@ -74,7 +74,7 @@ class DiskReserve:
                 self._file = tempfile.TemporaryFile(dir=self._folder, buffering=0)  # noqa: SIM115
             _allocate(self._file.fileno(), self.size, new_size)
         except OSError as error:
-            if error.errno in DISK_FULL_ERRNOS:
+            if error.errno in _DISK_FULL_ERRNOS:
                 raise
             self.release()  # this disk cannot reserve space
         else:

@@ -338,7 +338,7 @@ class LogWriter:
 _FINISHED = "the log is finished"
 """Reason why no message can be added to a finished log."""
 
-ACCOUNTS_BYTES = 16 << 10
+_ACCOUNTS_BYTES = 16 << 10
 """Space that is left free in a part of limited size, in bytes.
 
 It is used for the accounts, and for the messages for viewers that follow from one message.
@@ -533,7 +533,7 @@ class LogParts:
         # A part contains at least one message, however small the limit is.
         if limits.split_bytes is None or not writer.messages:
             return False
-        size = writer.most_bytes + payload_bytes + ACCOUNTS_BYTES
+        size = writer.most_bytes + payload_bytes + _ACCOUNTS_BYTES
         return size > limits.split_bytes
 
     @property

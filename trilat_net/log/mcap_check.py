@@ -73,25 +73,21 @@ class FileCheck:
         # reported after it.
         self._has_unreadable = False
 
-    def check_record(
-        self, frame: mcap_records.RecordFrame, content: bytes, data: bytes
-    ) -> None:
+    def check_record(self, record: mcap_records.ScannedRecord) -> None:
         """Checks one record of the file, and notes how it must appear in the file's index.
 
         The index, which is at the end of the file, is compared with these notes when the whole
         file has been read. Problems are added to the findings.
 
         Args:
-            frame: Kind and place of the record.
-            content: Content of the record.
-            data: Unpacked records of a chunk (block of messages). Empty for other records, and
-                if the chunk cannot be unpacked.
+            record: The record.
         """
+        frame = record.frame
         self._end = frame.end + len(mcap_records.MAGIC)
         if frame.offset == len(mcap_records.MAGIC) and frame.opcode != Opcode.HEADER:
             self._add("records", frame.offset, "the first record is not a header")
         try:
-            self._check_content(frame, content, data)
+            self._check_content(record)
         except mcap_records.UnreadableRecord as error:
             check = "checksums" if "CRC" in str(error) else "records"
             self._add(check, frame.offset, str(error))
@@ -101,17 +97,17 @@ class FileCheck:
         """Adds a problem at an offset of the file to the finding of a check."""
         self._findings[check].add(self._file, offset, text)
 
-    def _check_content(
-        self, frame: mcap_records.RecordFrame, content: bytes, data: bytes
-    ) -> None:
+    def _check_content(self, record: mcap_records.ScannedRecord) -> None:
         """Checks a record according to its kind.
 
         Raises:
             UnreadableRecord: The record makes no sense, or its checksum differs.
         """
+        frame = record.frame
+        content = record.content
         match frame.opcode:
             case Opcode.CHUNK:
-                self._check_chunk(frame, content, data)
+                self._check_chunk(record)
             case Opcode.MESSAGE_INDEX:
                 self._check_message_index(frame, content)
             case Opcode.MESSAGE:
@@ -227,9 +223,7 @@ class FileCheck:
         self.counts["messages"] += 1
         return channel, log_ns
 
-    def _check_chunk(
-        self, frame: mcap_records.RecordFrame, content: bytes, data: bytes
-    ) -> None:
+    def _check_chunk(self, record: mcap_records.ScannedRecord) -> None:
         """Checks the records of a chunk, and notes the entries that the index should contain.
 
         Two indexes refer to a chunk. A message index of each channel follows the chunk, and is
@@ -239,18 +233,17 @@ class FileCheck:
         that `_check_message_index` fills.
 
         Args:
-            frame: Place of the chunk.
-            content: Content of the chunk.
-            data: Unpacked records of the chunk. Empty if they could not be unpacked.
+            record: The chunk.
 
         Raises:
             UnreadableRecord: The chunk cannot be unpacked, or contains an invalid record.
         """
         # If the chunk cannot be read (exception), its message indexes are not checked.
         self._message_indexes = None
-        head = self._scanner.head(frame)
+        frame = record.frame
+        head = record.head()
         self.counts["chunks"] += 1
-        data = data or mcap_records.unpack_chunk(content)
+        data = record.unpack()
         has_crc = bool(head.crc)  # 0 means that there is no checksum
         self.counts["crcs"] += has_crc
         self._entries.clear()

@@ -49,7 +49,7 @@ KEPT_RATIO = 300
 
 The largest ratio of logs that trilat-net writes is about 120, for arms at rest in virtual time.
 """
-CHANNEL_SHARE = 1 / 3
+_CHANNEL_SHARE = 1 / 3
 """Largest fraction of this memory for one channel."""
 _DECODED_BYTES = 3_000
 _LONG_BYTES = 300
@@ -65,11 +65,6 @@ every byte of its record.
 
 Progress = Callable[[int, int], None]
 """Function that receives the progress of a task: the processed bytes, and all bytes."""
-Watch = Callable[[mcap_records.RecordFrame, bytes, bytes], None]
-"""Function that receives a record of a file: its place, its content, and its unpacked records.
-
-Only a chunk has unpacked records. They are empty if the chunk cannot be unpacked.
-"""
 
 
 def shift_progress(progress: Progress | None, before: int, total: int) -> Progress | None:
@@ -134,6 +129,10 @@ class McapMessage(NamedTuple):
 class McapReader:
     """Reader of one MCAP file, from its beginning to its end.
 
+    There are two ways of reading. `messages` yields the messages, and nothing else. `scan`
+    yields the records and the damaged parts of the file, as the scanner finds them, for the
+    check and the recovery of damaged files; `read_record` yields the messages of a record.
+
     Args:
         stream: The file, opened for reading.
         name: Name of the file for error messages.
@@ -155,10 +154,6 @@ class McapReader:
         offset: Offset of the record that is being read.
         complete: True if the file was finished and has been read completely.
         scanner: Scanner that finds the records of the file.
-        watch: Function that receives every record of the file, before the messages of the
-            record are yielded. If it is set, it also receives the records of a file that does
-            not begin as an MCAP file does, and the records after so many damaged parts that the
-            reader gives up (`MAX_DAMAGED_PARTS`). None if nobody needs the records.
     """
 
     def __init__(
@@ -183,15 +178,16 @@ class McapReader:
         self.size = self.scanner.size
         self._source = name
         self._progress = progress
-        self.watch: Watch | None = None
         self._schemas: dict[int, tuple[str, str, bytes]] = {}
         self._topics: dict[int, str] = {}
         self._session_channels: set[int] = set()
         # Memory that may still be used, for all messages and for each channel, in bytes.
         self._memory_left = max(KEPT_BYTES, KEPT_RATIO * self.size) if kept else None
-        share = math.inf if self._memory_left is None else CHANNEL_SHARE * self._memory_left
+        share = math.inf if self._memory_left is None else _CHANNEL_SHARE * self._memory_left
         self._channel_memory_left: defaultdict[int, float] = defaultdict(lambda: share)
         self._more_damage: list[mcap_records.Damage] = []
+        # True if the whole file is scanned, however damaged it is.
+        self._is_scanned = False
 
     @property
     def damaged(self) -> list[mcap_records.Damage]:
@@ -214,64 +210,70 @@ class McapReader:
     def messages(self) -> Iterator[McapMessage]:
         """Yields every message in the order of the file.
 
-        There are two ways of reading:
-
-        - Normally (`watch` is None), only the kinds of records in `_READ` are read, and the
-          file must begin with the mark of MCAP. The scanner stops after too many damaged parts.
-        - For the check and the recovery of damaged files, the caller has set `watch`, a
-          function that receives every record. Records of all kinds are read, and the file may
-          begin with anything. The scanner goes on to the end of the file, but no more records
-          are unpacked after too many damaged parts (`_gave_up`).
-
-        A part that cannot be read is added to `damaged`, and the reading continues behind it.
+        A part that cannot be read is added to `damaged`, and the reading continues behind it,
+        until there are too many damaged parts.
 
         Raises:
             LogError: The file is no MCAP file, or unpacks to far too much for its size.
         """
-        scanner = self.scanner
-        is_watched = self.watch is not None
-        if not scanner.begins and not is_watched:
+        if not self.scanner.begins:
             reason = "is empty" if not self.size else "does not begin with the mark of MCAP"
             raise LogError(f"{self._source}: is not an MCAP file: the file {reason}")
-        for frame in scanner.frames():
+        for item in self._walk():
+            if isinstance(item, mcap_records.ScannedRecord):
+                yield from self.read_record(item)
+
+    def scan(self) -> Iterator[mcap_records.ScannedRecord | mcap_records.Damage]:
+        """Yields the records and the damaged parts of the file, see `RecordScanner.scan`.
+
+        The file may begin with anything, and is scanned to its end. The caller passes each
+        record to `read_record`, also if it needs no messages: the metadata and the digests of
+        the file are found there. After too many damaged parts, `read_record` does nothing.
+        """
+        self._is_scanned = True
+        yield from self._walk()
+
+    def _walk(self) -> Iterator[mcap_records.ScannedRecord | mcap_records.Damage]:
+        """Yields what the scanner finds, and keeps the position and the progress."""
+        for item in self.scanner.scan():
+            if isinstance(item, mcap_records.Damage):
+                yield item
+                continue
+            frame = item.frame
             self.offset = frame.offset
-            if frame.opcode in _READ or is_watched:
-                try:
-                    yield from self._read_records(self._open(frame), frame)
-                except mcap_records.UnreadableRecord as error:
-                    # The scanner stops if its own list is too long. For `watch` it must go on,
-                    # so that the damage is added to another list.
-                    damaged = self._more_damage if is_watched else scanner.damaged
-                    damaged.append(mcap_records.Damage(frame.offset, frame.size, str(error)))
+            yield item
             if self._progress is not None:
                 self._progress(frame.end, self.size)
-        self.complete = scanner.finished and not self._gave_up
+        self.complete = self.scanner.finished and not self._gave_up
+
+    def read_record(self, record: mcap_records.ScannedRecord) -> Iterator[McapMessage]:
+        """Yields the messages in a record, and stores what it contains besides.
+
+        A record that cannot be read is added to `damaged`.
+
+        Args:
+            record: The next record of the file.
+
+        Raises:
+            LogError: The file unpacks to far too much for its size.
+        """
+        if record.frame.opcode not in _READ or self._gave_up:
+            return
+        try:
+            yield from self._read_messages(self._unpack(record), record.frame)
+        except mcap_records.UnreadableRecord as error:
+            # The scanner stops if its own list is too long. A scan must go on to the end of the
+            # file, so that the damage is added to another list.
+            damaged = self._more_damage if self._is_scanned else self.scanner.damaged
+            frame = record.frame
+            damaged.append(mcap_records.Damage(frame.offset, frame.size, str(error)))
 
     @property
     def _gave_up(self) -> bool:
         """True if there were so many damaged parts that no more records are read."""
-        return self.watch is not None and len(self.damaged) >= mcap_records.MAX_DAMAGED_PARTS
+        return self._is_scanned and len(self.damaged) >= mcap_records.MAX_DAMAGED_PARTS
 
-    def _open(self, frame: mcap_records.RecordFrame) -> bytes:
-        """Reads a record of the file, and passes it to `watch`.
-
-        Returns:
-            The messages and definitions in the record, unpacked.
-
-        Raises:
-            UnreadableRecord: The record cannot be read. It is passed to `watch` nevertheless.
-        """
-        content = self.scanner.content(frame)
-        data = b""
-        try:
-            if frame.opcode in _READ and not self._gave_up:
-                data = self._unpack(frame, content)
-        finally:
-            if self.watch is not None:
-                self.watch(frame, content, data)
-        return data
-
-    def _unpack(self, frame: mcap_records.RecordFrame, content: bytes) -> bytes:
+    def _unpack(self, record: mcap_records.ScannedRecord) -> bytes:
         """Processes a record of the file, and returns the messages and definitions in it.
 
         What happens depends on the kind of the record:
@@ -280,11 +282,10 @@ class McapReader:
         - A message or definition outside of chunks is returned in the same form as in a chunk.
         - Metadata, attachments and the header are stored in the attributes of the reader. They
           contain no messages. They are added to the digest here, the checksum that is compared
-          with the one in the file. `_read_records` adds what this method returns.
+          with the one in the file. `_read_messages` adds what this method returns.
 
         Args:
-            frame: Kind and place of the record.
-            content: Content of the record.
+            record: The record, of a kind in `_READ`.
 
         Returns:
             The messages and definitions, with the head of each. Empty if there are none.
@@ -292,10 +293,12 @@ class McapReader:
         Raises:
             UnreadableRecord: The record cannot be decoded, or its checksum is wrong.
         """
+        frame = record.frame
+        content = record.content
         match frame.opcode:
             case Opcode.CHUNK:
-                data = mcap_records.unpack_chunk(content)
-                self.chunks[self.scanner.head(frame).compression] += 1
+                data = record.unpack()
+                self.chunks[record.head().compression] += 1
                 self.packed_bytes += len(content)
                 self.unpacked_bytes += len(data)
                 return data
@@ -320,7 +323,7 @@ class McapReader:
         self._chain.add_entry(frame.opcode, content)
         return b""
 
-    def _read_records(
+    def _read_messages(
         self, data: bytes, frame: mcap_records.RecordFrame
     ) -> Iterator[McapMessage]:
         """Yields the messages of an unpacked chunk, and stores its schemas and channels.

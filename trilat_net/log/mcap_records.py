@@ -43,7 +43,7 @@ OP_MESSAGE = int(Opcode.MESSAGE)
 """Opcode of a message, as an int, because members of an enumeration compare slowly."""
 DEFINITIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
 """Kinds of the records that define schemas and channels."""
-FOOTER_BYTES = RECORD_HEAD_BYTES + 20 + len(MAGIC)
+_FOOTER_BYTES = RECORD_HEAD_BYTES + 20 + len(MAGIC)
 """Size of a finished file's footer and end mark, in bytes."""
 MAX_DAMAGED_PARTS = 100
 """Number of damaged parts of a file after which reading is given up."""
@@ -54,11 +54,11 @@ MAX_UNPACKED_RATIO = 32
 """Large chunks may unpack to this multiple of their compressed size, if that is more."""
 MAX_WINDOW_BYTES = 32 << 20
 """Largest window that a Zstandard frame may require, in bytes."""
-COMPRESSIONS = (b"zstd", b"lz4")
+_COMPRESSIONS = (b"zstd", b"lz4")
 """Supported compressions of chunks. Chunks may also be uncompressed."""
-COMPRESSION_NAME_OFFSET = 28
+_COMPRESSION_NAME_OFFSET = 28
 """Offset of the compression's name, with its length before it, in the content of a chunk."""
-MAX_HEAD_BYTES = COMPRESSION_NAME_OFFSET + 4 + 32 + 8
+_MAX_HEAD_BYTES = _COMPRESSION_NAME_OFFSET + 4 + 32 + 8
 """Largest size of a chunk's head, with a compression name of at most 32 bytes."""
 
 # Fields of a chunk's head: first log time, last log time, unpacked size, checksum, and the
@@ -69,7 +69,7 @@ _SIZE = struct.Struct("<Q")
 _SCAN_BYTES = 1 << 20
 # Name of a supported compression, preceded by its length.
 _COMPRESSION_NAME = re.compile(
-    b"|".join(re.escape(struct.pack("<I", len(name)) + name) for name in COMPRESSIONS)
+    b"|".join(re.escape(struct.pack("<I", len(name)) + name) for name in _COMPRESSIONS)
 )
 
 
@@ -104,7 +104,7 @@ def parse_chunk_head(content: bytes, length: int) -> ChunkHead:
     """Decodes the head of a chunk, and checks that it agrees with the length of the chunk.
 
     Args:
-        content: Content of the chunk. Its first `MAX_HEAD_BYTES` bytes suffice.
+        content: Content of the chunk. Its first `_MAX_HEAD_BYTES` bytes suffice.
         length: Length of the whole content, in bytes.
 
     Raises:
@@ -269,8 +269,63 @@ class Damage(NamedTuple):
         return f"{count_nouns(self.length, 'byte')} from byte {self.offset} on: {self.problem}"
 
 
+class ScannedRecord:
+    """A record at its place in a file, which is read when it is needed.
+
+    Args:
+        scanner: Scanner that has found the record.
+        frame: Kind and place of the record.
+
+    Attributes:
+        frame: Kind and place of the record.
+    """
+
+    __slots__ = ("_content", "_problem", "_scanner", "_unpacked", "frame")
+
+    def __init__(self, scanner: "RecordScanner", frame: RecordFrame) -> None:
+        self.frame = frame
+        self._scanner = scanner
+        self._content: bytes | None = None
+        self._unpacked: bytes | None = None
+        self._problem: UnreadableRecord | None = None
+
+    @property
+    def content(self) -> bytes:
+        """Content of the record, without the fields for its kind and its length."""
+        if self._content is None:
+            self._content = self._scanner.content(self.frame)
+        return self._content
+
+    def head(self) -> "ChunkHead":
+        """Returns the head of a chunk, see `RecordScanner.head`.
+
+        Raises:
+            UnreadableRecord: The head is incomplete, or contains impossible values.
+        """
+        return self._scanner.head(self.frame)
+
+    def unpack(self) -> bytes:
+        """Returns the records in a chunk. It is unpacked once, however often this is called.
+
+        Raises:
+            UnreadableRecord: The chunk cannot be unpacked, or its checksum is wrong.
+        """
+        if self._problem is not None:
+            raise self._problem
+        if self._unpacked is None:
+            try:
+                self._unpacked = unpack_chunk(self.content)
+            except UnreadableRecord as error:
+                self._problem = error
+                raise
+        return self._unpacked
+
+
 class RecordScanner:
     """Scanner that finds the records of a file, and skips damaged parts.
+
+    Every program that reads a file, whether it checks, recovers or verifies it, reads the
+    records that this scanner yields.
 
     Args:
         stream: The file, opened for reading. It begins at the current position of the stream.
@@ -291,7 +346,7 @@ class RecordScanner:
         self._base = stream.tell()
         self.size = stream.seek(0, os.SEEK_END) - self._base
         self.begins = self.read(0, len(MAGIC)) == MAGIC
-        end = self.read(max(0, self.size - FOOTER_BYTES), FOOTER_BYTES)
+        end = self.read(max(0, self.size - _FOOTER_BYTES), _FOOTER_BYTES)
         self.ends = end.startswith(RECORD_HEAD.pack(Opcode.FOOTER, 20)) and end.endswith(MAGIC)
         self.finished = False
         self.trailing = 0
@@ -312,10 +367,17 @@ class RecordScanner:
         return self._stream.read(max(0, min(length, self.size - offset)))
 
     def frames(self) -> Iterator[RecordFrame]:
-        """Yields the kind and the position of every record of the file.
+        """Yields the kind and the position of every record that `scan` finds."""
+        for item in self.scan():
+            if isinstance(item, ScannedRecord):
+                yield item.frame
 
-        Bytes that cannot be a record are skipped and added to `damaged`. If the end of the file
-        is missing, `torn` is set. Every call starts at the beginning of the file.
+    def scan(self) -> Iterator[ScannedRecord | Damage]:
+        """Yields the records and the damaged parts of the file in the order of their places.
+
+        Bytes that cannot be a record are skipped, added to `damaged`, and yielded as a damaged
+        part. If the end of the file is missing, `torn` is set. Every call starts at the
+        beginning of the file.
         """
         self.damaged = []
         self.torn = None
@@ -328,7 +390,7 @@ class RecordScanner:
                 frame = self._frame_at(offset)
                 if frame.opcode == Opcode.CHUNK:
                     self.head(frame)
-                elif frame.opcode == Opcode.FOOTER and frame.size + len(MAGIC) != FOOTER_BYTES:
+                elif frame.opcode == Opcode.FOOTER and frame.size + len(MAGIC) != _FOOTER_BYTES:
                     raise UnreadableRecord(
                         f"a footer record has {count_nouns(frame.length, 'byte')}, which is "
                         "not the length of a footer"
@@ -336,14 +398,16 @@ class RecordScanner:
             except UnreadableRecord as error:
                 # The length of the previous record may be wrong, so that the search includes
                 # it.
+                damaged_before = len(self.damaged)
                 resumed_at = self._resume(search_start, offset, str(error))
+                yield from self.damaged[damaged_before:]
                 if resumed_at is None:
                     return
                 offset = resumed_at
                 search_start = resumed_at
                 continue
 
-            yield frame
+            yield ScannedRecord(self, frame)
             if frame.opcode == Opcode.FOOTER:
                 self._end_at(frame.end)
                 return
@@ -388,7 +452,7 @@ class RecordScanner:
             self.damaged.append(Damage(damage_start, chunk_offset - damage_start, problem))
         elif self.ends:
             self.damaged.append(
-                Damage(offset, max(0, self.size - FOOTER_BYTES - offset), problem)
+                Damage(offset, max(0, self.size - _FOOTER_BYTES - offset), problem)
             )
             self.finished = True
         else:
@@ -440,7 +504,9 @@ class RecordScanner:
         Raises:
             UnreadableRecord: The head is incomplete, or contains impossible values.
         """
-        content = self.read(frame.offset + RECORD_HEAD_BYTES, min(frame.length, MAX_HEAD_BYTES))
+        content = self.read(
+            frame.offset + RECORD_HEAD_BYTES, min(frame.length, _MAX_HEAD_BYTES)
+        )
         return parse_chunk_head(content, frame.length)
 
     def _find_chunk(self, offset: int) -> int | None:
@@ -452,7 +518,7 @@ class RecordScanner:
         Returns:
             The offset of the chunk. None if there is no such chunk.
         """
-        lead_bytes = RECORD_HEAD_BYTES + COMPRESSION_NAME_OFFSET
+        lead_bytes = RECORD_HEAD_BYTES + _COMPRESSION_NAME_OFFSET
         for window_offset in range(offset, self.size, _SCAN_BYTES):
             # The window is so long that it contains the head of a chunk that begins at its end.
             window = self.read(window_offset, _SCAN_BYTES + lead_bytes + 8)
@@ -485,7 +551,7 @@ class RecordScanner:
         Returns:
             The footer. None if the file is not finished and therefore has no footer.
         """
-        content = self.read(max(0, self.size - FOOTER_BYTES) + RECORD_HEAD_BYTES, 20)
+        content = self.read(max(0, self.size - _FOOTER_BYTES) + RECORD_HEAD_BYTES, 20)
         return parse_record(Opcode.FOOTER, content) if self.ends else None
 
     def is_summary_intact(self, footer: records.Footer) -> bool:
@@ -498,7 +564,7 @@ class RecordScanner:
             True if the summary has this checksum.
         """
         summary_start = footer.summary_start
-        footer_start = self.size - FOOTER_BYTES
+        footer_start = self.size - _FOOTER_BYTES
         if not 0 <= summary_start <= footer_start:
             return False
         # The checksum covers the summary and the footer up to the checksum itself, which is the

@@ -25,7 +25,7 @@ from mcap.opcode import Opcode
 from .mcap_records import MAGIC, OP_MESSAGE, RECORD_HEAD
 from .running_digest import DIGESTS, RunningDigest
 
-CHUNK_BYTES = 1 << 20
+_CHUNK_BYTES = 1 << 20
 """Size of the messages in a chunk, in bytes before compression, from which it is closed."""
 
 # Fields of fixed size, in the order of the specification at mcap.dev.
@@ -130,7 +130,7 @@ class McapWriter:
     """
 
     def __init__(
-        self, stream: Sink, library: str, profile: str = "", chunk_bytes: int = CHUNK_BYTES
+        self, stream: Sink, library: str, profile: str = "", chunk_bytes: int = _CHUNK_BYTES
     ) -> None:
         self.position = 0
         self.messages = 0

@@ -32,7 +32,7 @@ QUATERNION_AXES = ("qw", "qx", "qy", "qz")
 """Names of the four numbers of a quaternion, in tables."""
 MATRIX_ENTRIES = ("r11", "r21", "r31", "r12", "r22", "r32")
 """Names of the six numbers of an orientation, with row and column of the rotation matrix."""
-SIX_AXES = (*TASK_AXES[:POSITION], *MATRIX_ENTRIES)
+_SIX_AXES = (*TASK_AXES[:POSITION], *MATRIX_ENTRIES)
 """Names of the nine numbers of a pose: the position, and six numbers for the orientation."""
 
 

@@ -46,7 +46,7 @@ from .log_layout import (
     describe_unfinished,
 )
 from .mcap_reader import McapReader, Progress, check_log
-from .mcap_records import UnreadableRecord
+from .mcap_records import Damage, ScannedRecord, UnreadableRecord
 from .mcap_writer import McapWriter
 from .provenance import collect_provenance
 from .recovery_survey import RecoverySurvey
@@ -59,9 +59,9 @@ _UNPROVEN = "has no checksum, and the log has no scenario by which to check mess
 _NO_SCENARIO = "the log has no scenario, without which no message can be checked"
 _MAX_REASONS = 3
 """Number of losses that the error message lists if nothing can be saved."""
-MAX_LISTED_LOSSES = 20
+_MAX_LISTED_LOSSES = 20
 """Number of losses that the metadata of the new file list one by one."""
-DAMAGED_SUFFIX = ".damaged"
+_DAMAGED_SUFFIX = ".damaged"
 """Suffix of the name of an attachment whose checksum is wrong."""
 _MAX_SCENARIO_BYTES = 64 << 20
 """Largest size of a scenario file beside the log, in bytes."""
@@ -152,7 +152,7 @@ class Recovery(Result):
         The texts state the source file, the losses and the missing records. A reader of the new
         file can thus recognise it as a recovered log.
         """
-        losses = self.lost[:MAX_LISTED_LOSSES]
+        losses = self.lost[:_MAX_LISTED_LOSSES]
         unlisted = len(self.lost) - len(losses)
         if unlisted:
             losses.append(f"and {unlisted} more")
@@ -333,7 +333,6 @@ class _FileCopy:
     def __init__(
         self, reader: McapReader, file: LogFile, survey: RecoverySurvey, result: Recovery
     ) -> None:
-        reader.watch = self._on_record
         self._reader = reader
         self._scanner = reader.scanner
         self._survey = survey
@@ -350,8 +349,6 @@ class _FileCopy:
         self.is_session_log = survey.is_session_log
         # True until a message, metadata or an attachment is copied.
         self._is_empty = True
-        # Number of damaged parts that were added to the losses already.
-        self._reported = 0
         # Schemas and channels of the source, by opcode and number.
         self._definitions: dict[tuple[int, int], Any] = {}
         # Numbers that the source defines in two ways.
@@ -404,9 +401,13 @@ class _FileCopy:
                 data=restored,
             )
             self._is_empty = False
-        # Reading the messages passes every record to `_on_record`.
-        deque(self._reader.messages(), maxlen=0)
-        self._report_damaged()
+        for item in self._reader.scan():
+            if isinstance(item, Damage):
+                self._report_damage(item)
+            else:
+                self._copy_or_report(item)
+                # The reader computes the digests of the source.
+                deque(self._reader.read_record(item), maxlen=0)
         if self._scanner.torn is not None:
             self._copy_torn_chunk(self._scanner.torn)
         self._out.flush()
@@ -420,50 +421,42 @@ class _FileCopy:
             )
         self._finish()
 
-    def _on_record(self, frame: mcap_records.RecordFrame, content: bytes, data: bytes) -> None:
-        """Copies one record of the source, or adds it to the losses if it cannot be read.
-
-        The arguments are those of `_copy_record`.
-        """
-        self._report_damaged()
+    def _copy_or_report(self, record: ScannedRecord) -> None:
+        """Copies one record of the source, or adds it to the losses if it cannot be read."""
         try:
-            self._copy_record(frame, content, data)
+            self._copy_record(record)
         except UnreadableRecord as error:
+            frame = record.frame
             self._result.add_loss(
                 f"{count_nouns(frame.size, 'byte')} at byte {frame.offset}: {error}", frame.size
             )
 
-    def _report_damaged(self) -> None:
-        """Adds the damaged parts to the losses that the reader has passed since the last call.
+    def _report_damage(self, damage: Damage) -> None:
+        """Adds a damaged part to the losses.
 
         Parts after the end of the data contain only the index, and are no loss.
         """
-        for damage in self._scanner.damaged[self._reported :]:
-            if damage.offset <= self._data_end:
-                self._result.add_loss(str(damage), damage.length)
-        self._reported = len(self._scanner.damaged)
+        if damage.offset <= self._data_end:
+            self._result.add_loss(str(damage), damage.length)
 
-    def _copy_record(
-        self, frame: mcap_records.RecordFrame, content: bytes, data: bytes
-    ) -> None:
+    def _copy_record(self, record: ScannedRecord) -> None:
         """Copies one record of the source.
 
         Args:
-            frame: Kind and place of the record.
-            content: Content of the record.
-            data: Unpacked records of a chunk. Empty for other records, and for a chunk that
-                cannot be unpacked.
+            record: The record.
 
         Raises:
             UnreadableRecord: The record cannot be trusted and was not copied.
         """
+        frame = record.frame
+        content = record.content
         opcode = frame.opcode
         if opcode == Opcode.HEADER or opcode in mcap_records.DEFINITIONS:
             return  # the survey has read them already
         if opcode in _REGENERATED:
             self._check_regenerated(frame, content)
         elif opcode == Opcode.CHUNK:
-            self._copy_chunk(frame, data or mcap_records.unpack_chunk(content))
+            self._copy_chunk(record)
         elif opcode == mcap_records.OP_MESSAGE:
             self._copy_single_message(content)
         elif opcode == Opcode.METADATA:
@@ -491,7 +484,7 @@ class _FileCopy:
     def _copy_attachment(self, content: bytes) -> None:
         """Copies an attachment.
 
-        A damaged attachment is renamed with the suffix `DAMAGED_SUFFIX`. If it kept its name,
+        A damaged attachment is renamed with the suffix `_DAMAGED_SUFFIX`. If it kept its name,
         nobody would notice the damage, because the writer adds a valid checksum.
         """
         entry = mcap_records.parse_record(Opcode.ATTACHMENT, content)
@@ -502,7 +495,7 @@ class _FileCopy:
         if name == SCENARIO and entry.data != self._survey.attachments.get(SCENARIO):
             problem = problem or "it belongs to another session"
         if problem:
-            name = f"{name}{DAMAGED_SUFFIX}"
+            name = f"{name}{_DAMAGED_SUFFIX}"
             self._result.add_loss(f"attachment {entry.name}: {problem}; it is kept as {name}")
         self._out.add_attachment(
             create_time=entry.create_time,
@@ -537,7 +530,7 @@ class _FileCopy:
                 f"an index record of kind {frame.opcode} appears in the data section"
             )
 
-    def _copy_chunk(self, frame: mcap_records.RecordFrame, data: bytes) -> None:
+    def _copy_chunk(self, chunk: ScannedRecord) -> None:
         """Copies the records of an unpacked chunk, if there is evidence that they are right.
 
         A chunk is a block of records, mostly with a checksum. There are four cases:
@@ -552,17 +545,17 @@ class _FileCopy:
           checksums: its records are copied.
 
         Args:
-            frame: Place of the chunk.
-            data: The unpacked records, whose checksum is valid if there is one.
+            chunk: The chunk.
 
         Raises:
-            UnreadableRecord: The chunk is not in its original place, is from another run, or
-                cannot be checked.
+            UnreadableRecord: The chunk cannot be unpacked, is not in its original place, is
+                from another run, or cannot be checked.
         """
-        problem = self._survey.misplaced.get(frame.offset)
+        data = chunk.unpack()
+        problem = self._survey.misplaced.get(chunk.frame.offset)
         if problem:
             raise UnreadableRecord(problem)
-        head = self._scanner.head(frame)
+        head = chunk.head()
         records = [
             (opcode, data[begin:end])
             for opcode, begin, end in mcap_records.iterate_records(data)
@@ -867,7 +860,7 @@ class _FileCopy:
             self._accounts.open_channel(topic)
         return channel
 
-    def _copy_torn_chunk(self, torn: mcap_records.Damage) -> None:
+    def _copy_torn_chunk(self, torn: Damage) -> None:
         """Copies the messages that can be read from the last chunk, if it is incomplete.
 
         The rest of the chunk is added to the losses, or the whole record if it is not a chunk.

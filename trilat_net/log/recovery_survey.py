@@ -118,19 +118,22 @@ class RecoverySurvey:
         # Schemas and channels, by (True in the summary, opcode).
         defined: dict[tuple[bool, int], list[Definition]] = defaultdict(list)
         has_messages = False
-        for frame in scanner.frames():
+        for record in scanner.scan():
+            if isinstance(record, mcap_records.Damage):
+                continue  # the copy reports it
+            frame = record.frame
             has_messages |= frame.opcode in (Opcode.CHUNK, Opcode.MESSAGE)
             if frame.opcode in mcap_records.DEFINITIONS:
-                entry = frame.opcode, scanner.content(frame)
+                entry = frame.opcode, record.content
                 is_in_summary = frame.offset >= summary_offset
                 defined[is_in_summary, frame.opcode].append(entry)
                 if not is_in_summary:
                     self._uncovered_offsets.setdefault(entry, frame.offset)
             elif frame.opcode == Opcode.CHUNK:
-                self._chunks.append((frame, scanner.head(frame)))
+                self._chunks.append((frame, record.head()))
             elif frame.opcode in _DESCRIBING:
                 with suppress(UnreadableRecord):
-                    self._read_description(frame, scanner.content(frame))
+                    self._read_description(frame, record.content)
         self._choose_definitions(defined)
 
         if summary_offset == scanner.size:

@@ -45,14 +45,15 @@ from .log_layout import (
 from .log_reader import Log
 from .mcap_check import FileCheck
 from .mcap_reader import ChannelInfo, McapMessage, McapReader, Progress, shift_progress
+from .mcap_records import ScannedRecord
 from .message_identity import AnyMessage, identify_message
 from .ros2 import cdr
 from .running_digest import DigestState, Integrity
 from .session_accounts import SessionAccounts
 
-MAX_AHEAD_NS = 10 * NS_PER_S
+_MAX_AHEAD_NS = 10 * NS_PER_S
 """Largest time by which the sending may be later than the arrival, because of wrong clocks."""
-MAX_BOOTS = 64
+_MAX_BOOTS = 64
 """Largest number of starts of a member whose messages are counted separately."""
 _CDR_HEAD = b"\x00\x01"
 """First bytes of a message in plain CDR, the encoding of ROS 2, in little-endian order."""
@@ -298,8 +299,8 @@ class ChannelCheck:
             publish_ns: Sending time of the message, in Unix time, in ns.
             offset: Offset of the message in the file.
         """
-        if message.boot not in self.boots and len(self.boots) >= MAX_BOOTS:
-            self._add("sequence", offset, f"there were more than {MAX_BOOTS} starts")
+        if message.boot not in self.boots and len(self.boots) >= _MAX_BOOTS:
+            self._add("sequence", offset, f"there were more than {_MAX_BOOTS} starts")
             return
         self.boots.add(message.boot)
 
@@ -354,10 +355,23 @@ class ChannelCheck:
                 f"message {number} was sent at {sent_ns} ns, but is stored with {publish_ns} ns"
             )
             self._add("times", offset, text)
-        elif publish_ns > log_ns + MAX_AHEAD_NS:
+        elif publish_ns > log_ns + _MAX_AHEAD_NS:
             ahead_s = (publish_ns - log_ns) / NS_PER_S
             text = f"message {number} arrived {ahead_s:.1f} s before it was sent"
             self._add("times", offset, text)
+
+
+def _read_checked(reader: McapReader, structure: FileCheck) -> Iterator[McapMessage]:
+    """Yields the messages of a file. Each record is checked before its messages are yielded.
+
+    Args:
+        reader: Reader of the file.
+        structure: Check of the file's bytes.
+    """
+    for item in reader.scan():
+        if isinstance(item, ScannedRecord):
+            structure.check_record(item)
+            yield from reader.read_record(item)
 
 
 def _parse_number(about: Mapping[str, str], key: str) -> int:
@@ -418,18 +432,18 @@ class SessionCheck:
         """
         reader = McapReader(stream, file, progress, kept=False)
         structure = FileCheck(file, reader.scanner, self._findings)
-        reader.watch = structure.check_record
         if reader.scanner.begins:
-            self._read_messages(file, reader)
+            self._read_messages(file, reader, structure)
         structure.finish()
         self._counts += structure.counts
 
-    def _read_messages(self, file: str, reader: McapReader) -> None:
-        """Checks the messages of a file, and compares the file with its digests.
+    def _read_messages(self, file: str, reader: McapReader, structure: FileCheck) -> None:
+        """Checks the records and the messages of a file, and compares it with its digests.
 
         Args:
             file: Name of the file.
             reader: Reader of the file.
+            structure: Check of the file's bytes.
 
         Raises:
             LogError: The file belongs to another session than the previous files.
@@ -437,7 +451,7 @@ class SessionCheck:
         checks: dict[str, ChannelCheck | None] = {}
         self._file = file
         has_begun = False
-        for message in reader.messages():
+        for message in _read_checked(reader, structure):
             if not has_begun:
                 # The reader has read the metadata when it yields the first message.
                 has_begun = True

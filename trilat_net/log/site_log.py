@@ -40,14 +40,14 @@ MAX_DECODED_RECORDS = 1 << 16
 BLOCK_RECORDS = 1 << 11
 """Number of records that are decoded together."""
 HEAVY_BYTES = 12 << 20
-HEAVY_RATIO = 10
+_HEAVY_RATIO = 10
 """The records of a site are heavy if their decoded form is larger than `HEAVY_BYTES`, and also
-larger than `HEAVY_RATIO` times their encoded form. Only few heavy records are kept decoded,
+larger than `_HEAVY_RATIO` times their encoded form. Only few heavy records are kept decoded,
 because a file that was made to do harm could otherwise fill the memory.
 """
-HEAVY_BLOCK = 128
+_HEAVY_BLOCK = 128
 """Number of heavy records that are decoded together."""
-HEAVY_BLOCKS = 8
+_HEAVY_BLOCKS = 8
 """Number of blocks of heavy records that are kept decoded."""
 
 DecodeStates = Callable[[Sequence[bytes]], list[State]]
@@ -151,8 +151,8 @@ class LazyRecords(Sequence[State]):
     def __init__(
         self, payloads: Sequence[bytes], decode_block: DecodeStates, *, heavy: bool = False
     ) -> None:
-        size = HEAVY_BLOCK if heavy else BLOCK_RECORDS
-        blocks = HEAVY_BLOCKS if heavy else MAX_DECODED_RECORDS // size
+        size = _HEAVY_BLOCK if heavy else BLOCK_RECORDS
+        blocks = _HEAVY_BLOCKS if heavy else MAX_DECODED_RECORDS // size
         self._payloads = payloads
         self._size = size
 
@@ -205,7 +205,7 @@ def decode_records(payloads: Sequence[bytes], decode_block: DecodeStates) -> Seq
     if len(payloads) > MAX_DECODED_RECORDS:
         return LazyRecords(payloads, decode_block)
 
-    remaining_bytes = max(HEAVY_BYTES, HEAVY_RATIO * sum(map(len, payloads)))
+    remaining_bytes = max(HEAVY_BYTES, _HEAVY_RATIO * sum(map(len, payloads)))
     states: list[State] = []
     with process.pause_gc():
         for first in range(0, len(payloads), BLOCK_RECORDS):

@@ -36,7 +36,7 @@ from .mcap_records import (
 PAGE_BYTES = 4096
 """Size of a page, in bytes. Operating systems and disks lose or misplace whole pages of a file.
 """
-MAX_SALVAGE_BYTES = 64 << 20
+_MAX_SALVAGE_BYTES = 64 << 20
 """Largest part of an incomplete chunk that is read, in bytes."""
 # Blocks of a Zstandard frame, from RFC 8878, section 3.1.1.2.
 _BLOCK_HEAD_BYTES = 3
@@ -82,7 +82,7 @@ class TornChunk(NamedTuple):
         record_head = scanner.read(offset, RECORD_HEAD_BYTES).ljust(RECORD_HEAD_BYTES, b"\0")
         _, length = RECORD_HEAD.unpack(record_head)
         begin = offset + RECORD_HEAD_BYTES
-        content = scanner.read(begin, MAX_SALVAGE_BYTES)
+        content = scanner.read(begin, _MAX_SALVAGE_BYTES)
         head = parse_chunk_head(content, length)
         if head.end_ns < head.start_ns:
             raise UnreadableRecord("the end time of a chunk is before its start time")

@@ -55,10 +55,10 @@ AHEAD_NS = 1_000_000_000
 The expected time of a record is the time of the previous one plus the time between their
 arrivals.
 """
-BRAKE_NS = 100_000_000
+_BRAKE_NS = 100_000_000
 """Time from a fault, or from the release of the dead-man switch, until the brakes hold, in ns.
 """
-HEARTBEAT_S = SILENCE_NS / 4e9
+_HEARTBEAT_S = SILENCE_NS / 4e9
 """Period with which the last message of an operator who does not move is repeated, in s."""
 _ACTIONS = {
     TorqueKind.LIVE_TIP: "move",
@@ -408,7 +408,7 @@ class ArmClient(OutsideClient):
 
         - before the first tick and after the run,
         - if the newest record is older than `FRESH_NS`,
-        - `BRAKE_NS` after a fault or after the release of the dead-man switch. Until then the
+        - `_BRAKE_NS` after a fault or after the release of the dead-man switch. Until then the
           torque brings the arm to rest.
 
         Returns:
@@ -430,7 +430,7 @@ class ArmClient(OutsideClient):
         is_switch_released = record.mode == "stopped" and stop_reason == [LifeReason.RELEASED]
         must_brake_soon = record.mode == "fault" or is_switch_released
         if must_brake_soon:
-            is_coming_to_rest = bool(begun_ns) and record.t_ns - begun_ns[0] < BRAKE_NS
+            is_coming_to_rest = bool(begun_ns) and record.t_ns - begun_ns[0] < _BRAKE_NS
             if not is_coming_to_rest:
                 return None
         return tuple(record.tau)
@@ -704,7 +704,7 @@ class Hand(SiteClient):
 
     def _repeat_messages(self) -> None:
         """Repeats the last message regularly until the object is closed."""
-        while not self._ended.wait(HEARTBEAT_S):
+        while not self._ended.wait(_HEARTBEAT_S):
             with self._lock:
                 if self._message is not None:
                     self._sender.repeat(self._message)

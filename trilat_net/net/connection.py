@@ -155,7 +155,7 @@ def _bind_ports(stack: ExitStack, ports: Sequence[int], *, shared: bool) -> list
 
 ENDS_SOON = timedelta(days=7)
 """Time before the end of the keys' validity from which on the user is warned."""
-DATE = "%Y-%m-%d %H:%M:%S UTC"
+_DATE = "%Y-%m-%d %H:%M:%S UTC"
 """Format of the end of validity in messages to the user."""
 RETRY_NS = 200_000_000
 """Time between two attempts to reach a router, in ns."""
@@ -243,8 +243,8 @@ class Connection:
         planned_end = datetime.now(UTC) + timedelta(seconds=left_s)
         if self.keys_end <= planned_end:
             raise UsageError(
-                f"--keys: the keys of {self.keys_of} expire on {self.keys_end:{DATE}}, but "
-                f"the session is planned until {planned_end:{DATE}}: renew the keys with "
+                f"--keys: the keys of {self.keys_of} expire on {self.keys_end:{_DATE}}, but "
+                f"the session is planned until {planned_end:{_DATE}}: renew the keys with "
                 "trilat keys renew (docs/sessions/network.md)"
             )
 
@@ -260,7 +260,7 @@ class Connection:
         if self.keys_end is None or self.keys_end - datetime.now(UTC) > ENDS_SOON:
             return ""
         remedy = "renew the keys with trilat keys renew (docs/sessions/network.md)"
-        return f"the keys of {self.keys_of} expire on {self.keys_end:{DATE}}: {remedy}"
+        return f"the keys of {self.keys_of} expire on {self.keys_end:{_DATE}}: {remedy}"
 
     def require(self, member: str) -> "Connection":
         """Checks that this connection has no keys, or the keys of the named member.

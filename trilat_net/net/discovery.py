@@ -41,7 +41,7 @@ POLL_NS = 5_000_000
 """Time between two polls for replies, in ns."""
 REPLY_TIMEOUT_S = 3.0
 """Longest wait for a reply, in s."""
-NAME_CHECK_S = 0.7
+_NAME_CHECK_S = 0.7
 """Time for which a playback looks for sites of a session with the same name, in s.
 
 Sites try to connect every half a second.
@@ -395,7 +395,7 @@ def refuse_running_session(
     Raises:
         SessionError: A site of that session replies.
     """
-    for info in find_members(bus, clock, session, stopped=stopped, timeout_s=NAME_CHECK_S):
+    for info in find_members(bus, clock, session, stopped=stopped, timeout_s=_NAME_CHECK_S):
         if info.member == topics.RECORDER:
             continue
         state = "is waiting to begin"

@@ -38,7 +38,7 @@ POLL_NS = 1_000_000
 """Time between two polls for replies, in ns."""
 PATIENCE_NS = 1_500_000_000
 """Time after which the command continues with the search for the session, in ns."""
-AT_ONCE = {"scouting": {"delay": 0}}
+_AT_ONCE = {"scouting": {"delay": 0}}
 """Settings of Zenoh that avoid its delay before the first message."""
 _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL
 """Flags that create a file, and fail if the file exists already."""
@@ -313,12 +313,12 @@ def _order_stop(known_sites: Sequence[KnownSite], sites: Sequence[str], keys: st
     Returns:
         True if all sites have replied that they stop.
     """
-    settings: Any = AT_ONCE
+    settings: Any = _AT_ONCE
     if keys:
         from .member_keys import read_member_keys
 
         key_settings = read_member_keys(Path(keys), stops=True).settings
-        settings = merge_settings(key_settings, AT_ONCE)
+        settings = merge_settings(key_settings, _AT_ONCE)
 
     remaining = set(sites or known_sites[0].sites)
     starts_by_name = Counter(known.site for known in known_sites)

@@ -62,7 +62,7 @@ STOPPING_TIME = datetime.timedelta(days=1)
 """Time after the end of the keys for which they can still be used to stop arms."""
 _CLOCK_TOLERANCE = datetime.timedelta(hours=1)
 """Difference between the clocks of two machines that is tolerated."""
-MOST_KEY_BYTES = 65_536
+_MOST_KEY_BYTES = 65_536
 """Largest number of bytes that are read from a key file."""
 _RENEWAL = (
     "renew the keys with trilat keys renew, or make new keys for all members with trilat keys "
@@ -71,7 +71,7 @@ _RENEWAL = (
 """Advice to the user for keys that have ended."""
 _DATE = "%Y-%m-%d %H:%M UTC"
 """Format of dates in messages to the user."""
-MOST_DAYS = 3_650
+_MOST_DAYS = 3_650
 """Longest validity of keys, in days."""
 MOST_LETTERS = 64
 """Longest name of a member. X.509 limits common names to 64 characters."""
@@ -127,8 +127,8 @@ def create_keys(
     """
     folder = Path(folder)
     faults = [_find_name_fault(members), *map(_find_host_fault, hosts)]
-    if not 0 <= days <= MOST_DAYS:
-        faults.append(f"the validity of keys must be 0 to {MOST_DAYS} days, not {days}")
+    if not 0 <= days <= _MOST_DAYS:
+        faults.append(f"the validity of keys must be 0 to {_MOST_DAYS} days, not {days}")
     for fault in faults:
         if fault:
             raise UsageError(fault)
@@ -221,8 +221,8 @@ def renew_keys(folder: str | Path, members: Sequence[str] = (), days: int = 30) 
         LogRefused: The disk refused to write.
     """
     folder = Path(folder)
-    if not 0 <= days <= MOST_DAYS:
-        raise UsageError(f"the validity of keys must be 0 to {MOST_DAYS} days, not {days}")
+    if not 0 <= days <= _MOST_DAYS:
+        raise UsageError(f"the validity of keys must be 0 to {_MOST_DAYS} days, not {days}")
     old_authority, authority_key = _read_authority(folder)
     present = [path.name for path in sorted(folder.iterdir()) if (path / MEMBERS).is_file()]
     names = list(members) or present
@@ -313,8 +313,8 @@ def add_keys(
     """
     folder = Path(folder)
     faults = [_find_name_fault(members), *map(_find_host_fault, hosts)]
-    if not 0 <= days <= MOST_DAYS:
-        faults.append(f"the validity of keys must be 0 to {MOST_DAYS} days, not {days}")
+    if not 0 <= days <= _MOST_DAYS:
+        faults.append(f"the validity of keys must be 0 to {_MOST_DAYS} days, not {days}")
     for fault in faults:
         if fault:
             raise UsageError(fault)
@@ -692,7 +692,7 @@ def _read_trusted(path: Path) -> bytes:
     """
     with open_regular(path) as stream:
         _check_permissions(path, os.fstat(stream.fileno()))
-        content: bytes = stream.read(MOST_KEY_BYTES)
+        content: bytes = stream.read(_MOST_KEY_BYTES)
     return content
 
 

@@ -306,20 +306,20 @@ class LinkTimingMonitor:
         return delay_ns
 
     def is_receiving(self, now_ns: int) -> bool:
-        """Returns True if a sample of the peer has arrived within the last UNHEARD_NS.
+        """Returns True if a sample of the peer has arrived within the last _UNHEARD_NS.
 
         A sample is the state that the peer publishes in each period of its control loop.
 
         Args:
             now_ns: Present time on the local clock, in ns.
         """
-        return self._received_ns >= 0 and now_ns - self._received_ns <= UNHEARD_NS
+        return self._received_ns >= 0 and now_ns - self._received_ns <= _UNHEARD_NS
 
     def is_acknowledged(self, now_ns: int) -> bool | None:
         """Determines whether the peer still receives the samples of this site.
 
         The samples of the peer (their published states) confirm which samples of this site it
-        has received. If they arrive, but have confirmed nothing new for UNHEARD_NS, the peer
+        has received. If they arrive, but have confirmed nothing new for _UNHEARD_NS, the peer
         does not receive this site.
 
         Args:
@@ -334,7 +334,7 @@ class LinkTimingMonitor:
         if not has_confirmed_any or not self.is_receiving(now_ns):
             return None
         unconfirmed_ns = self._received_ns - self._acknowledged_ns
-        return unconfirmed_ns <= UNHEARD_NS
+        return unconfirmed_ns <= _UNHEARD_NS
 
     def close_window(self, now_ns: int, slew_ns: int) -> OffsetEstimate | None:
         """Estimates the clock offset from the present window of time, once it is long enough.
@@ -414,12 +414,12 @@ class LinkTimingMonitor:
 
 FAULT_EVERY_NS = 1_000_000_000
 """Shortest time between two events about clock faults of one peer, in ns."""
-UNHEARD_NS = 200_000_000
+_UNHEARD_NS = 200_000_000
 """Time without a new acknowledgement after which a peer counts as not receiving this site.
 
 The condition applies only while samples of the peer itself arrive.
 """
-FIRST_BOUND_NS = 2_000_000
+_FIRST_BOUND_NS = 2_000_000
 """Margin that is added to the clock error that a joining site states, in ns."""
 
 
@@ -544,7 +544,7 @@ class SiteTiming:
         k = t_ns * self._rate_hz // NS_PER_S
         due_ns = self.schedule.due_ns(k)
         offset_ns = epoch_ns + k * NS_PER_S // self._rate_hz - due_ns
-        half_width_ns = bound_ns + FIRST_BOUND_NS
+        half_width_ns = bound_ns + _FIRST_BOUND_NS
         estimate = OffsetEstimate(
             local_ns=due_ns,
             offset_ns=offset_ns,
@@ -764,7 +764,7 @@ def _describe_acknowledgement(monitor: LinkTimingMonitor, k: int) -> ClockNotice
     """
     name = monitor.peer.name
     if monitor.is_unacknowledged:
-        timeout_ms = UNHEARD_NS // 1_000_000
+        timeout_ms = _UNHEARD_NS // 1_000_000
         kind = "unheard"
         text = f"{name} is heard and does not hear: for {timeout_ms} ms it acknowledged nothing"
     else:

@@ -45,11 +45,11 @@ MAX_BYTES = 65_536
 """Largest payload of a message, in bytes. `Info` and `Backfill` may be larger."""
 MAX_INFO_BYTES = 64 * 1024 * 1024
 """Largest payload of an `Info`, in bytes. It contains a scenario with its recorded delays."""
-MAX_PAST_BYTES = 2 * MAX_BYTES
+_MAX_PAST_BYTES = 2 * MAX_BYTES
 """Largest payload of a `Backfill`, in bytes."""
 SAMPLE_BYTES = 2_048
 """Largest size of a `PeerSample` without the numbers of its vectors, in bytes."""
-NUMBER_BYTES = 9
+_NUMBER_BYTES = 9
 """Size of an encoded floating-point number, in bytes."""
 
 _Sendable = LinkStats | Event | Info | RecorderStats | Request
@@ -66,7 +66,7 @@ _DECODERS = {
 }
 _SIZE_LIMITS: dict[type[msgspec.Struct], int] = {
     Info: MAX_INFO_BYTES,
-    Backfill: MAX_PAST_BYTES,
+    Backfill: _MAX_PAST_BYTES,
 }
 """Largest payloads of the messages that may be larger than `MAX_BYTES`."""
 _isfinite = math.isfinite
@@ -368,7 +368,7 @@ def make_decoder(
     parse = _DECODERS[kind].decode
     if kind is PeerSample and layout is not None:
         # Thousands of samples may wait in a ring, so their size is limited more tightly.
-        max_bytes = SAMPLE_BYTES + NUMBER_BYTES * (3 * layout.shared + layout.sent)
+        max_bytes = SAMPLE_BYTES + _NUMBER_BYTES * (3 * layout.shared + layout.sent)
     lengths_by_name = _list_vector_lengths(kind, layout or Layout())
     get_vectors = attrgetter(*lengths_by_name) if lengths_by_name else None
     required_lengths = list(lengths_by_name.values()) if layout else None

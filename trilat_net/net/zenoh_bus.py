@@ -39,9 +39,9 @@ from .bus import (
 )
 from .zenoh_config import Endpoint, ZenohFile, ZenohMode, check_zenoh_file, make_zenoh_config
 
-QUERY_TIMEOUT_S = 3.0
+_QUERY_TIMEOUT_S = 3.0
 """Time after which Zenoh discards a query without replies, in s."""
-SHARED_POOL = (
+_SHARED_POOL = (
     "(rx:(worker_threads:4),tx:(handover:rx),acc:(handover:rx),"
     "net:(handover:rx),app:(handover:rx))"
 )
@@ -67,7 +67,7 @@ def share_threads() -> None:
     A router must not call this function. A router that waits for room in its output queue
     blocks the thread that reads, and needs another pool to empty the queue.
     """
-    os.environ.setdefault("ZENOH_RUNTIME", SHARED_POOL)
+    os.environ.setdefault("ZENOH_RUNTIME", _SHARED_POOL)
 
 
 class RouterSilent(SessionError):  # noqa: N818 - it names an outcome
@@ -363,7 +363,7 @@ class ZenohBus:
             handlers.FifoChannel(256),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.QueryConsolidation(zenoh.ConsolidationMode.NONE),
-            timeout=QUERY_TIMEOUT_S,
+            timeout=_QUERY_TIMEOUT_S,
             allowed_destination=Locality.REMOTE,
             payload=payload,
             # Replies inherit these settings, so that no member waits for a hanging receiver.

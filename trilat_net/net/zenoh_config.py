@@ -48,14 +48,14 @@ is noticed by the age of its samples.
 
 BATCHES = 16
 """Number of batches that a transmission queue holds."""
-BATCH_BYTES = 65_535
+_BATCH_BYTES = 65_535
 """Size of a batch, in bytes."""
 MOST_PUT_BYTES = 262_144
 """Largest published message that is accepted, in bytes.
 
 It holds ten records of the longest arms.
 """
-MOST_QUERY_BYTES = 65_536
+_MOST_QUERY_BYTES = 65_536
 """Largest query that is accepted, in bytes."""
 
 ZenohMode = Literal["peer", "client", "router"]
@@ -63,7 +63,7 @@ ZenohMode = Literal["peer", "client", "router"]
 Endpoint = str | Mapping[str, Any]
 """An address such as "tcp/127.0.0.1:7447", or a group of addresses in Zenoh's format."""
 
-QUEUES = [
+_QUEUES = [
     "control",
     "real_time",
     "interactive_high",
@@ -75,17 +75,17 @@ QUEUES = [
 ]
 """Names of Zenoh's transmission queues of a connection, by priority."""
 
-CONNECT_TIMEOUT_MS = {"router": -1, "peer": -1, "client": 0}
+_CONNECT_TIMEOUT_MS = {"router": -1, "peer": -1, "client": 0}
 """Zenoh's setting `connect/timeout_ms` by mode: -1 retries without limit, 0 does not retry.
 
 A client cannot open its session without its router. `open_bus` tries again until the router
 runs.
 """
-CONNECT_EXIT_ON_FAILURE = {"router": False, "peer": False, "client": True}
+_CONNECT_EXIT_ON_FAILURE = {"router": False, "peer": False, "client": True}
 """Zenoh's setting `connect/exit_on_failure` by mode."""
-LISTEN_TIMEOUT_MS = {"router": 0, "peer": 0, "client": 0}
+_LISTEN_TIMEOUT_MS = {"router": 0, "peer": 0, "client": 0}
 """Zenoh's setting `listen/timeout_ms` by mode. These are the defaults of Zenoh."""
-LISTEN_EXIT_ON_FAILURE = {"router": True, "peer": True, "client": True}
+_LISTEN_EXIT_ON_FAILURE = {"router": True, "peer": True, "client": True}
 """Zenoh's setting `listen/exit_on_failure` by mode. These are the defaults of Zenoh."""
 
 
@@ -108,9 +108,9 @@ def _limit_sizes(name: str, messages: list[str], size: int) -> dict[str, Any]:
     }
 
 
-SIZE_LIMITS = [
+_SIZE_LIMITS = [
     _limit_sizes("puts", ["put", "delete"], MOST_PUT_BYTES),
-    _limit_sizes("queries", ["query"], MOST_QUERY_BYTES),
+    _limit_sizes("queries", ["query"], _MOST_QUERY_BYTES),
 ]
 """Size limits of every member, with and without keys."""
 
@@ -133,11 +133,11 @@ def make_zenoh_config(
     retry = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5}
     session_settings: dict[str, Any] = {
         "mode": mode,
-        "listen": {"endpoints": list(listen), "exit_on_failure": LISTEN_EXIT_ON_FAILURE[mode]},
+        "listen": {"endpoints": list(listen), "exit_on_failure": _LISTEN_EXIT_ON_FAILURE[mode]},
         "connect": {
             "endpoints": list(connect),
-            "timeout_ms": CONNECT_TIMEOUT_MS[mode],
-            "exit_on_failure": CONNECT_EXIT_ON_FAILURE[mode],
+            "timeout_ms": _CONNECT_TIMEOUT_MS[mode],
+            "exit_on_failure": _CONNECT_EXIT_ON_FAILURE[mode],
             "retry": retry,
         },
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
@@ -147,9 +147,9 @@ def make_zenoh_config(
                 "tx": {
                     "lease": LEASE_MS,
                     "keep_alive": 4,
-                    "batch_size": BATCH_BYTES,
+                    "batch_size": _BATCH_BYTES,
                     "queue": {
-                        "size": dict.fromkeys(QUEUES, BATCHES),
+                        "size": dict.fromkeys(_QUEUES, BATCHES),
                         "congestion_control": {"drop": {"wait_before_drop": 0}},
                         "batching": {"enabled": True},
                     },
@@ -157,7 +157,7 @@ def make_zenoh_config(
             },
             "shared_memory": {"enabled": False},
         },
-        "low_pass_filter": SIZE_LIMITS,
+        "low_pass_filter": _SIZE_LIMITS,
     }
     return merge_settings(session_settings, user_settings or {})
 
@@ -254,17 +254,17 @@ _MUST_BE_EMPTY = _require_value([], "empty: it would change or thin out a sessio
 _TX = "transport/link/tx"
 
 REQUIREMENTS: Mapping[str, _Requirement] = {
-    "connect/timeout_ms": _require_session_value(CONNECT_TIMEOUT_MS),
-    "connect/exit_on_failure": _require_session_value(CONNECT_EXIT_ON_FAILURE),
-    "listen/timeout_ms": _require_session_value(LISTEN_TIMEOUT_MS),
-    "listen/exit_on_failure": _require_session_value(LISTEN_EXIT_ON_FAILURE),
+    "connect/timeout_ms": _require_session_value(_CONNECT_TIMEOUT_MS),
+    "connect/exit_on_failure": _require_session_value(_CONNECT_EXIT_ON_FAILURE),
+    "listen/timeout_ms": _require_session_value(_LISTEN_TIMEOUT_MS),
+    "listen/exit_on_failure": _require_session_value(_LISTEN_EXIT_ON_FAILURE),
     "scouting/multicast/enabled": _MUST_BE_OFF,
     "scouting/gossip/enabled": _MUST_BE_OFF,
     **{
         f"{_TX}/queue/size/{queue}": _require_minimum(
             BATCHES, f"{BATCHES}: a burst of catch-up ticks must fit into the queue"
         )
-        for queue in QUEUES
+        for queue in _QUEUES
     },
     f"{_TX}/queue/congestion_control/drop/wait_before_drop": _require_value(
         0, "0: a loop never waits for room"
@@ -273,7 +273,7 @@ REQUIREMENTS: Mapping[str, _Requirement] = {
         True, "true: without batches a burst of catch-up ticks does not fit into the queue"
     ),
     f"{_TX}/batch_size": _require_minimum(
-        BATCH_BYTES, f"{BATCH_BYTES}: a burst of catch-up ticks must fit"
+        _BATCH_BYTES, f"{_BATCH_BYTES}: a burst of catch-up ticks must fit"
     ),
     f"{_TX}/lease": _require_minimum(
         LEASE_MS, f"{LEASE_MS} or more: a stall shorter than that loses no message"
@@ -288,7 +288,7 @@ REQUIREMENTS: Mapping[str, _Requirement] = {
     "qos/network": _MUST_BE_EMPTY,
     "downsampling": _MUST_BE_EMPTY,
     "low_pass_filter": (
-        lambda stated: stated in ([], SIZE_LIMITS),
+        lambda stated: stated in ([], _SIZE_LIMITS),
         "left out: a session sets it",
     ),
 }
@@ -541,7 +541,7 @@ BRIDGE = "bridge"
 PROTOCOLS = ("tls", "quic")
 """Protocols that are permitted with keys."""
 
-MOST_REPLY_BYTES = 8_388_608
+_MOST_REPLY_BYTES = 8_388_608
 """Largest reply that is accepted, in bytes: a reply with records that are sent again."""
 MOST_SESSIONS = 64
 """Largest number of connections of a member with keys."""
@@ -570,7 +570,7 @@ class _Role(NamedTuple):
     publishes_to: tuple[str, ...] = ()
 
 
-SITE_ROLE = _Role(
+_SITE_ROLE = _Role(
     publishes=(
         topics.SAMPLE,
         topics.STATE,
@@ -637,7 +637,7 @@ def describe_role(member: str) -> list[str]:
     """
     if member == ROUTER:
         return ["forwards the messages of all members, whatever they contain"]
-    role = ROLES.get(member, SITE_ROLE)
+    role = ROLES.get(member, _SITE_ROLE)
     orders = [channel for channel in role.queries if channel in (topics.SET, topics.STOP)]
     to_others = [_CHANNEL_WORDS[channel] for channel in (*role.publishes_to, *orders)]
     lines = []
@@ -665,7 +665,7 @@ def make_access_rules(members: Sequence[str]) -> dict[str, Any]:
             keys = [f"{topics.ROOT}/**"]
             member_rules = [_make_rule(["ingress", "egress"], _ALL_MESSAGES, keys)]
         else:
-            member_rules = list(_derive_rules(member, ROLES.get(member, SITE_ROLE)))
+            member_rules = list(_derive_rules(member, ROLES.get(member, _SITE_ROLE)))
         # A role without channels of some kind gives a rule without keys.
         member_rules = [rule for rule in member_rules if rule["key_exprs"]]
 
@@ -685,8 +685,8 @@ def make_access_rules(members: Sequence[str]) -> dict[str, Any]:
     return {
         "access_control": {**control, "subjects": subjects, "policies": policies},
         "low_pass_filter": [
-            *SIZE_LIMITS,
-            _limit_sizes("replies", ["reply"], MOST_REPLY_BYTES),
+            *_SIZE_LIMITS,
+            _limit_sizes("replies", ["reply"], _MOST_REPLY_BYTES),
         ],
     }
 
