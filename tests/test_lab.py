@@ -70,7 +70,7 @@ def test_verdicts_of_the_jitter_experiment_are_those_of_the_key(tmp_path: Path) 
     ]
 
 
-ANSWERS = (Path(__file__).parents[1] / "docs" / "lab-answers.md").read_text()
+ANSWERS = (Path(__file__).parents[1] / "docs" / "tutorials" / "lab-answers.md").read_text()
 
 
 def read_groups() -> list[list[float]]:

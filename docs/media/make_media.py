@@ -1,11 +1,12 @@
-"""Makes the pictures of README.md, docs/gallery.md and of the report in docs/first-result.md.
+"""Makes the pictures of README.md, docs/gallery.md and docs/tutorials/first-result.md.
 
 python docs/media/make_media.py [NAME...]
 
-`moving_picture.py` draws that of README.md, and `report_picture.py` that of the report, for which
-Chromium must be installed. A section of the gallery has a picture, as in `![...](img/gallery/wall/contact/contact.png)`, and
-a block of commands, which write `contact/contact.png` into the folder in which they run. NAME is
-the name of such a folder, here `wall`; without one, all pictures are made.
+`moving_picture.py` draws that of README.md, and `report_picture.py` the report of
+first-result.md, for which Chromium must be installed. A section of the gallery has a picture, as
+in `![...](img/gallery/wall/contact/contact.png)`, and a block of commands, which write
+`contact/contact.png` into the folder in which they run. NAME is the name of such a folder, here
+`wall`; without one, all pictures are made.
 
 Invariant:
     - The page is the only list of pictures. A command that a reader copies from it makes the

@@ -1,4 +1,4 @@
-"""Draws the picture of a report in docs/first-result.md: the first screen of the page.
+"""Draws the picture of a report in docs/tutorials/first-result.md: the first screen of the page.
 
 python docs/media/report_picture.py [FILE]
 
