@@ -98,6 +98,11 @@ class ExternalArm:
         self._reported_order = ""
         self._clock = clock
         self._address = address
+        _, session, *_ = address.split("/")
+        self._advice = (
+            "start the arm's program (in Python an ArmClient), or for a robot in ROS: "
+            f"trilat ros2 --session {session} --names FILE"
+        )
 
         # Start of the driver that is followed, and number of its newest measurement.
         self._boot = -1
@@ -126,7 +131,7 @@ class ExternalArm:
         Raises:
             SessionError: No measurement arrived in time.
         """
-        say(f"waiting for its arm on {self._address}")
+        say(f"waiting for its arm on {self._address}: {self._advice}")
         reported: set[str] = set()
         while not stopped():
             self.poll()
@@ -151,6 +156,8 @@ class ExternalArm:
         if self._dropped:
             counts = [f"{count} {reason}" for reason, count in self._dropped.items()]
             text += f"; dropped: {', '.join(counts)}"
+        else:
+            text += f"; {self._advice}"
         return SessionError(f"{text}; see {find_page('external-arm.md')}")
 
     def bind(self, q0_rad: Sequence[float]) -> str:

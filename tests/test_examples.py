@@ -3,6 +3,7 @@
 import itertools
 import math
 import os
+import random
 import re
 import runpy
 import sys
@@ -186,9 +187,17 @@ def test_robot_of_six_joints_follows_a_push_within_its_limits() -> None:
     assert {"stopped", "fault"}.isdisjoint(log["s"].mode)
 
 
-def test_file_of_the_robot_fits_the_scenario_of_six_joints() -> None:
-    scenario = trilat_net.load_scenario(LOOK.with_name("two_operators_six_joints.toml"))
-    table = read_topic_table(str(LOOK.with_name("robot.toml")))
+@pytest.mark.parametrize(
+    ("example", "file"),
+    [
+        ("two_operators_six_joints.toml", "robot.toml"),
+        ("two_operators.toml", "robot_two_joints.toml"),
+        ("external_arm.toml", "robot_two_joints.toml"),
+    ],
+)
+def test_file_of_the_robot_fits_its_scenario(example: str, file: str) -> None:
+    scenario = trilat_net.load_scenario(LOOK.with_name(example))
+    table = read_topic_table(str(LOOK.with_name(file)))
     robot = table.robots["s"]
     refuse_other_robots(table, scenario)
     joints = len(scenario.sites["s"].q0_rad)
@@ -295,6 +304,47 @@ def test_a_program_hands_over_and_back_without_a_step(
     times = re.findall(r"([.\d]+) times", capsys.readouterr().out)
     assert len(times) == 3
     assert max(map(float, times)) <= 1.2
+
+
+def test_recorded_episodes_are_marked_with_their_outcome(tmp_path: Path) -> None:
+    """One has time to arrive, the next one ends while the arm still moves."""
+    example = runpy.run_path(str(LOOK.with_name("record_episodes.py")))
+    scenario = load_scenario("play", {"duration_s": 6.5, "link.delay_ms": 0.0})
+    session = Session.whole(scenario, tmp_path)
+    found: list[bool] = []
+
+    def act(bus: Bus, clock: RelayClock) -> None:
+        def wait_s(time_s: float) -> None:
+            clock.sleep_until(clock.monotonic_ns() + round(time_s * 1e9))
+
+        with (
+            reached(bus, clock) as running,
+            open_hand(bus, clock, SESSION, "m1", scenario) as hand,
+        ):
+            for seconds in (4.0, 0.3):
+                found.extend(
+                    example["record"](
+                        running,
+                        hand,
+                        leads=True,
+                        episodes=1,
+                        seconds=seconds,
+                        draw=random.Random(1),
+                        now_s=lambda: 1e-9 * clock.monotonic_ns(),
+                        wait_s=wait_s,
+                    )
+                )
+
+    session.stranger(act)
+    log = session.run()
+    marks = [event.text for event in log.events if event.kind == "mark"]
+    assert found == [True, False]
+    assert [text.removeprefix("episode reach 1 ") for text in marks] == [
+        "begins",
+        "succeeded",
+        "begins",
+        "failed",
+    ]
 
 
 def test_a_person_takes_over_from_a_policy_that_fails(monkeypatch: pytest.MonkeyPatch) -> None:

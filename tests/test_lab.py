@@ -51,6 +51,25 @@ def test_no_command_of_the_sheet_tells_results_before_they_are_predicted() -> No
     assert not {("scenario", "show"), ("scenario", "list")} & named
 
 
+@pytest.mark.long
+def test_verdicts_of_the_jitter_experiment_are_those_of_the_key(tmp_path: Path) -> None:
+    (block,) = (block for block in BLOCKS if "sim jitter -o jitter.mcap" in block)
+    found = []
+    for _, command, *rest in map(shlex.split, block.splitlines()):
+        if command == "sim":
+            trilat(command, *rest, cwd=tmp_path)
+            log = rest[rest.index("-o") + 1]
+            words = trilat("certify", log, cwd=tmp_path).out.splitlines()[0]
+            found.append(re.split(r"[;,]| m\d", words)[0])
+    assert found == [
+        "ok   settled: decaying",
+        "FAIL not stable: growing",
+        "FAIL not stable: diverged:",
+        "FAIL not stable: diverged:",
+        "open hardly decaying",
+    ]
+
+
 ANSWERS = (Path(__file__).parents[1] / "docs" / "tutorials" / "lab-answers.md").read_text()
 
 

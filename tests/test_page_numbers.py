@@ -347,9 +347,9 @@ PORT_CONDITIONS: dict[str, Make] = {
 }
 LAB: dict[str, Make] = {
     "of these arms are {}, {} and {}, so": lambda: [
-        edge("p_d_margin", "control.d", 0.5, 1.5, {}),
-        edge("p_d_margin_two", "control.d", 1.0, 3.0, {}),
-        edge("p_d_margin", "control.d", 0.8, 2.4, {"dominance": SHARES}),
+        edge("p_d_margin", "control.d", 0.5, 1.5, {"control.K": 12.0}),
+        edge("p_d_margin_two", "control.d", 1.0, 3.0, {"control.K": 12.0}),
+        edge("p_d_margin", "control.d", 0.8, 2.4, {"control.K": 12.0, "dominance": SHARES}),
     ],
     "only the first decays: {} rad at 38 s": lambda: seen(
         "jitter", "error_peak_rad", (38, 40, "")

@@ -294,6 +294,10 @@ The time of the comparison grows faster than the product of their number and the
 """
 
 
+_UNIT_ENDINGS = ("deg", "hz", "kg", "m", "ms", "n", "nm", "ns", "rad", "s", "us")
+"""Units at the end of keys, in small letters."""
+
+
 def suggest_nearest(word: str, valid: Sequence[str], elsewhere: Sequence[str] = ()) -> str:
     """Suggests the valid word that is most similar to an unknown word.
 
@@ -334,6 +338,11 @@ def find_nearest(word: str, valid: Sequence[str], elsewhere: Sequence[str] = ())
             last = path.rpartition(".")[2] if paths is elsewhere else path
             if len(last) <= MOST_LETTERS:
                 words.setdefault(last.casefold(), path)
+        # Users forget the unit at the end of a key: "delay" and "dely" mean "delay_ms".
+        for last, path in list(words.items()):
+            name, _, unit = last.rpartition("_")
+            if name and unit in _UNIT_ENDINGS:
+                words.setdefault(name, path)
         choices.append(words)
 
     sought = word.casefold()

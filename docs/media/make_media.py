@@ -1,10 +1,12 @@
-"""Makes the pictures of README.md and docs/gallery.md, each by the commands that stand below it.
+"""Makes the pictures of README.md, docs/gallery.md and docs/tutorials/first-result.md.
 
 python docs/media/make_media.py [NAME...]
 
-A section of the gallery has a picture, as in `![...](img/gallery/wall/contact/contact.png)`, and
-a block of commands, which write `contact/contact.png` into the folder in which they run. NAME is
-the name of such a folder, here `wall`; without one, all pictures are made.
+`moving_picture.py` draws that of README.md, and `report_picture.py` the report of
+first-result.md, for which Chromium must be installed. A section of the gallery has a picture, as
+in `![...](img/gallery/wall/contact/contact.png)`, and a block of commands, which write
+`contact/contact.png` into the folder in which they run. NAME is the name of such a folder, here
+`wall`; without one, all pictures are made.
 
 Invariant:
     - The page is the only list of pictures. A command that a reader copies from it makes the
@@ -84,9 +86,9 @@ def main() -> None:
     """Makes the pictures that the command line names, or all of them."""
     wanted = sys.argv[1:]
     if not wanted:
-        subprocess.run(
-            [sys.executable, Path(__file__).with_name("moving_picture.py")], check=True
-        )
+        for program in ("moving_picture.py", "report_picture.py"):
+            path = Path(__file__).with_name(program)
+            subprocess.run([sys.executable, path], check=True)
     with tempfile.TemporaryDirectory() as folder:
         for picture in read_gallery(PAGE.read_text(encoding="utf-8")):
             if wanted and picture.path.parts[0] not in wanted:

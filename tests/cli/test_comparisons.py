@@ -26,7 +26,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_logs_stand_side_by_side_under_what_differs(logs: Path) -> None:
-    lines = trilat("compare", "a.mcap", "b.mcap", cwd=logs).succeeds().splitlines()
+    lines = trilat("compare", "a.mcap", "b.mcap", "--all", cwd=logs).succeeds().splitlines()
     assert next(line.split() for line in lines if "every link" in line)[2:] == [
         "200",
         "ms",
@@ -35,6 +35,23 @@ def test_logs_stand_side_by_side_under_what_differs(logs: Path) -> None:
     ]
     assert any("RMS spread, undelayed" in line and " rad " in line for line in lines)
     assert all(word not in " ".join(lines) for word in ("better", "best", "winner", "rank"))
+
+
+def test_short_text_has_verdicts_ten_metrics_and_a_conclusion(logs: Path) -> None:
+    files = ("a.mcap", "b.mcap")
+    facts = json.loads(trilat("compare", *files, "--json", cwd=logs).succeeds())
+    brief = trilat("compare", *files, cwd=logs).succeeds().splitlines()
+    full = trilat("compare", *files, "--all", cwd=logs).succeeds().splitlines()
+    indented = [line.split("  ")[1].strip() for line in brief if line.startswith("  ")]
+    rows = [name for name in indented if name]
+    names = [row["name"] for row in facts["rows"]]
+    assert len(rows) == 10
+    assert rows == [name for name in names if name in rows]
+    assert all(any(name in line for line in full) for name in names)
+    for log, (verdict, *_) in facts["remarks"].items():
+        assert sum(f"{log}: {verdict}" in line for line in brief) == 1
+    assert brief[-2].startswith(f"in short: a is {verdict.partition(':')[0]} and b is ")
+    assert f"--all prints all {len(names)} metrics" in brief[-1]
 
 
 @pytest.mark.long
@@ -106,6 +123,7 @@ def test_search_says_its_time_and_its_procedure_and_writes_folder(logs: Path) ->
         ),
         (["a.mcap", "b.mcap", "--force"], ["--force can be used only with --tune SCENARIO"]),
         (["a.mcap", "--tune", "free"], ["--tune makes its own runs"]),
+        (["--tune", "free", "--all"], ["leave it out with --tune"]),
         (["--tune", "fre"], ["no scenario of that name", "free"]),
         (
             ["--tune", "free", "--law", "adaptve"],

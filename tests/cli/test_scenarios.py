@@ -68,7 +68,7 @@ def test_check_says_what_follows_from_a_scenario(tmp_path: Path) -> None:
     assert ": m1 1.279, m2 0.4655, s 1.256" in text
     assert "20000 ticks of m1" in text
     assert "m2->s: 310 ms" in text
-    assert "assumed: " in text
+    assert "chosen here, not in the paper: " in text
 
 
 def test_new_writes_a_valid_template_and_keeps_existing_files(tmp_path: Path) -> None:

@@ -1,11 +1,14 @@
 """What a user meant instead: commands by their synonyms, and keys by the table that has them."""
 
 import re
+import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
 
 from trilat_net.app.cli import _SYNONYMS
+from trilat_net.app.cli.options import find_split_setting
 from trilat_net.errors import find_nearest, suggest_nearest
 
 from .running import trilat, whole_command
@@ -62,6 +65,10 @@ def test_every_synonym_leads_to_a_command() -> None:
     [
         ("delay_ms=400", "delay_ms: unknown key; did you mean 'link.delay_ms'?"),
         ("delay=400", "did you mean 'link.delay_ms'?"),
+        ("link.dely=400", "did you mean 'delay_ms'?"),
+        ("lnk.delay_ms=400", "did you mean 'link'?"),
+        ("contrl.Kd=5", "did you mean 'control'?"),
+        ("sites.m1.rte=500", "did you mean 'rate_hz'?"),
         ("links.delay_ms=400", "did you mean 'link.delay_ms'?"),
         ("Kd=5", "did you mean 'control.Kd'?"),
         ("law=p_d", "did you mean 'control.law'?"),
@@ -76,6 +83,45 @@ def test_an_unknown_key_suggests_the_whole_path(
     override: str, facts: str, tmp_path: Path
 ) -> None:
     trilat("scenario", "check", "paper", "--set", override, cwd=tmp_path).refuses(facts)
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        "dominance.m1={m2=0.1,s=0.9}",
+        "sites.m1.q0_rad=[0.1, 0.2]",
+        "dominance.m1={ m2 = 0.1, s = 0.9 }",
+    ],
+)
+@pytest.mark.parametrize("command", ["sim", "linear"])
+def test_a_setting_that_the_shell_splits_is_to_be_quoted(
+    setting: str, command: str, tmp_path: Path
+) -> None:
+    bash = shutil.which("bash")
+    if bash is None:
+        pytest.skip("needs a shell that expands braces")
+    line = f"printf '%s\\n' --set {setting}"
+    shell = subprocess.run([bash, "-c", line], capture_output=True, text=True, check=True)
+    words = shell.stdout.splitlines()
+    assert len(words) > 2
+    assert find_split_setting(words) == setting
+    said = in_one_line(trilat(command, "paper", *words, cwd=tmp_path).err)
+    assert "put it into quotes" in said
+    assert find_split_setting(["--set", setting, "--force"]) == ""
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--set", "control.Kd=5", "--set", "control.Kp=1"],
+        ["--set", "control.Kd=[3, 4]", "free"],
+        ["--set", "sites.m1.hands=[]"],
+        ["--set"],
+        ["--set", "no form"],
+    ],
+)
+def test_whole_settings_are_left_alone(words: list[str]) -> None:
+    assert find_split_setting(words) == ""
 
 
 def test_the_case_of_a_gain_is_corrected(tmp_path: Path) -> None:

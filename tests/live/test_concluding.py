@@ -47,7 +47,7 @@ def test_a_run_that_diverged_fails_though_its_log_is_sound(
     monkeypatch.setattr(recorder.record_process, "record_session", recorded)
     done = trilat("record", "--session", "x", "--conclude", cwd=tmp_path)
     failed = "".join(re.findall("^FAIL .*$", done.out, re.MULTILINE))
-    assert re.match(r"FAIL stability: not stable: diverged: \w+ joint \d", failed)
+    assert re.match(r"FAIL not stable: diverged: \w+ joint \d", failed)
     assert (tmp_path / "runs" / "x-001" / "report.html").is_file()  # a folder of its own
     done.refuses("run.mcap", "diverged at t = ", code=1)
 

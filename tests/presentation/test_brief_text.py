@@ -66,6 +66,6 @@ def test_short_certificate_keeps_what_speaks_against_stability() -> None:
 def test_short_certificate_is_the_beginning_of_the_long_one() -> None:
     certificate = runs.run("paper", {"duration_s": 2.0, "rate_hz": 100}).certificate
     *blocks, last = compose(certificate, brief=True)
-    texts = [line.text for line in describe_certificate(certificate)]
-    assert [block.lines()[0].split(" ", 1)[1].strip() for block in blocks] == texts
+    lines = [line.print_form.lines() for line in describe_certificate(certificate)]
+    assert [block.lines() for block in blocks] == lines
     assert last.lines() == ["--all prints 9 premises and the energies too"]

@@ -10,7 +10,7 @@ import pytest
 from tests.analysis import logs
 from tests.analysis.certificate import runs
 from trilat_net.analysis.certificate.stability_certificate import certify
-from trilat_net.analysis.run_end import EndBehaviour
+from trilat_net.analysis.run_end import EndBehaviour, Stability
 from trilat_net.analysis.stability_decision import LoopRoots
 from trilat_net.presentation.certificate_text import (
     describe_certificate,
@@ -91,6 +91,27 @@ def test_lines_give_the_judgement_and_then_verdict_end_and_balance(
     texts = [line.text for line in said]
     of_end = [] if name == "diverged" else [f"e and qd: {found.end.text}"]
     assert texts[1 : 1 + len(of_v + of_end)] == of_v + of_end
+
+
+@pytest.mark.parametrize("behaviour", EndBehaviour)
+@pytest.mark.parametrize("name", LOGS)
+@pytest.mark.parametrize("root_per_s", [-0.25, 0.25])
+def test_the_first_line_repeats_no_word_and_agrees_with_its_judgement(
+    name: str, behaviour: EndBehaviour, root_per_s: float
+) -> None:
+    found = certify(LOGS[name]())
+    word = "stable" if root_per_s < 0.0 else "unstable"
+    roots = LoopRoots(word, root_per_s, True, f"this rest: {word}, {root_per_s} /s")
+    judged = replace(found, end=found.end._replace(behaviour=behaviour), roots=roots)
+    lines = describe_certificate(judged)
+    (first,) = lines[0].print_form.lines()
+    assert not re.search(r"\b(\w+)\W+\1\b", first)
+    if judged.stability is Stability.STABLE:
+        assert "undecided" not in first
+        assert "too short" not in first
+    # A judgement against stability rests on a line that is marked so.
+    if judged.stability is Stability.NOT_STABLE and behaviour is not EndBehaviour.DIVERGED:
+        assert "FAIL" in [line.mark for line in lines[1:]]
 
 
 def test_divergence_is_said_once_with_its_joint() -> None:

@@ -197,7 +197,11 @@ def test_marks_divide_a_log_into_episodes(tmp_path: Path) -> None:
     assert tasks.index.tolist() == ["stack the cups"]
 
 
-def test_a_log_without_marks_stays_one_episode(tmp_path: Path) -> None:
+def test_a_log_without_marks_stays_one_episode_and_that_is_said(tmp_path: Path) -> None:
+    settings = {"episodes": "marks"}
+    summary = Exporter("lerobot", tmp_path / "said", settings=settings).export(log())
+    assert f"no episode is marked in {log().source}" in summary
+    assert "no episode is marked" not in Exporter("lerobot", tmp_path / "log").export(log())
     folder = exported(tmp_path, log(), episodes="marks")
     assert read(folder)["next.done"].to_list() == 179 * [False] + [True]
     assert "next.success" not in read(folder).columns
@@ -207,6 +211,22 @@ def test_an_episode_outside_the_records_is_refused(tmp_path: Path) -> None:
     late = logs.rewritten(log(), others=[told("episode one begins", 7.0)])
     with pytest.raises(LogError, match="no marked episode contains a time"):
         exported(tmp_path, late, episodes="marks")
+
+
+def test_the_reference_of_the_slave_is_an_observation_on_request(tmp_path: Path) -> None:
+    folder = exported(tmp_path, log(), observations="reference")
+    names = info(folder)["features"]["observation.state"]["names"]
+    assert names[:2] + names[4:] == ["c.q1.pos", "c.q2.pos", "c.q1.ref", "c.q2.ref"]
+    state = read(folder)["observation.state"].to_numpy()
+    assert np.array_equal(state[:, 4:], newest(log(), "c", "q_des", 180, 30))
+
+
+def test_settings_that_are_none_say_what_they_must_be(tmp_path: Path) -> None:
+    for value in ("thirty", "2.5", ""):
+        with pytest.raises(
+            UsageError, match=f"fps of lerobot must be a whole number, not '{value}'"
+        ):
+            Exporter("lerobot", tmp_path / "set", settings={"fps": value})
 
 
 def test_the_environment_state_is_the_state(tmp_path: Path) -> None:

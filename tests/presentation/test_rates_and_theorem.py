@@ -11,17 +11,22 @@ from trilat_net.presentation.certificate_text import describe_certificate, descr
 
 
 @pytest.mark.parametrize(
-    ("factor", "remarks"), [(1.0, 0), (1.1, 0), (2.0, 1), (0.5, 1), (-1, 1)]
+    ("factor", "remarks"), [(1.0, 0), (1.0 + 1e-6, 0), (1.1, 1), (0.5, 1), (-1, 1)]
 )
-def test_rates_that_differ_are_explained(factor: float, remarks: int) -> None:
+@pytest.mark.parametrize("exact", [True, False])
+def test_rates_that_print_differently_are_explained(
+    factor: float, remarks: int, *, exact: bool
+) -> None:
     found = certify_run(runs.run("paper", {"duration_s": 16.0, "rate_hz": 100}).log)
     assert found.twins is not None
     assert found.twins.worst is not None
     rate_per_s = factor * found.twins.worst.rate_per_s
-    roots = LoopRoots("stable", rate_per_s, True, "this rest: stable")
+    roots = LoopRoots("stable", rate_per_s, exact, "this rest: stable")
     lines = describe_certificate(replace(found, roots=roots))
-    told = [line for line in lines if line.text.startswith("the two rates are both")]
+    told = [line for line in lines if line.text.startswith("of the two rates")]
     assert [line.mark for line in told] == ["note"] * remarks
+    accuracy = "roots is exact" if exact else "roots is an approximation"
+    assert all(accuracy in line.text and "is measured" in line.text for line in told)
 
 
 def test_a_theorem_that_does_not_apply_has_not_passed() -> None:

@@ -1,15 +1,19 @@
 """An experiment as a Gymnasium environment: checked by it, a function of its seed, and saved as logs."""
 
+import warnings
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
+import polars as pl
 import pytest
 from gymnasium.utils.env_checker import check_env
 
 import trilat_net as tn
+from trilat_net.analysis.dominance_history import find_program
 from trilat_net.errors import ScenarioError, UsageError
+from trilat_net.presentation.export import Exporter
 from trilat_net.studies.gym_environment import (
     ENV_ID,
     Judgement,
@@ -95,6 +99,53 @@ def test_an_episode_is_saved_as_a_log_that_verifies(tmp_path: Path) -> None:
         assert np.array_equal(log["m2"].q[20 * n], observation["q"])
     with pytest.raises(UsageError, match="exists"):
         env.save(tmp_path / "episode.mcap")
+
+
+def test_a_saved_episode_says_that_a_program_moved_its_arm(tmp_path: Path) -> None:
+    """So that a dataset takes the action of the program, also at equal shares."""
+    env = tn.make_env("paper", BENT, user="m2", duration_s=1)
+    episode(env, 3, steps=5)
+    log = tn.open_log(env.save(tmp_path / "episode.mcap"))
+    (taken,) = [event for event in log.events if event.kind == "hand"]
+    assert (taken.member, taken.text) == ("m2", "m2: policy takes hold at t = 0.000 s")
+    assert find_program(log) == "m2"
+    assert find_program(tn.simulate("paper", duration_s=0.1)) == ""
+    summary = Exporter("lerobot", tmp_path / "set").export(log)
+    assert "the program is m2 (found in the log)" in summary
+    frames = pl.read_parquet(tmp_path / "set" / "data" / "chunk-000" / "file-000.parquet")
+    assert np.array_equal(frames["action"].to_numpy(), frames["action.m2"].to_numpy())
+    assert not frames["intervention"].any()
+
+
+@pytest.mark.parametrize(
+    ("vary", "words"),
+    [
+        ({"link.dely_ms": (0.0, 300.0)}, "did you mean 'delay_ms'"),
+        ({"link.delay_ms": (0.0, -300.0)}, "link.delay_ms"),
+        ({"seeds": [1, 2]}, "did you mean 'seed'"),
+        ({"link.delay_ms": []}, "link.delay_ms needs a pair of bounds or a list"),
+    ],
+)
+def test_varied_keys_are_checked_before_the_first_episode(
+    vary: dict[str, Any], words: str
+) -> None:
+    with pytest.raises((ScenarioError, UsageError), match=words):
+        tn.make_env("paper", BENT, duration_s=1, vary=vary)
+
+
+@pytest.mark.parametrize("normalize", [False, True])
+def test_clipped_actions_are_counted_and_warned_of_once(*, normalize: bool) -> None:
+    env = tn.make_env("paper", BENT, mode="force", duration_s=1, normalize=normalize)
+    _, info = env.reset(seed=1)
+    assert info["clipped_actions"] == 0
+    bound = env.action_space.high
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        counts = [env.step(factor * bound)[4] for factor in (1.0, 1.5, -2.0, 0.5)]
+    assert [info["clipped_actions"] for info in counts] == [0, 1, 2, 2]
+    (warning,) = caught
+    assert "is clipped" in str(warning.message)
+    assert env.reset()[1]["clipped_actions"] == 0
 
 
 def test_delay_is_what_the_user_knows_by() -> None:

@@ -22,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.life.live_hand import TAKEN
 from ..core.links.dominance import find_reach, perron_vector
 from ..core.step.ticks import DominanceRamp
 from ..core.step.vectors import Array
@@ -29,6 +30,7 @@ from ..errors import UsageError
 from ..log.log_reader import Log
 from ..log.record_columns import Ints
 from ..scenario import Scenario
+from ..scenario.operators.program_hand import POLICY, ProgramHand
 
 RAMP_TIME_TOLERANCE_S = 5e-10
 """Half of the nanosecond to which the starts and ends of ramps are rounded, in s."""
@@ -162,6 +164,31 @@ class UserShares(NamedTuple):
     shares: Array
     leader: Ints
     program: int
+
+
+def find_program(log: Log) -> str:
+    """Returns the user whose arm a program moved in a run.
+
+    It is the last user with a hand of kind "own", or otherwise the last user whose arm a policy
+    held, through the LeRobot plugin or in an environment.
+
+    Args:
+        log: Log of the run.
+
+    Returns:
+        Name of the user. Empty if no program moved an arm.
+    """
+    users = find_users(log.scenario)[1]
+    with_policy = []
+    with_program = []
+    for user in users:
+        begin = f"{user}: {POLICY} {TAKEN} "
+        if any(event.kind == "hand" and event.text.startswith(begin) for event in log.events):
+            with_policy.append(user)
+        hands = log.scenario.sites[user].hands
+        if any(isinstance(hand, ProgramHand) for hand in hands):
+            with_program.append(user)
+    return ["", *with_policy, *with_program][-1]
 
 
 def find_user_shares(scenario: Scenario, alpha: Array, program: str = "") -> UserShares:

@@ -235,7 +235,8 @@ class RunEnd(NamedTuple):
             end_error += f" of {self.end_error_where}"
         if self.end_speed_where:
             end_speed += f" of {self.end_speed_where}"
-        end = f"largest {end_error} and {end_speed} in the last second"
+        part = "in the last second" if self.lasts_s >= 1.0 else "in the whole record"
+        end = f"largest {end_error} and {end_speed} {part}"
         if behaviour is EndBehaviour.CONVERGED:
             if self.end_error_rad > SETTLED_ERROR_RAD:
                 return f"{LASTING_ERRORS}: {end}"

@@ -358,7 +358,7 @@ def _explain_open(run: RunFindings) -> str:
     if run.twins is None:
         return "no proof exists, and no run with small pushes was made"
     if not run.twins.pushes:
-        return f"no proof exists, and there are no {run.twins.text}"
+        return f"no proof exists, and no pushes were judged: {run.twins.why}"
     if run.end.stability is Stability.SETTLED:
         return run.twins.text
     if run.twins.judged_bursts < LEAST_BURSTS:

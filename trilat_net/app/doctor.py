@@ -431,13 +431,20 @@ def _run_in_process(code: str) -> Any:
         code: The code.
 
     Returns:
-        The JSON value in the last line that the process prints. None if the process fails.
+        The JSON value in the last line that the process prints.
+
+    Raises:
+        ChildProcessError: The process failed. The message gives the reason.
     """
     completed = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, encoding="utf-8", check=False
     )
     if completed.returncode:
-        return None
+        lines = completed.stderr.strip().splitlines() or ["it printed no reason"]
+        ending = f"exit code {completed.returncode}"
+        if completed.returncode < 0:
+            ending = f"ended by signal {-completed.returncode}"
+        raise ChildProcessError(f"{ending}: {lines[-1]}")
     return json.loads(completed.stdout.splitlines()[-1])
 
 
@@ -456,9 +463,11 @@ def examine_rights() -> Iterator[DoctorFinding]:
     Yields:
         One finding per setting. A single warning if the settings could not be tried.
     """
-    obtained: dict[str, str] | None = _run_in_process(_RIGHTS_CODE)
-    if obtained is None:
-        yield DoctorFinding("rights", "warn", "could not be tried")
+    try:
+        obtained: dict[str, str] = _run_in_process(_RIGHTS_CODE)
+    except ChildProcessError as error:
+        text = f"could not be tried, the process that tries them failed ({error})"
+        yield DoctorFinding("rights", "warn", text)
         return
     wanted = {"scheduling": "SCHED_FIFO", "memory": "locked", "timer_slack": "1 ns"}
     remedy = "ticks will be late by milliseconds under load: see compose.realtime.yaml"
@@ -647,9 +656,11 @@ def examine_rate() -> DoctorFinding:
             "rate", "warn", "not measured: the core is not yet compiled, see below"
         )
 
-    results: list[tuple[int, int, int]] | None = _run_in_process(_RATES_CODE)
-    if results is None:
-        return DoctorFinding("rate", "warn", "could not be measured")
+    try:
+        results: list[tuple[int, int, int]] = _run_in_process(_RATES_CODE)
+    except ChildProcessError as error:
+        text = f"could not be measured, the process that measures it failed ({error})"
+        return DoctorFinding("rate", "warn", text)
 
     # All rates before the last one were not achieved.
     rate_hz, late_us, largest_us = results[-1]

@@ -46,7 +46,13 @@ from trilat_net.net.connection import Connection
 from trilat_net.net.discovery import find_members, list_past_events
 from trilat_net.net.membership import read_messages, read_records
 from trilat_net.net.messages import Event, Info, LinkStats
-from trilat_net.net.ros2_graph import Attachment, Refusals, Ros2Graph, TopicPublisher
+from trilat_net.net.ros2_graph import (
+    ROUTER_ADVICE,
+    Attachment,
+    Refusals,
+    Ros2Graph,
+    TopicPublisher,
+)
 from trilat_net.net.zenoh_bus import RouterSilent
 from trilat_net.net.zenoh_config import BRIDGE
 from trilat_net.process import LOOP_NICE, raise_priority
@@ -889,7 +895,7 @@ def serve_ros2(
                 graph = open_graph(Refusals(say))
             except RouterSilent as silent:
                 if not is_announced:
-                    say(f"{silent}: waiting for it")
+                    say(f"{silent}: waiting for it; {ROUTER_ADVICE}")
                 is_announced = True
                 clock.sleep_until(clock.monotonic_ns() + LOOK_PERIOD_NS)
                 continue

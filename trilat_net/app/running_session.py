@@ -11,13 +11,15 @@ Invariant:
     - Each call opens a connection to the session, and closes it at its end, as the command of
       the same name does. A `RunningSession` therefore remains usable if sites come and go
       between calls.
+    - In a `with` block over a `RunningSession`, all calls use one connection, which the end of
+      the block closes.
 """
 
 import subprocess
 import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -156,6 +158,25 @@ class RunningSession:
         self._connection = connection
         self._bus = bus
         self._clock = clock or SystemClock()
+        # For each `with` block that is entered: how to leave it, and the connection before it.
+        self._blocks: list[tuple[ExitStack, Bus | None]] = []
+
+    def __enter__(self) -> "RunningSession":
+        """Opens one connection to the session, which all calls in the `with` block use.
+
+        Raises:
+            SessionError: No site of the session replies in time.
+        """
+        with ExitStack() as opening:
+            bus = opening.enter_context(self.reach(""))
+            self._blocks.append((opening.pop_all(), self._bus))
+        self._bus = bus
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Closes the connection of the `with` block. The session itself goes on."""
+        opened, self._bus = self._blocks.pop()
+        opened.close()
 
     @contextmanager
     def reach(
@@ -741,8 +762,11 @@ def session(
 ) -> RunningSession:
     """Returns an object that controls and observes a running session.
 
-    Its methods do the same as `trilat stop`, `set` and `ping`.
+    Its methods do the same as `trilat stop`, `set` and `ping`. Each of them opens a connection
+    of its own, unless the object is used in a `with` statement.
 
+    >>> with tn.session("paper") as paper:  # doctest: +SKIP
+    ...     paper.mark("look here")
     >>> paper = tn.session("paper")  # doctest: +SKIP
     >>> paper.set_link("m1->s", delay_ms=350)  # doctest: +SKIP
     >>> paper.stop("s"), paper.enable("s"), paper.ping()  # doctest: +SKIP

@@ -14,10 +14,10 @@ Invariant:
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
-from ..errors import ScenarioError, count_nouns
+from ..errors import ScenarioError, count_nouns, join_arguments
 from ..log.accounting import MIN_COVERAGE, describe_unknown_ends
 from ..log.findings import CheckReport, Finding
 from ..log.log_reader import Log, open_log
@@ -131,6 +131,8 @@ def run_log_checks(
     """
     result = verify(log, progress, min_coverage=min_coverage, resume_every=resume_every)
     findings = list(_check_log(log, result, virtual=virtual, progress=progress))
+    if not resume_every:
+        findings = [_add_memory_advice(finding, log, result) for finding in findings]
     return LogCheckReport(log, result, findings)
 
 
@@ -346,6 +348,31 @@ def _check_execution(result: VerifyResult, recorded: str) -> Finding:
     if result.first:
         text += f"; {result.differing} differ, the first: {result.first}"
     return Finding("executed again", text, result.agreed)
+
+
+def _add_memory_advice(finding: Finding, log: Log, result: VerifyResult) -> Finding:
+    """Adds to a finding how to check that a user's law keeps all of its memory in the records.
+
+    A law may remember something that its records lack, such as an attribute of its object. A
+    run that is executed as a whole repeats this memory too, so that all records agree. A site
+    that is restored from its records does not have it.
+
+    Args:
+        finding: Finding of a check.
+        log: Log of the run.
+        result: Result of executing the log again, without restoring sites from records.
+
+    Returns:
+        The finding, with an advice if it is about whole runs of users' laws that agree.
+    """
+    files = list(dict.fromkeys(str(law.file) for law in find_user_laws(log.scenario)))
+    is_about_runs = finding.check == "executed again" and finding.passed
+    if not (files and is_about_runs and result.whole_run) or result.withheld:
+        return finding
+    laws = " ".join(f"--law {file}" for file in files)
+    command = f"trilat verify {join_arguments(log.sources)} {laws} --resume-every 100"
+    advice = f"memory of your law that the records lack would not show here, but by: {command}"
+    return replace(finding, text=f"{finding.text}; {advice}")
 
 
 def _join_names(names: Sequence[str]) -> str:

@@ -15,13 +15,14 @@ Invariant:
 
 import bisect
 import io
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
 
 from .. import process
+from ..core.life.live_hand import TAKEN
 from ..core.step.site_step import Site
 from ..core.step.ticks import (
     NS_PER_S,
@@ -53,7 +54,7 @@ from ..net.wire import encode, encode_state
 from ..recorded_change import count_skipped_ticks
 from ..scenario import Scenario
 from ..scenario.imported_code import ImportedLaw
-from ..scenario.operators.program_hand import make_hand_players
+from ..scenario.operators.program_hand import POLICY, make_hand_players
 from ..scenario.own_plant import PlantPlayer, make_plant_players
 from ..scenario.validate import refuse_external_arms
 from .resumption import read_output, select_peer_channels
@@ -560,6 +561,7 @@ def write_virtual_log(
     *,
     hands: HandTracks = {},  # noqa: B006
     commands: ChangeSchedule = {},  # noqa: B006
+    policies: Collection[str] = (),
 ) -> bool:
     """Simulates a scenario in virtual time, and writes the log of the run to a stream.
 
@@ -576,6 +578,7 @@ def write_virtual_log(
         hands: Actions of live operators, see `execute_virtual`. They replace the programs that
             the scenario names as operators.
         commands: Changes that take effect during the run.
+        policies: Sites whose live operator is a trained program. An event of each says so.
 
     Returns:
         True if all sites stayed within their limits, False if one diverged.
@@ -613,6 +616,9 @@ def write_virtual_log(
             for site, arrivals, output in ticks:
                 if site.name not in members:
                     members[site.name] = _VirtualChannels(scenario, site, writer)
+                    if site.name in policies:
+                        taken = f"{site.name}: {POLICY} {TAKEN} at t = 0.000 s"
+                        members[site.name].write_hand_events([(0, taken)])
                 members[site.name].write_tick(arrivals, output)
                 if site.name in hand_players:
                     members[site.name].write_hand_events(hand_players[site.name].news)
@@ -647,6 +653,7 @@ def record_virtual(
     stopped: Callable[[], bool] = lambda: False,
     views_hz: float = VIZ_HZ,
     hands: HandTracks = {},  # noqa: B006
+    policies: Collection[str] = (),
 ) -> bool:
     """Simulates a scenario in virtual time, and writes the log of the run to a file.
 
@@ -657,6 +664,7 @@ def record_virtual(
         stopped: Function that is called after each tick. The run ends if it returns True.
         views_hz: Rate of the additional channels for viewers, in Hz.
         hands: Actions of live operators, see `execute_virtual`.
+        policies: Sites whose live operator is a trained program. An event of each says so.
 
     Returns:
         True if all sites stayed within their limits, False if one diverged.
@@ -669,7 +677,12 @@ def record_virtual(
     """
     with LogFile(path, force=force) as stream:
         return write_virtual_log(
-            scenario, stream, stopped=stopped, views_hz=views_hz, hands=hands
+            scenario,
+            stream,
+            stopped=stopped,
+            views_hz=views_hz,
+            hands=hands,
+            policies=policies,
         )
 
 

@@ -409,6 +409,13 @@ class TopicPublisher:
         self._declared.put(data, attachment=attachment.encode())
 
 
+ROUTER_ADVICE = (
+    "start it by: ros2 run rmw_zenoh_cpp rmw_zenohd, or without ROS by: "
+    "trilat router --listen tcp/127.0.0.1:7447"
+)
+"""How to start the router that ROS needs."""
+
+
 class Ros2Graph:
     """A ROS 2 node of this program, with its publishers, subscriptions and services.
 

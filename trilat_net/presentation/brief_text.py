@@ -24,7 +24,7 @@ from .certificate_text import (
     describe_in_words,
     select_premises,
 )
-from .result_text import MARKS, Block, MarkedText, TextTable
+from .result_text import Block, TextTable
 from .untrusted_text import sanitize
 
 MOST_LINES = 10
@@ -65,7 +65,7 @@ def compose_key_reasons(certificate: Certificate) -> Iterator[Block]:
     lines = describe_certificate(certificate)
     judgement, *chosen = _choose_lines(lines)
     for line in (judgement, *describe_in_words(certificate), *chosen):
-        yield MarkedText(MARKS[line.mark], line.text)
+        yield line.print_form
     premises = len(select_premises(certificate))
     counts = {"more line": max(0, len(lines) - MOST_LINES), "premise": premises}
     parts = [count_nouns(count, noun) for noun, count in counts.items() if count]

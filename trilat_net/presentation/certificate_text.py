@@ -42,8 +42,6 @@ _SOURCE_NAMES = {
 }
 """Texts of the sources of energy other than links, by their names in a balance."""
 
-_SAME_RATE = 0.2
-"""Largest relative difference of two rates that needs no explanation."""
 _HOLDS = {True: "holds", False: "fails", None: "undecided"}
 
 
@@ -58,7 +56,7 @@ def compose_certificate(certificate: Certificate) -> Iterator[Block]:
     """
     judgement, *reasons = describe_certificate(certificate)
     for line in (judgement, *describe_in_words(certificate), *reasons):
-        yield MarkedText(MARKS[line.mark], line.text)
+        yield line.print_form
 
     observed = certificate.observed
     premises = select_premises(certificate)
@@ -135,6 +133,11 @@ class CertificateLine(NamedTuple):
     mark: str
     text: str
 
+    @property
+    def print_form(self) -> MarkedText:
+        """The sentence behind its mark, without a first word that repeats the mark."""
+        return MarkedText(MARKS[self.mark], self.text.removeprefix(f"{self.mark}: "))
+
 
 def describe_certificate(certificate: Certificate) -> list[CertificateLine]:
     """Returns the judgement of a certificate, and then its reasons, each as a marked sentence.
@@ -162,6 +165,8 @@ def describe_certificate(certificate: Certificate) -> list[CertificateLine]:
         # Roots of an approximation cannot show stability.
         is_doubtful = roots.verdict == "stable" and not roots.exact
         mark = "note" if is_doubtful else _ROOT_MARKS.get(roots.verdict, "note")
+        if roots.is_refutation and certificate.stability is Stability.NOT_STABLE:
+            mark = "FAIL"
         lines.append(CertificateLine(mark, roots.text))
     twins = certificate.twins
     if twins is not None:
@@ -198,7 +203,10 @@ def explain_judgement(certificate: Certificate) -> str:
     if certificate.end.behaviour is EndBehaviour.DIVERGED or stability is Stability.OPEN:
         return ""
     if stability is Stability.SETTLED:
-        return "every small push died away and the arms came to rest, but no proof exists"
+        return (
+            "every small push died away and the arms came to rest, but no proof exists; "
+            "`trilat certify --accept settled` takes this for a success"
+        )
     pace = describe_pace(certificate)
     if stability is Stability.NOT_STABLE:
         return pace or "the motion of this loop does not come to rest"
@@ -265,7 +273,7 @@ def describe_theorem(certificate: Certificate) -> list[str]:
 
 
 def _compare_rates(roots: LoopRoots | None, twins: TwinGrowth) -> list[CertificateLine]:
-    """Returns why the rate of the pushes is not that of the roots, if the rates differ.
+    """Returns why the rate of the pushes is not that of the roots, if they print differently.
 
     Both are rates of amplitudes. The roots are about small motions near one pose, whereas
     pushes follow the motion of the run for a limited time.
@@ -282,13 +290,13 @@ def _compare_rates(roots: LoopRoots | None, twins: TwinGrowth) -> list[Certifica
         return []
     if twins.departure is not None or worst.factor == 0.0 or math.isnan(worst.rate_per_s):
         return []  # the text about the pushes states no rate of a push
-    difference = abs(roots.rate_per_s - worst.rate_per_s)
-    if difference <= _SAME_RATE * max(abs(roots.rate_per_s), abs(worst.rate_per_s)):
+    if f"{roots.rate_per_s:+.3g}" == f"{worst.rate_per_s:+.3g}":
         return []
+    accuracy = "exact" if roots.exact else "an approximation"
     text = (
-        "the two rates are both of amplitudes, exp(rate t), yet not of one motion: the roots "
-        "are about small motions near the final pose, in the long run; pushes were followed "
-        f"along this run, from {twins.from_s:.4g} to {twins.to_s:.4g} s"
+        f"of the two rates, exp(rate t), that of the roots is {accuracy}, for small motions "
+        "near the final pose; that of the pushes is measured along this run, from "
+        f"{twins.from_s:.4g} to {twins.to_s:.4g} s"
     )
     return [CertificateLine("note", text)]
 
@@ -329,7 +337,12 @@ def describe_judgement(certificate: Certificate) -> str:
     if certificate.decision.is_too_short:
         return f"{certificate.stability}: {'; '.join(certificate.reasons)}"
     reasons = []
+    roots = certificate.roots
+    rests_on = certificate.decision.rests_on
+    is_based_on_roots = roots is not None and rests_on == roots.describe_as_basis()
     for reason in certificate.reasons:
+        if is_based_on_roots and roots is not None and reason == roots.text:
+            continue  # the headline names these roots already
         new = reason.removeprefix(certificate.end.text).removeprefix("; ")
         if new:
             reasons.append(new)

@@ -31,6 +31,7 @@ from ..log.log_reader import Log
 from ..log.mcap_reader import Progress
 from ..log.site_log import SiteLog
 from ..scenario.code_consent import may_run_user_laws
+from ..scenario.expect import END_WINDOW_S
 from ..scenario.imported_code import allowed_code
 from ..workers import worker_pool
 from . import terminal_output
@@ -73,11 +74,8 @@ class Conclusion(CheckReport):
         They are the judgement about stability and its meaning, the checks of the log, the table
         of sites, the notes, and the paths of the files.
         """
-        # An open judgement begins with the word of its mark.
-        judgement = self.verdict.text.removeprefix("open: ")
-        yield MarkedText(MARKS[self.verdict.mark], f"stability: {judgement}")
-        for line in self.meaning:
-            yield MarkedText(MARKS[line.mark], line.text)
+        for line in (self.verdict, *self.meaning):
+            yield line.print_form
         for finding in self.findings:
             failed = "FAIL" if finding.judged else "open"
             mark = "ok" if finding.passed else failed
@@ -237,14 +235,17 @@ _TIMING_HEADERS = ("late p50 us", "p99", "max", "busy p50 us", "p99")
 def _tabulate_sites(log: Log, *, is_timed: bool) -> TextTable:
     """Returns a table with a row per site: records, timing, and largest error at the end.
 
-    The error is the largest one of the last second, of the joint that the table names.
+    The error is the largest one of the last second, of the joint that the table names. If the
+    run was shorter, it is that of the whole run.
 
     Args:
         log: Log of the run.
         is_timed: False to leave out the timing. Loops in virtual time are never late.
     """
     timing = _TIMING_HEADERS if is_timed else ()
-    headers = (*_HEADERS, *timing, f"max|e| last s, {shared_unit(log)}", "of")
+    has_second = any(log[site].t_s[-1] >= END_WINDOW_S for site in log.sites if len(log[site]))
+    part = " last s" if has_second else ""
+    headers = (*_HEADERS, *timing, f"max|e|{part}, {shared_unit(log)}", "of")
     rows = []
     for site in log.sites:
         records = log[site]

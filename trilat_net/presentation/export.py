@@ -169,10 +169,14 @@ def _parse_settings(
         if not types:
             valid = f"{form} has no settings"
         raise UsageError(f"{form} has no setting {unknown[0]!r}; {valid}")
-    try:
-        return {name: types[name](str(value)) for name, value in settings.items()}
-    except ValueError as error:
-        raise UsageError(f"a setting of {form} cannot be read: {error}") from None
+    values = {}
+    for name, value in settings.items():
+        try:
+            values[name] = types[name](str(value))
+        except ValueError:
+            kind = {int: "a whole number", float: "a number"}.get(types[name], "a text")
+            raise UsageError(f"{name} of {form} must be {kind}, not {str(value)!r}") from None
+    return values
 
 
 def store_tables(

@@ -32,6 +32,7 @@ from ..errors import count_nouns, join_words
 from ..log.findings import Finding
 from ..log.log_reader import Log
 from ..results import JsonObject
+from ..scenario.expect import END_WINDOW_S
 from .certificate_text import describe_pace
 from .page_html import NO_NUMBER, format_cell, render_details
 from .result_text import escape_text
@@ -275,7 +276,8 @@ def _describe_errors(log: Log, sites: Sequence[str], place: str) -> _KeyNumber:
     known = [error for error in last_errors if error is not None]
     last = max(known, key=lambda error: error.value, default=None)
     if last is not None:
-        detail += f"; {last.value:.3g} {unit} in the last second, of {last.joint}"
+        part = "in the last second" if log[last.site].t_s[-1] >= END_WINDOW_S else "in all"
+        detail += f"; {last.value:.3g} {unit} {part}, of {last.joint}"
         if last.site in _list_pushed_sites(log):
             detail += ", which a hand or a wall still pushes"
     return _KeyNumber(f"{join_words(sites)} {place}", f"{peak.value:.3g} {unit}", detail)

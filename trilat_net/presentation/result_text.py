@@ -264,13 +264,16 @@ def compose(result: Result, *, brief: bool = False) -> list[MarkedText | TextTab
 
     Args:
         result: What a command has computed, such as the measured numbers of a run.
-        brief: True for the ten most important lines of a certificate or of metrics.
+        brief: True for the ten most important lines of a certificate, of metrics or of a
+            comparison of logs.
 
     Returns:
         The blocks in the order of the text. Each line is a `MarkedText`, whose mark, such as a
         green "ok", may be empty.
     """
-    compose_blocks = getattr(result, "blocks", None)
+    compose_blocks = getattr(result, "brief_blocks", None) if brief else None
+    if compose_blocks is None:
+        compose_blocks = getattr(result, "blocks", None)
     if compose_blocks is None:
         composers = _BRIEF_COMPOSERS if brief else _COMPOSERS
         compose_blocks = partial(_import_composer(result, composers), result)

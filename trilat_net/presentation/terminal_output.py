@@ -173,7 +173,8 @@ def print_result(result: "Result", *, as_json: bool = False, brief: bool = False
     Args:
         result: The result of a command.
         as_json: True to print the values as JSON.
-        brief: True to print only the ten most important lines of a certificate or of metrics.
+        brief: True to print only the ten most important lines of a certificate, of metrics or
+            of a comparison of logs.
     """
     if as_json:
         print_json(result.to_dict())

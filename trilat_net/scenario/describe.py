@@ -48,12 +48,12 @@ from .urdf import UrdfJoint
 
 # Notes on the matrix of dominance factors, the weights with which sites follow their peers.
 COUPLED_OPERATORS = (
-    "beta differs between sites: it weighs the operators of single sites, and does not cover "
-    "hands that are coupled to one another (one user at two handles)"
+    "note: the weights differ, so the proof covers operators at single sites, but not one who "
+    "holds two handles"
 )
 IRREVERSIBLE_SHARES = (
-    "the shares are not reversible (alpha_ij alpha_jk alpha_ki is not alpha_ik alpha_kj "
-    "alpha_ji): some passive operators make the loop unstable, whatever its damping "
+    "note: the shares are not reversible (alpha_ij alpha_jk alpha_ki is not alpha_ik alpha_kj "
+    "alpha_ji), so no damping suffices for every passive operator "
     "(docs/theory/port-conditions.md, 14)"
 )
 
@@ -293,7 +293,7 @@ def describe_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> li
         *_describe_silences(scenario),
         *_describe_stops(scenario),
     ]
-    lines += [f"assumed: {text}" for text in scenario.assumed]
+    lines += [f"chosen here, not in the paper: {text}" for text in scenario.assumed]
     for key, drawn in scenario.drawn.items():
         if drawn.normal or drawn.uniform:
             lines.append(

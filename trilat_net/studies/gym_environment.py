@@ -18,6 +18,7 @@ Invariant:
 """
 
 import math
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -336,6 +337,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         self.metadata = {**self.metadata, "render_fps": rate_hz}
         self._picture: EpisodePicture | None = None
         self._runs = False
+        self._has_warned = False
         self._user = user
         self._mode = mode
         self._rate_hz = rate_hz
@@ -346,6 +348,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         self.task: EpisodeTask = task or ReachTask(leads)
         loaded = load_scenario(scenario, set, duration_s=duration_s)
         self._base = self._prepare(loaded)
+        self._check_varied_keys()
         user_spec = self._base.sites[user]
         tick_rate_hz = user_spec.rate_hz
         if tick_rate_hz % rate_hz:
@@ -463,6 +466,21 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
                 del drawn[key]
         return replace(scenario, sites=sites, drawn=drawn)
 
+    def _check_varied_keys(self) -> None:
+        """Refuses keys or values of `vary` that are not valid, before the first episode.
+
+        Raises:
+            ScenarioError: There is no such key, or it cannot have the value.
+            UsageError: A key has no values.
+        """
+        for key, values in self._vary.items():
+            if isinstance(values, str) or not len(values):
+                raise UsageError(
+                    f"vary: {key} needs a pair of bounds or a list of values, not {values!r}"
+                )
+        for end in (0, -1):
+            load_scenario(self._base, {key: values[end] for key, values in self._vary.items()})
+
     def _build_hand_site(self, scenario: Scenario) -> HandSite:
         """Returns the site and the settings of the operator that applies the actions."""
         spec = scenario.sites[self._user]
@@ -512,6 +530,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         self.scenario = scenario
         self._k = 0  # ticks of the user's site so far
         self._actions = list[Array]()
+        self._clipped_actions = 0
         hand_site = self._build_hand_site(scenario)
         self._player = ActedHand(hand_site, self._actions)
         self._plants = make_plant_players(scenario)  # users' programs that move arms, by site
@@ -656,6 +675,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
             "dominance": dominance,
             "t_s": scene.t_s,
             "success": succeeded,
+            "clipped_actions": self._clipped_actions,
         }
 
     def reset(
@@ -753,7 +773,20 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         limit = self._action_limit
         if self._normalize:
             values = limit * values
-        return np.clip(values, -limit, limit)
+        clipped = np.clip(values, -limit, limit)
+        # A bound in float32 may exceed the limit by its rounding.
+        if (np.abs(values) > WITH_ROUNDING * limit).any():
+            self._clipped_actions += 1
+            if not self._has_warned:
+                self._has_warned = True
+                given = np.asarray(action).tolist()
+                bound = 1.0 if self._normalize else limit
+                warnings.warn(
+                    f"the action {given} exceeds the bound {bound:g} of the action space and "
+                    "is clipped; info['clipped_actions'] counts such actions",
+                    stacklevel=3,
+                )
+        return clipped
 
     def render(self) -> Any:
         """Draws the arms and the goal as a picture of the present state.
@@ -805,7 +838,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         elapsed_s = self._k / self._tick_rate_hz
         scenario = replace(self.scenario, duration_s=elapsed_s)
         log_path = Path(path)
-        record_virtual(scenario, log_path, force=force, hands=hands)
+        record_virtual(scenario, log_path, force=force, hands=hands, policies=[self._user])
         return log_path
 
 

@@ -13,8 +13,13 @@ from pathlib import Path
 from typing import Any
 
 from ..analysis.judge import certify_run
-from ..analysis.metrics.log_metrics import MetricComparison, compare_metrics, comparison_to_json
-from ..errors import UsageError, count_nouns
+from ..analysis.metrics.log_metrics import (
+    ComparisonRow,
+    MetricComparison,
+    compare_metrics,
+    comparison_to_json,
+)
+from ..errors import UsageError, count_nouns, join_words
 from ..log.log_reader import Log, open_log
 from ..presentation.certificate_text import describe_judgement
 from ..presentation.result_text import Block, MarkedText, TextTable, format_number
@@ -27,6 +32,15 @@ from .tuning.candidate import check_final_posture
 
 _MOST_REASONS = 6
 """Largest number of reasons for missing metrics that the text lists."""
+MOST_METRICS = 10
+"""Largest number of metrics in the short text."""
+_ROUNDING_KEYS = ("unaccounted_j",)
+"""Keys of metrics that consist of rounding errors."""
+_SUBJECTS = {
+    "max": "largest of {}s",
+    "sum": "sum of {}s",
+}
+"""How the number of a run follows from those of its sites, links or walls, by `reduction`."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -59,6 +73,49 @@ class LogComparison(Result):
         The parts are the differences of the experiments, a table of the metrics, notes on how
         each run ended, and reasons for missing values.
         """
+        yield from self._compose_differences()
+        yield ""
+        yield _tabulate_quantities(self.metrics.rows, self.metrics.columns, self.means)
+        yield ""
+        for name, lines in self.remarks.items():
+            for line in lines:
+                yield MarkedText("[bold]note[/bold]", f"{name}: {line}")
+
+        reasons = list(self._explain_missing_values())
+        yield from reasons[:_MOST_REASONS]
+        hidden = len(reasons) - _MOST_REASONS
+        if hidden > 0:
+            yield f"and {hidden} more, which --json names"
+
+    def brief_blocks(self) -> Iterator[Block]:
+        """Yields the short text that `trilat compare` prints without --all.
+
+        The parts are the differences of the experiments, the judgement of each run, a table of
+        the metrics that differ most, and a sentence that sums up.
+        """
+        yield from self._compose_differences()
+        yield ""
+        for name, lines in self.remarks.items():
+            for line in lines:
+                yield MarkedText("[bold]note[/bold]", f"{name}: {line}")
+
+        rows = select_most_different(self.metrics.rows)
+        if rows:
+            chosen = set(rows)
+            means = [
+                mean
+                for row, mean in zip(self.metrics.rows, self.means, strict=False)
+                if row in chosen
+            ]
+            yield ""
+            yield _tabulate_quantities(rows, self.metrics.columns, means)
+        yield ""
+        yield self._sum_up(rows)
+        count = count_nouns(len(self.metrics.rows), "metric")
+        yield f"--all prints all {count}, and why numbers are missing"
+
+    def _compose_differences(self) -> Iterator[Block]:
+        """Yields the differences of the experiments, as a table or as a sentence."""
         names = {log.scenario.name for log in self.logs}
         if len(names) > 1:
             sorted_names = ", ".join(sorted(names))
@@ -71,18 +128,24 @@ class LogComparison(Result):
         else:
             yield "the same experiment"
 
-        yield ""
-        yield _tabulate_quantities(self.metrics, self.means)
-        yield ""
-        for name, lines in self.remarks.items():
-            for line in lines:
-                yield MarkedText("[bold]note[/bold]", f"{name}: {line}")
+    def _sum_up(self, rows: Sequence[ComparisonRow]) -> str:
+        """Returns the judgements and the largest difference of the runs in one sentence.
 
-        reasons = list(self._explain_missing_values())
-        yield from reasons[:_MOST_REASONS]
-        hidden = len(reasons) - _MOST_REASONS
-        if hidden > 0:
-            yield f"and {hidden} more, which --json names"
+        Args:
+            rows: The metrics that differ most.
+        """
+        verdicts = [
+            f"{name} is {lines[0].partition(':')[0]}" for name, lines in self.remarks.items()
+        ]
+        text = f"in short: {join_words(verdicts)}"
+        if not rows:
+            return f"{text}; no metric differs"
+        most = max(rows, key=lambda row: measure_difference(row.values))
+        values = [format_number(value, 4) for value in most.values]
+        unit = f" {most.quantity.unit}" if most.quantity.unit else ""
+        return (
+            f"{text}; the largest difference: {most.quantity.name}, {join_words(values)}{unit}"
+        )
 
     def _explain_missing_values(self) -> Iterator[str]:
         """Yields a sentence for each metric that applies to a log but has no value."""
@@ -172,6 +235,38 @@ def compare(*logs: str | Path | Log) -> LogComparison:
     )
 
 
+def measure_difference(values: Sequence[float | None]) -> float:
+    """Returns how far values are apart, as a share of the largest of them.
+
+    Args:
+        values: Values of one metric. None where it is missing.
+
+    Returns:
+        The range divided by the largest absolute value. 0 if fewer than two values are known,
+        or if all of them are zero.
+    """
+    known = [value for value in values if value is not None]
+    largest = max(map(abs, known), default=0.0)
+    return (max(known) - min(known)) / largest if largest > 0.0 else 0.0
+
+
+def select_most_different(rows: Sequence[ComparisonRow]) -> list[ComparisonRow]:
+    """Returns the metrics that differ most between runs, in their order.
+
+    Errors of the computation, which are rounding of different size in every run, are left out.
+
+    Args:
+        rows: The metrics of the runs.
+    """
+    differences = {}
+    for index, row in enumerate(rows):
+        difference = measure_difference(row.values)
+        if difference > 0.0 and row.quantity.key not in _ROUNDING_KEYS:
+            differences[index] = difference
+    ranked = sorted(differences, key=lambda index: (-differences[index], index))
+    return [rows[index] for index in sorted(ranked[:MOST_METRICS])]
+
+
 def _name_columns(files: Sequence[Path]) -> list[str]:
     """Returns a short and distinct name for the column of each log.
 
@@ -217,26 +312,32 @@ def _average_repeats(
 
 
 def _tabulate_quantities(
-    metrics: MetricComparison, means: Sequence[MeanInterval | None]
+    metrics: Sequence[ComparisonRow],
+    columns: Sequence[str],
+    means: Sequence[MeanInterval | None],
 ) -> TextTable:
     """Returns a table with one row per quantity and one column per log, in groups.
 
     Args:
         metrics: The metrics.
+        columns: Names of the logs.
         means: Mean of each row, for another column. Empty if there is no such column.
     """
     rows: list[list[str]] = []
-    mean_by_row = dict(zip(metrics.rows, means, strict=True)) if means else {}
-    for group, members in groupby(metrics.rows, key=lambda row: row.quantity.group):
+    mean_by_row = dict(zip(metrics, means, strict=True)) if means else {}
+    for group, members in groupby(metrics, key=lambda row: row.quantity.group):
         rows.append([group])
         for row in members:
             quantity = row.quantity
-            cells = [f"  {quantity.name}", quantity.unit or "-"]
+            subject = ""
+            if quantity.of != "run":
+                subject = _SUBJECTS[quantity.reduction].format(quantity.of)
+            cells = [f"  {quantity.name}", quantity.unit or "-", subject]
             cells += [format_number(value, 4) for value in row.values]
             if means:
                 cells.append(str(mean_by_row[row] or "-"))
             rows.append(cells)
-    header = ["", "unit", *metrics.columns]
+    header = ["", "unit", "over", *columns]
     if means:
         header.append("mean, 95 %")
-    return TextTable(tuple(header), rows, align="llr")
+    return TextTable(tuple(header), rows, align="lllr")

@@ -74,7 +74,7 @@ _SPREADS = {
 _LAGS = {
     "following_rms": "RMS {0}_m(t-T) - {0}_s",
     "following_max": "peak |{0}_m(t-T) - {0}_s|",
-    "following_end": "the same, last 1 s",
+    "following_end": "peak |{0}_m(t-T) - {0}_s|, last 1 s",
 }
 _ERROR_UNITS = {"joints": "rad", "position": "m", "pose": "m or rad"}
 
@@ -448,9 +448,9 @@ def _estimate_base_parameters(
     "site",
     LEARNING,
     Quantity("theta_error_first", "|theta_hat - theta| at first"),
-    Quantity("theta_error_last", "the same at last"),
+    Quantity("theta_error_last", "|theta_hat - theta| at last"),
     Quantity("theta_energy_first_j", "theta~' Gamma^-1 theta~ / 2 at first", "J"),
-    Quantity("theta_energy_last_j", "the same at last", "J"),
+    Quantity("theta_energy_last_j", "theta~' Gamma^-1 theta~ / 2 at last", "J"),
     Quantity("theta_slope_per_s", "|theta_hat'|, last 5 s", "1/s"),
     Quantity("unphysical_links", "unphysical links, at last", "", "sum"),
 )

@@ -124,9 +124,9 @@ def mechanical_energy(arm: ArmRows, records: AlignedRecords) -> Array:
     ENERGY,
     Quantity("controller_j", "given by the controller", "J", "sum"),
     Quantity("hands_j", "given by hands", "J", "sum"),
-    Quantity("hands_most_j", "given by hands at most", "J"),
+    Quantity("hands_most_j", "given by hands, most at any time", "J"),
     Quantity("walls_j", "given by environment", "J", "sum"),
-    Quantity("walls_most_j", "given by environment at most", "J"),
+    Quantity("walls_most_j", "given by environment, most at any time", "J"),
     Quantity("friction_j", "taken by friction", "J", "sum"),
     Quantity("mechanical_j", "gained by the arm", "J", "sum"),
     Quantity("unaccounted_j", "unaccounted for", "J"),
@@ -212,7 +212,7 @@ def _measure_most(energy: Array) -> Metric:
     "link",
     ENERGY,
     Quantity("delay_j", "given by the delay", "J", "sum"),
-    Quantity("delay_most_j", "given by the delay at most", "J"),
+    Quantity("delay_most_j", "given by the delay, most at any time", "J"),
 )
 def measure_delay_energy(view: RunView, link: str) -> MetricValues:
     """Measures the energy that the delay of a link injects into the receiving arm, in J.

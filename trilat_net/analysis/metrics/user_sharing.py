@@ -20,6 +20,7 @@ from ..aligned import AlignedRecords, find_common_rows, find_latest_rows
 from ..dominance_history import (
     RAMP_TIME_TOLERANCE_S,
     UserShares,
+    find_program,
     find_user_shares,
     find_users,
     list_ramps,
@@ -76,7 +77,7 @@ def read_user_shares(view: RunView) -> UserShares | Metric:
     if missing:
         return Metric(None, f"no records of {', '.join(missing)}")
     alpha = view.sites[slave].dominance.alpha
-    return find_user_shares(view.scenario, alpha)
+    return find_user_shares(view.scenario, alpha, find_program(view.log))
 
 
 @measures(
@@ -207,7 +208,8 @@ def measure_sharing(view: RunView, _run: str) -> MetricValues:
 
     Each user moves a master arm, and the slave follows the masters with weights. The user with
     the largest weight leads. A change of the leader is a takeover. A program may move the arm
-    of the last user. Any other user who leads is then said to intervene.
+    of a user, which the log tells; otherwise the last user counts as the program. Any other
+    user who leads is then said to intervene.
 
     Args:
         view: The recorded run.

@@ -474,8 +474,12 @@ def judge_twins(
                 pushes.append(growth._replace(group=group))
         departures += list(_find_departures(twins, amplitudes, joints, quiet))
 
+    is_too_short = end <= first
+    no_pushes = (
+        "too short a record to follow a push" if is_too_short else "no push moved an arm"
+    )
     return TwinGrowth(
-        "" if pushes else "no push moved anything",
+        "" if pushes else no_pushes,
         from_s=0.5 * float(t_s[first] + t_s[end]),
         to_s=float(t_s[end]),
         pushes=tuple(pushes),

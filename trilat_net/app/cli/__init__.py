@@ -21,9 +21,9 @@ from importlib import import_module
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
-from ...errors import LogRefused, TrilatError, UsageError, find_nearest
+from ...errors import LogRefused, TrilatError, UsageError, find_nearest, join_arguments
 from ...files import (
     DISK_ERRNOS,
     EXTRAS,
@@ -93,6 +93,24 @@ class _Group(TyperGroup):
         if not suggested:
             hint = f"{group} has the commands {', '.join(commands)}"
         return ctx.fail(f"There is no command {name!r}; {hint}")
+
+
+class _Command(TyperCommand):
+    """A command that recognises a setting which the shell has split into several arguments."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> Any:
+        """Parses the arguments of the command.
+
+        Raises:
+            UsageError: The value of an option --set was not quoted, and the shell has split it.
+        """
+        whole = options.find_split_setting(args)
+        if whole:
+            quoted = join_arguments(["--set", whole])
+            ctx.fail(
+                f"The shell has split the value of --set: put it into quotes, as in {quoted}"
+            )
+        return super().parse_args(ctx, args)
 
 
 class _Commands(_Group):
@@ -237,7 +255,7 @@ def _add_command(group: typer.Typer, command_line: str, run: Any) -> None:
     name = command_line.split()[-1]
     epilog = "\n\n".join([*examples, f"Docs: {run.page}"])
     panel = _find_panel(command_line) if group is app else None
-    declare = group.command(name, help=text, epilog=epilog, rich_help_panel=panel)
+    declare = group.command(name, cls=_Command, help=text, epilog=epilog, rich_help_panel=panel)
     declare(options.expand_option_tuples(run))
 
 

@@ -144,10 +144,13 @@ def log_export_command(
             folder with a file for each site and kind of record; npz or mat: one file with an
             array for each column; lerobot: a LeRobot dataset with an episode for each log in
             FILE (docs/studies/lerobot.md).
-        settings: Setting of the format; repeatable. For lerobot: fps=30; observations=plugin
-            for a policy that the LeRobot plugin runs; task=TEXT; episodes=marks for the
-            episodes that session.episode marked; program=m2 if the user m2 is a program, or
-            program=none. For ros2: names=crtk, or a file of names.
+        settings: Setting of the format; repeatable. For lerobot: fps=30; observations=slave,
+            observations=reference with the reference that the slave follows, or
+            observations=plugin for a policy that the LeRobot plugin runs, with site=m1 if the
+            plugin holds m1; environment_state=yes; actions, as --actions; task=TEXT;
+            episodes=log, or episodes=marks for the episodes that session.episode marked;
+            program=m2 if the user m2 is a program, or program=none. For ros2: names=crtk, or a
+            file of names. csv, mat, npz and parquet have no settings.
         actions: For lerobot: store the actions as the LeRobot plugin accepts them, as positions
             of the end effectors (tip) or angles of the joints (joints). Default: the values
             that the sites exchange.

@@ -266,6 +266,45 @@ InsecureOption = Annotated[
 ]
 
 
+_BRACKETS = {"{": "}", "[": "]"}
+"""Closing brackets of tables and lists, by the opening ones."""
+
+
+def find_split_setting(args: Sequence[str]) -> str:
+    """Finds a value of --set that a shell has split, because the user did not quote it.
+
+    A shell that expands braces makes two arguments of `dominance.m1={m2=0.1,s=0.9}`, which are
+    `dominance.m1=m2=0.1` and `dominance.m1=s=0.9`. A value with spaces is split at them.
+
+    Args:
+        args: Arguments of a command.
+
+    Returns:
+        The setting as the user wrote it. Empty if no setting was split.
+    """
+    for index, argument in enumerate(args[:-1]):
+        if argument != "--set":
+            continue
+        setting, *others = args[index + 1 :]
+        key, _, first = setting.partition("=")
+        prefix = f"{key}="
+        parts = [first]
+        for other in others:
+            if not other.startswith(prefix):
+                break
+            parts.append(other.removeprefix(prefix))
+        if len(parts) > 1:
+            is_table = all("=" in part for part in parts)
+            opening = "{" if is_table else "["
+            return f"{prefix}{opening}{','.join(parts)}{_BRACKETS[opening]}"
+        closing = _BRACKETS.get(first[:1], "")
+        if closing and closing not in first:
+            for count, other in enumerate(others, 1):
+                if closing in other:
+                    return " ".join([setting, *others[:count]])
+    return ""
+
+
 MOST_LETTERS = 80
 """Largest length of a session's name. The name of a scenario has at most 64 letters."""
 

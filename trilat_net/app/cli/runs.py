@@ -23,6 +23,7 @@ from .options import flag, value
 
 if TYPE_CHECKING:
     from ...log.log_reader import Log
+    from ...scenario import Scenario
 
 
 @options.command(
@@ -86,7 +87,7 @@ def sim_command(
     if as_json:
         terminal.print_json(open_log(path).to_dict())
     else:
-        terminal.print_text(f"{path}: {chosen.duration_s:g} s of {', '.join(chosen.names)}")
+        terminal.print_text(f"{path}: {_describe_length(chosen, path)}")
         files = {f" --law {shlex.quote(str(law.file))}" for law in find_user_laws(chosen)}
         report = f"trilat report {shlex.quote(str(path))}{''.join(sorted(files))}"
         terminal.print_text(f"next: {report}")
@@ -100,6 +101,22 @@ def sim_command(
             f"the limit is limits.qd_limit_rad_s{remedy}"
         )
         raise typer.Exit(1)
+
+
+def _describe_length(scenario: "Scenario", path: Path) -> str:
+    """Returns how long a simulated run is and which sites it has, as a phrase.
+
+    Args:
+        scenario: Scenario of the run.
+        path: The log of the run.
+    """
+    from ...log.log_reader import open_log
+
+    sites = ", ".join(scenario.names)
+    diverged_s = open_log(path).diverged_s
+    if diverged_s is None:
+        return f"{scenario.duration_s:g} s of {sites}"
+    return f"{diverged_s:.4g} s of {sites}, of {scenario.duration_s:g} s that were planned"
 
 
 @options.command("run.mcap", page="docs/logs/verify.md")

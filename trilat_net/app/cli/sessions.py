@@ -389,19 +389,23 @@ def _ping_topic(
     """
     from trilat_net.app.session_ping import ping_topic
 
-    from ...net.ros2_graph import Refusals, Ros2Graph
+    from ...net.ros2_graph import ROUTER_ADVICE, Refusals, Ros2Graph
     from ...net.ros2_names import check_ros_name
+    from ...net.zenoh_bus import RouterSilent
 
     name = check_ros_name(topic, "topic")
     clock = SystemClock()
-    graph = Ros2Graph(
-        refusals=Refusals(terminal.print_note),
-        routers=routers or [options.ROS_ROUTER],
-        namespace="",
-        name="trilat_ping",
-        clock=clock,
-        domain=domain,
-    )
+    try:
+        graph = Ros2Graph(
+            refusals=Refusals(terminal.print_note),
+            routers=routers or [options.ROS_ROUTER],
+            namespace="",
+            name="trilat_ping",
+            clock=clock,
+            domain=domain,
+        )
+    except RouterSilent as silent:
+        raise RouterSilent(f"{silent}; {ROUTER_ADVICE}") from None
     with graph, Interrupt() as interrupt:
         measurement = ping_topic(
             graph=graph,

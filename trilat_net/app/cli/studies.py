@@ -347,7 +347,9 @@ _option = partial(value, rich_help_panel="Tune laws")
 
 
 @options.command(
-    "a.mcap b.mcap", "--tune free --law adaptive,p_d", page="docs/studies/fair-comparison.md"
+    "a.mcap b.mcap",
+    "--tune free --law adaptive,p_d",
+    page="docs/reference/metrics.md, docs/studies/fair-comparison.md",
 )
 def compare_command(
     context: typer.Context,
@@ -374,11 +376,13 @@ def compare_command(
     on: options.OnOption = None,
     output: Annotated[Path | None, _option("--out -o", "DIR")] = None,
     force: options.ForceOption = False,
+    everything: options.AllOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
     """Compares logs, or tuned control laws, side by side.
 
-    For logs, the command also shows how their experiments differ. All control laws are tuned by
+    For logs, the command shows the settings that differ, the verdicts, and the ten metrics that
+    differ most; with --all it shows every metric. All control laws are tuned by
     the same procedure. Whether a tuned law is stable is judged from the motion in the second
     half of its runs alone; `trilat certify` also uses twins and roots. The results are not
     ranked, because small errors can also mean that an arm hangs freely, or that no operator
@@ -395,7 +399,7 @@ def compare_command(
     """
     if tune is None:
         for name in options.list_used_options(context):
-            if name not in ("files", "--json"):
+            if name not in ("files", "--all", "--json"):
                 raise UsageError(
                     f"{name} can be used only with --tune SCENARIO; logs are compared as they "
                     "were recorded"
@@ -405,10 +409,12 @@ def compare_command(
         logs = [terminal.open_with_progress(file) for file in files or []]
         with terminal.progress_lines(f"comparing {count_nouns(len(logs), 'log')}"):
             comparison = compare(*logs)
-        terminal.print_result(comparison, as_json=as_json)
+        terminal.print_result(comparison, as_json=as_json, brief=not everything)
         return
     if files:
         raise UsageError("--tune makes its own runs: leave out either the logs or --tune")
+    if everything:
+        raise UsageError("--all prints every metric of logs: leave it out with --tune")
     from ...studies.tuning import plan_tuning
 
     plan = plan_tuning(

@@ -143,7 +143,7 @@ class _CompilingNotice(event.Listener):
         self._restorers: list[Callable[[], None]] = []
 
     def on_start(self, event_data: Any) -> None:
-        """Reports the first compilation of a function of this package, because it takes long.
+        """Reports the first compilation of a function of the core, because it takes long.
 
         Numba calls this method at the start of each compilation. Until the end of the
         compilation, signals such as Ctrl-C end the process at once.
@@ -152,8 +152,11 @@ class _CompilingNotice(event.Listener):
             event_data: Numba's description of the compilation.
         """
         self._restorers.append(end_process_at_signals())
-        module = event_data.data["dispatcher"].py_func.__module__
-        if not self.is_reported and module.startswith(_CORE_PACKAGE):
+        function = event_data.data["dispatcher"].py_func
+        # Wrappers of the laws and models of users are compiled in every process.
+        is_wrapper = "<locals>" in function.__qualname__
+        is_core = function.__module__.startswith(_CORE_PACKAGE) and not is_wrapper
+        if is_core and not self.is_reported:
             self.is_reported = True
             self.report(COMPILING)
 

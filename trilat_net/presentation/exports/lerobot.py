@@ -30,19 +30,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...analysis.arm_rows import build_arm_rows
-from ...analysis.dominance_history import find_user_shares, find_users, trace_dominance
+from ...analysis.dominance_history import (
+    find_program,
+    find_user_shares,
+    find_users,
+    trace_dominance,
+)
 from ...core.arms.task_space import POSITION
-from ...core.life.live_hand import TAKEN
 from ...core.step.ticks import NS_PER_S
 from ...core.step.vectors import Array
-from ...errors import LogError, UsageError, count_nouns
+from ...errors import LogError, UsageError, count_nouns, join_words
 from ...files import import_extra
 from ...log.log_reader import Log
 from ...log.orientations import MATRIX_ENTRIES, expand_poses
 from ...log.provenance import collect_provenance
 from ...log.record_columns import Ints
 from ...scenario.arms import TASK_AXES
-from ...scenario.operators.program_hand import ProgramHand
 from ..export import EXPORT_MANIFEST, ExportFormat, Written
 from ..plugin_observation import find_plugin_actions, observe_as_plugin
 
@@ -50,8 +53,10 @@ _EXTRA = ("pyarrow.parquet", "lerobot", "datasets of LeRobot")
 _FILE = "chunk-000/file-000.parquet"
 _MEANINGS = {
     "observation.state": (
-        "angles, rad, and velocities, rad/s, of the slave's joints; with observations=plugin "
-        "the observation of lerobot_robot_trilat"
+        "angles, rad, and velocities, rad/s, of the slave's joints; with "
+        "observations=reference also the reference that it follows (.ref), in the units of the "
+        "actions that sites share; with observations=plugin the observation of "
+        "lerobot_robot_trilat"
     ),
     "observation.environment_state": "the same numbers, for policies that need this name",
     "action": (
@@ -98,15 +103,17 @@ ACTIONS = ("tip", "joints")
 These are also the modes of the LeRobot plugin that moves an arm to a position. Without one of
 them, actions are the values that the sites exchange.
 """
-OBSERVATIONS = ("slave", "plugin")
-"""Kinds of observations: the slave's joints, or what the LeRobot plugin observes."""
+OBSERVATIONS = ("slave", "reference", "plugin")
+"""Kinds of observations.
+
+They are the slave's joints, these joints with the reference that the slave follows, or what the
+LeRobot plugin observes.
+"""
 EPISODES = ("log", "marks")
 """Divisions into episodes: one for each log, or by the marks of `session.episode`."""
 SWITCHES = ("no", "yes")
 NO_PROGRAM = "none"
 """Value of the setting `program` for runs in which no program moves an arm."""
-POLICY = "policy"
-"""Name by which the LeRobot plugin takes hold of an arm, see `lerobot_robot_trilat`."""
 _EPISODE_MARK = re.compile(r"episode (.+) (begins|ended|succeeded|failed)", re.DOTALL)
 _OUTCOMES = {"succeeded": True, "failed": False}
 Names = dict[str, list[str]]
@@ -228,13 +235,14 @@ def _write(
     _check_choice("environment_state", environment_state, SWITCHES)
     _check_choice("episodes", episodes, EPISODES)
 
-    programs = [program or _find_program(log) for log in logs]
+    programs = [program or find_program(log) or NO_PROGRAM for log in logs]
     names: Names = {}
     tasks: dict[str, int] = {}
     parts = list[Columns]()
     sessions = []
     left_out = 0
     outside = 0
+    without_marks = []
     plugin_site = ""
     for log, log_program in zip(logs, programs, strict=True):
         settings = _Settings(
@@ -245,6 +253,8 @@ def _write(
             site=site,
         )
         attempts = _find_attempts(log) if episodes == "marks" else []
+        if episodes == "marks" and not attempts:
+            without_marks.append(log.source)
         frames = _choose_frames(log, fps, attempts or [_Attempt("")])
         columns, log_names = _read_columns(log, frames.rows, settings)
         names = names or log_names
@@ -320,6 +330,11 @@ def _write(
     text = f"{frames_text} in {episodes_text}; {gaps_text} left out"
     if outside:
         text += f"; {count_nouns(outside, 'frame')} outside the marked episodes"
+    if without_marks:
+        text += (
+            f"; no episode is marked in {join_words(without_marks)}: all of each log is one "
+            "(tn.session(NAME).episode marks episodes)"
+        )
     if plugin_site:
         text += f"; observations as the plugin makes them at {plugin_site}"
     if not has_program:
@@ -341,31 +356,6 @@ def _check_choice(name: str, value: str, choices: Sequence[str]) -> None:
     """
     if value not in choices:
         raise UsageError(f"{name} must be {' or '.join(choices)}, not {value!r}")
-
-
-def _find_program(log: Log) -> str:
-    """Returns the user whose arm a program moved in a run.
-
-    It is the last user with a hand of kind "own", or otherwise the last user whose arm a policy
-    held through the LeRobot plugin.
-
-    Args:
-        log: Log of the run.
-
-    Returns:
-        Name of the user, or `NO_PROGRAM`.
-    """
-    users = find_users(log.scenario)[1]
-    with_policy = []
-    with_program = []
-    for user in users:
-        begin = f"{user}: {POLICY} {TAKEN} "
-        if any(event.kind == "hand" and event.text.startswith(begin) for event in log.events):
-            with_policy.append(user)
-        hands = log.scenario.sites[user].hands
-        if any(isinstance(hand, ProgramHand) for hand in hands):
-            with_program.append(user)
-    return [NO_PROGRAM, *with_policy, *with_program][-1]
 
 
 def _choose_plugin_site(log: Log, settings: _Settings) -> str:
@@ -620,6 +610,10 @@ def _read_columns(
     state_names += [f"{slave}.{joint}.vel" for joint in joints[slave]]
     if settings.observations == "plugin":
         state, state_names = observe_as_plugin(log, slave, plugin_site, rows)
+    if settings.observations == "reference":
+        reference, coordinates = _read_reference(log, slave, slave_rows)
+        state = np.hstack([state, reference])
+        state_names += [f"{slave}.{name}.ref" for name in coordinates]
 
     features = [_Feature("observation.state", state, state_names)]
     if settings.environment_state:
@@ -645,6 +639,26 @@ def _read_columns(
         names[feature.key] = feature.names
     columns["intervention"] = has_program & (leader != shared.program)
     return columns, names
+
+
+def _read_reference(log: Log, slave: str, rows: Ints) -> tuple[Array, list[str]]:
+    """Returns the reference q_des that the slave follows, and the names of its n numbers.
+
+    Args:
+        log: Log of the run that is exported.
+        slave: Name of the slave.
+        rows: Index of each frame's record of the slave, shape (F,).
+
+    Returns:
+        The reference, shape (F, n), and the joints, or in task space the axes and the entries
+        of the rotation matrix.
+    """
+    reference = log[slave].q_des[rows]
+    if not log[slave].layout.task:
+        return reference, list(log.scenario.arms[slave].joint_names)
+    expanded = expand_poses(reference)
+    names = [*TASK_AXES[:POSITION], *MATRIX_ENTRIES]
+    return expanded, names[: expanded.shape[1]]
 
 
 def _read_commands(

@@ -43,6 +43,9 @@ if TYPE_CHECKING:
 PROGRAM_KEYS = ("class", "rate_hz", "delay_ms", "process", "source_sha256", "settings")
 """Keys that a program has in addition to the keys of a live operator."""
 
+POLICY = "policy"
+"""Name by which a trained program takes hold of an arm, as the log mentions it."""
+
 
 class ProgramHand(
     LiveHand, frozen=True, kw_only=True, tag="own", omit_defaults=True, rename={"code": "class"}

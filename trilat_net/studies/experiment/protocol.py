@@ -483,10 +483,11 @@ class ExperimentPlan(Result):
         """Yields the parts of the text that `trilat experiment check` prints."""
         protocol = self.protocol
         facts = self.to_dict()
-        units = "pairs" if len(protocol.users) > 1 else "participants"
+        unit = "pair" if len(protocol.users) > 1 else "participant"
+        units = count_nouns(facts["groups"], unit)
         users = ", ".join(protocol.users)
         yield f"{protocol.name}: {protocol.title or protocol.task.description}"
-        yield f"{facts['groups']} {units} at {users}, {protocol.task.description}"
+        yield f"{units} at {users}, {protocol.task.description}"
         conditions = count_nouns(len(protocol.conditions), "condition")
         block_size = self.trials[-1].trial
         counted = count_nouns(block_size - protocol.practice, "trial")
