@@ -192,6 +192,8 @@ COMMAND_PAGES = {
     "docs/reference/laws.md",
     "docs/studies/linear.md",
     "docs/reference/metrics.md",
+    "docs/reference/silent-peers.md",
+    "docs/reference/stability.md",
     "docs/studies/ports.md",
     "docs/logs/log-checks.md",
     "docs/logs/log-tools.md",
@@ -203,6 +205,7 @@ COMMAND_PAGES = {
 SHORTER = ["--law", "p_d,adaptive", "--budget", "4", "--duration", "2", "--jobs", "1"]
 """What is added to a command that tunes, which else would take minutes."""
 OF_RUNS = {
+    "docs/reference/stability.md": "paper",
     "docs/reference/metrics.md": "paper",
     "docs/reference/json.md": "free",
     "docs/reference/log.md": "free",
