@@ -19,7 +19,7 @@ help:
 	@echo "make test    everything that CI checks"
 	@echo "make test-long    all of that and the rest: every test, every live session, endurance"
 	@echo "make push-set     measure anew which tests make test leaves to make test-long"
-	@echo "make faults       docs/reference/faults.md: two thousand sessions in which things go wrong, and the matrix of faults"
+	@echo "make faults       docs/data/fault-matrix.csv: two thousand sessions in which things go wrong, and the matrix of faults"
 	@echo "make docs         the documentation as a site, with search, offline: build/site/html/index.html"
 	@echo "make media        the moving picture of README.md, from the log of a simulated run"
 	@echo "make bench   the figures of docs/theory/benchmarks.md, measured on this machine"

@@ -100,7 +100,6 @@ ELSEWHERE = {
     "docs/logs/replay.md: trilat replay": "tests/live/test_replay.py",
     "docs/maps/README.md: trilat sweep runs/mine --confirm": "tests/studies/sweep/test_confirmation.py",
     "docs/maps/README.md: trilat sweep SCENARIO": "tests/cli/test_sweeps.py",
-    "docs/maps/p_d.md: trilat sweep runs/map-p_d --confirm": "tests/studies/sweep/test_confirmation.py",
     "docs/sessions/network.md: trilat keys new keys m1 m2 s recorder operator --host": "tests/live/test_namespaces.py",
     "docs/sessions/network.md: trilat keys new keys m1 m2 s recorder operator router": "tests/live/test_routers.py",
     "docs/sessions/network-check.md: trilat ping --answer": "tests/sites/test_network_benchmark.py",
@@ -121,12 +120,11 @@ ELSEWHERE = {
 """Beginnings of blocks that take machines, a robot, a session or minutes, and the tests of the same."""
 
 NOT_RUN = {
-    "docs/maps/contact.md: trilat sweep contact": "1 640 runs: minutes; it draws the page itself",
-    "docs/maps/exponents.md: trilat sweep": "306 runs with four twins: minutes; it draws the page itself",
-    "docs/maps/jitter.md: trilat sweep jitter": "2 200 runs: minutes; it draws the page itself",
-    "docs/maps/p_d.md: trilat sweep p_d_margin --duration 20 --over": "1 640 runs: minutes; it draws it",
-    "docs/maps/round-trips.md: trilat sweep p_d_margin_two": "3 135 runs: minutes; it draws the page itself",
-    "docs/maps/tick-rate.md: trilat sweep free": "870 runs: minutes; it draws the page itself",
+    "docs/maps/README.md: trilat sweep contact": "1 640 runs: minutes; it draws a map of the page",
+    "docs/maps/README.md: trilat sweep jitter": "2 200 runs: minutes; it draws a map of the page",
+    "docs/maps/README.md: trilat sweep p_d_margin --duration 20 --over": "1 640 runs: minutes; it draws a map",
+    "docs/maps/README.md: trilat sweep p_d_margin_two": "3 135 runs: minutes; it draws a map of the page",
+    "docs/maps/README.md: trilat sweep free": "870 runs: minutes; it draws a map of the page",
     "docs/sessions/ros2.md: export RMW": "needs an installation of ROS 2",
     "docs/sessions/two-operators.md: ZENOH_CONFIG_OVERRIDE": "needs an installation of ROS 2",
     "docs/sessions/ros2.md: ros2": "needs an installation of ROS 2",

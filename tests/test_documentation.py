@@ -183,6 +183,9 @@ def list_pages(pages: set[str], pushed: set[str]) -> list[Any]:
 COMMAND_PAGES = {
     "docs/extend/arm-gains.md",
     "docs/extend/arms.md",
+    "docs/reference/certificate-premises.md",
+    "docs/theory/certificate-energy.md",
+    "docs/theory/coming-to-rest.md",
     "docs/theory/damping-conditions.md",
     "docs/extend/delay-traces.md",
     "docs/studies/fair-comparison.md",
@@ -192,6 +195,8 @@ COMMAND_PAGES = {
     "docs/reference/laws.md",
     "docs/studies/linear.md",
     "docs/reference/metrics.md",
+    "docs/reference/silent-peers.md",
+    "docs/reference/stability.md",
     "docs/studies/ports.md",
     "docs/logs/log-checks.md",
     "docs/logs/log-tools.md",
@@ -203,6 +208,9 @@ COMMAND_PAGES = {
 SHORTER = ["--law", "p_d,adaptive", "--budget", "4", "--duration", "2", "--jobs", "1"]
 """What is added to a command that tunes, which else would take minutes."""
 OF_RUNS = {
+    "docs/reference/certificate-premises.md": "paper",
+    "docs/theory/certificate-energy.md": "paper",
+    "docs/reference/stability.md": "paper",
     "docs/reference/metrics.md": "paper",
     "docs/reference/json.md": "free",
     "docs/reference/log.md": "free",

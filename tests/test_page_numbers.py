@@ -250,7 +250,7 @@ def certified(folder: Path) -> str:
 
 
 def uniform_age(order: Any, low_ms: float, high_ms: float) -> float:
-    """The mean age in use by the sums of docs/reference/definitions.md, at 1 kHz, ms."""
+    """The mean age in use by the sums of docs/data/age-in-use.txt, at 1 kHz, ms."""
     return float(order(uniform(low_ms, high_ms - low_ms).cdf, 1.0)[0])
 
 
@@ -408,7 +408,7 @@ PAGES: dict[str, dict[str, Make]] = {
     "docs/reference/laws-adaptive.md": {"towards one pose: {} N m/rad": lambda: [G**2 * 1.2]},
     "docs/theory/linear-method.md": LINEAR_METHOD,
     "docs/theory/linear-examples.md": LINEAR,
-    "docs/reference/definitions.md": {
+    "docs/reference/metrics.md": {
         "± 50 ms gives {} ms and {} ms, uniform 0 to 400 ms gives {} ms and {} ms": lambda: [
             uniform_age(order, *ends)
             for ends in ((150, 250), (0, 400))
@@ -620,7 +620,7 @@ def class_of(longest_s: float, **changes: Any) -> CellClass:
 @pytest.mark.long
 @pytest.mark.parametrize("row", range(19))
 def test_an_edge_of_p_d_lies_between_two_runs(row: int) -> None:
-    """Of the table of edges of docs/maps/p_d.md: unstable below, stable above."""
+    """Of the table of edges of docs/maps/README.md: unstable below, stable above."""
     assert len(EDGES) == 19
     stiffness, delay_ms, _, low, high = map(float, EDGES[row][:5])
     soft, longest_s = (SOFT, 640.0) if stiffness == SOFT["control.K"] else ({}, 320.0)
@@ -644,7 +644,7 @@ def test_a_cell_that_was_run_live_has_its_class(row: int) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize(("delay_ms", "d"), [(1560, 2.5), (1600, 2.7)])
 def test_a_mode_that_hardly_takes_part_is_not_passed_over(delay_ms: float, d: float) -> None:
-    """As docs/maps/p_d.md says: it grows at 0.01 to 0.03 /s, and the cell is not decided."""
+    """As docs/maps/README.md says: it grows at 0.01 to 0.03 /s, and the cell is not decided."""
     assert 0.005 < root("p_d_margin", {"link.delay_ms": delay_ms, "control.d": d})[0] < 0.035
     found = class_of(160.0, link__delay_ms=delay_ms, control__d=d, duration_s=20.0)
     assert found is CellClass.UNDECIDED

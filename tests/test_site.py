@@ -129,7 +129,7 @@ def check_search() -> None:
     with browser_page("about:blank") as page:
         asked: list[str] = []
         page.on("request", lambda request: asked.append(request.url))
-        page.goto((HTML / "maps" / "p_d.html").as_uri())
+        page.goto((HTML / "maps" / "index.html").as_uri())
         page.locator(".md-search__button").first.click()
         page.locator("dialog input").first.fill("dominance")
         page.locator("dialog a", has_text="trilat set dominance").first.click()

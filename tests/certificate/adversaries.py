@@ -11,7 +11,7 @@ the program.
     python -m tests.certificate.adversaries
     python -m tests.certificate.adversaries --find-truths
 
-The first prints the table of docs/theory/adversarial-runs.md, of the two thousand experiments of `ALL`; the second finds the stored
+The first prints the table of docs/reference/stability.md, of the two thousand experiments of `ALL`; the second finds the stored
 truths anew.
 """
 
@@ -844,7 +844,7 @@ def tally_clear(judged: Iterable[Judged], by: str = "certified") -> Tally:
 
 
 def main() -> None:
-    """Prints the table of docs/theory/adversarial-runs.md."""
+    """Prints the table of docs/reference/stability.md."""
     parser = argparse.ArgumentParser(
         description="What is said of random experiments whose truth is known."
     )

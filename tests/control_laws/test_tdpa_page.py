@@ -1,4 +1,4 @@
-"""`tdpa` written once more from docs/reference/laws-tdpa.md, "The default scheme, tick by tick", and from nothing else.
+"""`tdpa` written once more from docs/data/tdpa-steps.txt, and from nothing else.
 
 Arms, hands and the law are this file's own. The network is an input: which sample was in use at each tick is
 read from the run of the program, which draws delays and losses.

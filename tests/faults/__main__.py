@@ -1,7 +1,8 @@
 """Judges seeds on all cores: `python -m tests.faults`.
 
-With --write the matrix of docs/reference/faults.md is made, and its evidence: sessions and tests of each fault
-(docs/data/faults.csv), and how often each event came about (docs/data/fault-counts.csv).
+With --write the matrix of faults is made (docs/data/fault-matrix.csv), with its evidence: sessions and tests of each
+fault (docs/data/faults.csv), how often each event came about (docs/data/fault-counts.csv), and how far torques
+stepped (docs/data/fault-torques.txt). What came of the seeds is written to docs/reference/faults.md.
 """
 
 import argparse
@@ -23,8 +24,10 @@ from .judged_seed import Judged, find_undisturbed_step, time_seed
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "reference" / "faults.md"
+MATRIX = ROOT / "docs" / "data" / "fault-matrix.csv"
 TESTS = ROOT / "docs" / "data" / "faults.csv"
 COUNTS = ROOT / "docs" / "data" / "fault-counts.csv"
+TORQUES = ROOT / "docs" / "data" / "fault-torques.txt"
 BEGIN, END = "<!-- made by python -m tests.faults --write -->", "<!-- end -->"
 
 
@@ -126,10 +129,11 @@ def find_evidence(row: Row, seeds: Seeds, ends: dict[str, str]) -> Evidence:
     return Evidence(row, len(sessions), broken, results)
 
 
-def describe_row(evidence: Evidence) -> str:
+def describe_row(evidence: Evidence) -> tuple[str, str, str, str]:
+    """Returns the row of the matrix: number, fault, what must happen, what was not tried."""
     row = evidence.row
-    gap = row.gap if evidence.holds else "**does not hold**"
-    return f"| {row.mark} {row.fault} | {row.required} | {gap} |"
+    gap = row.gap if evidence.holds else "does not hold"
+    return row.mark, row.fault, row.required, gap
 
 
 def list_evidence(evidence: Evidence) -> list[tuple[str, str, str]]:
@@ -153,8 +157,6 @@ def describe_seeds(seeds: Seeds) -> list[str]:
         f"{count} seeds, {broken} with a violation. Each takes {each_s:.1f} s of a processor: two sessions of "
         f"5 s, of which the second must give the same bytes. Held {len(holds)} times: at most {most} ticks "
         "after the last sample that came into use.",
-        "",
-        describe_torques(seeds),
     ]
 
 
@@ -189,31 +191,36 @@ def main() -> int:
     parser.add_argument(
         "--write",
         action="store_true",
-        help="run the matrix's tests too, and write docs/reference/faults.md",
+        help="run the matrix's tests too, and write docs/data and docs/reference/faults.md",
     )
     parser.add_argument("--jobs", type=int, help="processes at a time; all cores if left out")
     asked = parser.parse_args()
     seeds = judge_seeds(asked.seeds, asked.jobs)
     lines = describe_seeds(seeds)
-    print("\n".join(lines))
+    torques = describe_torques(seeds)
+    print("\n".join([*lines, "", torques]))
     if asked.write:
         ends = run_tests(
             find_tests([name for row in ROWS for name in (*row.virtual, *row.real)])
         )
         found = [find_evidence(row, seeds, ends) for row in ROWS]
-        table = [describe_row(evidence) for evidence in found]
+        write_table(
+            MATRIX,
+            ("number", "fault", "what must happen", "not tried"),
+            [describe_row(evidence) for evidence in found],
+        )
         write_table(
             TESTS,
             ("fault", "evidence", "result"),
             [line for evidence in found for line in list_evidence(evidence)],
         )
         write_table(COUNTS, ("event", "count"), count_visits(seeds))
-        heads = ["| fault | what must happen | not tried |", "|---|---|---|"]
+        TORQUES.write_text(torques + "\n", "utf-8")
         text = PAGE.read_text("utf-8")
         before, _, rest = text.partition(BEGIN)
-        made = "\n".join([BEGIN, "", *heads, *table, "", *lines, "", END])
+        made = "\n".join([BEGIN, "", *lines, "", END])
         PAGE.write_text(before + made + rest.partition(END)[2], "utf-8")
-        print("\n".join(describe_row(evidence) for evidence in found if not evidence.holds))
+        print("\n".join(" | ".join(describe_row(one)) for one in found if not one.holds))
     return int(bool(seeds.failed))
 
 

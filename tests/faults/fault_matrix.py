@@ -1,6 +1,6 @@
 """The fault matrix: every fault, what is required, and what shows it, in virtual time and for real.
 
-`python -m tests.faults` runs all of it and writes docs/reference/faults.md.
+`python -m tests.faults --write` runs all of it and writes docs/data/fault-matrix.csv.
 """
 
 from typing import NamedTuple

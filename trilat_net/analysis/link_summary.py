@@ -4,7 +4,7 @@ A site is the process that runs one arm. A link is the one-way connection from o
 another. In every tick of its control loop, a site sends a sample of its state. The receiver
 uses the newest sample that has arrived and whose emulated delay has passed. The effective delay
 of the link is the age of the sample in use (age of information; Kaul, Yates and Gruteser 2012).
-docs/reference/definitions.md defines each quantity.
+docs/reference/metrics.md defines each quantity.
 
 The program delays samples itself, to emulate a network. Each delay depends only on the seed,
 the link and the number of the sample. Therefore this module can compute the delays again from
@@ -322,7 +322,7 @@ class AgeHistogram(NamedTuple):
 class ClockSummary(NamedTuple):
     """The clock of a link's sender, compared with the receiver's.
 
-    docs/reference/definitions.md defines the quantities under `clock.*`.
+    docs/reference/metrics.md defines the quantities under `clock.*`.
 
     Attributes:
         offset_us: Last estimate of the sender's clock minus the receiver's, in microseconds.
@@ -394,7 +394,7 @@ def summarise_clock(log: Log, peer: str, site: str) -> ClockSummary | None:
 class SampleCounts(NamedTuple):
     """Numbers of samples of a link, counted from the receiver's records.
 
-    A sample is the state that a site publishes in one tick. docs/reference/definitions.md
+    A sample is the state that a site publishes in one tick. docs/reference/metrics.md
     defines the numbers under `samples.*`.
 
     Attributes:
@@ -426,7 +426,7 @@ class SampleCounts(NamedTuple):
 class LinkSummary(NamedTuple):
     """Summary of what a link did in a run: its delay, its losses and its counts.
 
-    A link is the directed connection from a peer to a site. docs/reference/definitions.md
+    A link is the directed connection from a peer to a site. docs/reference/metrics.md
     ("Links") defines the quantities. A quantity that the log does not determine is None. The
     age of a sample is the time since the peer sent it. A sample is judged if the log shows
     whether it arrived.

@@ -3,8 +3,7 @@
 A metric is a number that describes a recorded run or a part of it. A site is the process that
 runs one arm. The arm is a master, which a person moves, or a slave. The error of a site is the
 difference between the joint angles of its arm and the weighted mean of the angles of the arms
-that it follows, which arrive with a delay. docs/reference/metrics.md and
-docs/reference/definitions.md define every metric.
+that it follows, which arrive with a delay. docs/reference/metrics.md defines every metric.
 
 Invariant:
     - The error includes the delay of the links. The largest distance between the arms (spread)
