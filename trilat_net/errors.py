@@ -264,6 +264,21 @@ def count_nouns(count: object, singular: str, plural: str = "") -> str:
     return f"{count} {plural or pluralise(singular)}"
 
 
+def format_wall_time(seconds: float) -> str:
+    """Returns a duration as a string with a readable unit, as in "2.5 h".
+
+    A larger unit is used from one and a half units on, and days from two days on.
+
+    Args:
+        seconds: The duration, in s.
+    """
+    units = (("days", 86_400.0, 172_800.0), ("h", 3600.0, 5400.0), ("min", 60.0, 90.0))
+    for unit, unit_s, smallest_s in units:
+        if seconds >= smallest_s:
+            return f"{seconds / unit_s:.3g} {unit}"
+    return f"{max(1, round(seconds))} s"
+
+
 def pluralise(singular: str) -> str:
     """Returns the plural of a noun.
 

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 import trilat_net as tn
+from trilat_net.analysis.theory.hand_files import read_hands
 from trilat_net.analysis.theory.port_passivity import HandMatrices
 from trilat_net.core.step.vectors import Array
 from trilat_net.errors import UsageError
-from trilat_net.studies.hand_impedance import HandImpedance, identify_hand, read_hands
+from trilat_net.studies.hand_impedance import HandImpedance, identify_hand
 
 ALONG_X, ALONG_Y = (
     (0.5, 1.0, 1.5, 2.0, 3.0, 4.5, 6.5),

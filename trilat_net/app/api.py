@@ -49,7 +49,7 @@ def _list_override_texts(overrides: Overrides, duration_s: float | None) -> list
         overrides: Overrides by key, or a text or texts KEY=VALUE.
         duration_s: Duration of the run in s, which becomes the last override. None adds none.
     """
-    from ..studies.trials import list_assignments
+    from ..work.study_folder import list_assignments
 
     texts: list[Any]
     if isinstance(overrides, Mapping):
@@ -298,8 +298,8 @@ def linear(
         ScenarioError: The scenario is not valid, or has no linear loop.
         UsageError: Another argument is not valid.
     """
+    from ..analysis.theory.hand_files import read_hands
     from ..analysis.theory.linear_analysis import analyse_linear_loop
-    from ..studies.hand_impedance import read_hands
 
     try:
         angles = None if pose is None else tuple(map(float, pose))

@@ -29,7 +29,7 @@ Invariant:
 """
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -42,7 +42,6 @@ from scipy.special import stdtrit
 
 from ..analysis.aligned import AlignedRecords, align_records
 from ..analysis.theory.characteristic_roots import Complex
-from ..analysis.theory.port_passivity import HandMatrices
 from ..analysis.torque_sources import compute_operator_script, split_torque
 from ..core.arms.exogenous import SCRIPTED_KINDS
 from ..core.step.vectors import Array
@@ -63,8 +62,6 @@ MAX_CONDITION = 1e3
 """Largest condition number of the motions with which the axes can be distinguished."""
 _TINY = 1e-300
 """Smallest divisor, so that 0 / 0 gives 0."""
-KEYS = {"mass_kg": "M", "damping_n_s_m": "B", "stiffness_n_m": "K"}
-"""Name of the matrix under each key of the JSON file."""
 UNITS = {"M": "kg", "B": "N s/m", "K": "N/m"}
 """Unit of each matrix."""
 
@@ -609,43 +606,3 @@ def _fit_impedance(force: Complex, motions: Complex, segments: NDArray[np.int64]
     fit = least_squares(compute_weighted_residuals, first_guess, x_scale="jac")
     impedance: Array = fit.x
     return impedance
-
-
-def read_hands(files: Sequence[str | Path]) -> list[HandMatrices]:
-    """Reads the mass, damping and stiffness of hands from files.
-
-    Args:
-        files: Paths of JSON files that `trilat identify hand --json` wrote.
-
-    Returns:
-        The mass, damping and stiffness matrices of each hand, in the order of the files.
-
-    Raises:
-        UsageError: A file does not contain a hand.
-    """
-    return [_read_hand(Path(file)) for file in files]
-
-
-def _read_hand(file: Path) -> HandMatrices:
-    """Reads an identified hand from a JSON file.
-
-    Raises:
-        UsageError: The file does not contain a hand.
-    """
-    try:
-        values = json.loads(file.read_text(encoding="utf-8"))
-        M, B, K = (np.array(values[key], dtype=np.float64) for key in KEYS)
-        have_same_shape = M.shape == B.shape == K.shape
-        if not have_same_shape or M.shape not in ((2, 2), (3, 3)):
-            raise ValueError("the matrices must all have 2 rows and columns, or all have 3")
-        if not np.isfinite([M, B, K]).all():
-            raise ValueError("a number is not finite")
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        problem = str(error)
-        # The text of a KeyError is only the key.
-        if isinstance(error, KeyError):
-            problem = f"the key {error} is missing"
-        raise UsageError(
-            f"{file}: does not contain the output of `trilat identify hand --json`: {problem}"
-        ) from None
-    return HandMatrices(M, B, K)

@@ -48,7 +48,6 @@ from ..core.step.jit import is_core_cached
 from ..errors import LawFailed, LogError, ScenarioError, TrilatError, count_nouns
 from ..execution import virtual
 from ..execution.verify import verify
-from ..fields import is_distribution
 from ..log.log_reader import open_log
 from ..net.clock import SystemClock
 from ..presentation.result_text import Block, MarkedText, TextTable
@@ -58,7 +57,7 @@ from ..scenario.code_consent import list_imported_code
 from ..scenario.scenario_reader import read_experiment, reseed_scenario
 from ..work.executor import MAX_LOSSES, WorkerPool, Workers, open_worker_pool
 from ..work.intervals import MeanInterval, mean_interval
-from ..work.study_folder import format_command, format_toml_value, set_options
+from ..work.study_folder import format_command, list_assignments, set_options
 from .measure_run import (
     ExpectationResult,
     RunMetrics,
@@ -271,20 +270,6 @@ def _check_expectations_reachable(scenario: Scenario, source: str) -> None:
                 f"must not be after the end of the run at {end_s:g} s, not {window.to_s:g}"
             )
             raise ScenarioError(problem, path=f"expect.windows[{n}].to_s", source=source)
-
-
-def list_assignments(overrides: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
-    """Yields the overrides of a nested mapping as texts KEY=VALUE, as on the command line.
-
-    Args:
-        overrides: Values by key, also as nested tables.
-        prefix: Keys of the enclosing tables, each followed by a dot.
-    """
-    for key, value in overrides.items():
-        if isinstance(value, Mapping) and not is_distribution(value):
-            yield from list_assignments(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}={format_toml_value(value)}"
 
 
 def evaluate_live_log(

@@ -15,7 +15,8 @@ import trilat_net
 from tests.log_editing import edited, recorded, without
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import apply_overrides, load_scenario
-from trilat_net.studies.trials import Trial, evaluate_live_log, list_assignments
+from trilat_net.studies.trials import Trial, evaluate_live_log
+from trilat_net.work.study_folder import list_assignments
 
 from .results import TOO_MUCH, quick
 

@@ -14,24 +14,20 @@ import os
 import platform
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ...errors import UsageError, count_nouns
+from ...errors import UsageError, count_nouns, format_wall_time
 from ...net.clock import SystemClock
 from ...presentation import terminal_output as terminal
 from . import options
 from .options import flag, value
+from .run_progress import run_in_own_folder, show_progress
 
 if TYPE_CHECKING:
-    from trilat_net.app.demo_session import SessionResult
-
-    from ...scenario import Scenario
     from ...studies.bench import BenchResults
     from ...studies.bench.bench_run import BenchFolder
     from ...studies.trials import Trial, TrialReport, TrialResult
@@ -214,88 +210,6 @@ def _run_live(trials: "list[Trial]") -> "TrialReport":
     return TrialReport(results, (clock.monotonic_ns() - start_ns) * 1e-9)
 
 
-def run_in_own_folder(scenario: "Scenario", label: str, folder_name: str) -> "SessionResult":
-    """Runs a scenario live, with its results in a new folder.
-
-    Args:
-        scenario: The scenario.
-        label: Name of the run in the printed line.
-        folder_name: Name of the folder, to which a number is added.
-
-    Raises:
-        typer.Exit: The session was interrupted.
-    """
-    from trilat_net.app.demo_session import run_demo
-
-    from ...files import make_results_folder
-
-    folder = make_results_folder(None, folder_name, force=False)
-    terminal.print_text(f"{label}: {scenario.duration_s:g} s live, into {folder}")
-    outcome = run_demo(scenario, folder, terminal.out)
-    if outcome.interrupted:
-        terminal.err.print("interrupted")
-        raise typer.Exit(128 + outcome.interrupted)
-    return outcome
-
-
-_PROGRESS_LINES = 10
-"""Number of lines that show progress if the output is not a terminal."""
-
-
-@contextmanager
-def show_progress(
-    label: str, print_line: Callable[[str], None], items: str = "runs"
-) -> Iterator[Callable[[int, int], None]]:
-    """Shows progress as a bar in a terminal, and elsewhere as a few printed lines.
-
-    Args:
-        label: Label of the bar.
-        print_line: Function that prints a line.
-        items: Noun of the counted items, in the plural.
-
-    Yields:
-        A function to call with the number of finished items and of all items.
-    """
-    if terminal.err.is_interactive:
-        with terminal.progress_bar(label) as show:
-            yield show
-        return
-    from ...studies.sweep.sweep_run import format_wall_time
-
-    clock = SystemClock()
-    first_call_ns = -1  # time of the first call of `show_line`, -1 before it
-    done_at_first_call = 0
-    printed_tenths = 0  # tenths of the items that were finished at the last printed line
-
-    def show_line(done: int, total: int) -> None:
-        """Prints a line with the remaining time, about once per tenth of the items.
-
-        The remaining time follows from the mean duration of the items since the first call. No
-        line is printed at the first call, where this duration is unknown, nor after the last
-        item.
-
-        Args:
-            done: Number of finished items.
-            total: Number of all items.
-        """
-        nonlocal first_call_ns, done_at_first_call, printed_tenths
-        if first_call_ns < 0:
-            # The time before the first item is the start of the processes, which does not
-            # count towards the duration of an item.
-            first_call_ns = clock.monotonic_ns()
-            done_at_first_call = done
-        finished_tenths = done * _PROGRESS_LINES // total
-        has_no_remaining_time = done in (total, done_at_first_call)
-        if has_no_remaining_time or finished_tenths <= printed_tenths:
-            return
-        printed_tenths = finished_tenths
-        elapsed_s = (clock.monotonic_ns() - first_call_ns) * 1e-9
-        remaining_s = elapsed_s / (done - done_at_first_call) * (total - done)
-        print_line(f"  {done} of {total} {items}, about {format_wall_time(remaining_s)} left")
-
-    yield show_line
-
-
 def _run_tuning(
     plan: "TuningPlan",
     folder: Path | None,
@@ -316,7 +230,6 @@ def _run_tuning(
         as_json: True to print the result as JSON.
     """
     from ...files import make_results_folder
-    from ...studies.sweep.sweep_run import format_wall_time
     from ...studies.tuning.tuning_report import describe_procedure, write_tuning
     from ...work.executor import count_workers
 
@@ -706,6 +619,29 @@ def bench_command(
     paths = write_bench(results, folder.path, format_command("bench", *arguments))
     terminal.print_result(results, as_json=as_json)
     terminal.print_paths([] if as_json else paths)
+
+
+@options.command("run.mcap --site m1 --json > m1.json", page="docs/studies/measured-hands.md")
+def identify_hand_command(
+    file: options.LogsArgument,
+    site: Annotated[
+        str,
+        value("--site", "SITE", "Site of the held arm.", autocompletion=options.complete_sites),
+    ] = "m1",
+    as_json: options.JsonOption = False,
+) -> None:
+    """Identifies the mass, damping and stiffness of the hand that holds an arm.
+
+    A sum of sines must move the arm during the run, so the scenario needs an operator of kind
+    "multisine" at any site (docs/studies/measured-hands.md). `trilat linear
+    --operators` reads the JSON of the result.
+    """
+    from ...studies.hand_impedance import identify_hand
+
+    log = terminal.open_with_progress(*file)
+    with terminal.progress_lines(f"identifying the hand at {site}"):
+        identified = identify_hand(log, site)
+    terminal.print_result(identified, as_json=as_json)
 
 
 ProtocolArgument = Annotated[

@@ -17,11 +17,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ...errors import UsageError, count_nouns, join_arguments
+from ...errors import UsageError, count_nouns, format_wall_time, join_arguments
 from ...presentation import terminal_output as terminal
 from . import options
 from .options import flag, value
-from .studies import parse_seeds, run_in_own_folder, show_progress
+from .run_progress import run_in_own_folder, show_progress
+from .studies import parse_seeds
 
 if TYPE_CHECKING:
     from ...scenario import Scenario
@@ -226,7 +227,7 @@ def _run_sweep(
 
     folder = existing_folder or sweep_run.prepare_sweep_folder(plan, path)
     if estimate.seconds:
-        duration = sweep_run.format_wall_time(estimate.seconds)
+        duration = format_wall_time(estimate.seconds)
         terminal.print_text(f"  about {duration}, by some of its cells; into {folder.path}")
     finished = _run_in_folder(folder, jobs, on, estimate)
     was_complete = not (estimate.entries or finished.runs)

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from ...analysis.metrics.log_metrics import measure_run
-from ...errors import ScenarioError, UsageError, count_nouns
+from ...errors import ScenarioError, UsageError, count_nouns, format_wall_time
 from ...execution.virtual import simulate_scenario
 from ...files import make_results_folder, write_whole
 from ...net.clock import SystemClock
@@ -392,21 +392,6 @@ def refuse_oversized_sweep(
         f"{cells} ({sizes}{seeds}) would take about {format_wall_time(expected.seconds)} "
         f"on {cores}; use larger steps for fewer cells, or run the sweep anyway with --yes"
     )
-
-
-def format_wall_time(seconds: float) -> str:
-    """Returns a duration as a string with a readable unit, as in "2.5 h".
-
-    A larger unit is used from one and a half units on, and days from two days on.
-
-    Args:
-        seconds: The duration, in s.
-    """
-    units = (("days", 86_400.0, 172_800.0), ("h", 3600.0, 5400.0), ("min", 60.0, 90.0))
-    for unit, unit_s, smallest_s in units:
-        if seconds >= smallest_s:
-            return f"{seconds / unit_s:.3g} {unit}"
-    return f"{max(1, round(seconds))} s"
 
 
 def run_sweep(
