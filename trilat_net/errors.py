@@ -24,6 +24,7 @@ from typing import ClassVar
 _PROGRAM = Path(__file__).parents[1]
 _OTHER_CODE = (
     *(_PROGRAM / package for package in ("trilat_net", "sites", "recorder", "live")),
+    _PROGRAM / "packages",
     Path(os.__file__).parent,
 )
 """Folders of this program and of Python's standard library."""
