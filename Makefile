@@ -3,6 +3,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+PACKAGES := $(wildcard packages/trilat-*)
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --no-input
 LOCKED := --quiet --require-hashes --only-binary :all: -r
 # uv takes a quarter of pip's time; pip does what uv cannot, as where only its own settings name a package index
@@ -45,10 +46,10 @@ $(VENV)/uv.stamp: requirements/uv.lock | $(VENV)/bin/python
 	@$(PIP) $(LOCKED) $< || echo "there is no uv for this machine: pip installs, more slowly"
 	@touch $@
 
-$(VENV)/runtime.stamp: requirements/runtime.lock pyproject.toml | $(VENV)/uv.stamp
+$(VENV)/runtime.stamp: requirements/runtime.lock pyproject.toml $(PACKAGES:=/pyproject.toml) | $(VENV)/uv.stamp
 	@echo "installing locked dependencies into $(VENV)"
 	$(INSTALL)
-	@$(PIP) --quiet --no-deps --no-build-isolation -e .
+	@$(PIP) --quiet --no-deps --no-build-isolation $(addprefix -e ,. $(PACKAGES))
 	@touch $@
 
 $(VENV)/compiled.stamp: $(VENV)/runtime.stamp $(wildcard trilat_net/core/*/*.py)
@@ -76,7 +77,7 @@ pytest: $(VENV)/dev.stamp
 		-m "not live and not long" --ignore tests/live
 
 SESSIONS = TRILAT_TEST_RUN=sessions flock -o $(VENV)/sessions.lock $(BIN)/python -m pytest -q -p tests.progress \
-	-o cache_dir=.pytest_cache/sessions -m "live and not long" tests/live tests/studies/sweep
+	-o cache_dir=.pytest_cache/sessions -m "live and not long" tests/live packages/trilat-studies/tests/sweep_tests
 
 sessions: $(VENV)/dev.stamp
 	@$(SESSIONS) || { echo "real-time sessions depend on what else the machine does: those that failed run once more"; \
@@ -101,7 +102,7 @@ lint: $(VENV)/dev.stamp
 
 platforms: $(VENV)/dev.stamp
 	for other in win32 darwin; do \
-		$(BIN)/mypy --platform $$other --follow-imports silent --cache-dir .mypy_cache/$$other -p trilat_net || exit 1; \
+		$(BIN)/mypy --platform $$other --follow-imports silent --cache-dir .mypy_cache/$$other -p trilat_net -p trilat_studies || exit 1; \
 	done
 
 faults: $(VENV)/dev.stamp

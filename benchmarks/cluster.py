@@ -13,8 +13,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from trilat_net.studies.sweep import plan_sweep
-from trilat_net.studies.sweep.sweep_run import CellItem, run_cell
+from trilat_studies.sweep import plan_sweep
+from trilat_studies.sweep.sweep_run import CellItem, run_cell
+
 from trilat_net.work.executor import open_worker_pool, run_batch
 from trilat_net.workers import worker_pool
 

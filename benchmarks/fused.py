@@ -8,6 +8,8 @@ import dataclasses
 import time
 
 import numpy as np
+from trilat_studies.gym_environment import make_env
+from trilat_studies.sweep.sweep_cell import classify_cell
 
 from tests.theory.delay_equations import equations
 from trilat_net.errors import ScenarioError
@@ -15,8 +17,6 @@ from trilat_net.execution import virtual
 from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.laws import LAWS
-from trilat_net.studies.gym_environment import make_env
-from trilat_net.studies.sweep.sweep_cell import classify_cell
 from trilat_net.workers import count_cores, worker_pool
 
 from .stopwatch import best_s

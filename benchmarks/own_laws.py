@@ -6,8 +6,9 @@ on the machine bears on all alike.
 
 import time
 
+from trilat_studies.sweep.sweep_cell import classify_cell
+
 from trilat_net.scenario import load_scenario
-from trilat_net.studies.sweep.sweep_cell import classify_cell
 from trilat_net.workers import count_cores, worker_pool
 
 CELLS = 400

@@ -78,7 +78,7 @@ def read_commands(text: str) -> Iterator[tuple[list[str], list[str]]]:
 ELSEWHERE = {
     "README.md": ".ci/readme",
     "docs/commands.md": ".ci/readme",
-    "docs/studies/bench.md: trilat bench --small": "tests/cli/test_benches.py",
+    "docs/studies/bench.md: trilat bench --small": "packages/trilat-studies/tests/command_tests/test_benches.py",
     "docs/sessions/code-that-runs.md: trilat verify": "tests/cli/test_code_from_logs.py",
     "docs/sessions/code-that-runs.md: log = tn.open_log": "tests/cli/test_code_from_logs.py",
     "docs/sessions/devices.md: import trilat_net": "tests/sites/test_device_hand.py",
@@ -98,8 +98,9 @@ ELSEWHERE = {
     "docs/sessions/live-page.md: trilat live": "tests/live/test_live_page.py",
     "docs/studies/measured-hands.md: trilat identify hand": "tests/cli/test_linears.py",
     "docs/logs/replay.md: trilat replay": "tests/live/test_replay.py",
-    "docs/maps/README.md: trilat sweep runs/mine --confirm": "tests/studies/sweep/test_confirmation.py",
-    "docs/maps/README.md: trilat sweep SCENARIO": "tests/cli/test_sweeps.py",
+    "docs/maps/README.md: trilat sweep runs/mine --confirm": "packages/trilat-studies/tests/sweep_tests/test_confirmation.py",
+    "docs/maps/README.md: trilat sweep SCENARIO": "packages/trilat-studies/tests/command_tests/test_sweeps.py",
+    "docs/maps/p_d.md: trilat sweep runs/map-p_d --confirm": "packages/trilat-studies/tests/sweep_tests/test_confirmation.py",
     "docs/sessions/network.md: trilat keys new keys m1 m2 s recorder operator --host": "tests/live/test_namespaces.py",
     "docs/sessions/network.md: trilat keys new keys m1 m2 s recorder operator router": "tests/live/test_routers.py",
     "docs/sessions/network-check.md: trilat ping --answer": "tests/sites/test_network_benchmark.py",
@@ -113,9 +114,9 @@ ELSEWHERE = {
     "docs/tutorials/two-people.md: trilat experiment new": "tests/cli/test_experiments.py",
     "docs/tutorials/two-people.md: trilat experiment run": "tests/live/test_experiment_sessions.py",
     "docs/tutorials/two-people.md: trilat experiment analyse": "tests/studies/experiment/test_experiment_analysis.py",
-    "docs/theory/growth-exponents.md: $ trilat sweep p_d_margin": "tests/studies/sweep/test_exponents.py",
-    "docs/studies/sweep.md: $ trilat sweep p_d_margin": "tests/cli/test_sweeps.py",
-    "docs/studies/sweep-cluster.md: $ dask scheduler": "tests/studies/test_dask_cluster.py",
+    "docs/theory/growth-exponents.md: $ trilat sweep p_d_margin": "packages/trilat-studies/tests/sweep_tests/test_exponents.py",
+    "docs/studies/sweep.md: $ trilat sweep p_d_margin": "packages/trilat-studies/tests/command_tests/test_sweeps.py",
+    "docs/studies/sweep-cluster.md: $ dask scheduler": "packages/trilat-studies/tests/test_dask_cluster.py",
 }
 """Beginnings of blocks that take machines, a robot, a session or minutes, and the tests of the same."""
 

@@ -8,24 +8,29 @@ from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-TOPS = ("trilat_net", "sites", "recorder", "live")
+TOPS = {
+    **dict.fromkeys(("trilat_net", "sites", "recorder", "live"), ROOT),
+    "trilat_studies": ROOT / "packages" / "trilat-studies",
+}
+"""The packages of the program, each with the folder in which it lies."""
 BELOW_ALL = {
-    "errors",
-    "process",
-    "signals",
-    "workers",
-    "files",
-    "results",
-    "fields",
-    "records",
-    "recorded_change",
-    "hooks",
+    *("errors", "process", "signals", "workers", "files", "results", "fields", "records"),
+    *("recorded_change", "hooks", "entry_points", "package_names"),
 }
 
 
 def files() -> list[Path]:
     """Returns every source file, tests aside."""
-    return sorted(path for top in (*TOPS, "containers") for path in (ROOT / top).rglob("*.py"))
+    folders = [parent / top for top, parent in TOPS.items()]
+    return sorted(
+        path for folder in (*folders, ROOT / "containers") for path in folder.rglob("*.py")
+    )
+
+
+def _dotted_parts(path: Path) -> tuple[str, ...]:
+    """Returns the name of a file's module, in parts; the name of a file of no package is its path."""
+    parents = [parent for top, parent in TOPS.items() if path.is_relative_to(parent / top)]
+    return path.relative_to(*(parents or [ROOT])).with_suffix("").parts
 
 
 @cache
@@ -40,7 +45,7 @@ INNER_ROOMS = {("app", "api"), ("app", "cli"), ("analysis", "theory")}
 
 def room(path: Path) -> str:
     """Returns the room of a file: its top-level folder, or one of those of `trilat_net`."""
-    top, *below = path.relative_to(ROOT).with_suffix("").parts
+    top, *below = _dotted_parts(path)
     if top != "trilat_net":
         return top
     return below[1] if tuple(below[:2]) in INNER_ROOMS else below[0]
@@ -48,7 +53,7 @@ def room(path: Path) -> str:
 
 def imported_names(path: Path) -> Iterator[tuple[str, ...]]:
     """Yields what a file imports, wherever in it the import stands, as the parts of a dotted name."""
-    package = path.relative_to(ROOT).parent.parts
+    package = _dotted_parts(path)[:-1]
     for node in ast.walk(tree(path)):
         if isinstance(node, ast.ImportFrom):
             base = package[: len(package) - node.level + 1] if node.level else ()
@@ -62,8 +67,9 @@ def _imported(path: Path) -> Iterator[Path]:
     """Yields the files of this program that a file imports."""
     for name in imported_names(path):
         for parts in (name, name[:-1]):
-            at = ROOT.joinpath(*parts)
-            if parts and parts[0] in TOPS and (found := _module(at)) is not None:
+            if not parts or parts[0] not in TOPS:
+                continue
+            if (found := _module(TOPS[parts[0]].joinpath(*parts))) is not None:
                 yield found
                 break
 
@@ -112,7 +118,7 @@ def layers() -> dict[str, int]:
 
 
 def _dotted(path: Path) -> str:
-    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+    return ".".join(_dotted_parts(path)).removesuffix(".__init__")
 
 
 @cache
@@ -181,7 +187,19 @@ def unused_methods() -> set[str]:
         )
     )
     methods = set()
-    folders = (*TOPS, "containers", "plugins", "tests", "benchmarks", "examples", "docs")
+    folders = (
+        "trilat_net",
+        "sites",
+        "recorder",
+        "live",
+        "packages",
+        "containers",
+        "plugins",
+        "tests",
+        "benchmarks",
+        "examples",
+        "docs",
+    )
     for path in sorted(path for folder in folders for path in (ROOT / folder).rglob("*.py")):
         for node in ast.walk(tree(path)):
             match node:
@@ -191,7 +209,7 @@ def unused_methods() -> set[str]:
                     references.add(name)
                 case ast.Constant(value=str(name)):
                     references.add(name)
-                case ast.ClassDef() if not path.is_relative_to(ROOT / "tests"):
+                case ast.ClassDef() if "tests" not in path.parts:
                     methods |= {
                         (node.name, method.name)
                         for method in node.body

@@ -23,15 +23,15 @@ from pathlib import Path
 
 from . import house
 
-SOURCES = (*house.TOPS, "packages", "plugins")
+SOURCES = ("trilat_net", "sites", "recorder", "live", "packages", "plugins")
 PARTS = {
     "ros2": r"ros2|robot_model",
     "lerobot": r"lerobot",
-    "people": r"studies/experiment|^live/|sites/devices|device_hand|hand_impedance",
-    "studies": r"^trilat_net/studies/",
+    "people": r"studies/experiment|cli/experiments|^live/|sites/devices|device_hand|hand_impedance",
+    "studies": r"^trilat_net/studies/|^packages/trilat-studies/",
     "kernel": r"^trilat_net/(core|laws)/|^trilat_net/(fields|errors|files|process|signals|workers|results|hooks|records|recorded_change)\.py",
     "analysis": r"^trilat_net/analysis/",
-    "app": r"^trilat_net/(app|presentation|work)/|^trilat_net/(__init__|__main__)\.py",
+    "app": r"^trilat_net/(app|presentation|work)/|^trilat_net/(__init__|__main__|entry_points|package_names)\.py",
     "session": r"^trilat_net/(scenario|net|log|execution)/|^sites/|^recorder/",
 }
 """The files of each part by their paths; the first pattern that matches decides."""

@@ -106,7 +106,7 @@ def prepare_process(folder: Path) -> dict[str, str]:
     """Returns the environment of such a process and its workers; each leaves a file in a folder."""
     folder.mkdir()
     lacks, refused = read_typeshed()
-    facts = {"lacks": lacks, "refused": refused, "ours": TOPS}
+    facts = {"lacks": lacks, "refused": refused, "ours": [*TOPS]}
     (folder / "facts.json").write_text(json.dumps(facts), encoding="utf-8")
     (folder / "sitecustomize.py").write_text(_START, encoding="utf-8")
     return {

@@ -8,6 +8,15 @@ from pathlib import Path
 from typing import get_args
 
 import pytest
+from trilat_studies.bench import bench_plan, bench_results, bench_run
+from trilat_studies.sweep import (
+    live_confirmation,
+    margin_search,
+    sweep_cell,
+    sweep_plan,
+    sweep_run,
+)
+from trilat_studies.tuning import candidate, search_space, tuning_plan
 
 from recorder import backfill, record_process, site_reception
 from sites import (
@@ -42,15 +51,6 @@ from trilat_net.files import find_page
 from trilat_net.log import accounting, log_file, mcap_reader, mcap_records, site_log
 from trilat_net.net import arm_client, offset, requests, session, timing, zenoh_config
 from trilat_net.scenario import delay_period, laws, operators, resolve
-from trilat_net.studies.bench import bench_plan, bench_results, bench_run
-from trilat_net.studies.sweep import (
-    live_confirmation,
-    margin_search,
-    sweep_cell,
-    sweep_plan,
-    sweep_run,
-)
-from trilat_net.studies.tuning import candidate, search_space, tuning_plan
 from trilat_net.work import dask_cluster, executor
 
 ROOT = Path(__file__).parents[1]

@@ -17,6 +17,13 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 from scipy.stats import uniform
+from trilat_studies.sweep.sweep_cell import CellClass, classify_cell
+from trilat_studies.tuning.candidate import CandidateScore, measure_candidate
+from trilat_studies.tuning.search_space import (
+    SEARCH_SPACES,
+    build_model_information,
+    select_search_spaces,
+)
 
 import trilat_net
 from tests.analysis.ages_in_use import in_order, newest_wins
@@ -36,13 +43,6 @@ from trilat_net.analysis.theory.port_analysis import PortAnalysis, analyse_ports
 from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.delay_models import DELAY_MODELS
-from trilat_net.studies.sweep.sweep_cell import CellClass, classify_cell
-from trilat_net.studies.tuning.candidate import CandidateScore, measure_candidate
-from trilat_net.studies.tuning.search_space import (
-    SEARCH_SPACES,
-    build_model_information,
-    select_search_spaces,
-)
 
 ROOT = Path(__file__).parents[1]
 NUMBER = r"([-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?)"

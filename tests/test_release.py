@@ -185,6 +185,8 @@ def run(*words: object, cwd: Path, **more: str) -> str:
 
 
 CORE, WHOLE = "trilat-net-core", "trilat-net"
+PACKAGES = [path.parent.name for path in sorted(ROOT.glob("packages/trilat-*/pyproject.toml"))]
+EXAMPLE = "trilat-lag"
 
 
 @pytest.fixture(scope="module")
@@ -200,7 +202,8 @@ def built(sources: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
     """By distribution its sdist, and the wheel that is made of that sdist."""
     build = "from setuptools.build_meta import *; import sys; print(globals()[sys.argv[1]](sys.argv[2]))"
     made = {}
-    for name in (CORE, WHOLE):
+    shutil.copytree(ROOT / "examples" / "package", sources / EXAMPLE)
+    for name in (CORE, *PACKAGES, WHOLE, EXAMPLE):
         folder = tmp_path_factory.mktemp("built")
         run(sys.executable, "-c", build, "build_sdist", folder, cwd=sources / name)
         (sdist,) = folder.glob("*.tar.gz")
@@ -226,8 +229,9 @@ def test_both_distributions_are_one_program_of_one_version(sources: Path) -> Non
         WHOLE,
         VERSION,
     )
-    first, *added = whole["dependencies"]
-    assert first == f"{CORE}=={VERSION}"
+    brought = [f"{name}=={VERSION}" for name in (CORE, *PACKAGES)]
+    added = whole["dependencies"][len(brought) :]
+    assert whole["dependencies"][: len(brought)] == brought
     assert names_of(added) == set(STUDY_LIBRARIES)
     assert sorted([*core["dependencies"], *added]) == sorted(PROJECT["project"]["dependencies"])
     assert {**core["scripts"], **whole["scripts"]} == PROJECT["project"]["scripts"]
@@ -238,6 +242,16 @@ def test_both_distributions_are_one_program_of_one_version(sources: Path) -> Non
         "README.md",
         "LICENSE",
     }
+
+
+@pytest.mark.parametrize("name", PACKAGES)
+def test_a_package_has_the_version_and_bounds_of_the_program(name: str, sources: Path) -> None:
+    released = tomllib.loads((sources / name / "pyproject.toml").read_text(encoding="utf-8"))
+    first, *libraries = released["project"]["dependencies"]
+    assert (released["project"]["version"], first) == (VERSION, f"{CORE}=={VERSION}")
+    assert "dynamic" not in released["project"]
+    assert set(libraries) <= set(PROJECT["project"]["dependencies"])
+    assert distribution(name).version == VERSION
 
 
 def needed(names: set[str]) -> dict[str, Distribution]:
@@ -325,11 +339,58 @@ def test_a_robot_runs_trilat_net_core_alone(
         for process in started:
             process.kill()
     assert "4000/4000 records identical" in run(trilat, "verify", "run.mcap", cwd=tmp_path)
+    for name in PACKAGES:
+        install(clean, built[name][1], stated)
     install(clean, built[WHOLE][1], stated)
     for name in PROJECT["project"]["scripts"]:
         assert run(clean / "bin" / name, "--version", cwd=tmp_path) == f"trilat-net {VERSION}\n"
     run(clean / "bin" / "trilat-net", "report", "run.mcap", "-o", "report", cwd=tmp_path)
     assert (tmp_path / "report" / "report.html").is_file()
+
+
+ALONE = """
+import sys
+import trilat_net as tn
+print(tn.simulate("two_sites", duration_s=0.1)["m"].q.shape)
+import recorder.record_process, sites.site_process, trilat_net.app.doctor
+from trilat_net.errors import UsageError
+try:
+    tn.sweep("two_sites")
+except UsageError as error:
+    print(error)
+print([name for name in sys.modules if name.startswith("trilat_studies")])
+"""
+
+
+@pytest.mark.long
+def test_packages_and_those_of_others_join_the_core(
+    built: dict[str, list[Path]], tmp_path: Path
+) -> None:
+    """The core imports none of them, and says what to install; with them it has their commands and functions."""
+    clean = tmp_path / "clean"
+    run(sys.executable, "-m", "venv", "--without-pip", clean, cwd=tmp_path)
+    stated = names_of(PROJECT["project"]["dependencies"])
+    install(clean, built[CORE][1], stated - set(STUDY_LIBRARIES))
+    python, trilat = clean / "bin" / "python", clean / "bin" / "trilat"
+    printed = run(python, "-c", ALONE, cwd=tmp_path).splitlines()
+    assert printed[-3] == "(100, 2)"
+    assert "pip install trilat-studies" in printed[-2]
+    assert printed[-1] == "[]"
+    refused = subprocess.run([trilat, "sweep", "two_sites"], capture_output=True, text=True)
+    assert refused.returncode == 2
+    assert refused.stderr.splitlines() == [
+        "error: trilat sweep is in a package of its own: pip install trilat-studies"
+    ]
+    install(clean, built[EXAMPLE][1], set())
+    assert "lag " in run(trilat, "--help", cwd=tmp_path)
+    words = ("lag", "two_sites", "--seeds", "2", "--duration", "0.1")
+    assert len(run(trilat, *words, cwd=tmp_path).splitlines()) == 2
+    called = "import trilat_net as tn; print(len(tn.measure_lags('two_sites', 2, 0.1)))"
+    assert run(python, "-c", called, cwd=tmp_path) == "2\n"
+    install(clean, built["trilat-studies"][1], stated)
+    grid = ("--over", "link.delay_ms=0,100", "--duration", "0.5", "--jobs", "1", "-o", "grid")
+    run(trilat, "sweep", "two_sites", *grid, cwd=tmp_path)
+    assert (tmp_path / "grid" / "results.csv").is_file()
 
 
 @pytest.mark.long

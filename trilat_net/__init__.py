@@ -15,6 +15,7 @@ last bit. Functions of this package return objects with `summary()`, `to_frame()
 `to_dict()`. docs/studies/python.md lists them all.
 """
 
+import os as _os
 from importlib import import_module as _import_module
 from typing import TYPE_CHECKING as _TYPE_CHECKING
 from typing import Any as _Any
@@ -22,8 +23,20 @@ from typing import Any as _Any
 # These packages register functions in `hooks` that packages below them call.
 from . import log as _log  # noqa: F401
 from . import presentation as _presentation  # noqa: F401
+from .package_names import PACKAGE_FUNCTIONS as _PACKAGE_FUNCTIONS
 
 if _TYPE_CHECKING:
+    from trilat_studies.arm_gains import tune_arm as tune_arm
+    from trilat_studies.gym_environment import make_env as make_env
+    from trilat_studies.hand_impedance import identify_hand as identify_hand
+    from trilat_studies.log_comparison import compare as compare
+    from trilat_studies.study_functions import bench as bench
+    from trilat_studies.study_functions import margin as margin
+    from trilat_studies.study_functions import sweep as sweep
+    from trilat_studies.study_functions import tune as tune
+    from trilat_studies.trials import check as check
+    from trilat_studies.trials import trials as trials
+
     from sites.devices import Device as Device
     from sites.devices import DeviceState as DeviceState
     from sites.devices.haply_inverse3 import HaplyInverse3 as HaplyInverse3
@@ -37,16 +50,12 @@ if _TYPE_CHECKING:
 
     from .analysis.file_overview import info as info
     from .analysis.twins.twin_growth import twin as twin
-    from .app.api import bench as bench
     from .app.api import certify as certify
     from .app.api import export as export
     from .app.api import linear as linear
-    from .app.api import margin as margin
     from .app.api import metrics as metrics
     from .app.api import report as report
     from .app.api import simulate as simulate
-    from .app.api import sweep as sweep
-    from .app.api import tune as tune
     from .app.api import verify as verify
     from .app.api import view as view
     from .core.life.own_hand import HandContext as HandContext
@@ -80,7 +89,6 @@ if _TYPE_CHECKING:
     from .scenario.skeletons import new_hand as new_hand
     from .scenario.skeletons import new_law as new_law
     from .scenario.skeletons import new_plant as new_plant
-    from .studies.arm_gains import tune_arm as tune_arm
     from .studies.experiment.experiment_analysis import analyse_experiment as analyse_experiment
     from .studies.experiment.experiment_analysis import (
         compute_experiment_power as compute_experiment_power,
@@ -89,11 +97,6 @@ if _TYPE_CHECKING:
     from .studies.experiment.experiment_run import new_experiment as new_experiment
     from .studies.experiment.experiment_run import open_experiment as open_experiment
     from .studies.experiment.experiment_run import run_experiment as run_experiment
-    from .studies.gym_environment import make_env as make_env
-    from .studies.hand_impedance import identify_hand as identify_hand
-    from .studies.log_comparison import compare as compare
-    from .studies.trials import check as check
-    from .studies.trials import trials as trials
 
     __version__: str
 
@@ -107,8 +110,7 @@ _NAMES = {
     "trilat_net.app.running_session": "hand session start",
     "trilat_net.analysis.file_overview": "info",
     "trilat_net.analysis.twins.twin_growth": "twin",
-    "trilat_net.app.api": "bench certify export linear margin metrics report simulate sweep "
-    "tune verify view",
+    "trilat_net.app.api": "certify export linear metrics report simulate verify view",
     "trilat_net.core.plug.compiled_law": "compiled",
     "trilat_net.core.life.own_hand": "HandContext HandView",
     "trilat_net.core.plug.user_law": "LawContext LawInput",
@@ -128,20 +130,17 @@ _NAMES = {
     "trilat_net.scenario.own_plant": "PlantContext",
     "trilat_net.scenario.simulated_arm": "SimulatedArm",
     "trilat_net.scenario.skeletons": "new_hand new_law new_plant",
-    "trilat_net.studies.arm_gains": "tune_arm",
     "trilat_net.studies.experiment.experiment_analysis": "analyse_experiment "
     "compute_experiment_power",
     "trilat_net.studies.experiment.experiment_run": "check_experiment new_experiment "
     "open_experiment run_experiment",
-    "trilat_net.studies.gym_environment": "make_env",
-    "trilat_net.studies.hand_impedance": "identify_hand",
-    "trilat_net.studies.log_comparison": "compare",
-    "trilat_net.studies.trials": "check trials",
 }
 """The public names that each module defines, separated by spaces."""
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
 """For each public name the module that defines it."""
-__all__ = sorted(["__version__", *_MODULES])
+_PACKAGE_NAMES = " ".join(_PACKAGE_FUNCTIONS.values()).split()
+"""The public names of packages of their own, such as trilat-studies."""
+__all__ = sorted(["__version__", *_MODULES, *_PACKAGE_NAMES])
 
 
 def __getattr__(name: str) -> _Any:
@@ -149,7 +148,7 @@ def __getattr__(name: str) -> _Any:
 
     Python calls this function for names that the package does not contain. Importing everything
     at once would delay commands such as `trilat --help` by seconds, since Numba alone takes a
-    second.
+    second. Other installed packages may add names (`entry_points`).
 
     Raises:
         AttributeError: There is no such public name.
@@ -158,9 +157,26 @@ def __getattr__(name: str) -> _Any:
         from .files import find_version
 
         return find_version()
-    if name in _MODULES:
+    if name in _MODULES or name in _PACKAGE_NAMES or _is_added(name):
         return _import_name(name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def _is_added(name: str) -> bool:
+    """Returns True if another installed package adds a name.
+
+    Before Python imports a module of this package, it asks for an attribute of that name. Such
+    names are recognised by their files, because reading the entry points takes milliseconds.
+
+    Args:
+        name: The name.
+    """
+    files = (f"{folder}/{name}{ending}" for folder in __path__ for ending in ("", ".py"))
+    if name.startswith("_") or any(map(_os.path.exists, files)):
+        return False
+    from .entry_points import FUNCTIONS, find_entries
+
+    return name in find_entries(FUNCTIONS)
 
 
 def _import_name(name: str) -> _Any:
@@ -177,7 +193,11 @@ def _import_name(name: str) -> _Any:
     from .errors import UsageError
 
     try:
-        return getattr(_import_module(_MODULES[name]), name)
+        if name in _MODULES:
+            return getattr(_import_module(_MODULES[name]), name)
+        from .entry_points import FUNCTIONS, load_entry
+
+        return load_entry(FUNCTIONS, name, f"trilat_net.{name}")
     except UsageError as error:
         return _make_stand_in(name, str(error))
     except ModuleNotFoundError as error:
@@ -204,4 +224,6 @@ def _make_stand_in(name: str, problem: str) -> _Any:
 
 
 def __dir__() -> list[str]:
-    return __all__
+    from .entry_points import FUNCTIONS, find_entries
+
+    return sorted({*__all__, *find_entries(FUNCTIONS)})

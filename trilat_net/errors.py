@@ -24,6 +24,7 @@ from typing import ClassVar
 _PROGRAM = Path(__file__).parents[1]
 _OTHER_CODE = (
     *(_PROGRAM / package for package in ("trilat_net", "sites", "recorder", "live")),
+    _PROGRAM / "packages",
     Path(os.__file__).parent,
 )
 """Folders of this program and of Python's standard library."""
@@ -262,6 +263,21 @@ def count_nouns(count: object, singular: str, plural: str = "") -> str:
     if str(count) == "1":
         return f"{count} {singular}"
     return f"{count} {plural or pluralise(singular)}"
+
+
+def format_wall_time(seconds: float) -> str:
+    """Returns a duration as a string with a readable unit, as in "2.5 h".
+
+    A larger unit is used from one and a half units on, and days from two days on.
+
+    Args:
+        seconds: The duration, in s.
+    """
+    units = (("days", 86_400.0, 172_800.0), ("h", 3600.0, 5400.0), ("min", 60.0, 90.0))
+    for unit, unit_s, smallest_s in units:
+        if seconds >= smallest_s:
+            return f"{seconds / unit_s:.3g} {unit}"
+    return f"{max(1, round(seconds))} s"
 
 
 def pluralise(singular: str) -> str:

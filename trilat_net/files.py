@@ -29,6 +29,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from .errors import LogError, LogRefused, TrilatError, UsageError
+from .package_names import PACKAGE_COMMANDS
 
 DISK_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
 """System errors with which a disk refuses data, for example because it is full."""
@@ -84,7 +85,10 @@ def describe_missing_library(function: str, error: ModuleNotFoundError) -> str:
     package = (error.name or "").partition(".")[0]
     if package in ("", "live", "recorder", "sites", "trilat_net"):
         raise error
-    if package in STUDY_LIBRARIES:
+    distribution = package.replace("_", "-")
+    if distribution in PACKAGE_COMMANDS:
+        remedy = f"a package of its own: pip install {distribution}"
+    elif package in STUDY_LIBRARIES:
         remedy = "which trilat-net-core does not include: pip install trilat-net"
     elif package in EXTRAS:
         remedy = f"which is not installed: {format_extra_install(EXTRAS[package])}"

@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from trilat_studies.sweep.sweep_cell import classify_cell
 
 import trilat_net
 from trilat_net.analysis.certificate.premises import explain_no_functional
@@ -38,7 +39,6 @@ from trilat_net.errors import ScenarioError
 from trilat_net.execution.fused import FusedRun
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.studies.sweep.sweep_cell import classify_cell
 
 from .drawn_loops import (
     SAMPLED,

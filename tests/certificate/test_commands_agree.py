@@ -8,6 +8,9 @@ from typing import Any, NamedTuple
 
 import msgspec
 import pytest
+from trilat_studies.bench import plan_bench
+from trilat_studies.bench.bench_run import BenchRunItem, judge_bench_run, run_bench_task
+from trilat_studies.sweep.sweep_cell import classify_cell
 
 import trilat_net as tn
 from tests.certificate.drawn_loops import draw_experiment
@@ -17,9 +20,6 @@ from trilat_net.analysis.run_end import Stability
 from trilat_net.analysis.theory.linear_analysis import analyse_linear_loop
 from trilat_net.analysis.twins.twin_growth import TwinGrowth, twin
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.studies.bench import plan_bench
-from trilat_net.studies.bench.bench_run import BenchRunItem, judge_bench_run, run_bench_task
-from trilat_net.studies.sweep.sweep_cell import classify_cell
 
 DRAWN_S = 10.0
 """Duration of a drawn run. A shorter run has other words, but the same ones by every command."""

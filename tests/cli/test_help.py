@@ -5,12 +5,12 @@ from typing import Any
 
 import pytest
 import typer.main
+from trilat_studies.tuning.search_space import SEARCH_SPACES
 from typer.testing import CliRunner
 
 from tests.golden.surface import all_options
 from trilat_net.app.cli import app
 from trilat_net.app.cli.options import list_laws
-from trilat_net.studies.tuning.search_space import SEARCH_SPACES
 
 from .running import simulated, trilat
 

@@ -4,8 +4,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-
-from tests.studies.sweep.quick import SHORT
+from sweep_tests.quick import SHORT
 
 from .running import shorten, trilat
 

@@ -37,8 +37,8 @@ import trilat_net.laws
 trilat_net.laws.__path__.append(sys.argv[1])
 import trilat_net as tn
 from trilat_net.core.step.control import limit_torque
-from trilat_net.studies.bench.bench_plan import LAWS_OF_ANY, LAWS_OF_TWO
-from trilat_net.studies.tuning.search_space import SEARCH_SPACES
+from trilat_studies.bench.bench_plan import LAWS_OF_ANY, LAWS_OF_TWO
+from trilat_studies.tuning.search_space import SEARCH_SPACES
 changes = {"control.law": "soft_spring", "control.K": 9.0, "duration_s": 0.2}
 log = tn.simulate("free", changes)
 verdict = tn.verify(log)

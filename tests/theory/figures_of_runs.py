@@ -6,10 +6,10 @@ The figures that tests here cite were made with another implementation of the sa
 from typing import Any
 
 import pytest
+from trilat_studies.measure_run import RunMetrics, measure_virtual_run
 
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.expect import ALL_SITES_QUANTITIES, window_quantities
-from trilat_net.studies.measure_run import RunMetrics, measure_virtual_run
 
 Overrides = dict[str, Any]
 

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import sympy as sp
+from trilat_studies.sweep.stability_map import evaluate_criterion
 
 from tests.theory.networks import Network, Wire
 from tests.theory.position_networks import count_growing, position_network, rods
@@ -20,7 +21,6 @@ from trilat_net.laws.conditions import (
 )
 from trilat_net.scenario import load_scenario
 from trilat_net.scenario.describe import describe_law_conditions, list_law_proofs
-from trilat_net.studies.sweep.stability_map import evaluate_criterion
 
 LAB = [[0.0, 0.1, 0.9], [0.8, 0.0, 0.2], [0.8, 0.2, 0.0]]
 """The lab sheet's first exercise: 0.1 0.2 0.8 = 0.016 along the circle, 0.9 0.2 0.8 = 0.144 back."""

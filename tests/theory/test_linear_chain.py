@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import eigvals
+from trilat_studies.sweep.stability_map import evaluate_criterion
 
 from tests.chains import two_arms
 from tests.core.chain_references import ARMS
@@ -51,7 +52,6 @@ from trilat_net.execution.fused import FusedRun
 from trilat_net.presentation.linear_text import describe_ports
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.scenario_reader import parse_scenario
-from trilat_net.studies.sweep.stability_map import evaluate_criterion
 
 POSE = (0.0, -1.1, 1.2, -0.4, 0.3, 0.1)
 LOADED = [2, 3, 4, 5, 6]

@@ -5,6 +5,8 @@ from functools import cache
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from trilat_studies.measure_run import run_whole
+from trilat_studies.sweep.sweep_cell import CellClass, classify_cell
 
 from tests.core.chain_references import Array, ChainState, chain_references
 from trilat_net.analysis.run_end import Stability
@@ -12,8 +14,6 @@ from trilat_net.analysis.theory import iterate_linear_edges
 from trilat_net.analysis.theory.equilibrium import find_equilibrium
 from trilat_net.analysis.theory.linear_edge import LinearEdge, find_contact_growth
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.studies.measure_run import run_whole
-from trilat_net.studies.sweep.sweep_cell import CellClass, classify_cell
 
 ENVIRONMENT = "sites.s.environment"
 STIFFNESS = f"{ENVIRONMENT}.0.stiffness_n_m"

@@ -4,7 +4,7 @@ What a wall tells apart: scenarios `contact` and `windup`.
 
 What the shipped scenarios expect are the figures, within their last printed digit or 2 %.
 
-That they meet what they expect is tested in `tests/studies/trials/test_shipped.py`.
+That they meet what they expect is tested in `packages/trilat-studies/tests/trial_tests/test_shipped.py`.
 
 P+d at its margin, and jitter: scenarios `p_d_margin`, `p_d_margin_two`, `jitter`.
 

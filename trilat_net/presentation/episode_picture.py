@@ -1,6 +1,6 @@
 """Draws pictures of an episode of a task, as arrays of pixels for a film.
 
-An episode is one attempt of a learned program at the task, see `trilat_net.studies`. A picture
+An episode is one attempt of a learned program at the task, see `trilat_studies`. A picture
 has a panel per site, the process that controls one arm, and the panel shows the pose of the
 arm. One of the panels also shows the goal of the task.
 

@@ -1,6 +1,1 @@
-"""Studies of many runs: trials, sweeps, tuning, benchmarks, and experiments with people.
-
-Invariant:
-    - A study is a function of its plan. The number of worker processes, and the order in which
-      they finish, do not change any result.
-"""
+"""Experiments with people, and former places of names of the package trilat-studies."""

@@ -19,6 +19,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from functools import cache
 from importlib import metadata
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,6 +29,7 @@ from ..files import import_extra
 from ..log.provenance import collect_provenance
 from ..net.clock import SystemClock
 from ..net.host_names import UnknownHost, check_hosts
+from ..package_names import PACKAGE_COMMANDS
 from ..scenario.code_consent import ImportedCode
 from ..scenario.imported_code import read_code
 
@@ -61,10 +63,11 @@ def describe_worker() -> WorkerIdentity:
     A worker of a cluster may run items of a study only if its description equals that of the
     process that started the study, as otherwise results could differ.
     """
-    root = Path(__file__).resolve().parents[1]
     digest = hashlib.sha256()
-    for file in sorted(root.rglob("*.py")):
-        digest.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes())
+    for root in _find_sources():
+        for file in sorted(root.rglob("*.py")):
+            name = file.relative_to(root.parent).as_posix()
+            digest.update(name.encode() + b"\0" + file.read_bytes())
     provenance = collect_provenance()
     return {
         "trilat-net": provenance["version_trilat-net"],
@@ -74,6 +77,14 @@ def describe_worker() -> WorkerIdentity:
         "Python": ".".join(platform.python_version_tuple()[:2]),
         **{name: metadata.version(name) for name in _PACKAGES},
     }
+
+
+def _find_sources() -> list[Path]:
+    """Returns the folders of this program's sources, with those of its installed packages."""
+    specs = [find_spec(name.replace("-", "_")) for name in sorted(PACKAGE_COMMANDS)]
+    origins = [Path(spec.origin) for spec in specs if spec is not None and spec.origin]
+    program = Path(__file__).resolve().parents[1]
+    return [program, *(origin.resolve().parent for origin in origins)]
 
 
 class WorkerRequirements(NamedTuple):

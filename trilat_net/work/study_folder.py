@@ -17,7 +17,7 @@ import io
 import json
 import os
 import zlib
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
@@ -26,6 +26,7 @@ import tomli_w
 
 from ..core.step.fingerprint import compute_fingerprint
 from ..errors import ScenarioError, join_arguments
+from ..fields import is_distribution
 from ..files import describe_write_error, extend_file
 from ..log.provenance import collect_provenance
 from ..scenario.imported_code import name_law_classes
@@ -82,6 +83,20 @@ def format_toml_value(value: Any) -> str:
         raise ScenarioError(
             f"{value!r:.80} cannot be a value in a scenario: scenarios contain TOML values only"
         ) from None
+
+
+def list_assignments(overrides: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    """Yields the overrides of a nested mapping as texts KEY=VALUE, as on the command line.
+
+    Args:
+        overrides: Values by key, also as nested tables.
+        prefix: Keys of the enclosing tables, each followed by a dot.
+    """
+    for key, value in overrides.items():
+        if isinstance(value, Mapping) and not is_distribution(value):
+            yield from list_assignments(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}={format_toml_value(value)}"
 
 
 # Packages that compute the results, by their keys in the provenance of a log.

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from trilat_studies.tuning.tuning_report import list_energy_notes
 
 from tests.energy_runs import CONSTANT, FOLLOWER, JITTER, LAWS, pair
 from tests.log_editing import edited, opened, recorded
@@ -27,7 +28,6 @@ from trilat_net.log.log_reader import Log
 from trilat_net.presentation.certificate_text import describe_certificate
 from trilat_net.presentation.figures.registry import figure
 from trilat_net.scenario import load_scenario
-from trilat_net.studies.tuning.tuning_report import list_energy_notes
 
 B, DELAY_S, TO, HAND, WALL = 10.0, 0.05, 0.3, 50.0, 1000.0
 PAIR = f"""

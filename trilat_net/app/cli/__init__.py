@@ -17,12 +17,15 @@ import inspect
 import os
 import pkgutil
 import sys
+from collections.abc import Callable, Iterator
+from functools import cached_property
 from importlib import import_module
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from ...entry_points import COMMANDS, find_entries, find_package, load_entry
 from ...errors import LogRefused, TrilatError, UsageError, find_nearest, join_arguments
 from ...files import (
     DISK_ERRNOS,
@@ -32,6 +35,7 @@ from ...files import (
     find_version,
     require_libraries,
 )
+from ...package_names import PACKAGE_COMMANDS
 from ...presentation.terminal_output import err, print_error, print_line
 from ...signals import Interrupt
 from . import options, sessions
@@ -72,7 +76,15 @@ Words that are only misspelt need no entry.
 
 
 class _Group(TyperGroup):
-    """A group of commands that suggests a command in place of an unknown one."""
+    """A group of commands that suggests a command in place of an unknown one.
+
+    The group also has the commands that other packages add to it.
+    """
+
+    def __init__(self, *, name: str | None = None, **settings: Any) -> None:
+        super().__init__(name=name, **settings)
+        for command in _list_package_commands(name or ""):
+            self.commands.setdefault(str(command.name), command)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Finds the command that the arguments name.
@@ -170,6 +182,98 @@ def _main(
     ] = False,
 ) -> None:
     """Declares the options of `trilat` itself, which have their own functions."""
+
+
+def _deferred(read: Callable[[Any], Any]) -> Any:
+    """Returns a property that reads a value when the value is needed.
+
+    Click assigns such attributes when it makes a command. The assigned values are ignored.
+
+    Args:
+        read: Method that returns the value.
+    """
+    return property(read, lambda _command, _value: None)
+
+
+class _PackageCommand(TyperCommand):
+    """A command of another package, which is imported when somebody uses the command.
+
+    The help of the whole program needs only the first sentence of the command's help.
+
+    Args:
+        command_line: Name of the command, with that of its group, as in "identify hand".
+    """
+
+    def __init__(self, command_line: str) -> None:
+        name = command_line.split()[-1]
+        panel = _find_panel(command_line) if name == command_line else None
+        super().__init__(name, rich_help_panel=panel, rich_markup_mode="rich")
+        self._command_line = command_line
+        self._entry_name = command_line.replace(" ", "-")
+
+    @cached_property
+    def _command(self) -> Any:
+        """The imported command.
+
+        Raises:
+            UsageError: The package of the command is not installed or cannot be imported.
+        """
+        run = load_entry(COMMANDS, self._entry_name, f"trilat {self._command_line}")
+        if not hasattr(run, "examples"):
+            raise UsageError(
+                f"trilat {self._command_line} is no command: its function lacks the decorator "
+                "trilat_net.extension.command"
+            )
+        group = typer.Typer(rich_markup_mode="rich", pretty_exceptions_enable=False)
+        _add_command(group, self._command_line, run)
+        return typer.main.get_group(group).commands[str(self.name)]
+
+    @_deferred
+    def short_help(self) -> str:
+        """The first sentence of the help, or why there is no help."""
+        package = find_package(COMMANDS, self._entry_name)
+        if package:
+            return PACKAGE_COMMANDS[package][self._entry_name]
+        try:
+            return str(self._command.help).split("\n\n")[0]
+        except UsageError as error:
+            return str(error)
+
+    @_deferred
+    def help(self) -> Any:
+        """The help of the imported command."""
+        return self._command.help
+
+    @_deferred
+    def epilog(self) -> Any:
+        """The text below the help of the imported command."""
+        return self._command.epilog
+
+    @_deferred
+    def params(self) -> Any:
+        """The options and arguments of the imported command."""
+        return self._command.params
+
+    def make_context(self, *arguments: Any, **settings: Any) -> Any:
+        """Parses the arguments of the command. The command of the context is the imported one.
+
+        Raises:
+            UsageError: The package of the command is not installed or cannot be imported.
+        """
+        return self._command.make_context(*arguments, **settings)
+
+
+def _list_package_commands(group: str) -> Iterator[_PackageCommand]:
+    """Yields the commands of other packages that belong to a group.
+
+    Args:
+        group: Name of the group. Empty for commands without a group.
+    """
+    of_packages = (name for commands in PACKAGE_COMMANDS.values() for name in commands)
+    for entry_name in dict.fromkeys([*of_packages, *find_entries(COMMANDS)]):
+        first, _, rest = entry_name.partition("-")
+        if (first if rest and first in _GROUPS else "") == group:
+            yield _PackageCommand(f"{first} {rest}" if group else entry_name)
 
 
 _OWN_PANEL = "Make your own"

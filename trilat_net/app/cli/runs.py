@@ -293,29 +293,6 @@ def twin_command(
     )
 
 
-@options.command("run.mcap --site m1 --json > m1.json", page="docs/studies/measured-hands.md")
-def identify_hand_command(
-    file: options.LogsArgument,
-    site: Annotated[
-        str,
-        value("--site", "SITE", "Site of the held arm.", autocompletion=options.complete_sites),
-    ] = "m1",
-    as_json: options.JsonOption = False,
-) -> None:
-    """Identifies the mass, damping and stiffness of the hand that holds an arm.
-
-    A sum of sines must move the arm during the run, so the scenario needs an operator of kind
-    "multisine" at any site (docs/studies/measured-hands.md). `trilat linear
-    --operators` reads the JSON of the result.
-    """
-    from ...studies.hand_impedance import identify_hand
-
-    log = terminal.open_with_progress(*file)
-    with terminal.progress_lines(f"identifying the hand at {site}"):
-        identified = identify_hand(log, site)
-    terminal.print_result(identified, as_json=as_json)
-
-
 @options.command("run.mcap", page="docs/reference/metrics.md")
 def metrics_command(
     file: options.LogsArgument,
@@ -592,8 +569,8 @@ def linear_command(
     verdict.
     """
     options.check_picture(picture, force=force)
+    from ...analysis.theory.hand_files import read_hands
     from ...analysis.theory.linear_analysis import analyse_linear_loop
-    from ...studies.hand_impedance import read_hands
 
     draws_ports = picture is not None and drawn is not LinearFigure.ROOTS
     hands = read_hands(operators or [])

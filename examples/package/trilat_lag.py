@@ -1,0 +1,51 @@
+"""Adds the command `trilat lag` and the function `trilat_net.measure_lags`.
+
+pip install .
+trilat lag paper --seeds 3
+"""
+
+from typing import Annotated
+
+import trilat_net as tn
+from trilat_net.extension import (
+    JsonOption,
+    ScenarioArgument,
+    UsageError,
+    command,
+    print_json,
+    print_line,
+    value,
+)
+
+
+def measure_lags(scenario: str, seeds: int = 1, duration_s: float | None = None) -> list[float]:
+    """Returns the RMS error of the slave for each of the seeds 1, 2, ..., in rad.
+
+    Args:
+        scenario: Name of a shipped scenario, or path of a TOML file.
+        seeds: Number of seeds.
+        duration_s: Duration of each run, in s. By default that of the scenario.
+    """
+    lags_rad = []
+    for seed in range(1, seeds + 1):
+        log = tn.simulate(scenario, seed=seed, duration_s=duration_s)
+        lags_rad.append(tn.metrics(log).sites["s"]["rms_error_rad"].value)
+    return lags_rad
+
+
+@command("paper --seeds 3")
+def lag_command(
+    scenario: ScenarioArgument,
+    seeds: Annotated[int, value("--seeds", "N", "Number of seeds.")] = 1,
+    duration: Annotated[float | None, value("--duration", "S", "Duration of a run, s.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Measures how far the slave lags behind, seed by seed."""
+    if seeds < 1:
+        raise UsageError(f"--seeds must be at least 1, not {seeds}")
+    lags_rad = measure_lags(scenario, seeds, duration)
+    if as_json:
+        print_json({"rms_error_rad": lags_rad})
+        return
+    for number, lag_rad in enumerate(lags_rad, start=1):
+        print_line(f"seed {number}: {lag_rad:.4f} rad")

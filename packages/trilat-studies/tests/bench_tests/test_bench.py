@@ -1,0 +1,695 @@
+"""The suite: its runs are the program's runs, interruptions leave no trace, and its intervals are SciPy's."""
+
+import shlex
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from scipy import optimize, stats
+from trilat_studies.bench import (
+    BenchResults,
+    bench_plan,
+    bench_run,
+    plan_bench,
+    prepare_bench_folder,
+    run_bench,
+)
+from trilat_studies.bench.bench_plan import (
+    EQUAL_LAWS,
+    KNOWLEDGE,
+    LINKS,
+    SHORTER_REACH,
+    STUDIES,
+    TASKS,
+    TUNED_ROUND_TRIPS_MS,
+    BenchCell,
+    BenchPlan,
+    TunedGains,
+    build_settings,
+    choose_round_trip,
+    explain_no_cell,
+    find_stale,
+    fingerprint_tuning,
+    format_settings,
+    read_gains,
+    tune_laws,
+    write_gains,
+)
+from trilat_studies.bench.bench_results import (
+    LEAST_CONTACT_N,
+    BenchCellResult,
+    BenchRun,
+    build_bench_page,
+    encode_runs,
+)
+from trilat_studies.bench.bench_run import (
+    MAX_RUN_TICKS,
+    BenchRunItem,
+    JudgedRun,
+    find_least_energy,
+    lengthen_run,
+    run_bench_task,
+)
+from trilat_studies.measure_run import RecordBatch
+from trilat_studies.tuning import plan_tuning
+from trilat_studies.tuning.candidate import (
+    CandidateClass,
+    load_tuning_scenario,
+    measure_candidate,
+)
+from trilat_studies.tuning.search_space import SEARCH_SPACES
+
+import trilat_net
+from trilat_net.analysis.run_end import EndBehaviour, RunEnd, Stability
+from trilat_net.analysis.stability_decision import LoopRoots
+from trilat_net.analysis.twins.envelope_trend import EnvelopeFit, EnvelopeTrend
+from trilat_net.analysis.twins.twin_growth import TwinGrowth
+from trilat_net.core.step.vectors import Array
+from trilat_net.errors import UsageError
+from trilat_net.execution.fused import FusedRun
+from trilat_net.scenario import load_scenario
+from trilat_net.scenario.laws import BUILT_IN
+from trilat_net.work.study_folder import encode_csv
+
+LEVEL = {"laws": ["p_d"], "study": "round-trips"}
+
+
+def asked(**more: Any) -> BenchPlan:
+    """Two cells of two sites, one of them with two seeds."""
+    return plan_bench(
+        **{**LEVEL, "tasks": ["free"], "links": ["rtt8", "rtt68-loss25"], "seeds": 2, **more}
+    )
+
+
+def files(results: BenchResults) -> list[str]:
+    return [
+        build_bench_page(results, "trilat bench"),
+        encode_csv(results.to_rows()),
+        encode_runs(results),
+    ]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> BenchResults:
+    folder = prepare_bench_folder(asked(), tmp_path_factory.mktemp("suite") / "whole")
+    return run_bench(folder, jobs=1)
+
+
+def test_an_interrupted_suite_goes_on_to_the_same_bytes(
+    whole: BenchResults, tmp_path: Path
+) -> None:
+    folder, made = prepare_bench_folder(asked(), tmp_path / "parts"), []
+
+    def stop(done: int, _total: int) -> None:
+        made.append(done)
+        if done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_bench(folder, jobs=1, progress=stop)
+    again = run_bench(prepare_bench_folder(asked(), tmp_path / "parts"), jobs=1, progress=stop)
+    assert made == [1, 2, 3]
+    assert again.runs == whole.runs
+    assert files(again) == files(whole)
+
+
+@pytest.mark.long
+def test_what_runs_the_cells_enters_no_result(whole: BenchResults, tmp_path: Path) -> None:
+    with ThreadPoolExecutor(1) as executor:
+        found = run_bench(prepare_bench_folder(asked(), tmp_path / "elsewhere"), on=executor)
+    assert files(found) == files(whole)
+
+
+def test_seeds_are_other_runs_where_anything_is_drawn(whole: BenchResults) -> None:
+    still, first, second = whole.runs
+    assert (still.random, first.random) == (False, True)
+    assert first.error_rad != second.error_rad
+    lossy = whole.plan.cells[1]
+    assert run_bench_task(BenchRunItem(lossy, 2)) == second
+
+
+def test_a_cell_is_the_log_that_its_command_makes(whole: BenchResults) -> None:
+    cell = whole.plan.cells[1]
+    words = shlex.split(cell.build(1).command)
+    assert words[:3] == ["trilat", "sim", "_bench_two"]
+    log = trilat_net.simulate(load_scenario(words[2], words[4::2]))
+    run, user = whole.runs[1], log["m1"]
+    assert log.scenario.sha256 == run.sha256
+    off = log["s"].q - user.q
+    assert run.error_rad == pytest.approx(np.sqrt(np.mean(off**2)), rel=1e-12)
+    hand = user.tau_x - 0.5 * user.qd  # without the friction of the user's arm
+    assert run.hand_nm == pytest.approx(np.sqrt(np.mean(hand**2)), rel=1e-12)
+
+
+def test_effort_is_that_of_the_compiled_run(whole: BenchResults) -> None:
+    scenario = whole.plan.cells[0].build(1).scenario
+    run = FusedRun(scenario)
+    run.advance_to(scenario.duration_s)
+    assert whole.runs[0].effort_nm == pytest.approx(run.totals.effort_nm, rel=1e-12)
+
+
+def rest_in_contact(K: float, settings: Any) -> tuple[Array, Array]:
+    """Pose of the user's arm at rest under P+d, and the torque of the hand on it."""
+    target = np.array(settings["sites.m1.hands"][0]["to_rad"])
+
+    def unbalanced(q: Array) -> Array:
+        tip, slave = reach(q[2:])
+        wall = slave.T @ [-2000.0 * max(tip[0] - 1.3376933693863516, 0.0), 0.0]
+        link = K * (q[:2] - q[2:])
+        return np.concatenate([50.0 * (target - q[:2]) - link, link + wall])
+
+    q = optimize.fsolve(unbalanced, [*target, *target], xtol=1e-12)[:2]
+    return q, 50.0 * (target - q)
+
+
+def test_stiffness_at_the_hand_is_that_of_statics() -> None:
+    """Two springs and the wall of P+d, which is nearly at rest 2 s after contact."""
+    (cell,) = asked(tasks=["contact"], links=["rtt8"]).cells
+    ends = []
+    for settings in (SHORTER_REACH, TASKS["contact"].settings):
+        q, torque = rest_in_contact(60.0, settings)
+        tip, jacobian = reach(q)
+        ends.append((tip[0], np.linalg.solve(jacobian.T, torque)[0]))
+    (near_m, near_n), (far_m, far_n) = ends
+    run = run_bench_task(BenchRunItem(with_gains(cell, K=60.0, d=6.0), 1))
+    assert run.stiffness_n_m == pytest.approx((far_n - near_n) / (far_m - near_m), rel=5e-2)
+
+
+def test_stiffness_is_that_of_the_logs_two_seconds_after_contact() -> None:
+    (cell,) = asked(tasks=["contact"], links=["rtt8"]).cells
+    cell = with_gains(cell, K=60.0, d=6.0)
+    built, ends = cell.build(1), []
+    for settings in (SHORTER_REACH, TASKS["contact"].settings):
+        overrides = [*built.overrides, *format_settings(settings)]
+        log = trilat_net.simulate(load_tuning_scenario(built.source, overrides).scenario)
+        user, slave = log["m1"], log["s"]
+        slave_m = np.cos(slave.q[:, 0]) + np.cos(slave.q.sum(axis=1))
+        touch_s = slave.t_s[slave_m > 1.3376933693863516][0]
+        window = (user.t_s > touch_s + 1.8995) & (user.t_s < touch_s + 2.0995)
+        tips = [reach(q) for q in user.q[window]]
+        hand = 0.5 * user.qd[window] - user.tau_x[window]
+        forces = [
+            np.linalg.solve(jacobian.T, torque)[0]
+            for (_, jacobian), torque in zip(tips, hand, strict=True)
+        ]
+        ends.append((np.mean([tip[0] for tip, _ in tips]), np.mean(forces)))
+    (near_m, near_n), (far_m, far_n) = ends
+    run = run_bench_task(BenchRunItem(cell, 1))
+    assert run.stiffness_n_m == pytest.approx((far_n - near_n) / (far_m - near_m), rel=1e-6)
+
+
+def test_impedance_in_free_motion_is_that_of_two_coupled_arms() -> None:
+    """P+d over 4 ms: D = M s^2 + (d + 0.5) s + K - K e^-sT (M s^2 + d s + K)^-1 K e^-sT."""
+    (cell,) = asked(tasks=["contact"], links=["rtt8"]).cells
+    K, d, s = 60.0, 12.0, 2j * np.pi
+    q, _ = rest_in_contact(K, TASKS["contact"].settings)
+    cosine = np.cos(q[1])
+    M = np.array([[3.0 + 2.0 * cosine, 1.0 + cosine], [1.0 + cosine, 1.0]])
+    one = np.eye(2)
+    coupling = K * np.exp(-4e-3 * s)
+    slave = M * s**2 + (d * s + K) * one
+    user = M * s**2 + ((d + 0.5) * s + K) * one - coupling**2 * np.linalg.inv(slave)
+    jacobian = reach(q)[1]
+    motion = np.linalg.solve(user + (5.0 * s + 50.0) * one, jacobian[0])
+    force = np.linalg.solve(jacobian.T, user @ motion)
+    expected = abs(force[0] / (s * (jacobian @ motion)[0]))
+    run = run_bench_task(BenchRunItem(with_gains(cell, K=K, d=d), 1))
+    assert run.free_impedance_n_s_m == pytest.approx(expected, rel=2e-2)
+    assert run.impedance_n_s_m is not None
+
+
+def reach(q: Array) -> tuple[Array, Array]:
+    """The end effector of two links of 1 m, and its Jacobian."""
+    a, b = q[0], q[0] + q[1]
+    tip = np.array([np.cos(a) + np.cos(b), np.sin(a) + np.sin(b)])
+    return tip, np.array([[-tip[1], -np.sin(b)], [tip[0], np.cos(b)]])
+
+
+def with_gains(cell: BenchCell, **gains: float) -> BenchCell:
+    return cell._replace(tuned=msgspec.structs.replace(cell.tuned, gains=gains))
+
+
+def test_a_wall_that_is_hardly_touched_masks_the_numbers() -> None:
+    (cell,) = asked(tasks=["contact"], links=["rtt8"]).cells
+    run = run_bench_task(BenchRunItem(with_gains(cell, K=2.0, d=20.0), 1))
+    assert run.wall_n is not None
+    assert run.wall_n < LEAST_CONTACT_N
+    assert run.stiffness_n_m is None
+    results = BenchResults(
+        BenchPlan("round-trips", [cell], [("p_d", "level")]), {(cell.key, 1): run}
+    )
+    assert results.places[0].compute_mean("error_rad") is None
+    assert "no contact" in build_bench_page(results, "trilat bench")
+
+
+def test_what_is_not_stable_stays_so_over_twice_the_length(tmp_path: Path) -> None:
+    (cell,) = asked(links=["rtt272"]).cells
+    plan = BenchPlan("round-trips", [with_gains(cell, K=60.0, d=0.5)], [("p_d", "level")])
+    (run,) = run_bench(prepare_bench_folder(plan, tmp_path / "suite"), jobs=1).runs
+    assert run.stability is Stability.NOT_STABLE
+    assert run.behaviour is EndBehaviour.DIVERGED or run.confirmed
+    assert (
+        run_bench_task(BenchRunItem(with_gains(cell, K=10.0, d=4.0), 1)).stability
+        is Stability.STABLE
+    )
+
+
+def batch(t_ns: Array, qd: Array, tau_x: Array) -> RecordBatch:
+    """Records of one joint."""
+    zero = np.zeros((len(t_ns), 1))
+    return RecordBatch(
+        t_ns, zero, qd[:, None], zero, zero, tau_x[:, None], np.zeros((len(t_ns), 0), int)
+    )
+
+
+def test_least_energy_is_that_of_outside_until_any_instant() -> None:
+    """It puts in 3 J in the first second, takes out 5 J in the second, and puts in 4 J more."""
+    t_ns = np.arange(3001) * 1_000_000
+    power = np.select([t_ns < 1e9, t_ns < 2e9], [3.0, -5.0], 4.0)
+    assert find_least_energy(
+        {"s": batch(t_ns, np.full(3001, 2.0), -power / 2.0)}
+    ) == pytest.approx(-2.0, abs=0.01)
+    assert find_least_energy({"s": batch(t_ns, np.ones(3001), np.zeros(3001))}) == 0.0
+
+
+def test_an_interrupted_confirmation_goes_on(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Every run is repeated once over twice its length, and no finished run a second time."""
+    made: list[float] = []
+
+    def run(item: BenchRunItem) -> BenchRun:
+        made.append(item.to_s)
+        return make_run(
+            item.cell,
+            item.seed,
+            stability=Stability.NOT_STABLE,
+            behaviour=EndBehaviour.BOUNDED,
+            length_s=item.to_s or 30.0,
+            to_s=item.to_s,
+        )
+
+    shown: list[int] = []
+
+    def stop(done: int, _total: int) -> None:
+        shown.append(done)
+        if len(shown) == 4:  # the first of three repetitions
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(bench_run, "run_bench_task", run)
+    folder = prepare_bench_folder(asked(), tmp_path / "suite")
+    with ThreadPoolExecutor(1) as executor, pytest.raises(KeyboardInterrupt):
+        run_bench(folder, on=executor, progress=stop)
+    assert made.count(0.0) == 3
+    before = len(made)
+    with ThreadPoolExecutor(1) as executor:
+        results = run_bench(prepare_bench_folder(asked(), tmp_path / "suite"), on=executor)
+    assert made[before:] == [60.0, 60.0]
+    assert [(one.confirmed, one.length_s) for one in results.runs] == [(True, 60.0)] * 3
+
+
+def judged_run(rate_per_s: float | None, **more: Any) -> JudgedRun:
+    """A run of 20 s of two sites that decays slowly."""
+    fit = EnvelopeFit(EnvelopeTrend.HARDLY, -0.02)
+    facts = {
+        "scenario": asked(links=["rtt8"]).cells[0].build(1).scenario,
+        "records": {},
+        "end": RunEnd(EndBehaviour.HARDLY, fit, fit, 0.1, 0.1),
+        "twins": TwinGrowth(""),
+        "roots": LoopRoots("stable" if rate_per_s else "", rate_per_s, True, ""),
+        "stability": Stability.OPEN,
+        "text": "open",
+        **more,
+    }
+    return JudgedRun(**facts)
+
+
+@pytest.mark.parametrize(
+    ("rate_per_s", "length_s", "words"),
+    [
+        (-0.01, 600.0, ""),  # the root, six time constants of 100 s
+        (None, 300.0, ""),  # no roots: the envelope, six of 50 s
+        (-0.001, 1500.0, f"safety limit of {MAX_RUN_TICKS} ticks"),  # 6000 s of two sites
+        (-1.0, 20.0, ""),
+    ],
+)
+def test_length_follows_the_slowest_time_constant(
+    rate_per_s: float | None, length_s: float, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    judged = judged_run(rate_per_s)
+    monkeypatch.setattr(
+        bench_run,
+        "judge_bench_run",
+        lambda scenario, to_s: judged._replace(
+            scenario=msgspec.structs.replace(scenario, duration_s=to_s)
+        ),
+    )
+    longer = lengthen_run(judged)
+    assert longer.scenario.duration_s == length_s
+    assert words in longer.text
+
+
+def test_a_decided_run_at_rest_is_long_enough() -> None:
+    fit = EnvelopeFit(EnvelopeTrend.DECAYS, -0.02)
+    end = RunEnd(EndBehaviour.CONVERGED, fit, fit, 0.0, 0.0)
+    judged = judged_run(-0.001, end=end, stability=Stability.SETTLED)
+    assert lengthen_run(judged) is judged
+
+
+def test_a_longer_run_refutes_or_confirms() -> None:
+    cell = asked(links=["rtt8"]).cells[0]
+    judged = [
+        (Stability.STABLE, Stability.STABLE, False),
+        (Stability.NOT_STABLE, Stability.NOT_STABLE, True),
+    ]
+    for longer, stability, confirmed in judged:
+        run = make_run(cell, 1, stability=Stability.NOT_STABLE, length_s=40.0)
+        again = make_run(cell, 1, stability=longer, length_s=80.0, to_s=80.0)
+        results = BenchResults(
+            BenchPlan("round-trips", [cell], [("p_d", "level")]),
+            {(one.cell, 1): one for one in (run, again)},
+        )
+        (found,) = results.runs
+        assert (found.stability, found.confirmed) == (stability, confirmed)
+
+
+def test_a_law_without_stable_gains_has_an_empty_row(monkeypatch: pytest.MonkeyPatch) -> None:
+    kept = {
+        key: msgspec.structs.replace(one, gains={}) if one.law == "pd_d" else one
+        for key, one in read_gains().items()
+    }
+    monkeypatch.setattr(bench_plan, "read_gains", lambda: kept)
+    plan = plan_bench("round-trips", laws=["p_d", "pd_d"], tasks=["free"], links=["rtt8"])
+    assert [cell.law for cell in plan.cells] == ["p_d"]
+    run = make_run(plan.cells[0], 1)
+    page = build_bench_page(BenchResults(plan, {(run.cell, 1): run}), "trilat bench")
+    assert "| pd_d (two sites) | no gains |" in page
+    with pytest.raises(UsageError, match="no candidate was stable for pd_d"):
+        plan_bench("round-trips", laws=["pd_d"], tasks=["free"], links=["rtt8"])
+
+
+def test_laws_of_equal_torque_run_once() -> None:
+    """`six_channel` is `four_channel` with a check of the shares, so it would run the same."""
+    for law, equal in EQUAL_LAWS.items():
+        kind, equal_kind = BUILT_IN[law], BUILT_IN[equal]
+        assert (kind.torque, kind.begin) == (equal_kind.torque, equal_kind.begin)
+        assert kind.Settings.__struct_fields__ == equal_kind.Settings.__struct_fields__
+        with pytest.raises(UsageError, match=f"{law} computes the torque of {equal}"):
+            plan_bench("full", laws=[law])
+        assert all(law not in laws for laws in STUDIES["full"].laws.values())
+
+
+def test_laws_get_nine_tenths_of_gravity() -> None:
+    laws = STUDIES["full"].laws
+    for form in laws:
+        for law in laws[form]:
+            reason = explain_no_cell(law, form, "gravity-90")
+            assert reason == ("exact model" if law == "impedance" else bench_plan.NO_GAINS)
+    (told,) = plan_bench("full", laws=["p_d"], tasks=["gravity-90"], links=["rtt68"]).cells
+    (exact,) = plan_bench("full", laws=["p_d"], tasks=["free"], links=["rtt68"]).cells
+    assert told.inputs != exact.inputs
+    found = [cell.build(1).scenario.sites["s"].control for cell in (told, exact)]
+    assert [control.gravity for control in found] == [0.9, 1.0]  # type: ignore[attr-defined]
+
+
+def test_a_law_whose_shares_stay_hands_nothing_over() -> None:
+    tasks = {cell.task for cell in plan_bench("full", laws=["wave"], links=["rtt68"]).cells}
+    assert tasks == TASKS.keys() - {"handover"}
+
+
+@pytest.mark.parametrize("base", ["_bench_three", "_bench_two"])
+def test_no_user_is_without_friction(base: str) -> None:
+    users = [site for site in load_scenario(base).sites.values() if site.role == "master"]
+    assert all(min(user.environment[0].damping_nm_s_rad) > 0.0 for user in users)  # type: ignore[union-attr]
+
+
+def test_a_run_lasts_for_forty_round_trips() -> None:
+    assert [
+        build_settings("two", "free", link)["duration_s"]
+        for link in LINKS
+        if "loss" not in link
+    ] == [
+        pytest.approx(max(20.0, 40.0 * trip_s))
+        for trip_s in (0.008, 0.068, 0.136, 0.272, 0.544, 1.088, 0.0, 0.0, 0.6, 0.0)
+    ]
+
+
+@pytest.mark.long
+def test_shared_slave_errs_by_its_distance_from_mean_by_dominance() -> None:
+    """After the handover the second user has three quarters; the error is of the present shares."""
+    plan = plan_bench("full", laws=["p_d"], tasks=["handover"], links=["rtt68"])
+    run = run_bench_task(BenchRunItem(plan.cells[0], 1))
+    log = trilat_net.simulate(plan.cells[0].build(1).scenario)
+    t_s, (m1, m2, s) = log["s"].t_s, (log[name].q for name in ("m1", "m2", "s"))
+    a = np.interp(t_s, [7.0, 9.0], [0.75, 0.25])[:, None]
+    assert run.error_rad == pytest.approx(
+        np.sqrt(np.mean((s - a * m1 - (1.0 - a) * m2) ** 2)), rel=1e-9
+    )
+
+
+def make_run(cell: BenchCell, seed: int, **more: Any) -> BenchRun:
+    facts = {
+        "stability": Stability.STABLE,
+        "behaviour": EndBehaviour.CONVERGED,
+        "text": "",
+        **more,
+    }
+    return BenchRun(cell.name, cell.inputs, seed, True, "", **facts)
+
+
+def place(*errors: float | None) -> BenchCellResult:
+    cell = asked().cells[1]
+    return BenchCellResult(
+        cell, [make_run(cell, n, error_rad=error) for n, error in enumerate(errors)]
+    )
+
+
+def test_intervals_over_twenty_seeds_are_those_of_scipy() -> None:
+    errors = tuple(0.3 + 0.01 * (7 * n % 20) for n in range(20))
+    found: Any = place(*errors).compute_mean("error_rad")
+    low, high = stats.t.interval(0.95, 19, np.mean(errors), stats.sem(errors))
+    assert (found.mean - found.half, found.mean + found.half) == pytest.approx(
+        (low, high), rel=1e-12
+    )
+    share = stats.binomtest(20, 20).proportion_ci(method="wilson")
+    assert place(*errors).interval == pytest.approx((share.low, share.high), rel=1e-12)
+    assert place(*errors[:19]).interval is None
+    assert place(*errors[:19]).compute_mean("error_rad") == pytest.approx(
+        np.mean(errors[:19]), rel=1e-12
+    )
+    assert place(0.31, None).compute_mean("error_rad") is None
+
+
+FULL = plan_bench("full", tasks=["handover", "outage"], links=["rtt272"])
+
+
+@pytest.mark.parametrize("cell", FULL.cells, ids=lambda cell: f"{cell.task}/{cell.law}")
+def test_every_law_fits_every_task_in_which_it_runs(cell: BenchCell) -> None:
+    found = cell.build(1)
+    assert {site.control.__struct_config__.tag for site in found.scenario.sites.values()} == {
+        cell.law
+    }
+    assert len(found.scenario.names) == (2 if cell.form == "two" else 3)
+    assert np.allclose(found.scenario.alpha.sum(axis=1), 1.0)
+
+
+def test_every_link_fits_both_forms() -> None:
+    for link in LINKS:
+        for form, base in (("three", "_bench_three"), ("two", "_bench_two")):
+            scenario = load_scenario(base, build_settings(form, "outage", link))
+            cut = [name for name, one in scenario.links.items() if one.outages_s]
+            assert sorted(cut) == sorted(
+                name for name in scenario.links if "s" in name.split("->")
+            )
+
+
+def test_gains_of_all_studies_are_there_and_within_their_ranges() -> None:
+    gains = read_gains()
+    for study in STUDIES.values():
+        for form, laws in study.laws.items():
+            for law in laws:
+                for round_trip_ms in TUNED_ROUND_TRIPS_MS:
+                    kept = gains[form, law, round_trip_ms].gains
+                    knobs = {knob.name: knob for knob in SEARCH_SPACES[law].knobs}
+                    assert kept.keys() in (knobs.keys(), {}.keys())
+                    assert all(
+                        knobs[key].low <= value <= knobs[key].high
+                        for key, value in kept.items()
+                    )
+
+
+@pytest.mark.long
+def test_kept_gains_are_the_least_error_that_keeps_the_margin(tmp_path: Path) -> None:
+    found = tune_laws({"level": ["p_d"]}, 1, budget=4)
+    assert [one.round_trip_ms for one in found] == list(TUNED_ROUND_TRIPS_MS)
+    settings = format_settings(build_settings("level", "contact", "rtt272"))
+    (search,) = plan_tuning("_bench_two", settings, laws=["p_d"], budget=8).run(1).found
+    places = [
+        n for n, score in enumerate(search.scores) if score.outcome is CandidateClass.SETTLED
+    ]
+    places.sort(key=lambda n: search.scores[n].error_rad or 0.0)
+    assert (found[1].settled, found[1].tried) == (len(places), 8)
+    later = load_tuning_scenario("_bench_two", [*settings, "link.delay_ms=204"])
+
+    def keeps(place: int) -> bool:
+        longer = later.with_gains(SEARCH_SPACES["p_d"], KNOWLEDGE, search.tried[place])
+        return measure_candidate(*longer.texts).outcome is CandidateClass.SETTLED
+
+    first = next(place for place in places if keeps(place))
+    assert (found[1].gains, found[1].passed) == (search.tried[first], places.index(first))
+    write_gains(found[:2], tmp_path / "gains.json")
+    write_gains(found[1:], tmp_path / "gains.json")
+    assert sorted(map(str, read_gains(tmp_path / "gains.json").values())) == sorted(
+        map(str, found)
+    )
+    assert find_stale(found) == []
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("law", "gains"),
+    [
+        ("impedance", {"M": 0.1766, "B": 1.067, "K": 5.239}),
+        ("sync", {"Lambda": 3.407, "Kp": 8.189, "Gamma": 0.861}),
+    ],
+)
+def test_laws_with_another_promise_can_be_tuned(law: str, gains: dict[str, float]) -> None:
+    """Both end away from the pose of the hand, and are stable by what they promise."""
+    base = bench_plan.load_tuning_task("three", law, 68)
+    candidate = base.with_gains(SEARCH_SPACES[law], KNOWLEDGE, gains)
+    score = measure_candidate(*candidate.texts)
+    assert score.outcome is CandidateClass.SETTLED
+    assert score.pose_rad is not None
+    assert score.pose_rad > 0.1
+
+
+def test_an_interrupted_tuning_goes_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Gains are stored one by one, and those that are up to date are not tuned again."""
+    path, made = tmp_path / "gains.json", []
+
+    def tune(form: str, law: str, round_trip_ms: int, *_: Any) -> TunedGains:
+        if len(made) == 2:
+            raise KeyboardInterrupt
+        made.append(round_trip_ms)
+        mark = fingerprint_tuning(form, law, round_trip_ms)
+        return TunedGains(form, law, round_trip_ms, {"K": 1.0}, 1, 1, 0, 0.1, 1.0, mark)
+
+    def go_on() -> list[TunedGains]:
+        return tune_laws(
+            {"level": ["p_d"]},
+            known=read_gains(path).values(),
+            store=lambda gains: write_gains([gains], path),
+        )
+
+    monkeypatch.setattr(bench_plan, "_tune_law", tune)
+    with pytest.raises(KeyboardInterrupt):
+        go_on()
+    assert len(read_gains(path)) == 2
+    made.clear()
+    assert len(go_on()) == 3
+    assert made == [TUNED_ROUND_TRIPS_MS[-1]]
+
+
+class Damped(BUILT_IN["p_d"]):
+    """P+d with twice the damping that it is given."""
+
+    @classmethod
+    def write_control(cls, gains: Any, site: Any) -> dict[str, Any]:
+        return super().write_control({**gains, "d": 2.0 * gains["d"]}, site)
+
+
+def test_gains_are_outdated_by_another_motion_alone() -> None:
+    """Neither texts nor names of a law's code matter, but how it moves the arms does."""
+    space = SEARCH_SPACES["p_d"]
+    task = bench_plan.load_tuning_task("level", "p_d", 68)
+    same = space._replace(kind=type("Renamed", (BUILT_IN["p_d"],), {}))
+    assert bench_plan._probe_law(task, same) == bench_plan._probe_law(task, space)
+    other = space._replace(kind=Damped)
+    assert bench_plan._probe_law(task, other) != bench_plan._probe_law(task, space)
+
+
+def list_shipped_gains() -> Iterator[Any]:
+    """Yields all gains that are shipped; every ninth is tried on a push."""
+    for place, gains in enumerate(read_gains().values()):
+        yield pytest.param(
+            gains, id=str(gains), marks=() if place % 9 == 0 else pytest.mark.long
+        )
+
+
+@pytest.mark.parametrize("gains", list(list_shipped_gains()))
+def test_shipped_gains_are_up_to_date(gains: TunedGains) -> None:
+    assert find_stale([gains]) == []
+
+
+def test_gains_are_those_of_the_next_longer_round_trip() -> None:
+    assert [choose_round_trip(ms) for ms in (0.0, 68.0, 69.0, 600.0, 5000.0)] == [
+        68,
+        68,
+        272,
+        1088,
+        1088,
+    ]
+
+
+def test_gains_of_another_law_or_scenario_are_stale() -> None:
+    kept = asked().cells[0].tuned
+    other = msgspec.structs.replace(kept, fingerprint="0" * 16)
+    assert find_stale([other]) == [f"p_d (level, {kept.round_trip_ms} ms)"]
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        ({"study": "smal"}, "no study 'smal' is available; did you mean 'small'"),
+        ({"laws": ["p_dd"]}, "no law 'p_dd' is available; did you mean"),
+        ({"tasks": ["handover"]}, "no task 'handover' is available"),
+        ({"links": ["rtt9"]}, "no link 'rtt9' is available; did you mean"),
+        ({"seeds": 0}, "seeds must be a number from 1 to 1000, not 0"),
+        (
+            {"study": "full", "laws": ["smith"], "tasks": ["handover"]},
+            "cannot run in handover",
+        ),
+    ],
+)
+def test_what_cannot_be_asked_is_refused(more: dict[str, Any], words: str) -> None:
+    with pytest.raises(UsageError) as refused:
+        asked(**more)
+    assert words in str(refused.value)
+
+
+@pytest.mark.long
+def test_folder_takes_more_of_suite_and_nothing_from_elsewhere(
+    whole: BenchResults, tmp_path: Path
+) -> None:
+    first = run_bench(prepare_bench_folder(asked(links=["rtt8"]), tmp_path / "one"), jobs=1)
+    made: list[int] = []
+    more = run_bench(
+        prepare_bench_folder(asked(), tmp_path / "one"),
+        jobs=1,
+        progress=lambda done, _: made.append(done),
+    )
+    assert made == [2, 3]
+    assert more.runs == whole.runs
+    assert more.runs[0] == first.runs[0]
+    gains = {"K": 20.0, "d": 5.0}
+    cell = asked().cells[0]
+    other = cell._replace(tuned=msgspec.structs.replace(cell.tuned, gains=gains))
+    changed = BenchPlan("round-trips", [other], [])
+    assert (
+        run_bench(prepare_bench_folder(changed, tmp_path / "one"), jobs=1).runs[0]
+        != first.runs[0]
+    )
+    origin = tmp_path / "one" / "origin.json"
+    origin.write_text(origin.read_text().replace("numpy", "numpi"))
+    with pytest.raises(
+        UsageError, match="results from both cannot be mixed: choose another folder with out"
+    ):
+        prepare_bench_folder(asked(), tmp_path / "one")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "mine.txt").touch()
+    with pytest.raises(UsageError, match="is not empty"):
+        prepare_bench_folder(asked(), tmp_path / "full")

@@ -1,0 +1,73 @@
+"""`trilat bench`: what it prints, what it leaves, what it refuses."""
+
+import csv
+import json
+import shlex
+from pathlib import Path
+
+import pytest
+
+from tests.cli.running import trilat
+from tests.json_outline import is_documented
+
+SOME = (
+    "--study",
+    "round-trips",
+    "--task",
+    "contact",
+    "--law",
+    "p_d",
+    "--link",
+    "rtt8,rtt68-loss10",
+)
+
+
+def test_part_of_suite_leaves_its_results_and_goes_on(tmp_path: Path) -> None:
+    done = trilat("bench", *SOME, "--seeds", "2", "--jobs", "1", "--json", cwd=tmp_path)
+    assert done.code == 0
+    assert "note: 2 cells, 3 runs, into runs/bench-round-trips" in done.err
+    facts = json.loads(done.out)
+    assert is_documented("bench", facts)
+    assert [place["runs"] for place in facts["places"]] == [1, 2]
+    folder = tmp_path / "runs" / "bench-round-trips"
+    with (folder / "places.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert [float(row["error_rad"]) for row in rows] == [
+        place["error_rad"] for place in facts["places"]
+    ]
+    page = (folder / "bench.md").read_text()
+    assert f"    trilat bench {shlex.join(SOME)} --seeds 2" in page
+    assert "## Delay against loss" in page
+    assert (folder / "bench-error.png").stat().st_size > 5000
+    before = (folder / "runs.csv").read_bytes()
+    again = trilat("bench", *SOME, "--seeds", "2", "--jobs", "1", cwd=tmp_path)
+    assert "contact: RMS distance of the slave from its users, rad" in again.out
+    assert (folder / "runs.csv").read_bytes() == before
+
+
+def test_a_cell_is_a_command_that_runs(tmp_path: Path) -> None:
+    name = "contact/p_d/rtt68-loss10"
+    lines = (
+        trilat("bench", *SOME, "--seeds", "2", "--cell", name, cwd=tmp_path)
+        .succeeds()
+        .splitlines()
+    )
+    assert len(lines) == 2
+    trilat(*shlex.split(lines[1])[1:], "--duration", "0.1", cwd=tmp_path).succeeds()
+    assert (tmp_path / "contact-p_d-rtt68-loss10-2.mcap").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "facts"),
+    [
+        (("--study", "ful"), ["no study 'ful'", "did you mean 'full'"]),
+        (("--law", "adaptiv"), ["no law 'adaptiv'"]),
+        (("--cell", "free/p_d/rtt9"), ["no cell 'free/p_d/rtt9'"]),
+        (("--tune", "--law", "p_dd"), ["--law: p_dd is not a law of the study full"]),
+        (("--jobs", "2", "--on", "tcp://127.0.0.1:1"), ["--jobs sets the number of processes"]),
+    ],
+)
+def test_what_cannot_be_asked_is_refused_in_a_line(
+    words: tuple[str, ...], facts: list[str], tmp_path: Path
+) -> None:
+    trilat("bench", *words, cwd=tmp_path).refuses(*facts)

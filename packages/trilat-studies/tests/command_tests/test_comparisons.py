@@ -1,0 +1,151 @@
+"""`trilat compare`: logs side by side, and laws tuned alike."""
+
+import json
+from pathlib import Path
+
+import pytest
+from tuning_tests.experiments import TRIO
+
+from tests.cli.running import trilat
+from tests.json_outline import is_documented
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("logs")
+    quick = ["--set", "rate_hz=100", "--duration"]
+    trilat("sim", "free", "-o", "a.mcap", *quick, "2", cwd=folder)
+    trilat("sim", "free", "-o", "b.mcap", *quick, "2", "--set", "link.delay_ms=50", cwd=folder)
+    hanging = ["--set", "control.law=pd_d", "--set", "control.gravity=0"]
+    trilat("sim", "free", "-o", "hang.mcap", *quick, "12", *hanging, cwd=folder)
+    trilat("sim", "two_sites", "-o", "c.mcap", *quick, "1", cwd=folder)
+    (folder / "trio.toml").write_text(TRIO)
+    (folder / "no.mcap").write_bytes(b"no log")
+    return folder
+
+
+def test_logs_stand_side_by_side_under_what_differs(logs: Path) -> None:
+    lines = trilat("compare", "a.mcap", "b.mcap", "--all", cwd=logs).succeeds().splitlines()
+    assert next(line.split() for line in lines if "every link" in line)[2:] == [
+        "200",
+        "ms",
+        "50",
+        "ms",
+    ]
+    assert any("RMS spread, undelayed" in line and " rad " in line for line in lines)
+    assert all(word not in " ".join(lines) for word in ("better", "best", "winner", "rank"))
+
+
+def test_short_text_has_verdicts_ten_metrics_and_a_conclusion(logs: Path) -> None:
+    files = ("a.mcap", "b.mcap")
+    facts = json.loads(trilat("compare", *files, "--json", cwd=logs).succeeds())
+    brief = trilat("compare", *files, cwd=logs).succeeds().splitlines()
+    full = trilat("compare", *files, "--all", cwd=logs).succeeds().splitlines()
+    indented = [line.split("  ")[1].strip() for line in brief if line.startswith("  ")]
+    rows = [name for name in indented if name]
+    names = [row["name"] for row in facts["rows"]]
+    assert len(rows) == 10
+    assert rows == [name for name in names if name in rows]
+    assert all(any(name in line for line in full) for name in names)
+    for log, (verdict, *_) in facts["remarks"].items():
+        assert sum(f"{log}: {verdict}" in line for line in brief) == 1
+    assert brief[-2].startswith(f"in short: a is {verdict.partition(':')[0]} and b is ")
+    assert f"--all prints all {len(names)} metrics" in brief[-1]
+
+
+@pytest.mark.long
+def test_the_same_log_twice_is_one_experiment(logs: Path) -> None:
+    printed = trilat("compare", "a.mcap", "a.mcap", cwd=logs).succeeds()
+    assert "the same experiment" in printed
+    assert "1: a.mcap" in printed
+
+
+def test_logs_of_different_scenarios_are_compared_and_that_is_said(logs: Path) -> None:
+    printed = trilat("compare", "a.mcap", "c.mcap", cwd=logs).succeeds()
+    assert "logs of different scenarios: free, two_sites" in printed
+
+
+def test_json_is_for_programs(logs: Path) -> None:
+    facts = json.loads(trilat("compare", "a.mcap", "hang.mcap", "--json", cwd=logs).succeeds())
+    assert facts["columns"] == ["a", "hang"]
+    assert [log["scenario"] for log in facts["logs"]] == ["free", "free"]
+    assert {"control", "duration_s"} <= {one["key"] for one in facts["differences"]}
+    hanging = [
+        log
+        for log, remarks in facts["remarks"].items()
+        if "hang at the end" in " ".join(remarks)
+    ]
+    assert hanging == ["hang"]
+    assert all(len(row["values"]) == 2 for row in facts["rows"])
+
+
+@pytest.mark.long
+def test_search_says_its_time_and_its_procedure_and_writes_folder(logs: Path) -> None:
+    options = [
+        "--law",
+        "p_d,known",
+        "--budget",
+        "8",
+        "--jobs",
+        "1",
+        "--duration",
+        "12",
+        "--out",
+        "fronts",
+    ]
+    printed = trilat("compare", "--tune", "trio.toml", *options, cwd=logs).succeeds()
+    assert "18 runs on 1 core: about " in printed
+    assert "torques clamped at 60 N m" in printed
+    assert "trilat sim trio.toml --set duration_s=12.0 --set 'control={law = " in printed
+    written = sorted(path.name for path in (logs / "fronts").iterdir())
+    assert written == ["front.json", "front.md", "front.pdf", "front.png"]
+    again = trilat(
+        "compare", "--tune", "trio.toml", *options, "--force", "--json", cwd=logs
+    ).succeeds()
+    assert json.loads(again) == json.loads((logs / "fronts" / "front.json").read_text())
+    assert is_documented("compare --tune", json.loads(again))
+    trilat("compare", "--tune", "trio.toml", *options, cwd=logs).refuses(
+        "fronts: is not empty", "--force"
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "facts"),
+    [
+        ([], ["name at least two logs", "--tune free"]),
+        (["a.mcap"], ["name at least two logs"]),
+        (["a.mcap", "no.mcap"], ["no.mcap"]),
+        (["a.mcap", "none.mcap"], ["none.mcap", "cannot be read"]),
+        (
+            ["a.mcap", "b.mcap", "--budget", "3"],
+            ["--budget can be used only with --tune SCENARIO"],
+        ),
+        (["a.mcap", "b.mcap", "--force"], ["--force can be used only with --tune SCENARIO"]),
+        (["a.mcap", "--tune", "free"], ["--tune makes its own runs"]),
+        (["--tune", "free", "--all"], ["leave it out with --tune"]),
+        (["--tune", "fre"], ["no scenario of that name", "free"]),
+        (
+            ["--tune", "free", "--law", "adaptve"],
+            ["no law 'adaptve'", "did you mean 'adaptive'"],
+        ),
+        (["--tune", "free", "--budget", "0"], ["--budget", "not 0"]),
+        (["--tune", "training"], ["keep only one of the operators"]),
+    ],
+)
+def test_bad_input_is_refused_in_one_line(
+    logs: Path, arguments: list[str], facts: list[str]
+) -> None:
+    trilat("compare", *arguments, cwd=logs).refuses(*facts)
+
+
+@pytest.mark.long
+def test_a_built_in_law_is_called_by_its_name(tmp_path: Path) -> None:
+    for law in ("tdpa", "wave", "adaptive"):
+        how = ["--set", f"control.law={law}", "--set", "scheme=digital", "--duration", "0.5"]
+        trilat("sim", "two_sites", *how, "-o", f"{law}.mcap", cwd=tmp_path).succeeds()
+    text = trilat("compare", "tdpa.mcap", "wave.mcap", "adaptive.mcap", cwd=tmp_path).succeeds()
+    assert "the law tdpa does not say which part of its torque is due to a peer" in " ".join(
+        text.split()
+    )
+    for word in ("somebody", "own law", "law own"):
+        assert word not in text

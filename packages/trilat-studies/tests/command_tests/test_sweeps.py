@@ -1,0 +1,194 @@
+"""`trilat sweep` with `--map`, `--margin`, `--confirm`: what it prints, what it leaves, what it refuses."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from sweep_tests.quick import SHORT
+from trilat_studies.sweep_command import parse_seed_count
+
+from tests.cli.running import trilat
+
+OVER = ("--over", "link.delay_ms=0:40:20", "--over", "control.Kd=1:4:1")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("sweeps")
+    (path / "trio.toml").write_text(SHORT)
+    text = trilat(
+        "sweep", "trio.toml", *OVER, "--map", "-o", "done", "--jobs", "1", cwd=path
+    ).succeeds()
+    (path / "printed.txt").write_text(text)
+    return path
+
+
+def test_a_sweep_tells_its_plan_outcome_and_next_step(folder: Path, tmp_path: Path) -> None:
+    text = trilat("sweep", folder / "trio.toml", *OVER, "--jobs", "1", cwd=tmp_path).succeeds()
+    lines = text.splitlines()
+    assert lines[0] == "trio: 12 cells (3 x 4), seed 1"
+    assert "  over link.delay_ms=0:40:20: 0, 20, 40" in lines
+    (verdicts,) = (line for line in lines if line.startswith("12 runs of 12 cells: "))
+    assert sum(int(part.split()[0]) for part in verdicts.partition(": ")[2].split(", ")) == 12
+    assert "times real time per process" in text
+    # without lines of progress
+    assert len(re.findall(r"\d+ runs", text.replace("of 12 runs", ""))) == 1
+    assert "results: runs/sweep-trio-001/results.csv" in lines
+    again = trilat("sweep", "runs/sweep-trio-001", cwd=tmp_path).succeeds().splitlines()
+    assert verdicts in again
+    for line in (line for line in again if line.startswith("  trilat sweep ")):
+        words = line.partition("#")[0].split()
+        trilat(*words[1:], "--jobs", "1", cwd=tmp_path).succeeds()
+
+
+def test_a_cell_is_a_command_that_runs(folder: Path) -> None:
+    for source in ("done", "done/results.csv"):
+        text = trilat("sweep", source, "--cell", "6", cwd=folder).succeeds()
+    assert text.startswith(
+        "trilat sim trio.toml --set link.delay_ms=20 --set control.Kd=3 --seed 1 "
+    )
+    trilat(*text.split()[1:], cwd=folder).succeeds()
+    assert (folder / "cell-6.mcap").exists()
+
+
+def test_a_finished_sweep_is_not_computed_again(folder: Path) -> None:
+    before = (folder / "done" / "results.csv").read_bytes()
+    for how in (("trio.toml", *OVER, "-o", "done"), ("--resume", "done")):
+        text = trilat("sweep", *how, cwd=folder).succeeds()
+        assert "12 runs are done already" in text
+        assert "nothing was left to run" in text
+    assert (folder / "done" / "results.csv").read_bytes() == before
+
+
+def test_a_folder_that_is_called_as_a_scenario_is_none(folder: Path) -> None:
+    (folder / "free").mkdir(exist_ok=True)
+    trilat("sweep", "free", "--over", "control.Kx=1,2", cwd=folder).refuses(
+        "free: control.Kx", "did you mean"
+    )
+
+
+def test_seeds_are_a_number_or_a_list() -> None:
+    assert parse_seed_count(None) == 1
+    assert parse_seed_count("10") == 10
+    assert parse_seed_count("1..3,8") == [1, 2, 3, 8]
+    assert parse_seed_count("7..7") == parse_seed_count("7,") == [7]
+
+
+BAD = {
+    "no key of that name": (
+        ["--over", "link.dely_ms=0:1:1"],
+        ["link.dely_ms", "did you mean 'delay_ms'?"],
+    ),
+    "another sweep's folder": (
+        ["--over", "control.Kd=1,2", "-o", "done"],
+        ["done", "a sweep with other axes", "results cannot be mixed"],
+    ),
+    "somebody else's folder": (["--over", "control.Kd=1,2", "-o", "."], ["is not empty"]),
+    "nothing to sweep": ([], ["--over"]),
+    "no seeds": (["--over", "control.Kd=1,2", "--seeds", "5..1"], ["1..20"]),
+    "a cell of a scenario": (["--cell", "3"], ["trio.toml", "no results of a sweep"]),
+}
+
+
+@pytest.mark.parametrize("kind", BAD)
+def test_what_cannot_be_right_is_one_line_and_leaves_nothing(kind: str, folder: Path) -> None:
+    before = sorted(folder.rglob("*"))
+    arguments, facts = BAD[kind]
+    trilat("sweep", "trio.toml", *arguments, cwd=folder).refuses(*facts)
+    assert sorted(folder.rglob("*")) == before
+
+
+def test_an_enormous_sweep_is_refused_with_count_and_time(folder: Path) -> None:
+    before = sorted(folder.rglob("*"))
+    done = trilat(
+        "sweep", "trio.toml", "--over", "control.Kd=1:2:1e-6", "--over", OVER[1], cwd=folder
+    )
+    assert done.code == 2, done
+    (problem,) = done.err.splitlines()
+    for fact in ("error: 3000003 cells (1000001 x 3) would take about ", " on ", "--yes"):
+        assert fact in problem
+    assert sorted(folder.rglob("*")) == before
+
+
+def test_map_lies_beside_results_and_names_command_that_makes_it(folder: Path) -> None:
+    names = sorted(path.name for path in (folder / "done").iterdir())
+    assert {"map.md", "map.png", "map.svg", "results.csv"} <= set(names)
+    text = (folder / "done" / "map.md").read_text()
+    assert f"trilat sweep trio.toml {' '.join(OVER)} --map\n" in text
+
+
+def test_a_map_shows_its_progress_and_what_was_fixed(folder: Path) -> None:
+    lines = (folder / "printed.txt").read_text().splitlines()
+    assert lines.index("map: the lines of theory ...") < lines.index("map: drawing ...")
+    assert any(
+        re.fullmatch(r"  \d of 3 columns of the map, about .* left", line) for line in lines
+    )
+    assert "not swept: adaptive: Lambda 1, Kp 1, Gamma 1, theta_hat0 0" in lines
+    page = (folder / "done" / "map.md").read_text()
+    assert (
+        "- gains that were not swept: adaptive: Lambda 1, Kp 1, Gamma 1, theta_hat0 0\n" in page
+    )
+    assert "- laws at their best gains compare fairly by: `trilat compare --tune`\n" in page
+
+
+@pytest.mark.long
+def test_results_are_drawn_once_more_the_same(folder: Path) -> None:
+    before = {
+        name: (folder / "done" / name).read_bytes() for name in ("map.md", "map.png", "map.svg")
+    }
+    text = trilat("sweep", "done", "--map", "--jobs", "1", cwd=folder).succeeds()
+    assert "done/map.png" in text
+    for name, data in before.items():
+        assert (folder / "done" / name).read_bytes() == data
+    trilat(
+        "sweep", "done/results.csv", "--map", "--width", "7", "--jobs", "1", cwd=folder
+    ).succeeds()
+    assert (folder / "done" / "map.png").read_bytes() != before["map.png"]
+
+
+@pytest.mark.long
+def test_margins_are_printed_and_kept(folder: Path) -> None:
+    asked = ("--over", "link.delay_ms=0,40", "--margin", "control.Kd=1:4", "--tolerance", "0.1")
+    text = trilat(
+        "sweep", "trio.toml", *asked, "--jobs", "1", "-o", "edges", cwd=folder
+    ).succeeds()
+    assert "edge of Kd (N m s/rad)" in text
+    facts = json.loads((folder / "edges" / "margin.json").read_text())
+    assert [place["link.delay_ms"] for place in facts["places"]] == [0.0, 40.0]
+    assert (folder / "edges" / "margin.md").read_text().startswith("# ")
+    words = facts["command"].split()
+    assert words[:3] == ["trilat", "sweep", "trio.toml"]
+
+
+@pytest.mark.parametrize(
+    ("words", "problem"),
+    [
+        (("done", "--over", "control.Kd=1,2"), "--over is already set by the sweep"),
+        (("--resume", "done", "--seeds", "3"), "--seeds is already set by the sweep"),
+        (("trio.toml", "--resume", "done"), "--resume continues the sweep that is stored"),
+        (("done", "--cell", "12"), "numbered from 0 to 11"),
+        (("--cell", "1"), "--cell needs the results"),
+        (("--resume", "none"), "this folder contains no sweep"),
+        (("none.csv",), "no results of a sweep"),
+        (("--over", "control.Kd=1,2"), "name a scenario"),
+        (("done", "--map", "--confirm", "1"), "--map and --confirm cannot be combined"),
+        (("done", "--map", "--cell", "1"), "--map and --cell cannot be combined"),
+        (("done", "--width", "7"), "--width sets the width of a map"),
+        (
+            ("done", "--map", "--width", "5"),
+            "the width of a figure must be 3.5 or 7 inches, not 5",
+        ),
+        (("done", "--margin", "control.Kd=1:4"), "--margin starts a new search in a scenario"),
+        (
+            ("trio.toml", *OVER, "--tolerance", "0.1"),
+            "--tolerance sets the tolerance of a stability limit",
+        ),
+        (("trio.toml", *OVER, "--confirm", "2"), "--confirm needs the results"),
+        (("trio.toml", *OVER, "--margin", "control.Kd=1:4"), "control.Kd: is swept twice"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_a_sentence(
+    folder: Path, words: tuple[str, ...], problem: str
+) -> None:
+    trilat("sweep", *words, cwd=folder).refuses(problem)

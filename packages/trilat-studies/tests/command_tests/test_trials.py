@@ -1,0 +1,142 @@
+"""`trilat test`: exit codes in every direction, what it prints, what it refuses, how Ctrl-C ends it."""
+
+import signal
+import sys
+import xml.etree.ElementTree as Xml
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from trial_tests.results import QUICK
+from trilat_studies.study_commands import parse_seeds
+
+from tests.cli.running import started, trilat
+from tests.net.waiting import until
+from trilat_net.errors import UsageError
+from trilat_net.scenario import list_shipped, load_scenario
+
+TOO_MUCH = ("--set", "expect.mean_age_max_ms=1.0")
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "quick.toml").write_text(QUICK)
+    return tmp_path
+
+
+def test_what_holds_is_0_with_a_table(folder: Path) -> None:
+    text = trilat(
+        "test", "./quick.toml", "--seeds", "1..3", "--jobs", "1", cwd=folder
+    ).succeeds()
+    assert "ok  ./quick.toml  peak_error_max_rad" in text
+    assert "3/3" in text
+    assert "3 runs, 1.5 s simulated in " in text
+
+
+def test_a_failed_expectation_is_1_with_commands_that_repeat_it(folder: Path) -> None:
+    done = trilat(
+        "test", "./quick.toml", "--seeds", "4,6", "--jobs", "1", *TOO_MUCH, cwd=folder
+    )
+    assert done.code == 1, done
+    assert done.err == ""
+    assert "0/2" in done.out
+    again = "trilat test ./quick.toml --seeds 6 --set expect.mean_age_max_ms=1.0"
+    assert f"  again: {again}" in done.out.splitlines()
+    repeated = trilat(*again.split()[1:], cwd=folder)
+    assert repeated.code == 1, repeated
+    (figures,) = (line for line in done.out.splitlines() if "seed 6: mean_age_max_ms" in line)
+    assert figures in repeated.out
+    (look,) = (
+        line for line in done.out.splitlines() if "trilat sim" in line and "--seed 6" in line
+    )
+    trilat(*look.split()[2:], cwd=folder).succeeds()
+    assert (folder / "quick-seed6.mcap").exists()
+
+
+def test_one_scenario_that_fails_among_others_is_1(folder: Path) -> None:
+    (folder / "bad.toml").write_text(QUICK.replace("100.0", "1.0"))
+    done = trilat("test", "./quick.toml", "./bad.toml", "--jobs", "1", cwd=folder)
+    assert done.code == 1, done
+    marks = [line[:4] for line in done.out.splitlines() if ".toml  " in line]
+    assert marks == ["ok  ", "ok  ", "ok  ", "FAIL"]
+
+
+def test_junit_is_written_whether_all_held_or_not(folder: Path) -> None:
+    command = ("test", "./quick.toml", "--seeds", "1..2", "--jobs", "1", "--junit", "o.xml")
+    for more, failures in (((), "0"), (TOO_MUCH, "2")):
+        trilat(*command, *more, cwd=folder)
+        root = Xml.parse(folder / "o.xml").getroot()
+        assert (root.get("tests"), root.get("failures")) == ("2", failures)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("./missing.toml", "missing.toml"),
+        ("./quick.toml", "--set", "expect.stabel=true", "did you mean 'stable'"),
+        ("./quick.toml", "--set", "expect.end_pose_rad.x=[0.0, 0.0]", "the sites are m, s"),
+        ("./quick.toml", "--set", "expect.peak_error_min_rad=3.0", "peak_error_max_rad"),
+        ("./quick.toml", "--seeds", "5..1", "1..20 or 1,5,9"),
+        ("./quick.toml", "--junit", "no/folder.xml", "no/folder.xml"),
+        ("./mute.toml", "[expect]"),
+    ],
+)
+def test_bad_input_is_2_before_anything_runs(words: tuple[str, ...], folder: Path) -> None:
+    (folder / "mute.toml").write_text(QUICK.partition("[expect]")[0])
+    trilat("test", *words[:-1], cwd=folder).refuses(words[-1])
+
+
+def test_without_arguments_every_shipped_scenario_that_expects_something_is_meant() -> None:
+    from trilat_studies.study_commands import _list_trials
+
+    named = [trial.source for trial in _list_trials([], [1, 2], [], live=False)]
+    assert set(named) == {
+        name for name in list_shipped() if load_scenario(name).expect.has_expectations
+    }
+    assert "paper" in named
+
+
+@given(
+    first=st.integers(0, 500),
+    count=st.integers(0, 30),
+    others=st.lists(st.integers(0, 10**17), max_size=5),
+)
+def test_seeds_are_read_as_they_are_written(first: int, count: int, others: list[int]) -> None:
+    text = ",".join([f"{first}..{first + count}", *map(str, others)])
+    assert parse_seeds(text) == [*range(first, first + count + 1), *others]
+
+
+@pytest.mark.parametrize(
+    "text", ["", "a", "1..", "..3", "3..1", "1,,2", "-1", "1.5", "1..9" + "9" * 30, "0..999999"]
+)
+def test_other_texts_name_no_seeds(text: str) -> None:
+    with pytest.raises(UsageError, match="seeds"):
+        parse_seeds(text)
+
+
+@pytest.mark.long
+@pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+def test_ctrl_c_ends_it_with_130_and_leaves_no_process(folder: Path) -> None:
+    (folder / "long.toml").write_text(QUICK.replace("duration_s = 0.5", "duration_s = 20000.0"))
+    process = started("test", "long.toml", "--seeds", "1..9", "--jobs", "2", cwd=folder)
+
+    def workers() -> list[Path]:
+        threads = Path(f"/proc/{process.pid}/task").glob("*/children")
+        children = [
+            Path("/proc", pid) for thread in threads for pid in thread.read_text().split()
+        ]
+        return [
+            child for child in children if b"LokyProcess" in (child / "cmdline").read_bytes()
+        ]
+
+    try:
+        until(lambda: len(workers()) == 2, timeout_s=60)
+        begun = workers()
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=60)
+        assert process.returncode == 130, err
+        assert "Traceback" not in err
+        until(lambda: not any(path.exists() for path in begun), timeout_s=20)
+    finally:
+        process.kill()

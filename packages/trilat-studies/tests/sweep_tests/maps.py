@@ -1,0 +1,48 @@
+"""Results of sweeps that were never run, for tests of what is drawn of them."""
+
+from collections.abc import Callable, Iterator
+from itertools import product
+from typing import Any
+
+from trilat_studies.sweep.stability_map import MapPlane, build_plane
+from trilat_studies.sweep.sweep_cell import CellClass
+
+from trilat_net.scenario import load_scenario
+
+P_D = load_scenario("p_d_margin")
+DELAYS_MS = (0, 100, 200, 300, 400)
+DAMPINGS = (0.2, 0.7, 1.2, 1.7, 2.2)
+KEYS = ("link.delay_ms", "control.d")
+
+Row = dict[str, Any]
+Judge = Callable[..., CellClass]
+
+
+def by_the_line(delay_ms: float, d: float, *_: Any) -> CellClass:
+    """What the condition of P+d says of K = 10 and three sites."""
+    return CellClass.CONVERGED if d > 5e-3 * delay_ms else CellClass.BOUNDED
+
+
+def rows(verdict: Judge = by_the_line, seeds: int = 1, **axes: Any) -> Iterator[Row]:
+    """Yields one row per place and seed, judged by a function of its values and its seed."""
+    every = {KEYS[0]: DELAYS_MS, KEYS[1]: DAMPINGS} | {
+        key.replace("__", "."): some for key, some in axes.items()
+    }
+    for number, values in enumerate(product(*every.values())):
+        for seed in range(1, seeds + 1):
+            yield {
+                "cell": number,
+                **dict(zip(every, values, strict=True)),
+                "law": "p_d",
+                "seed": seed,
+                "verdict": verdict(*values, seed).value,
+                "ran_s": 20.0,
+                "diverged_s": None,
+                "scenario": P_D.text,
+            }
+
+
+def drawn(verdict: Judge = by_the_line, seeds: int = 1, **axes: Any) -> MapPlane:
+    """Returns the plane of such rows."""
+    made = list(rows(verdict, seeds, **axes))
+    return build_plane(made, [*KEYS, *(key.replace("__", ".") for key in axes)], P_D)

@@ -1,0 +1,97 @@
+"""One run: what its command makes is what was judged, and its text is kept as what differs."""
+
+import json
+import pickle
+import shlex
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from trilat_studies.sweep import sweep_cell
+from trilat_studies.sweep.sweep_cell import apply_diff, diff_lines
+from trilat_studies.sweep.sweep_results import build_sim_command
+from trilat_studies.sweep.sweep_run import CellItem, run_cell
+
+from sweep_tests.quick import Judge, asked
+from trilat_net.app.cli.options import load_chosen_scenario
+from trilat_net.errors import ScenarioError
+from trilat_net.scenario import load_scenario, parse_scenario
+
+
+@pytest.fixture
+def judge(monkeypatch: pytest.MonkeyPatch) -> Judge:
+    found = Judge()
+    monkeypatch.setattr(sweep_cell, "classify_cell", found)
+    return found
+
+
+def test_an_entry_holds_the_text_that_was_judged(tmp_path: Path, judge: Judge) -> None:
+    plan = asked(tmp_path, "link.loss=0.1", seeds=2)
+    entry = run_cell(CellItem(plan, plan.cell(5), 2))
+    (text,) = judge.texts
+    assert apply_diff(entry.scenario, plan.base.text) == text
+    assert entry.outcome == judge(text, plan.longest_s)
+    assert (entry.cell, entry.seed, entry.random, entry.law) == (5, 2, True, "adaptive")
+    same = asked(tmp_path)
+    assert not run_cell(CellItem(same, same.cell(5), 1)).random
+
+
+def test_command_of_cell_runs_its_scenario_for_so_long(tmp_path: Path, judge: Judge) -> None:
+    plan = asked(
+        tmp_path, "link.loss=0.1", "duration_s=0.25", laws=["p_d"], over=["link.delay_ms=0,20"]
+    )
+    run_cell(CellItem(plan, plan.cell(1), 1))
+    words = shlex.split(build_sim_command(plan, plan.cell(1).overrides, 1, 0.25, "a b.mcap"))
+    assert words[:3] == ["trilat", "sim", str(tmp_path / "trio.toml")]
+    assert words[-6:] == ["--seed", "1", "--duration", "0.25", "-o", "a b.mcap"]
+    settings = words[3:-6]
+    assert settings[::2] == ["--set"] * (len(settings) // 2)
+    assert load_chosen_scenario(words[2], settings[1::2], 0.25, 1).text == judge.texts[0]
+
+
+@pytest.mark.usefixtures("judge")
+def test_a_task_makes_the_same_entry_in_another_process(tmp_path: Path) -> None:
+    plan = asked(tmp_path, laws=["adaptive", "p_d"], over=["link.delay_ms=0,20"])
+    task = CellItem(plan, plan.cell(3), 1)
+    sent = pickle.loads(pickle.dumps(task))
+    assert run_cell(sent) == run_cell(task)
+    assert (
+        parse_scenario(apply_diff(run_cell(sent).scenario, plan.base.text)).sites["s"].control.K
+    )
+
+
+def test_a_cell_that_is_no_scenario_is_named(tmp_path: Path) -> None:
+    plan = asked(tmp_path)
+    cell = plan.cell(7)._replace(overrides=("link.delay_ms=60", "control.Kd=-1"))
+    with pytest.raises(
+        ScenarioError, match=r"cell 7 \(link.delay_ms=60, control.Kd=-1\): .*Kd"
+    ):
+        run_cell(CellItem(plan, cell, 1))
+
+
+texts = st.text(alphabet="ab\n ", max_size=60) | st.text(max_size=40)
+
+
+@given(text=texts, base=texts)
+def test_a_text_is_found_again_whatever_it_was_compared_with(text: str, base: str) -> None:
+    parts = diff_lines(text, base)
+    assert apply_diff(parts, base) == text
+    assert apply_diff(json.loads(json.dumps(parts)), base) == text
+
+
+@given(
+    text=texts, line=st.integers(0, 10), other=st.text(alphabet="xy", min_size=1, max_size=5)
+)
+def test_a_line_that_was_changed_is_all_that_differs(text: str, line: int, other: str) -> None:
+    lines = text.split("\n")
+    lines[line % len(lines)] = other
+    own = [part for part in diff_lines("\n".join(lines), text) if isinstance(part, str)]
+    assert own in ([other], [])
+
+
+def test_a_scenario_differs_in_what_an_override_changed() -> None:
+    base = load_scenario("p_d_margin")
+    changed = load_scenario("p_d_margin", ["sites.m1.control.d=2.5", "seed=7"])
+    own = [part for part in diff_lines(changed.text, base.text) if isinstance(part, str)]
+    assert own == ["seed = 7", "d = [2.5, 2.5]"]

@@ -1,0 +1,201 @@
+"""Cells beside edges, run once more: which are taken, and what counts as the same."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+from trilat_studies.sweep import sweep_cell
+from trilat_studies.sweep.live_confirmation import (
+    SessionRunner,
+    choose_cells_near_edges,
+    confirm_cell,
+    tabulate_confirmations,
+)
+from trilat_studies.sweep.sweep_cell import CellClass
+
+from trilat_net.errors import UsageError
+from trilat_net.execution import virtual
+from trilat_net.scenario import Scenario, load_scenario
+
+from .maps import KEYS, Row, by_the_line, rows
+
+BRIEF = {"link.delay_ms": 0.0, "rate_hz": 200, "duration_s": 12.0}
+CALM = load_scenario("p_d_margin", {**BRIEF, "control.d": 4.0})
+WILD = load_scenario(
+    "p_d_margin",
+    {**BRIEF, "control.d": 0.2, "link.delay_ms": 500.0, "limits.qd_limit_rad_s": 12.0},
+)
+
+
+def cell(scenario: Scenario) -> Row:
+    """A cell's row, as its own run makes it."""
+    outcome = sweep_cell.classify_cell(scenario.text, scenario.duration_s)
+    return {
+        "cell": 3,
+        **dict.fromkeys(KEYS, 1.0),
+        "law": "p_d",
+        "seed": 1,
+        "verdict": outcome.verdict.value,
+        "ran_s": outcome.ran_s,
+        "diverged_s": outcome.diverged_s,
+        "scenario": scenario.text,
+    }
+
+
+def runner(folder: Path, *problems: str, instead: Scenario | None = None) -> SessionRunner:
+    """A network that is none: sessions are runs in virtual time."""
+
+    def run(scenario: Scenario, name: str) -> tuple[Path, Sequence[str]]:
+        log = folder / f"{name}.mcap"
+        with log.open("wb") as stream:
+            virtual.write_virtual_log(instead or scenario, stream)
+        return log, problems
+
+    return run
+
+
+@pytest.mark.parametrize("scenario", [CALM, WILD], ids=["calm", "wild"])
+def test_a_log_of_the_same_run_has_the_same_verdict(scenario: Scenario, tmp_path: Path) -> None:
+    row = cell(scenario)
+    found = confirm_cell(row, runner(tmp_path))
+    assert found.same
+    assert found.live is found.virtual is CellClass(row["verdict"])
+    assert found.log == tmp_path / "cell-3.mcap"
+
+
+def test_another_run_differs(tmp_path: Path) -> None:
+    found = confirm_cell(cell(CALM), runner(tmp_path, instead=WILD))
+    assert not found.same
+    assert (found.virtual, found.live) == (CellClass.CONVERGED, CellClass.DIVERGED)
+
+
+def test_a_session_is_as_long_as_the_cell_ran(tmp_path: Path) -> None:
+    """Also where the cell had been extended; one that diverged has half a second more, to get there."""
+    asked: list[float] = []
+
+    def run(scenario: Scenario, _: str) -> tuple[Path, Sequence[str]]:
+        asked.append(scenario.duration_s)
+        return tmp_path / "none.mcap", ["failed"]
+
+    for changes in ({"ran_s": 8.0}, {"ran_s": 2.5, "diverged_s": 2.5}):
+        confirm_cell({**cell(CALM), **changes}, run)
+    assert asked == [8.0, 3.0]
+
+
+def test_what_failed_confirms_nothing(tmp_path: Path) -> None:
+    row = cell(CALM)
+    found = confirm_cell(row, runner(tmp_path, "s was killed by SIGKILL"))
+    assert (found.same, found.live, found.text) == (False, None, "s was killed by SIGKILL")
+
+    def torn(_: Scenario, name: str) -> tuple[Path, Sequence[str]]:
+        (tmp_path / name).write_bytes(b"no log")
+        return tmp_path / name, []
+
+    found = confirm_cell(row, torn)
+    assert (found.same, found.live) == (False, None)
+    assert "cell-3" in found.text
+    missing = confirm_cell(row, lambda *_, **__: (tmp_path / "missing.mcap", []))
+    assert (missing.same, missing.log) == (False, None)
+
+
+def stable(row: Row) -> bool | None:
+    return CellClass(row["verdict"]).stable
+
+
+def test_cells_are_beside_an_edge_as_many_on_either_side() -> None:
+    every = list(rows())
+    found = choose_cells_near_edges(every, KEYS, 3)
+    assert [stable(row) for row in found] == [True] * 3 + [False] * 3
+    assert len({row["cell"] for row in found}) == 6
+    for row in found:
+        delay, d = row[KEYS[0]], row[KEYS[1]]
+        near = [
+            one
+            for one in every
+            if (abs(one[KEYS[0]] - delay), round(abs(one[KEYS[1]] - d), 9))
+            in ((100, 0.0), (0, 0.5))
+        ]
+        assert any(stable(one) is not stable(row) for one in near)
+
+
+def test_cells_are_spread_over_the_edge() -> None:
+    found = choose_cells_near_edges(list(rows()), KEYS, 2)
+    delays = [row[KEYS[0]] for row in found if stable(row)]
+    assert max(delays) - min(delays) >= 300
+
+
+def test_undecided_cells_are_not_run_and_edge_is_beyond_them() -> None:
+    def band(delay_ms: float, d: float, *_: Any) -> CellClass:
+        return (
+            CellClass.UNDECIDED if abs(d - 5e-3 * delay_ms) < 0.3 else by_the_line(delay_ms, d)
+        )
+
+    found = choose_cells_near_edges(list(rows(band)), KEYS, 3)
+    assert [stable(row) for row in found] == [True] * 3 + [False] * 3
+    with pytest.raises(UsageError, match="no edge"):
+        choose_cells_near_edges(list(rows(lambda *_, **__: CellClass.UNDECIDED)), KEYS, 1)
+
+
+def test_another_seed_or_law_is_no_neighbour() -> None:
+    def by(row: Row) -> Row:
+        side = (
+            CellClass.CONVERGED
+            if (row["seed"], row["law"]) == (1, "p_d")
+            else CellClass.DIVERGED
+        )
+        return {**row, "verdict": side.value}
+
+    many = [by(row) for row in rows(seeds=2)] + [by({**row, "law": "pd_d"}) for row in rows()]
+    with pytest.raises(UsageError, match="no edge"):
+        choose_cells_near_edges(many, KEYS, 1)
+
+
+def lasting(row: Row, ran_s: Callable[[Row], float]) -> Row:
+    return {**row, "ran_s": ran_s(row)}
+
+
+def test_long_cells_are_passed_over_for_the_next_ones() -> None:
+    """Stable cells right at the edge ran long: those a step further are taken."""
+    edge = {row["cell"] for row in choose_cells_near_edges(list(rows()), KEYS, 4)}
+    late = [
+        lasting(row, lambda row: 160.0 if stable(row) and row["cell"] in edge else 20.0)
+        for row in rows()
+    ]
+    found = [row for row in choose_cells_near_edges(late, KEYS, 2) if stable(row)]
+    assert len(found) == 2
+    assert all(row["ran_s"] == 20.0 for row in found)
+    with pytest.raises(UsageError, match="stable side of an edge ran longer than 60 s"):
+        choose_cells_near_edges([lasting(row, lambda _: 160.0) for row in rows()], KEYS, 10)
+
+
+def test_none_is_no_number_of_cells() -> None:
+    with pytest.raises(UsageError, match="at least 1, not 0"):
+        choose_cells_near_edges(list(rows()), KEYS, 0)
+
+
+def test_the_table_tells_both_verdicts_and_where_the_log_is(tmp_path: Path) -> None:
+    found = [confirm_cell(cell(CALM), runner(tmp_path, instead=one)) for one in (CALM, WILD)]
+    grid = tabulate_confirmations(found, KEYS)
+    assert [row[grid.headers.index("virtual")] for row in grid.rows] == ["converged"] * 2
+    assert [row[grid.headers.index("live")] for row in grid.rows] == ["converged", "diverged"]
+    assert [row[-3] for row in grid.rows] == ["same", "DIFFERS"]
+    assert all(row[-1] == str(tmp_path / "cell-3.mcap") for row in grid.rows)
+
+
+@pytest.mark.live
+@pytest.mark.long
+@pytest.mark.parametrize("scenario", [CALM, WILD], ids=["calm", "wild"])
+def test_a_session_over_zenoh_has_the_verdict_of_virtual_time(
+    scenario: Scenario, tmp_path: Path
+) -> None:
+    from rich.console import Console
+
+    from trilat_net.app.demo_session import run_demo
+
+    def run(wanted: Scenario, _: str) -> tuple[Path, Sequence[str]]:
+        outcome = run_demo(wanted, tmp_path, Console(quiet=True))
+        return outcome.log, outcome.problems
+
+    found = confirm_cell(cell(scenario), run)
+    assert found.same, found.text

@@ -1,0 +1,128 @@
+"""Sweeps judged by twins: exponents are the roots of the linear loop, and their zero line is its edge."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.collections import QuadMesh
+from matplotlib.colors import to_hex
+from trilat_studies.sweep import prepare_sweep_folder, run_sweep
+from trilat_studies.sweep.map_page import draw_stability_map, tabulate_edges
+from trilat_studies.sweep.stability_map import (
+    StabilityMap,
+    build_plane,
+    build_stability_map,
+)
+from trilat_studies.sweep.sweep_plan import build_sweep_command, plan_from_json, plan_sweep
+from trilat_studies.sweep.sweep_results import SweepResults, read_results
+
+from trilat_net.analysis.theory.linear_edge import compute_growth_column
+from trilat_net.errors import UsageError
+from trilat_net.presentation.appearance import make_print_size
+
+from .maps import KEYS, P_D, rows
+from .quick import asked
+
+DELAYS_MS = (200.0, 250.0)
+DAMPINGS = (0.8, 1.0, 1.2, 1.4)
+NEAR_REST = (
+    "sites.m1.q0_rad=[0.101,0.2]",
+    "sites.m2.q0_rad=[0.1,0.2]",
+    "sites.s.q0_rad=[0.1,0.2]",
+)
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> SweepResults:
+    """P+d near its edge; the arms start so close together that the motion is small."""
+    over = {KEYS[0]: DELAYS_MS, KEYS[1]: DAMPINGS}
+    plan = plan_sweep(
+        "p_d_margin", [*NEAR_REST, "duration_s=40", "rate_hz=200"], over=over, judge="twins"
+    )
+    folder = prepare_sweep_folder(plan, tmp_path_factory.mktemp("exponents") / "o")
+    run_sweep(folder, 1)
+    return read_results(folder.path)
+
+
+@pytest.fixture(scope="module")
+def chart(results: SweepResults) -> StabilityMap:
+    return build_stability_map(results, (), 1)
+
+
+def test_an_exponent_is_the_real_part_of_the_rightmost_root(results: SweepResults) -> None:
+    """Within 2 % or 2e-3 /s, whichever is larger; some grow and some do not."""
+    for delay_ms in DELAYS_MS:
+        column = [row for row in results.rows if row[KEYS[0]] == delay_ms]
+        scenarios = [
+            results.plan.scenario(f"link.delay_ms={delay_ms}", f"control.d={d}")
+            for d in DAMPINGS
+        ]
+        roots = compute_growth_column(scenarios, KEYS[1], DAMPINGS).growth_per_s
+        assert min(roots) < -0.01
+        assert max(roots) > 0.01
+        for row, root in zip(column, roots, strict=True):
+            assert row["exponent_per_s"] == pytest.approx(root, rel=0.02, abs=2e-3)
+
+
+def test_the_zero_line_is_the_edge_of_the_linear_analysis(chart: StabilityMap) -> None:
+    """Within 2 %, from cells that are 0.2 apart."""
+    zero, *_, linear = chart.lines[0]
+    assert (zero.rank, linear.rank) == (-1, 1)
+    for n in range(len(DELAYS_MS)):
+        (edge,) = linear.crossings(n, chart.plane.y)
+        assert zero.crossings(n, chart.plane.y) == [pytest.approx(edge, rel=0.02)]
+
+
+def test_page_sets_zero_of_column_beside_verdicts_and_theory(chart: StabilityMap) -> None:
+    table = tabulate_edges(chart.plane, chart.plane.panels[0], chart.lines[0])
+    assert table.headers[1:4] == ("edge of d (N m s/rad)", "stable is", "edge of the verdicts")
+    assert [row[0] for row in table.rows] == ["200", "250"]
+    for row, n in zip(table.rows, range(2), strict=True):
+        (zero,) = chart.lines[0][0].crossings(n, chart.plane.y)
+        assert row[1:3] == (f"{zero:.4g}", "above")
+        low, high = map(float, row[3].split(" to "))
+        assert low < high
+
+
+def test_a_cell_without_growth_or_decay_is_white() -> None:
+    """Four fifths of the exponents are paler than the ends of the bar."""
+    made = [row | {"exponent_per_s": row[KEYS[1]] - 1.2} for row in rows()]
+    plane = build_plane(made, KEYS, P_D)
+    figure = draw_stability_map(plane, ((),), make_print_size(3.5))
+    mesh: Any = next(one for one in figure.axes[0].collections if isinstance(one, QuadMesh))
+    assert to_hex(mesh.to_rgba(0.0)) == "#ffffff"
+    assert mesh.get_clim() == (-1.0, 1.0)
+    assert figure.axes[-1].get_yticks().tolist() == [-1.0, -0.5, 0.0, 0.5, 1.0]
+    blue, red = mesh.to_rgba(-0.5), mesh.to_rgba(0.5)
+    assert blue[2] > blue[0]
+    assert red[0] > red[2]
+
+
+def test_place_has_mean_of_its_seeds_and_none_without_exponent() -> None:
+    made = [row | {"exponent_per_s": float(row["seed"])} for row in rows(seeds=3)]
+    made[0] |= {"exponent_per_s": None}
+    exponents = build_plane(made, KEYS, P_D).panels[0].exponents_per_s
+    assert np.isnan(exponents[0, 0])
+    assert np.nanmin(exponents) == np.nanmax(exponents) == 2.0
+    assert not build_plane(list(rows()), KEYS, P_D).judged_by_twins
+
+
+def test_verdicts_and_exponents_are_not_mixed_in_a_folder(tmp_path: Path) -> None:
+    verdicts, twins = (asked(tmp_path, judge=judge) for judge in ("verdict", "twins"))
+    assert "judge" not in verdicts.facts()
+    assert plan_from_json(verdicts.facts()).judge == "verdict"
+    prepare_sweep_folder(verdicts, tmp_path / "o")
+    longest = asked(tmp_path, judge="twins", longest_s=verdicts.longest_s)
+    with pytest.raises(UsageError, match="another judge: there verdict, here twins"):
+        prepare_sweep_folder(longest, tmp_path / "o")
+    assert (twins.longest_s, verdicts.longest_s) == (0.5, 4.0)
+    with pytest.raises(UsageError, match="verdict, twins, not 'luck'"):
+        asked(tmp_path, judge="luck")
+
+
+def test_the_command_of_a_map_names_its_judge(tmp_path: Path) -> None:
+    assert build_sweep_command(asked(tmp_path, judge="twins"), "--map").endswith(
+        " --judge twins --map"
+    )
+    assert "--judge" not in build_sweep_command(asked(tmp_path))

@@ -1,0 +1,228 @@
+"""The folder of a sweep goes on with its own alone; of its journal a torn line costs no other."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from trilat_studies.sweep.sweep_cell import CellRun
+from trilat_studies.sweep.sweep_run import (
+    PLAN_FILE,
+    open_sweep_folder,
+    prepare_sweep_folder,
+)
+
+from trilat_net.core.step.fingerprint import compute_fingerprint
+from trilat_net.errors import LogRefused, UsageError
+from trilat_net.log.provenance import collect_provenance
+from trilat_net.work import study_folder as folders
+from trilat_net.work.study_folder import RunJournal
+
+from .quick import DAMPING, SHORT, asked, outcome_of
+
+
+def refused(path: Path, *overrides: str, **settings: Any) -> str:
+    with pytest.raises(UsageError) as error:
+        prepare_sweep_folder(asked(path.parent, *overrides, **settings), path)
+    assert error.value.exit_code == 2
+    return str(error.value)
+
+
+@pytest.fixture
+def begun(tmp_path: Path) -> Path:
+    """The folder of a sweep that was begun."""
+    return prepare_sweep_folder(asked(tmp_path), tmp_path / "o").path
+
+
+def test_the_same_sweep_goes_on_in_its_folder(begun: Path) -> None:
+    plan = (begun / PLAN_FILE).read_bytes()
+    again = prepare_sweep_folder(asked(begun.parent), begun)
+    assert open_sweep_folder(begun).facts == again.facts == json.loads(plan)
+    assert (begun / PLAN_FILE).read_bytes() == plan
+    assert [path.name for path in begun.iterdir()] == [PLAN_FILE]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "settings", "words"),
+    [
+        (["control.Kp=2"], {}, ("another scenario", "trio (sha256 ")),
+        (["control.Kd=3"], {}, ("other settings", "there none, here control.Kd=3")),
+        (
+            [],
+            {"over": [DAMPING]},
+            ("other axes", "axes: link.delay_ms=0:40:20, control.Kd=1:4:1 in the folder, "),
+        ),
+        ([], {"seeds": 3}, ("other seeds", "1..1 in the folder, 1..3 now")),
+        ([], {"seeds": [5, 1]}, ("other seeds", "5, 1 now")),
+        ([], {"laws": ["adaptive"]}, ("other laws", "none in the folder, adaptive now")),
+        ([], {"longest_s": 2.0}, ("another longest time", "4 s in the folder, 2 s now")),
+    ],
+)
+def test_another_sweep_is_refused_with_what_differs(
+    begun: Path, overrides: list[str], settings: dict[str, Any], words: tuple[str, ...]
+) -> None:
+    problem = refused(begun, *overrides, **settings)
+    for word in (str(begun), "results cannot be mixed", "choose another folder", *words):
+        assert word in problem
+
+
+def test_a_scenario_that_was_edited_since_is_refused(begun: Path) -> None:
+    (begun.parent / "trio.toml").write_text(
+        SHORT.replace("delay_ms = 50.0", "delay_ms = 50.0 # ms")
+    )
+    assert "another text of the scenario" in refused(begun)
+
+
+def test_another_arithmetic_or_program_is_refused(
+    begun: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(folders, "compute_fingerprint", lambda: "0" * 16)
+        words = f"another kind of arithmetic: there {compute_fingerprint()}, here 0000"
+        assert words in refused(begun)
+    older = {**collect_provenance(), "version_numba": "0.1"}
+    monkeypatch.setattr(folders, "collect_provenance", lambda: older)
+    with pytest.raises(UsageError, match=r"another version of the program: .*numba 0\.1"):
+        open_sweep_folder(begun)
+
+
+def test_a_folder_that_holds_something_else_is_left_alone(tmp_path: Path) -> None:
+    other = tmp_path / "o"
+    other.mkdir()
+    (other / "precious").write_text("precious")
+    assert "is not empty; choose another folder" in refused(other)
+    assert [path.name for path in other.iterdir()] == ["precious"]
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (None, "this folder contains no sweep"),
+        ("{", "is not JSON"),
+        ("[]", "is not the plan"),
+        ("{}", "is not the plan"),
+    ],
+)
+def test_a_folder_without_a_plan_is_refused(
+    tmp_path: Path, content: str | None, words: str
+) -> None:
+    if content is not None:
+        (tmp_path / PLAN_FILE).write_text(content)
+    with pytest.raises(UsageError, match=words):
+        open_sweep_folder(tmp_path)
+
+
+NAME = "the sweep"
+
+
+def entry(cell: int, seed: int = 1) -> CellRun:
+    return CellRun(
+        cell,
+        seed,
+        bool(cell % 2),
+        "p_d",
+        "ab" * 32,
+        ((0, 4), f"é = {cell}"),
+        outcome_of(str(cell)),
+    )
+
+
+def opened(path: Path, sweep: str) -> RunJournal[CellRun]:
+    return RunJournal(
+        path, sweep, CellRun, folders.build_resume_hint("sweep", "--resume", str(path.parent))
+    )
+
+
+def written(path: Path, entries: list[CellRun], sweep: str = NAME) -> bytes:
+    with opened(path, sweep) as journal:
+        for one in entries:
+            journal.add(one)
+    return path.read_bytes()
+
+
+def read(path: Path, sweep: str = NAME) -> list[CellRun]:
+    with opened(path, sweep) as journal:
+        return list(journal.done.values())
+
+
+FIVE = [entry(cell) for cell in range(5)]
+
+
+@pytest.fixture(scope="module")
+def five(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    return written(tmp_path_factory.mktemp("journal") / "j", FIVE)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "j"
+
+
+def test_what_is_written_is_read_number_for_number(path: Path) -> None:
+    odd = msgspec.structs.replace(
+        FIVE[0],
+        cell=9,
+        outcome=msgspec.structs.replace(FIVE[0].outcome, peak_error_rad=math.inf),
+    )
+    written(path, [*FIVE, odd])
+    assert read(path) == [*FIVE, odd]
+
+
+@given(data=st.data())
+def test_file_cut_anywhere_keeps_every_whole_line_and_takes_more(
+    five: bytes, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    cut = data.draw(st.integers(0, len(five)))
+    path = tmp_path_factory.mktemp("cut") / "j"
+    path.write_bytes(five[:cut])
+    whole = five[:cut].count(b"\n")
+    kept = read(path)
+    assert kept[:whole] == FIVE[:whole]
+    assert len(kept) <= whole + 1  # a line that lacks its line feed alone is whole
+    written(path, FIVE)
+    assert sorted(read(path), key=lambda one: one.cell) == FIVE
+
+
+@given(data=st.data())
+def test_a_byte_that_is_wrong_loses_its_line_alone(
+    five: bytes, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    at = data.draw(st.integers(0, len(five) - 1))
+    flipped = data.draw(st.integers(0, 255).filter(lambda byte: byte != five[at]))
+    path = tmp_path_factory.mktemp("flip") / "j"
+    path.write_bytes(five[:at] + bytes([flipped]) + five[at + 1 :])
+    kept = read(path)
+    line = five[:at].count(b"\n")
+    lost = {line, line + 1} if five[at : at + 1] == b"\n" else {line}
+    assert [one for one in FIVE if one.cell not in lost] == [
+        one for one in kept if one.cell not in lost
+    ]
+    assert all(one in FIVE for one in kept)
+
+
+def test_lines_of_another_sweep_count_for_nothing(path: Path) -> None:
+    written(path, FIVE, "another sweep")
+    assert read(path) == []
+    written(path, FIVE[:2])
+    assert read(path) == FIVE[:2]
+    assert read(path, "another sweep") == FIVE
+
+
+def test_a_run_refused_by_a_full_disk_is_not_done(path: Path) -> None:
+    """`/dev/full` answers as a disk does that is full."""
+    with opened(path, "sweep") as journal:
+        journal.add(FIVE[0])
+        whole = journal._file
+        with Path("/dev/full").open("ab", buffering=0) as full:
+            journal._file = full
+            with pytest.raises(
+                LogRefused, match=r"No space left on device.*make room, and continue with"
+            ) as found:
+                journal.add(FIVE[1])
+        journal._file = whole
+        assert [entry.cell for entry in journal.done.values()] == [FIVE[0].cell]
+    assert found.value.exit_code == 5

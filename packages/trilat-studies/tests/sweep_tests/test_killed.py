@@ -1,0 +1,94 @@
+"""A sweep that is killed and interrupted comes to the same end, and makes no run twice."""
+
+import os
+import re
+import signal
+import subprocess
+from pathlib import Path
+
+import msgspec
+import pytest
+from trilat_studies.sweep.sweep_run import JOURNAL_FILE
+
+from tests.cli.running import COMMAND, PLAIN, trilat
+from tests.net.waiting import until
+
+from .quick import SHORT
+
+OPTIONS = (
+    "--over",
+    "control.Kd=1:4:0.1",
+    "--over",
+    "link.loss=0,0.1",
+    "--seeds",
+    "2",
+    "--longest",
+    "8",
+)
+RUNS = 31 * 3
+LONGER = SHORT.replace("rate_hz = 100", "rate_hz = 500").replace(
+    "duration_s = 0.5", "duration_s = 8.0"
+)
+
+
+def lines(results: Path) -> int:
+    """How many runs the journal has."""
+    journal = results / JOURNAL_FILE
+    return journal.read_bytes().count(b"\n") if journal.exists() else 0
+
+
+def stopped(folder: Path, number: int, count: int, *arguments: str) -> tuple[int, str]:
+    """Runs `trilat sweep` until its journal has so many runs; returns how a signal ended it.
+
+    SIGKILL goes to all of its processes, as when a machine is switched off.
+    """
+    process = subprocess.Popen(
+        [*COMMAND, "sweep", *arguments, "--jobs", "2"],
+        cwd=folder,
+        env=PLAIN,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    until(lambda: lines(folder / "parts") >= count or process.poll() is not None, 120.0)
+    (os.killpg if number == signal.SIGKILL else os.kill)(process.pid, number)
+    err = process.communicate(timeout=120)[1]
+    return process.returncode, err
+
+
+def keys(journal: Path) -> list[tuple[int, int]]:
+    """The runs whose lines are whole, as often as they stand there."""
+    whole = [
+        line
+        for line in journal.read_bytes().splitlines()
+        if re.fullmatch(rb"{.*}\t[0-9a-f]{8}", line)
+    ]
+    found = [msgspec.json.decode(line.partition(b"\t")[0]) for line in whole]
+    return [(one["cell"], one["seed"]) for one in found]
+
+
+@pytest.mark.long
+def test_killed_interrupted_and_resumed_it_comes_to_the_same_bytes(tmp_path: Path) -> None:
+    """SIGKILL to all its processes, then Ctrl-C; two processes, where the whole sweep had one."""
+    (tmp_path / "trio.toml").write_text(LONGER)
+    sweep = ("trio.toml", *OPTIONS, "-o")
+    trilat("sweep", *sweep, "whole", "--jobs", "1", cwd=tmp_path).succeeds()
+    parts = tmp_path / "parts"
+    code, err = stopped(tmp_path, signal.SIGKILL, 11, *sweep, "parts")
+    assert (code, err) == (-signal.SIGKILL, "")
+    done = lines(parts)
+    code, err = stopped(tmp_path, signal.SIGINT, done + 10, "--resume", "parts")
+    kept = len(keys(parts / JOURNAL_FILE))
+    assert code == 130
+    assert err.splitlines() == [
+        f"{kept} runs are done and kept; continue with: trilat sweep --resume parts",
+        "interrupted",
+    ]
+    assert done + 10 <= kept < RUNS
+    assert not (parts / "results.csv").exists()
+    text = trilat("sweep", *sweep, "parts", "--jobs", "2", cwd=tmp_path).succeeds()
+    assert f"{kept} runs are done already" in text
+    assert (parts / "results.csv").read_bytes() == (tmp_path / "whole/results.csv").read_bytes()
+    made = keys(parts / JOURNAL_FILE)
+    assert len(made) == len(set(made)) == RUNS

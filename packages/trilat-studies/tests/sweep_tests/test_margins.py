@@ -1,0 +1,233 @@
+"""Margins: an edge encloses what is there; over a plane beside theory, as table, page and JSON."""
+
+import json
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from trilat_studies.sweep import margin_search, sweep_cell
+from trilat_studies.sweep.margin_search import (
+    SCAN_POINTS,
+    GridPointMargin,
+    KeyMargin,
+    SearchRange,
+    SweepMargins,
+    format_range_axis,
+    parse_search_range,
+    search_key_margin,
+    search_margins,
+)
+from trilat_studies.sweep.stability_map import StabilityEdge
+from trilat_studies.sweep.sweep_cell import CellClass, CellResult
+from trilat_studies.sweep.sweep_plan import SweepPlan, plan_sweep
+
+from tests.json_outline import is_documented
+from trilat_net.analysis.run_end import EndBehaviour
+from trilat_net.errors import UsageError
+from trilat_net.scenario import parse_scenario
+
+WITHIN = SearchRange("control.d", 0.2, 3.0, 0.005)
+
+
+def asked(*over: str, **settings: object) -> SweepPlan:
+    axes = over or ("link.delay_ms=100,200",)
+    return plan_sweep("p_d_margin", over=[*axes, format_range_axis(WITHIN)], **settings)  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def by_the_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A judge that goes by the condition of P+d, and remembers nothing."""
+
+    def judge(text: str, _: float) -> CellResult:
+        scenario = parse_scenario(text)
+        delay_s = max(link.moments().mean_ms for link in scenario.links.values()) / 1e3
+        stable = scenario.sites["s"].control.d[0] > 5.0 * delay_s  # type: ignore[union-attr]
+        verdict = CellClass.CONVERGED if stable else CellClass.DIVERGED
+        motion = EndBehaviour.CONVERGED if stable else EndBehaviour.DIVERGED
+        return CellResult(verdict, motion, 1.0, 0, 0.0, 0.0, None, None, 0.0, None, None)
+
+    monkeypatch.setattr(sweep_cell, "classify_cell", judge)
+
+
+@pytest.fixture
+def without_roots(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No linear analysis, which takes seconds."""
+    monkeypatch.setattr(margin_search, "find_root_crossings", lambda *_, **__: ((), ""))
+
+
+@pytest.mark.usefixtures("by_the_line")
+def test_a_place_has_its_edge_beside_theory() -> None:
+    (one,) = search_margins(asked("link.delay_ms=200"), WITHIN, 1)
+    assert one.cell.values == (200.0,)
+    (span,) = one.margin.spans
+    assert span.low <= 1.0 <= span.high
+    assert one.closed == pytest.approx(1.0)
+    assert one.linear == (pytest.approx(1.0, rel=0.04),)
+    assert one.remark == ""
+
+
+@pytest.mark.usefixtures("by_the_line", "without_roots")
+def test_seeds_are_places_of_their_own_where_anything_is_random() -> None:
+    lossy = search_margins(asked("link.loss=0,0.1", seeds=2), WITHIN, 1)
+    assert [(one.cell.values, one.seed) for one in lossy] == [
+        ((0.0,), 1),
+        ((0.1,), 1),
+        ((0.1,), 2),
+    ]
+
+
+@pytest.mark.long
+def test_the_number_of_processes_changes_nothing() -> None:
+    """Runs of p_d at 100 Hz, 1 s: what they show is another question."""
+    brief = ["duration_s=1.0", "rate_hz=100"]
+    within = WITHIN._replace(tolerance=0.2)
+    wanted = plan_sweep(
+        "p_d_margin",
+        brief,
+        over=["link.delay_ms=100,400", format_range_axis(within)],
+        longest_s=1.0,
+    )
+    assert search_margins(wanted, within, 1) == search_margins(wanted, within, 2)
+
+
+@pytest.mark.usefixtures("by_the_line", "without_roots")
+def test_a_key_of_whole_numbers_is_searched_in_them() -> None:
+    """The judge calls 300 Hz and 50 Hz alike: what counts is that no value between whole numbers is run."""
+    within = SearchRange("rate_hz", 50.0, 300.0, 0.005)
+    wanted = plan_sweep("p_d_margin", over=["link.delay_ms=100,200", format_range_axis(within)])
+    assert [one.margin.stable for one in search_margins(wanted, within, 1)] == [True, True]
+
+
+def found(*spans: StabilityEdge, stable: bool | None = None) -> GridPointMargin:
+    cell = asked().cell(0)
+    return GridPointMargin(
+        cell._replace(values=(100.0,)), 1, KeyMargin(spans, stable, 0, 12), (0.5, 2.0), "", 0.51
+    )
+
+
+def test_table_tells_edges_islands_and_what_there_is_none_of() -> None:
+    edges = (StabilityEdge(0.49, 0.492, False, True), StabilityEdge(1.8, 2.1, True, False))
+    every = [found(*edges), found(stable=True), found(stable=False), found()]
+    grid = SweepMargins(asked(), WITHIN, every).table()
+    edge = grid.headers.index("edge of d (N m s/rad)")
+    assert [row[edge] for row in grid.rows] == [
+        "0.49 to 0.492",
+        "1.8 to 2.1 (undecided between)",
+        "none: all stable",
+        "none: nothing stable",
+        "none: nothing decided",
+    ]
+    assert [row[edge + 1] for row in grid.rows] == ["above", "below", "-", "-", "-"]
+    linear = grid.headers.index("linear")
+    assert [row[linear] for row in grid.rows[:2]] == ["0.5", "2"]  # each beside its own
+    assert grid.rows[0][linear + 1] == f"{100 * (0.5 / 0.491 - 1):+.2f} %"
+    assert (
+        "not monotone at 1 of 2 grid points" in SweepMargins(asked(), WITHIN, every[:2]).page()
+    )
+
+
+def test_the_facts_are_json_and_name_the_command() -> None:
+    margins = SweepMargins(asked(), WITHIN, [found(StabilityEdge(0.49, 0.492, False, True))])
+    told = json.loads(json.dumps(margins.to_dict(), allow_nan=False))
+    assert told["command"] == margins.command
+    assert told["command"].endswith(
+        "--over link.delay_ms=100,200 --margin control.d=0.2:3 --tolerance 0.005"
+    )
+    (place,) = told["places"]
+    assert place.pop("link.delay_ms") == 100.0
+    assert is_documented("sweep --margin", told)
+    assert place["edges"] == [
+        {"low": 0.49, "high": 0.492, "stable_below": False, "sharp": True}
+    ]
+
+
+@pytest.mark.parametrize(
+    "text", ["control.d", "control.d=1:1", "=1:2", "control.d=a:b", "d=0:inf"]
+)
+def test_what_is_no_range_is_refused(text: str) -> None:
+    with pytest.raises(UsageError, match=r"along must have the form KEY=FROM:TO"):
+        parse_search_range(text)
+
+
+def test_a_range_is_read_as_it_is_written() -> None:
+    assert parse_search_range("control.d=0.2:3") == WITHIN
+    assert format_range_axis(WITHIN) == "control.d=0.2,3"
+    with pytest.raises(UsageError, match="fraction of the value at the edge"):
+        parse_search_range("control.d=0.2:3", 0.0)
+
+
+@given(st.floats(0.25, 2.95), st.booleans(), st.sampled_from([0.05, 0.005, 1e-4]))
+def test_an_edge_is_enclosed_to_the_tolerance(
+    edge: float, above: bool, tolerance: float
+) -> None:
+    asked = []
+
+    def stable(value: float) -> bool:
+        asked.append(value)
+        return (value > edge) is above
+
+    found = search_key_margin(stable, 0.2, 3.0, tolerance)
+    (span,) = found.spans
+    assert span.low <= edge <= span.high
+    assert span.high - span.low <= tolerance * span.high
+    assert span.stable_below is not above
+    assert span.sharp
+    assert found.runs == len(asked) == len(set(asked))
+    assert found.runs <= SCAN_POINTS + 1 + math.log2(
+        2.8 / (SCAN_POINTS - 1) / (0.2 * tolerance)
+    )
+
+
+@given(st.floats(0.35, 2.8), st.floats(0.001, 0.1), st.booleans())
+def test_what_stays_undecided_is_the_interval_that_is_given(
+    edge: float, width: float, above: bool
+) -> None:
+    def stable(value: float) -> bool | None:
+        return None if abs(value - edge) < width else (value > edge) is above
+
+    found = search_key_margin(stable, 0.2, 3.0, 0.01)
+    (span,) = found.spans
+    assert span.low <= edge - width + 1e-9
+    assert edge + width - 1e-9 <= span.high
+    if span.sharp:
+        assert span.high - span.low <= 0.01 * span.high
+    else:
+        assert found.undecided > 0
+        assert (edge - width) - span.low <= 0.01 * span.high
+        assert span.high - (edge + width) <= 0.01 * span.high
+
+
+@pytest.mark.parametrize("side", [True, False, None])
+def test_without_change_there_is_no_edge_and_side_is_told(side: bool | None) -> None:
+    found = search_key_margin(lambda _: side, 0.2, 3.0)
+    assert (found.spans, found.stable, found.runs) == ((), side, SCAN_POINTS)
+
+
+def test_an_island_has_both_its_shores() -> None:
+    found = search_key_margin(lambda value: not 1.0 < value < 1.9, 0.0, 4.0)
+    first, second = found.spans
+    assert first.low <= 1.0 <= first.high
+    assert second.low <= 1.9 <= second.high
+    assert (first.stable_below, second.stable_below) == (True, False)
+    assert found.stable is None
+
+
+@given(st.floats(20.2, 299.8))
+def test_whole_numbers_are_narrowed_to_neighbours(edge: float) -> None:
+    def stable(value: float) -> bool:
+        assert value == round(value)
+        return value > edge
+
+    (span,) = search_key_margin(stable, 20.0, 300.0, 1e-9, whole=True).spans
+    assert (span.low, span.high) == (math.floor(edge), math.floor(edge) + 1) or edge == round(
+        edge
+    )
+
+
+def test_an_edge_near_nothing_ends_all_the_same() -> None:
+    """A tolerance relative to 0 is never met."""
+    (span,) = search_key_margin(lambda value: value > 1e-300, 0.0, 1.0).spans
+    assert span.low <= 1e-300 <= span.high
+    (span,) = search_key_margin(lambda value: value > 0.0, -1.0, 1.0).spans
+    assert span.low <= 0.0 <= span.high

@@ -1,0 +1,275 @@
+"""The page of a map, and its figure: colours are the verdicts, borders half way, lines on top."""
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from matplotlib.collections import QuadMesh
+from matplotlib.colors import rgb_to_hsv, to_hex, to_rgb
+from matplotlib.contour import QuadContourSet
+from matplotlib.figure import Figure
+from trilat_studies.sweep.fixed_gains import describe_fixed_gains
+from trilat_studies.sweep.map_page import (
+    CLASS_COLOURS,
+    build_map_page,
+    draw_stability_map,
+    tabulate_classes,
+    tabulate_edges,
+    write_map,
+)
+from trilat_studies.sweep.stability_map import CELL_CLASSES, MapLine, MapPlane, StabilityMap
+from trilat_studies.sweep.sweep_cell import CellClass
+from trilat_studies.sweep.sweep_plan import plan_sweep
+
+from trilat_net.presentation.appearance import make_print_size
+
+from .maps import DAMPINGS, DELAYS_MS, by_the_line, drawn, rows
+
+SPARE = np.array(DAMPINGS)[:, np.newaxis] - 5e-3 * np.array(DELAYS_MS)
+EXACT = MapLine("$d$", "d = 5 T", "the condition", SPARE, 0)
+HALF = MapLine(
+    "half", "half of it", "half of the condition", SPARE + 2.5e-3 * np.array(DELAYS_MS), 1
+)
+
+
+@pytest.fixture
+def chart() -> StabilityMap:
+    plane = drawn(link__playout_ms=(0.0, 400.0))
+    return StabilityMap(
+        plane, ((EXACT, HALF), (EXACT,)), ("a remark",), ("trilat sweep a", "trilat map"), "P+d"
+    )
+
+
+def test_the_folder_has_a_picture_a_vector_and_a_page(
+    chart: StabilityMap, tmp_path: Path
+) -> None:
+    paths = write_map(chart, tmp_path)
+    assert [path.name for path in paths] == ["map.png", "map.svg", "map.pdf", "map.md"]
+    # 3.5 in, 300 pixels to the inch
+    assert int.from_bytes(paths[0].read_bytes()[16:20], "big") == 1050
+    assert paths[1].read_text().startswith("<?xml")
+
+
+@pytest.mark.long
+def test_the_same_results_give_the_same_bytes(chart: StabilityMap, tmp_path: Path) -> None:
+    again = tmp_path / "again"
+    again.mkdir()
+    for one, other in zip(write_map(chart, tmp_path), write_map(chart, again), strict=True):
+        assert one.read_bytes() == other.read_bytes()
+
+
+def test_the_page_tells_commands_lines_and_remarks(chart: StabilityMap) -> None:
+    text = build_map_page(chart, "map.png")
+    assert text.startswith("# P+d\n")
+    assert "trilat sweep a\ntrilat map\n```" in text
+    assert "![map](map.png)" in text
+    assert text.count("d = 5 T: the condition") == 1
+    assert "- a remark" in text
+    assert "## playout 0 ms" in text
+
+
+def test_counts_are_of_all_runs() -> None:
+    plane = drawn(lambda _x, _y, seed: list(CellClass)[seed - 1], seeds=3)
+    assert tabulate_classes(plane).rows == [("all", "25", "25", "25", "0")]
+
+
+def test_an_edge_stands_beside_each_line_with_its_difference() -> None:
+    plane = drawn()
+    table = tabulate_edges(plane, plane.panels[0], (EXACT, HALF))
+    heads = [
+        "delay (ms)",
+        "edge of d (N m s/rad)",
+        "stable is",
+        "d = 5 T",
+        "difference",
+        "half of it",
+    ]
+    assert table.headers == (*heads, "difference")
+    assert [row[0] for row in table.rows] == ["100", "200", "300", "400"]
+    for row in table.rows:
+        low, high = map(float, row[1].split(" to "))
+        assert row[2] == "above"
+        assert low <= float(row[3]) <= high
+        assert row[4] == "within"
+        half, middle = 2.5e-3 * float(row[0]), 0.5 * (low + high)
+        expected = "within" if low <= half <= high else f"{100 * (half / middle - 1):+.1f} %"
+        assert row[6] == expected
+
+
+def test_a_line_that_is_not_there_has_no_difference() -> None:
+    plane = drawn()
+    table = tabulate_edges(
+        plane, plane.panels[0], (EXACT._replace(excess=np.full((5, 5), np.nan)),)
+    )
+    assert all(row[-2:] == ("-", "-") for row in table.rows)
+
+
+def test_a_map_without_an_edge_has_no_table() -> None:
+    plane = drawn(lambda *_, **__: CellClass.CONVERGED)
+    assert tabulate_edges(plane, plane.panels[0], (EXACT,)).rows == []
+
+
+LINE = MapLine("$d$", "d", "", SPARE, 0)
+
+
+def figure(plane: MapPlane, width_in: float = 3.5, lines: tuple[MapLine, ...] = ()) -> Figure:
+    return draw_stability_map(plane, [lines] * len(plane.panels), make_print_size(width_in))
+
+
+def meshes(made: Figure) -> list[QuadMesh]:
+    return [one for axes in made.axes for one in axes.collections if isinstance(one, QuadMesh)]
+
+
+def every(*place: Any) -> CellClass:
+    return CELL_CLASSES[(DELAYS_MS.index(place[0]) + DAMPINGS.index(place[1])) % 4]
+
+
+def test_every_place_has_the_colour_of_its_verdict() -> None:
+    made = figure(drawn(every))
+    made.canvas.draw()
+    (mesh,) = meshes(made)[:1]
+    colours = mesh.get_facecolors().reshape(len(DAMPINGS), len(DELAYS_MS), 4)
+    for i, d in enumerate(DAMPINGS):
+        for j, delay in enumerate(DELAYS_MS):
+            assert to_hex(colours[i, j]) == CLASS_COLOURS[every(delay, d)]
+
+
+def test_a_place_reaches_half_way_to_the_next() -> None:
+    (mesh,) = meshes(figure(drawn()))[:1]
+    corners = mesh.get_coordinates()
+    assert np.allclose(corners[0, :, 0], [0, 50, 150, 250, 350, 450])
+    assert np.allclose(corners[:, 0, 1], [0, 0.45, 0.95, 1.45, 1.95, 2.45])
+
+
+def test_classes_are_apart_in_lightness() -> None:
+    """Grey print: luminance after Rec. 709; white stands for undecided, and is hatched besides."""
+    light = [
+        float(np.dot(to_rgb(CLASS_COLOURS[v]), (0.2126, 0.7152, 0.0722))) for v in CELL_CLASSES
+    ]
+    assert min(abs(a - b) for n, a in enumerate(light) for b in light[:n]) > 0.09
+    assert rgb_to_hsv(to_rgb(CLASS_COLOURS[CellClass.UNDECIDED]))[1] == 0.0
+
+
+def test_lines_are_drawn_where_they_are_and_named() -> None:
+    made = figure(drawn(), lines=(LINE, LINE._replace(label="linear analysis", rank=1)))
+    first, second = (one for one in made.axes[0].collections if isinstance(one, QuadContourSet))
+    for line in (first, second):
+        ends = np.concatenate([path.vertices for path in line.get_paths()])
+        assert np.allclose(ends[:, 1], 5e-3 * ends[:, 0])
+        assert ends[:, 1].max() - ends[:, 1].min() > 2.0
+    assert first.get_linestyle() != second.get_linestyle()
+    (legend,) = made.legends
+    words = [text.get_text() for text in legend.get_texts()]
+    assert words == ["converged", "bounded oscillation", "$d$", "linear analysis"]
+
+
+def test_the_legend_has_only_what_occurs() -> None:
+    (legend,) = figure(drawn(lambda *_, **__: CellClass.UNDECIDED)).legends
+    assert [text.get_text() for text in legend.get_texts()] == ["undecided"]
+
+
+def test_several_runs_show_their_share_with_a_scale() -> None:
+    plane = drawn(lambda x, y, seed: by_the_line(x, y - 0.3 * seed), seeds=4)
+    made = figure(plane, 7.0)
+    share = meshes(made)[0].get_array()
+    assert share is not None
+    assert np.allclose(np.ma.getdata(share), plane.panels[0].share)
+    assert "share of stable runs" in [axes.get_ylabel() for axes in made.axes]
+    texts = {text.get_text() for text in made.axes[0].texts}
+    assert texts
+    for i, j in np.argwhere((plane.panels[0].share > 0.0) & (plane.panels[0].share < 1.0)):
+        assert f"{round(4 * plane.panels[0].share[i, j])}/4" in texts
+    assert not any(text in ("0/4", "4/4") for text in texts)
+
+
+@pytest.mark.parametrize(("panels", "width_in"), [(1, 3.5), (3, 3.5), (6, 7.0)])
+def test_every_panel_has_a_title_and_shares_one_label(panels: int, width_in: float) -> None:
+    plane = drawn(rate_hz=tuple(float(n) for n in range(1, panels + 1)))
+    made = figure(plane, width_in, (LINE,))
+    assert made.get_figwidth() == width_in
+    assert [axes.get_title() for axes in made.axes if axes.collections] == [
+        p.title for p in plane.panels
+    ]
+    labels = [made.get_supxlabel(), *(axes.get_xlabel() for axes in made.axes)]
+    assert [text for text in labels if text] == ["delay (ms)"]
+
+
+def test_nothing_of_matplotlib_is_left_changed() -> None:
+    before = dict(mpl.rcParams)
+    figure(drawn())
+    assert dict(mpl.rcParams) == before
+
+
+def test_a_place_that_did_not_run_is_no_verdict() -> None:
+    from trilat_studies.sweep.stability_map import build_plane
+
+    from .maps import KEYS, P_D
+
+    made = figure(build_plane([row for row in rows() if row["cell"] != 12], KEYS, P_D))
+    classes = meshes(made)[0].get_array()
+    assert classes is not None
+    assert int(np.ma.getmaskarray(classes).sum()) == 1
+
+
+def test_uneven_values_are_named_one_by_one() -> None:
+    plane = drawn()
+    uneven = plane._replace(x=plane.x._replace(values=(8, 68, 136, 272, 1088)))
+    made = figure(uneven)
+    made.canvas.draw()
+    assert [text.get_text() for text in made.axes[0].get_xticklabels()] == [
+        "8",
+        "68",
+        "136",
+        "272",
+        "1088",
+    ]
+
+
+FIXED = ("p_d: K 10, gravity 1", "adaptive: Lambda 1, Kp 1, Kd 3, Gamma 1, theta_hat0 0")
+
+
+@pytest.mark.parametrize("panels", [(0.0,), (0.0, 400.0)])
+@pytest.mark.parametrize("width_in", [3.5, 7.0])
+def test_a_caption_covers_no_label(panels: tuple[float, ...], width_in: float) -> None:
+    plane = drawn(link__playout_ms=panels)
+    figure = draw_stability_map(
+        plane, [()] * len(plane.panels), make_print_size(width_in), FIXED
+    )
+    figure.draw_without_rendering()
+    (caption,) = figure.texts[:1]
+    box = caption.get_window_extent()
+    assert box.x1 <= figure.bbox.width
+    others = [axes.get_tightbbox() for axes in figure.axes]
+    others += [text.get_window_extent() for text in figure.texts[1:]]
+    for text in (figure._supxlabel, figure._supylabel):  # type: ignore[attr-defined]
+        others += [text.get_window_extent()] if text is not None else []
+    for other in others:
+        assert other is not None
+        assert not box.overlaps(other)
+    words = " ".join(caption.get_text().split())
+    assert words.startswith(f"not swept: {'; '.join(FIXED)}")
+    assert "trilat compare --tune" in words
+
+
+@pytest.mark.parametrize(
+    ("axes", "laws", "texts"),
+    [
+        (["link.delay_ms=20,40", "control.d=1,2"], [], ["p_d: K 10, gravity 1"]),
+        (
+            ["sites.s.control.d=1,2"],
+            [],
+            ["p_d of m1, m2: K 10, d 1.1, gravity 1", "p_d of s: K 10, gravity 1"],
+        ),
+        (["rate_hz=500,1000"], ["p_d", "pd_d"], ["p_d: K 10, d 1.1, gravity 1", "pd_d: "]),
+        (["control.K=1,2", "control.d=1,2", "control.gravity=0,1"], [], ["p_d: none"]),
+    ],
+)
+def test_gains_that_were_not_swept_are_named(
+    axes: list[str], laws: list[str], texts: list[str]
+) -> None:
+    found = describe_fixed_gains(plan_sweep("p_d_margin", over=axes, laws=laws))
+    assert len(found) == len(texts)
+    for one, text in zip(found, texts, strict=True):
+        assert one.startswith(text)

@@ -1,0 +1,347 @@
+"""Plans: axes are texts that a person would write; what cannot run is refused before anything does."""
+
+import json
+from decimal import Decimal
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from trilat_studies.sweep.sweep_plan import (
+    SweepPlan,
+    list_axes,
+    parse_axis,
+    plan_from_json,
+    plan_sweep,
+)
+
+from tests.laws import Adaptive
+from trilat_net.errors import ScenarioError, UsageError
+from trilat_net.scenario import load_scenario
+
+from .quick import SHORT, asked
+
+
+def refused(source: str, *overrides: str, **settings: object) -> str:
+    with pytest.raises((ScenarioError, UsageError)) as error:
+        plan_sweep(source, overrides, **settings)  # type: ignore[arg-type]
+    assert error.value.exit_code == 2
+    return str(error.value)
+
+
+@pytest.fixture(scope="module")
+def cube(tmp_path_factory: pytest.TempPathFactory) -> SweepPlan:
+    """Two laws, and three axes."""
+    over = ["link.delay_ms=0:40:20", "sites.s.q0_rad.0=0.1,0.2", "link.order=newest,in_order"]
+    return asked(tmp_path_factory.mktemp("cube"), over=over, laws=["p_d", "adaptive"])
+
+
+@given(
+    places=st.tuples(st.integers(0, 1), st.integers(0, 2), st.integers(0, 1), st.integers(0, 1))
+)
+def test_cells_are_numbered_row_by_row(cube: SweepPlan, places: tuple[int, ...]) -> None:
+    law, delay, pose, order = places
+    number = ((law * 3 + delay) * 2 + pose) * 2 + order
+    cell = cube.cell(number)
+    assert cell.number == number
+    assert cell.law == ["p_d", "adaptive"][law]
+    assert cell.values == (20.0 * delay, [0.1, 0.2][pose], ["newest", "in_order"][order])
+
+
+VALUES = st.lists(st.floats(0.0, 1e3), min_size=1, max_size=4, unique=True)
+
+
+@given(
+    delays=VALUES,
+    counts=st.lists(st.integers(0, 50), min_size=1, unique=True),
+    as_array=st.booleans(),
+)
+def test_values_by_key_are_the_axes_that_texts_are(
+    delays: list[float], counts: list[int], as_array: bool
+) -> None:
+    given = [np.array(one) if as_array else one for one in (delays, counts)]
+    over = {
+        "link.delay_ms": given[0],
+        "control.d": given[1],
+        "link.order": ["newest", "in_order"],
+    }
+    first, second, third = map(parse_axis, list_axes(over))
+    assert [first.value(n) for n in range(len(delays))] == delays
+    assert [second.value(n) for n in range(len(counts))] == counts
+    assert third == parse_axis("link.order=newest,in_order")
+    assert list_axes("link.delay_ms=0:400:50") == list_axes({"link.delay_ms": "0:400:50"})
+
+
+def test_laws_by_key_are_classes_and_vectors_are_single_values() -> None:
+    laws, poses = list_axes({"control.law": [Adaptive, "p_d"], "sites.s.q0_rad": np.eye(2)})
+    assert laws == 'control.law="tests.laws:Adaptive",p_d'
+    assert len(parse_axis(laws).texts) == len(parse_axis(poses).texts) == 2
+    with pytest.raises(ScenarioError, match="cannot be a value in a scenario"):
+        list_axes({"control.d": [None]})
+
+
+@given(number=st.integers(0, 23), seed=st.integers(1, 3))
+def test_a_cell_is_what_its_overrides_make_of_the_scenario(
+    cube: SweepPlan, number: int, seed: int
+) -> None:
+    scenario = cube.scenario(*cube.cell(number).overrides, f"seed={seed}")
+    delay_ms, pose, order = cube.cell(number).values
+    assert {link.delay_ms for link in scenario.links.values()} == {delay_ms}
+    assert {link.order for link in scenario.links.values()} == {order}
+    assert (scenario.sites["s"].q0_rad, scenario.seed) == ((pose, 0.1), seed)
+    assert {spec.control.__struct_config__.tag for spec in scenario.sites.values()} == {
+        cube.cell(number).law
+    }
+
+
+def test_there_is_no_cell_beyond_the_last(cube: SweepPlan) -> None:
+    assert cube.shape == (2, 3, 2, 2)
+    assert cube.cells == 24
+    for number in (-1, 24):
+        with pytest.raises(UsageError, match="numbered from 0 to 23"):
+            cube.cell(number)
+
+
+def test_facts_make_the_plan_again(cube: SweepPlan) -> None:
+    again = plan_from_json(json.loads(json.dumps(cube.facts())))
+    assert again.facts() == cube.facts()
+    assert again.base == cube.base
+    assert [again.cell(n) for n in range(24)] == [cube.cell(n) for n in range(24)]
+    assert (again.seeds, again.longest_s) == (cube.seeds, cube.longest_s)
+
+
+def test_law_that_all_sites_have_keeps_gains_of_scenario() -> None:
+    found = plan_sweep("p_d_margin", ["control.K=7"], laws=["p_d", "pd_d"])
+    stays, other = (found.scenario(*found.cell(n).overrides).sites["s"].control for n in (0, 1))
+    assert (stays.K, stays.d) == ((7.0, 7.0), (1.1, 1.1))
+    assert (other.K, other.Kd, other.d) == ((7.0, 7.0), (3.0, 3.0), (5.0, 5.0))
+
+
+def test_another_law_replaces_every_sites_law_and_gains() -> None:
+    found = plan_sweep("contact", laws=["p_f", "p_d"])
+    assert found.cell(0).overrides == ()
+    of_all = found.scenario(*found.cell(1).overrides)
+    assert {spec.control for spec in of_all.sites.values()} == {
+        load_scenario("paper", ["control.law=p_d"]).sites["s"].control
+    }
+
+
+def test_seeds_are_counted_from_the_scenarios_own_or_named(tmp_path: Path) -> None:
+    assert asked(tmp_path).seeds == (1,)
+    assert asked(tmp_path, "seed=5", seeds=3).seeds == (5, 6, 7)
+    assert asked(tmp_path, seeds=[4, 2, 4]).seeds == (4, 2)
+    assert "1 to 100000" in refused("paper", seeds=0)
+    assert "1 to 100000" in refused("paper", seeds=100_001)
+    assert "from 0 to 2^63 - 1, not -1" in refused("paper", seeds=[-1])
+
+
+def test_an_undecided_cell_may_run_eight_times_as_long(tmp_path: Path) -> None:
+    assert asked(tmp_path).longest_s == 4.0
+    assert asked(tmp_path, longest_s=0.5).longest_s == 0.5
+    assert plan_sweep("paper", ["duration_s=80000"]).longest_s == 86_400.0
+    for longest_s in (0.4, 1e6, float("nan")):
+        assert "from 0.5 s to 86400 s" in refused(
+            str(tmp_path / "trio.toml"), longest_s=longest_s
+        )
+
+
+@pytest.mark.parametrize(
+    ("over", "words"),
+    [
+        (
+            ["link.delay=0:1:1"],
+            ("p_d_margin: link.delay: unknown key", "did you mean 'delay_ms'?"),
+        ),
+        (["sites.q.rate_hz=1,2"], ("no such site", "m1, m2, s")),
+        (["links.m1-s.delay_ms=1,2"], ("did you mean 'm1->s'?",)),
+        (["link.order=newest,in_ordr"], ("'in_ordr'", "'newest' or 'in_order'")),
+        (["control.d=-1:1:0.5"], ("d[0]", ">= 0")),
+        (
+            ["sites.s.environment.0.stiffness_n_m=1,2"],
+            ("sites.s.environment.0: there is no such entry",),
+        ),
+        (["link.delay_ms=0,1", "link.delay_ms=2,3"], ("link.delay_ms: is swept twice",)),
+    ],
+)
+def test_axis_that_cannot_be_right_is_refused_before_anything_runs(
+    over: list[str], words: tuple[str, ...]
+) -> None:
+    problem = refused("p_d_margin", over=over)
+    for word in words:
+        assert word in problem
+
+
+def test_a_key_that_nothing_follows_is_refused(tmp_path: Path) -> None:
+    own = SHORT + "".join(f"[sites.{name}.control]\nKd = 2.0\n" for name in ("m1", "m2", "s"))
+    (tmp_path / "own.toml").write_text(own)
+    problem = refused(str(tmp_path / "own.toml"), over=["control.Kd=1:3:1"])
+    assert "control.Kd: 1 and 2 give the same experiment" in problem
+    assert "sites.NAME.control" in problem
+
+
+def test_a_scenario_that_is_live_only_is_refused() -> None:
+    outside = refused("paper", "sites.s.plant=external", over=["control.Kd=1,2"])
+    assert "paper: sites.s.plant: is external" in outside
+    assert "only run live" in outside
+    measured = refused("paper", "link.model=measured", over=["control.Kd=1,2"])
+    assert "model: is 'measured', the delay of a real network" in measured
+    assert "link.model=constant" in measured
+
+
+@pytest.mark.parametrize(
+    ("laws", "words"),
+    [
+        (["p_dd"], ("laws", "no law 'p_dd'", "did you mean 'p_d'?")),
+        (
+            ["mine.laws:Law"],
+            ("the module mine.laws, which mine.laws:Law names, was not found",),
+        ),
+        (["p_d", "p_f"], ("with law p_f", "two sites")),
+    ],
+)
+def test_a_law_that_cannot_be_swept_is_refused(laws: list[str], words: tuple[str, ...]) -> None:
+    problem = refused("p_d_margin", laws=laws)
+    for word in words:
+        assert word in problem
+
+
+def test_axis_that_swept_law_has_not_is_refused_with_law() -> None:
+    problem = refused("p_d_margin", over=["control.d=1,2"], laws=["p_d", "adaptive"])
+    assert "control.d: with law adaptive: belongs to law" in problem
+    assert "is swept twice" in refused(
+        "p_d_margin", over=["control.law=p_d,pd_d"], laws=["p_d"]
+    )
+
+
+decimals = st.decimals(-1000, 1000, places=4)
+steps = st.decimals(Decimal("0.0001"), 50, places=4)
+
+
+def axis_refused(text: str) -> str:
+    with pytest.raises(ScenarioError) as error:
+        parse_axis(text)
+    assert error.value.exit_code == 2
+    return str(error.value)
+
+
+@given(
+    first=decimals,
+    step=steps,
+    count=st.integers(1, 300),
+    beyond=st.decimals(0, Decimal("0.9"), places=2),
+)
+def test_a_range_is_whole_steps_from_its_first_value(
+    first: Decimal, step: Decimal, count: int, beyond: Decimal
+) -> None:
+    last = first + (count - 1 + beyond) * step
+    found = parse_axis(f"control.d={first}:{last}:{step}")
+    assert len(found.texts) == count
+    assert found.numeric
+    values = [Decimal(text) for text in found.texts]
+    assert values == [first + n * step for n in range(count)]
+    assert [found.value(n) for n in range(count)] == [float(value) for value in values]
+    downwards = parse_axis(f"control.d={values[-1]}:{first}:{-step}")
+    assert [Decimal(text) for text in downwards.texts] == values[::-1]
+
+
+def test_an_end_on_the_grid_within_rounding_counts() -> None:
+    assert list(parse_axis("a=0:1:0.3333333333").texts)[-1] == "0.9999999999"
+    assert list(parse_axis("a=0:0.9999999999:0.25").texts)[-1] == "1.00"
+
+
+def test_exponents_are_written_out_so_that_whole_numbers_stay_whole() -> None:
+    assert list(parse_axis("rate_hz=1e2:3e2:1e2").texts) == ["100", "200", "300"]
+    assert list(parse_axis("a=1e-7:2e-7:1e-7").texts) == ["0.0000001", "0.0000002"]
+
+
+def test_a_list_has_words_numbers_and_tables() -> None:
+    found = parse_axis(" link.order = newest, in_order ")
+    assert (found.description, found.key, found.texts) == (
+        "link.order=newest, in_order",
+        "link.order",
+        ("newest", "in_order"),
+    )
+    assert (found.numeric, found.value(1)) == (False, "in_order")
+    assert parse_axis("a=1,2.5,1e3").numeric
+    assert parse_axis("a=true,false").value(0) == "true"
+    assert parse_axis("q0_rad=[0.1,0.2],[0.3,0.4]").texts == ("[0.1,0.2]", "[0.3,0.4]")
+    assert parse_axis('a="x:y,z",{b="]:,"}').texts == ('"x:y,z"', '{b="]:,"}')
+
+
+def test_a_range_of_very_many_values_takes_no_room() -> None:
+    found = parse_axis("a=0:1e8:0.001")
+    assert len(found.texts) == 10**11 + 1
+    assert found.texts[10**11] == "100000000.000"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("link.delay_ms", ("KEY=VALUES", "'link.delay_ms'")),
+        ("=1,2", ("KEY=VALUES",)),
+        ("", ("KEY=VALUES",)),
+        ("a=", ("a: is empty", "KEY=1,2,5")),
+        ("a=1,,2", ("a: is empty",)),
+        ("a=1:2", ("KEY=0:1600:50", "'1:2'")),
+        ("a=1:2:3:4", ("'1:2:3:4'",)),
+        ("a=x:y:z", ("a range a:b:step must consist of numbers", "'x'")),
+        ("a=0:nan:1", ("finite", "'nan'")),
+        ("a=0:inf:1", ("finite", "'inf'")),
+        ("a=1,nan", ("finite", "nan")),
+        ("a=1,-inf", ("finite", "-inf")),
+        ("a=0:10:0", ("a step of 0",)),
+        ("a=3:0.2:0.1", ("is empty", "did you mean 0.2:3:0.1?")),
+        ("a=0.2:3:-0.1", ("is empty", "did you mean 0.2:3:0.1?")),
+        ("a=0:1e18:1e-18", ("values", "a larger step")),
+        ("a=0:1e19:1", ("1e19", "from 1e-18 to 1e18")),
+        ("a=1,2,1", ("has 1 twice",)),
+        ("a=0,0x0", ("has 0x0 twice",)),
+        ("a=1,1.0", ("has 1.0 twice",)),
+        ("seed=1:9:1", ("seeds=1..20",)),
+        ("duration_s=1,2", ("longest_s",)),
+    ],
+)
+def test_an_invalid_axis_is_refused_with_a_valid_one(text: str, words: tuple[str, ...]) -> None:
+    problem = axis_refused(text)
+    for word in words:
+        assert word in problem
+
+
+@pytest.mark.parametrize(
+    ("overrides", "laws"),
+    [
+        (["link.model=uniform"], []),
+        (["link.model=uniform", "link.half_width_ms=10"], []),
+        (["link.model=gamma", "link.deviation_ms=4"], []),
+        (["link.model=sine", "link.amplitude_ms=5", "link.period_s=1"], []),
+        (["link.preset=rtt68-loss10"], []),
+        (["control.d=2"], ["p_d"]),
+        (["link.model=uniform", "control.d=2"], ["p_d", "pd_d"]),
+    ],
+)
+def test_overrides_may_need_what_is_swept(overrides: list[str], laws: list[str]) -> None:
+    plan = plan_sweep("free", overrides, over=["link.delay_ms=20:60:20"], laws=laws)
+    again = plan_from_json(json.loads(json.dumps(plan.facts())))
+    assert again.facts() == plan.facts()
+    for number in range(plan.cells):
+        cell = plan.cell(number)
+        scenario = plan.scenario(*cell.overrides)
+        assert again.scenario(*again.cell(number).overrides).sha256 == scenario.sha256
+        assert {link.delay_ms for link in scenario.links.values()} == {cell.values[0]}  # type: ignore[attr-defined]
+        if laws:
+            assert {spec.control.__struct_config__.tag for spec in scenario.sites.values()} == {
+                cell.law
+            }
+
+
+def test_an_axis_of_models_needs_no_widths() -> None:
+    plan = plan_sweep("free", ["link.delay_ms=40"], over=["link.model=uniform,constant"])
+    assert plan.cells == 2
+
+
+@pytest.mark.parametrize("text", ["name = 'x'", "no TOML", "name = 'x'\nsites = 5\n"])
+def test_a_broken_scenario_is_refused_with_laws(text: str, tmp_path: Path) -> None:
+    (tmp_path / "broken.toml").write_text(text)
+    with pytest.raises(ScenarioError, match="broken"):
+        plan_sweep(tmp_path / "broken.toml", laws=["p_d"], over=["control.d=1,2"])

@@ -1,0 +1,180 @@
+"""Runs of a sweep: the same results however they were made, nothing twice, every run counted."""
+
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from trilat_studies.sweep import prepare_sweep_folder, run_sweep, sweep_cell
+from trilat_studies.sweep.sweep_cell import CellClass
+from trilat_studies.sweep.sweep_plan import plan_sweep
+from trilat_studies.sweep.sweep_results import (
+    RESULTS_FILE,
+    describe_sweep_plan,
+    summarize_sweep,
+)
+from trilat_studies.sweep.sweep_run import (
+    DurationEstimate,
+    estimate_sweep,
+    open_sweep_folder,
+    refuse_oversized_sweep,
+)
+
+from trilat_net.errors import ScenarioError, UsageError
+
+from .quick import DELAYS, Judge, asked
+
+
+@pytest.fixture
+def judge(monkeypatch: pytest.MonkeyPatch) -> Judge:
+    found = Judge()
+    monkeypatch.setattr(sweep_cell, "classify_cell", found)
+    return found
+
+
+@pytest.mark.long
+def test_results_are_the_same_bytes_whatever_the_number_of_processes(tmp_path: Path) -> None:
+    """The judge of the package, in this process and in two others."""
+    sweep = asked(tmp_path, "link.loss=0.2", seeds=2, over=[DELAYS])
+    alone, others = (
+        run_sweep(prepare_sweep_folder(sweep, tmp_path / str(jobs)), jobs) for jobs in (1, 2)
+    )
+    assert (alone.folder.path / RESULTS_FILE).read_bytes() == (
+        others.folder.path / RESULTS_FILE
+    ).read_bytes()
+    assert [row["cell"] for row in others.results.rows] == [0, 0, 1, 1, 2, 2]
+    assert (alone.runs, others.jobs) == (6, 2)
+
+
+class _StopError(Exception):
+    pass
+
+
+def test_interrupted_work_is_not_done_again(tmp_path: Path, judge: Judge) -> None:
+    sweep = asked(tmp_path, "link.loss=0.2", seeds=2)
+    run_sweep(prepare_sweep_folder(sweep, tmp_path / "whole"), 1)
+    whole = (tmp_path / "whole" / RESULTS_FILE).read_bytes()
+    texts = judge.texts.copy()
+    assert len(texts) == 24
+    judge.texts.clear()
+    folder = prepare_sweep_folder(sweep, tmp_path / "parts")
+    for stop in (1, 2, 7, 20):
+
+        def stopped(done: int, _total: int, stop: int = stop) -> None:
+            if done >= stop:
+                raise _StopError
+
+        with pytest.raises(_StopError):
+            run_sweep(folder, 1, stopped)
+        assert not (folder.path / RESULTS_FILE).exists()
+        folder = open_sweep_folder(folder.path)
+    swept = run_sweep(folder, 1)
+    assert (folder.path / RESULTS_FILE).read_bytes() == whole
+    assert Counter(judge.texts) == Counter(texts)
+    assert run_sweep(folder, 1).runs == 0
+    assert Counter(judge.texts) == Counter(texts)
+    assert 0 < swept.runs < 24
+
+
+def test_one_seed_is_run_where_nothing_is_random(tmp_path: Path, judge: Judge) -> None:
+    told: list[tuple[int, int]] = []
+    sweep = asked(tmp_path, over=["link.loss=0,0.1,1"], seeds=5)
+    rows = run_sweep(
+        prepare_sweep_folder(sweep, tmp_path / "o"), 1, lambda *one: told.append(one)
+    ).results.rows
+    seeds_of = [(row["cell"], row["seed"]) for row in rows]
+    assert seeds_of == [(0, 1), *((1, seed) for seed in range(1, 6)), (2, 1)]
+    assert [row["random"] for row in rows] == [False, *[True] * 5, False]
+    assert told == [(1, 3), (2, 3), (3, 3), (4, 7), (5, 7), (6, 7), (7, 7)]
+    assert len(judge.texts) == 7
+
+
+def test_the_runs_of_an_estimate_are_not_made_again(tmp_path: Path, judge: Judge) -> None:
+    sweep = asked(tmp_path)
+    expected = estimate_sweep(sweep, jobs=1)
+    assert [entry.cell for entry in expected.entries] == [0, 1, 3, 5, 7, 9, 11]
+    assert (expected.runs, expected.seconds > 0.0) == (12, True)
+    judge.texts.clear()
+    run_sweep(prepare_sweep_folder(sweep, tmp_path / "o"), 1, known=expected.entries)
+    assert len(judge.texts) == 5
+    assert estimate_sweep(sweep, [(0, 1), (1, 1)], 1).entries[0].cell == 3
+    assert estimate_sweep(sweep, [(n, 1) for n in range(12)], 1) == DurationEstimate(0, 0.0, [])
+
+
+def test_an_estimate_counts_seeds_where_something_is_random(
+    tmp_path: Path, judge: Judge
+) -> None:
+    assert estimate_sweep(asked(tmp_path, seeds=10), jobs=1).runs == 12
+    assert estimate_sweep(asked(tmp_path, "link.loss=0.1", seeds=10), jobs=1).runs == 120
+    assert judge.texts
+
+
+def test_enormous_sweep_is_refused_with_its_count_and_its_time(judge: Judge) -> None:
+    over = ["link.delay_ms=0:9999:1", "control.d=0.1:20:0.1"]
+    sweep = plan_sweep("p_d_margin", over=over)
+    with pytest.raises(UsageError) as error:
+        refuse_oversized_sweep(
+            sweep, estimate_sweep(sweep, jobs=2)._replace(seconds=90_000.0), jobs=2
+        )
+    assert error.value.exit_code == 2
+    for word in (
+        "2000000 cells (10000 x 200)",
+        "25 h on 2 cores",
+        "larger steps",
+        "with yes",
+    ):
+        assert word in str(error.value)
+    many = DurationEstimate(1_000_001, 60.0, [])
+    with pytest.raises(UsageError, match="would take about 60 s"):
+        refuse_oversized_sweep(sweep, many)
+    refuse_oversized_sweep(sweep, DurationEstimate(1_000_000, 86_400.0, []))
+    assert len(judge.texts) == 8
+
+
+def test_a_cell_that_cannot_run_is_named(tmp_path: Path, judge: Judge) -> None:
+    """The ends of both axes are fine alone and together; a pair between them is not."""
+    sweep = asked(tmp_path, over=["link.loss=0.1,0.7,0.2", "link.loss_burst=5,1.5,6"])
+    folder = prepare_sweep_folder(sweep, tmp_path / "o")
+    with pytest.raises(
+        ScenarioError, match=r"cell 4 \(link.loss=0.7, link.loss_burst=1.5\): .*too short"
+    ):
+        run_sweep(folder, 1)
+    with folder.journal() as journal:
+        assert sorted(journal.done) == [(n, 1) for n in range(4)]
+    assert judge.texts
+
+
+def test_the_opening_names_axes_laws_and_seeds(tmp_path: Path) -> None:
+    sweep = asked(
+        tmp_path,
+        over=["control.Kd=0.2:3:0.1", DELAYS],
+        laws=["pd_d", "adaptive"],
+        seeds=10,
+        longest_s=1.0,
+    )
+    assert describe_sweep_plan(sweep) == [
+        "trio: 174 cells (29 x 3 x laws pd_d, adaptive), 10 seeds each where anything is random",
+        "  over control.Kd=0.2:3:0.1: 0.2, 0.3, ..., 3.0",
+        "  over link.delay_ms=0:40:20: 0, 20, 40",
+        "  0.5 s each, an undecided one up to 1 s",
+    ]
+
+
+def test_a_summary_counts_every_run_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sweep_cell, "classify_cell", Judge())
+    sweep = asked(tmp_path, over=["link.loss=0:0.9:0.05"], seeds=8)
+    results = run_sweep(prepare_sweep_folder(sweep, tmp_path / "o"), 1).results
+    first, *others = summarize_sweep(results)
+    assert first.startswith(f"{1 + 18 * 8} runs of 19 cells: ")
+    counts = [int(part.split()[0]) for part in first.partition(": ")[2].split(", ")]
+    assert counts == [
+        sum(row["verdict"] == verdict for row in results.rows) for verdict in CellClass
+    ]
+    assert sum(counts) == len(results.rows)
+    text = "\n".join(others)
+    assert "undecided after 0.5 s and continued, the longest to 4 s" in text
+    assert "in 1 cell nothing is random: one seed was run there" in text
+    assert "stable with some seeds and not with others" in text
+    assert "95 % interval" in text
+    assert "all in places.csv" in text

@@ -1,0 +1,286 @@
+"""Results: what was run, number for number, in a file that other programs read; shares with intervals."""
+
+import csv
+import json
+import math
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from trilat_studies.sweep import prepare_sweep_folder, read_results, run_sweep, sweep_cell
+from trilat_studies.sweep.sweep_cell import CellClass, CellRun, diff_lines
+from trilat_studies.sweep.sweep_plan import plan_sweep
+from trilat_studies.sweep.sweep_results import (
+    GRID_POINTS_FILE,
+    GridPoint,
+    SweepResults,
+    build_result_rows,
+    collect_grid_points,
+    encode_results,
+    reproduction_duration_s,
+)
+
+from trilat_net.errors import UsageError
+from trilat_net.work.intervals import wilson_interval
+
+from .quick import DELAYS, Judge, asked, outcome_of
+
+ORDERS = "link.order=newest,in_order"
+
+
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, SweepResults, Judge]:
+    """Numbers and words, two laws, two seeds where something is random; its folder, and who judged."""
+    path = tmp_path_factory.mktemp("swept")
+    sweep = asked(path, over=["link.loss=0,0.1", ORDERS], laws=["adaptive", "p_d"], seeds=2)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(sweep_cell, "classify_cell", judge := Judge())
+        return path / "o", run_sweep(prepare_sweep_folder(sweep, path / "o"), 1).results, judge
+
+
+def test_what_is_read_is_what_was_run(swept: tuple[Path, SweepResults, Judge]) -> None:
+    path, results, judge = swept
+    again = read_results(path)
+    assert list(again.rows) == list(results.rows)
+    assert again.plan.facts() == results.plan.facts()
+    assert read_results(path / "results.csv") == again
+    for row in again.rows:
+        assert again.outcome(row) == judge(row["scenario"], 4.0)
+        assert f"seed = {row['seed']}" in row["scenario"]
+        assert (
+            f'order = "{row["link.order"]}"' in row["scenario"] or row["link.order"] == "newest"
+        )
+
+
+def test_rows_are_in_the_order_of_cells_and_seeds(
+    swept: tuple[Path, SweepResults, Judge],
+) -> None:
+    _, results, _ = swept
+    assert [(row["cell"], row["seed"]) for row in results.rows] == [
+        (cell, seed) for cell in range(8) for seed in ((1, 2) if cell % 4 >= 2 else (1,))
+    ]
+    assert [row["law"] for row in results.rows] == ["adaptive"] * 6 + ["p_d"] * 6
+    assert [row["seed"] for row in results.of_cell(3)] == [1, 2]
+    assert "cell-0.mcap" in results.of_cell(0)[0]["command"]
+    assert "cell-3-seed-2.mcap" in results.of_cell(3)[1]["command"]
+    with pytest.raises(UsageError, match="from 0 to 7"):
+        results.of_cell(8)
+
+
+def test_bytes_do_not_depend_on_order_in_which_runs_ended(
+    swept: tuple[Path, SweepResults, Judge],
+) -> None:
+    path, results, _ = swept
+    with prepare_sweep_folder(results.plan, path).journal() as journal:
+        entries = list(journal.done.values())
+    for order in (entries, entries[::-1]):
+        table = encode_results(results.plan, build_result_rows(results.plan, order))
+        assert table.encode() == (path / "results.csv").read_bytes()
+
+
+def test_csv_readers_find_every_number(swept: tuple[Path, SweepResults, Judge]) -> None:
+    path, results, _ = swept
+    with (path / "results.csv").open(newline="") as stream:
+        lines = list(csv.DictReader(stream))
+    for line, row in zip(lines, results.rows, strict=True):
+        for name, value in row.items():
+            if name == "scenario":
+                continue
+            if value is None or isinstance(value, bool):
+                assert line[name] == {None: "", True: "true", False: "false"}[value]
+            elif isinstance(value, float):
+                assert float(line[name]) == value
+            else:
+                assert line[name] == str(value)
+
+
+def test_pandas_reads_the_types_of_columns(swept: tuple[Path, SweepResults, Judge]) -> None:
+    pandas = pytest.importorskip("pandas")
+    path, results, _ = swept
+    frame = pandas.read_csv(path / "results.csv")
+    kinds = [str(frame.dtypes[name]) for name in ("link.loss", "cell", "random")]
+    assert kinds == ["float64", "int64", "bool"]
+    peaks_rad = [row["peak_error_rad"] for row in results.rows]
+    assert list(frame["peak_error_rad"]) == pytest.approx(peaks_rad, rel=1e-15)
+
+
+def test_the_request_stands_beside_the_table(swept: tuple[Path, SweepResults, Judge]) -> None:
+    path, results, _ = swept
+    facts = json.loads((path / "plan.json").read_text())
+    assert facts["scenario_sha256"] == results.plan.base.sha256
+    assert facts["text"] == results.plan.written.text
+    assert set(facts["versions"]) == {"version_trilat-net", "version_numba", "version_numpy"}
+
+
+def test_a_sweep_needs_no_optional_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("pandas", "polars", "pyarrow"):
+        monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.setattr(sweep_cell, "classify_cell", Judge())
+    plan = asked(tmp_path, over=[DELAYS], seeds=2)
+    run_sweep(prepare_sweep_folder(plan, tmp_path / "o"), 1)
+    assert len(read_results(tmp_path / "o").rows) == 3
+
+
+def test_a_very_long_scenario_is_read_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sweep_cell, "classify_cell", Judge())
+    plan = asked(tmp_path, over=[DELAYS])
+    rows = list(run_sweep(prepare_sweep_folder(plan, tmp_path / "o"), 1).results.rows)
+    rows[1] = {**rows[1], "scenario": '# "letters", and\r\n' + "x" * 300_000}
+    (tmp_path / "o" / "results.csv").write_text(encode_results(plan, rows), newline="")
+    assert read_results(tmp_path / "o").rows == rows
+
+
+@pytest.mark.long
+def test_ten_thousand_scenarios_take_little_room(tmp_path: Path) -> None:
+    sweep = plan_sweep("p_d_margin", over=["link.delay_ms=0:1980:20", "control.d=0.2:10.1:0.1"])
+    base = sweep.base.text
+    entries = []
+    for number in range(sweep.cells):
+        delay, damping = sweep.cell(number).values
+        text = base.replace("delay_ms = 200.0", f"delay_ms = {delay}").replace(
+            "1.1", f"{damping}"
+        )
+        entries.append(
+            CellRun(
+                number,
+                1,
+                False,
+                "p_d",
+                f"{number:064x}",
+                diff_lines(text, base),
+                outcome_of(text),
+            )
+        )
+    table = encode_results(sweep, build_result_rows(sweep, entries))
+    assert len(entries) == 10_000
+    assert len(table) < 10e6
+    (tmp_path / "results.csv").write_text(table)
+    (tmp_path / "plan.json").write_text(json.dumps(sweep.facts()))
+    assert read_results(tmp_path).rows[1234]["scenario"].count("delay_ms = 240.0") == 6
+
+
+def test_a_run_that_diverged_is_given_time_to_diverge_again(tmp_path: Path) -> None:
+    sweep = asked(tmp_path, over=[DELAYS])
+    outcomes = [outcome_of(str(n)) for n in range(100)]
+    for outcome in outcomes:
+        lasts_s = reproduction_duration_s(sweep, outcome)
+        if outcome.diverged_s is None:
+            assert lasts_s == outcome.ran_s
+        else:
+            assert lasts_s == min(4.0, 0.5 * 2.0**outcome.extended) > outcome.diverged_s
+
+
+def test_what_holds_no_results_is_refused(tmp_path: Path) -> None:
+    def refused(path: Path, *words: str) -> None:
+        with pytest.raises(UsageError) as error:
+            read_results(path)
+        for word in (str(path), *words):
+            assert word in str(error.value)
+
+    begun = prepare_sweep_folder(asked(tmp_path), tmp_path / "o").path
+    refused(begun, "no results", f"trilat sweep --resume {begun}")
+    refused(tmp_path / "none.csv", "no results")
+    (tmp_path / "other.csv").write_text("a,b\n1,2\n")
+    refused(tmp_path / "other.csv", "contains no results of a sweep", "plan.json")
+
+
+@pytest.mark.parametrize(
+    ("damage", "word"),
+    [
+        (lambda text: text.replace("verdict", "verdicts", 1), "'verdict' is missing"),
+        (lambda text: text[:-60], "cannot be read"),
+        (lambda text: text.replace("0,", "zero,", 1), "cannot be read"),
+        (lambda text: text.replace("false", "yes", 1), "'yes' is neither true nor false"),
+        (lambda text: text[: text.rindex("[")], "cannot be read"),
+        (lambda _: "PAR1 nothing PAR1\n\0", "contains no results"),
+    ],
+)
+def test_a_damaged_table_is_refused(
+    damage: Callable[[str], str], word: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sweep_cell, "classify_cell", Judge())
+    folder = run_sweep(
+        prepare_sweep_folder(asked(tmp_path, over=[DELAYS]), tmp_path / "o"), 1
+    ).folder.path
+    table = folder / "results.csv"
+    table.write_text(damage(table.read_text()))
+    with pytest.raises(UsageError, match=word) as error:
+        read_results(folder)
+    assert str(table) in str(error.value)
+
+
+@pytest.fixture
+def points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[GridPoint]:
+    monkeypatch.setattr(sweep_cell, "classify_cell", Judge())
+    sweep = asked(tmp_path, over=["link.loss=0:0.5:0.1", DELAYS], seeds=12)
+    return collect_grid_points(
+        run_sweep(prepare_sweep_folder(sweep, tmp_path / "o"), 1).results
+    )
+
+
+def test_every_run_is_counted_once(points: list[GridPoint]) -> None:
+    assert [place.cell for place in points] == list(range(18))
+    assert [sum(place.counts) for place in points] == [1] * 3 + [12] * 15
+    for place in points:
+        converged, bounded, diverged, undecided = place.counts
+        assert (place.stable, place.decided) == (converged, converged + bounded + diverged)
+        assert place.decided + undecided == sum(place.counts)
+        assert place.doubtful == (0 < converged < place.decided)
+        assert place.interval == wilson_interval(converged, converged + bounded + diverged)
+
+
+def test_they_stand_in_a_file_where_there_are_seeds(
+    points: list[GridPoint], tmp_path: Path
+) -> None:
+    with (tmp_path / "o" / GRID_POINTS_FILE).open(newline="") as stream:
+        lines = list(csv.DictReader(stream))
+    for line, place in zip(lines, points, strict=True):
+        row = {
+            name: float(text) if text and name != "law" else None for name, text in line.items()
+        }
+        assert tuple(row[verdict.value] for verdict in CellClass) == place.counts
+        assert (row["link.loss"], row["link.delay_ms"]) == place.values
+        assert (row["stable_share_low"], row["stable_share_high"]) == place.interval
+        if place.decided:
+            assert row["stable_share_low"] <= row["stable_share"] <= row["stable_share_high"]
+        else:
+            assert row["stable_share"] is None
+
+
+@pytest.mark.parametrize(
+    ("successes", "runs", "low", "high"),
+    [
+        (81, 263, 0.2553, 0.3662),
+        (15, 148, 0.0624, 0.1605),
+        (0, 20, 0.0, 0.1611),
+        (1, 29, 0.0061, 0.1718),
+    ],
+)
+def test_intervals_are_those_of_a_published_table(
+    successes: int, runs: int, low: float, high: float
+) -> None:
+    """Newcombe, Statistics in Medicine 17 (1998), table I, the score method without continuity correction."""
+    assert wilson_interval(successes, runs) == pytest.approx((low, high), abs=5.1e-5)
+
+
+@pytest.mark.parametrize("runs", [10, 20, 100])
+def test_the_interval_holds_the_truth_95_times_of_100(runs: int) -> None:
+    """Coverage by the binomial sums, over even shares: 0.95 within 0.01; nowhere below 0.83."""
+    shares = np.linspace(0.0005, 0.9995, 1000)
+    held = np.zeros(len(shares))
+    for seen in range(runs + 1):
+        weight = math.comb(runs, seen) * shares**seen * (1.0 - shares) ** (runs - seen)
+        low, high = wilson_interval(seen, runs)
+        held += np.where((low <= shares) & (shares <= high), weight, 0.0)
+    assert held.mean() == pytest.approx(0.95, abs=0.01)
+    assert held.min() > 0.83
+
+
+def test_without_runs_nothing_is_known() -> None:
+    assert wilson_interval(0, 0) == (0.0, 1.0)

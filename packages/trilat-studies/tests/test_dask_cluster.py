@@ -1,0 +1,244 @@
+"""Studies on a real Dask cluster on loopback: the same bytes, and no worker that could change them."""
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from sweep_tests.quick import SHORT
+from sweep_tests.quick import asked as plan
+from trial_tests.results import quick
+from trilat_studies.sweep import prepare_sweep_folder, run_sweep
+from trilat_studies.sweep.sweep_results import RESULTS_FILE
+
+import trilat_net
+from tests.cli.running import trilat
+from tests.net.waiting import until
+from trilat_net.errors import UsageError
+from trilat_net.files import format_extra_install
+from trilat_net.work import dask_cluster
+from trilat_net.work.dask_cluster import (
+    WorkerRequirements,
+    describe_worker,
+    explain_unfit_worker,
+)
+from trilat_net.work.executor import open_worker_pool
+
+ROOT = Path(trilat_net.__file__).resolve().parents[1]
+
+
+class Cluster:
+    """A scheduler and workers, each a process of its own."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.processes: list[subprocess.Popen[bytes]] = []
+        file = folder / "scheduler.json"
+        self._start("scheduler", "--port", "0", "--no-show", "--scheduler-file", str(file))
+        self.address: str = (
+            until(lambda: file.exists() and file.read_text(), 60)
+            and json.loads(file.read_text())["address"]
+        )
+
+    def _start(self, *words: str, path: Path = ROOT) -> "subprocess.Popen[bytes]":
+        log = (self.folder / f"{len(self.processes)}.log").open("wb")
+        command = [
+            sys.executable,
+            "-P",
+            "-m",
+            "dask",
+            *words,
+            "--host",
+            "127.0.0.1",
+            "--no-dashboard",
+        ]
+        process = subprocess.Popen(
+            command,
+            cwd=self.folder,
+            stdout=log,
+            stderr=log,
+            env={**os.environ, "PYTHONPATH": str(path)},
+        )
+        log.close()
+        self.processes.append(process)
+        return process
+
+    def add_worker(self, path: Path = ROOT) -> "subprocess.Popen[bytes]":
+        """Starts a worker of one thread, without a nanny: one that is killed stays dead."""
+        return self._start("worker", self.address, "--nthreads", "1", "--no-nanny", path=path)
+
+    def close(self) -> None:
+        for process in self.processes:
+            process.kill()
+            process.wait()
+
+
+@pytest.fixture
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
+    made = Cluster(tmp_path_factory.mktemp("cluster"))
+    yield made
+    made.close()
+
+
+def run_on_cluster(cluster: Cluster, folder: Path, count: int) -> None:
+    """A sweep on two workers, of which one is killed half way, and the same sweep in this process."""
+    (folder / "trio.toml").write_text(SHORT.replace("duration_s = 0.5", "duration_s = 4.0"))
+    sweep = plan(folder, over=[f"control.Kd=1:{1 + 0.1 * (count - 1):g}:0.1"], longest_s=4.0)
+    assert sweep.cells == count
+    alone = run_sweep(prepare_sweep_folder(sweep, folder / "alone"), 1)
+    killed, *_ = [cluster.add_worker() for _ in range(2)]
+    alive_at: list[int] = []
+
+    def kill_half_way(done: int, total: int) -> None:
+        if done >= total // 2 and not alive_at:
+            os.kill(killed.pid, signal.SIGKILL)
+            alive_at.append(done)
+
+    until(lambda: workers_of(cluster) == 2, 60)
+    shared = run_sweep(
+        prepare_sweep_folder(sweep, folder / "shared"),
+        progress=kill_half_way,
+        on=cluster.address,
+    )
+    assert killed.wait(10) == -signal.SIGKILL
+    assert alive_at[0] < count
+    assert (shared.runs, shared.jobs) == (count, 2)
+    assert (shared.folder.path / RESULTS_FILE).read_bytes() == (
+        alone.folder.path / RESULTS_FILE
+    ).read_bytes()
+
+
+def workers_of(cluster: Cluster) -> int:
+    with dask_cluster.DaskCluster(cluster.address) as opened:
+        return opened.workers
+
+
+@pytest.mark.long
+@pytest.mark.timeout(120)
+def test_a_sweep_with_a_killed_worker_gives_the_same_bytes(
+    cluster: Cluster, tmp_path: Path
+) -> None:
+    run_on_cluster(cluster, tmp_path, 300)
+
+
+@pytest.mark.long
+@pytest.mark.timeout(300)
+def test_so_does_one_of_2000_cells(cluster: Cluster, tmp_path: Path) -> None:
+    run_on_cluster(cluster, tmp_path, 2000)
+
+
+@pytest.mark.long
+def test_trials_margins_and_tuning_run_there_too(cluster: Cluster, tmp_path: Path) -> None:
+    cluster.add_worker()
+    (tmp_path / "trio.toml").write_text(SHORT)
+    on = ("--on", cluster.address)
+    for n, words in enumerate(
+        [
+            (
+                "sweep",
+                "trio.toml",
+                "--margin",
+                "control.d=0.2:3",
+                "--set",
+                "control.law=p_d",
+                "-o",
+            ),
+            ("compare", "--tune", "trio.toml", "--law", "p_d", "--budget", "4", "--out"),
+        ]
+    ):
+        for name, more in (("here", ("--jobs", "1")), ("there", on)):
+            trilat(*words, f"{name}{n}", *more, cwd=tmp_path).succeeds()
+    for file in ("0/margin.json", "1/front.json"):
+        assert (tmp_path / f"here{file}").read_bytes() == (
+            tmp_path / f"there{file}"
+        ).read_bytes()
+    batch = trilat_net.trials(quick(), [5, 2, 9])
+    here, there = (
+        trilat_net.check(quick(), [5, 2, 9], **how) for how in ({"jobs": 1}, {"on": on[1]})
+    )
+    assert [result.outcomes for result in here.results] == [
+        result.outcomes for result in there.results
+    ]
+    assert len(batch) == len(there.results)
+
+
+@pytest.mark.long
+def test_a_worker_with_another_program_is_refused_even_later(
+    cluster: Cluster, tmp_path: Path
+) -> None:
+    shutil.copytree(
+        ROOT / "trilat_net",
+        tmp_path / "trilat_net",
+        ignore=shutil.ignore_patterns("__pycache__"),
+    )
+    with (tmp_path / "trilat_net" / "errors.py").open("a") as file:
+        file.write("# another one\n")
+    first = cluster.add_worker()
+    here = describe_worker()["source files"]
+    with open_worker_pool(None, cluster.address) as pool:
+        assert pool.map(abs, [-1, -2]) == [1, 2]
+        cluster.add_worker(tmp_path)
+        until(lambda: workers_of(cluster) == 2, 60)
+        first.kill()
+        with pytest.raises(
+            UsageError,
+            match=rf"the worker tcp://\S+ has source files \w+, .*the study needs.* {here}",
+        ):
+            pool.map(abs, range(-99, 0))
+    with (
+        pytest.raises(UsageError, match=f"source files .* {here}"),
+        open_worker_pool(None, cluster.address),
+    ):
+        pass
+
+
+@pytest.mark.long
+def test_a_worker_without_the_file_of_a_law_is_refused(
+    cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copy(ROOT / "tests" / "golden" / "spring_law.py", tmp_path / "lonely_law.py")
+    monkeypatch.chdir(tmp_path)
+    cluster.add_worker()
+    scenario = quick(**{"control.law": "lonely_law:Spring"})
+    with pytest.raises(
+        UsageError, match=r"the worker tcp://\S+ lacks the control law lonely_law:Spring"
+    ):
+        trilat_net.check(scenario, on=cluster.address)
+
+
+def test_what_differs_is_named_on_both_sides() -> None:
+    here = describe_worker()
+    assert explain_unfit_worker(WorkerRequirements(here), here, []) == ""
+    for name in ("trilat-net", "arithmetic", "Python", "numpy", "numba", "scipy"):
+        text = explain_unfit_worker(WorkerRequirements(here), {**here, name: "other"}, [])
+        assert f"has {name} other, but the study needs {name} {here[name]}" in text
+    assert explain_unfit_worker(WorkerRequirements(here), {**here, "commit": "other"}, []) == ""
+    assert "a.b:Law" in explain_unfit_worker(WorkerRequirements(here), here, ["a.b:Law"])
+
+
+@pytest.mark.long
+def test_a_scheduler_that_does_not_answer_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dask_cluster, "CONNECT_S", 0.3)
+    sweep = ("sweep", "free", "--over", "control.Kd=1,2", "--on")
+    trilat(*sweep, "tcp://127.0.0.1:1", cwd=tmp_path).refuses(
+        "tcp://127.0.0.1:1", "no Dask scheduler"
+    )
+    trilat(*sweep, "nowhere", cwd=tmp_path).refuses("nowhere")
+    trilat("test", "free", "--on", "tcp://127.0.0.1:1", cwd=tmp_path).refuses(
+        "tcp://127.0.0.1:1"
+    )
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_dask_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(UsageError, match=re.escape(format_extra_install("cluster"))):
+        dask_cluster.DaskCluster("tcp://127.0.0.1:1")

@@ -1,0 +1,408 @@
+"""One definition of every metric: a run is measured as its log is, however it is cut into batches."""
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from trilat_studies.measure_run import (
+    BATCH_RECORDS,
+    RecordBatch,
+    RunMetrics,
+    SiteStats,
+    WindowStats,
+    evaluate_expectations,
+    join_batches,
+    measure_log,
+    measure_virtual_run,
+    run_compiled_in_batches,
+    run_in_batches,
+)
+
+import trilat_net
+from tests.log_editing import edited, opened, recorded, without
+from trilat_net.core.arms.two_link_arm import end_effector_jacobian
+from trilat_net.errors import ScenarioError
+from trilat_net.log.log_reader import Log
+from trilat_net.scenario import Scenario, load_scenario
+from trilat_net.scenario.expect import ExpectWindow, window_quantities
+
+RANDOM = {"link": {"model": "uniform", "delay_ms": 20.0, "half_width_ms": 10.0}}
+SHORT = {"duration_s": 2.5, "rate_hz": 500, "link.delay_ms": 20.0}
+
+
+def scenario(**changes: Any) -> Scenario:
+    return load_scenario("free", {**SHORT, **changes})
+
+
+def agree(one: RunMetrics, other: RunMetrics) -> None:
+    """Equal but for the last bits of means."""
+    for field in RunMetrics.__struct_fields__:
+        a, b = getattr(one, field), getattr(other, field)
+        if field == "rms_error_rad":
+            assert a == pytest.approx(b, rel=1e-12)
+        elif field == "ages":
+            assert a.keys() == b.keys()
+            for link in a:
+                assert a[link].max_ms == b[link].max_ms
+                assert (a[link].mean_ms is None) == (b[link].mean_ms is None)
+                assert a[link].mean_ms is None or a[link].mean_ms == pytest.approx(
+                    b[link].mean_ms
+                )
+        else:
+            assert a == b, field
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        RANDOM,
+        {"sites.m2.rate_hz": 90, "sites.s.rate_hz": 333},
+        {"limits.qd_limit_rad_s": 0.3},
+        {"link.delay_ms": 9000.0},
+    ],
+    ids=["plain", "random", "rates", "diverged", "never heard of"],
+)
+def test_a_run_and_its_log_have_the_same_figures(changes: dict[str, Any]) -> None:
+    assert scenario().ticks("m1") > BATCH_RECORDS
+    chosen = scenario(**changes)
+    agree(measure_virtual_run(chosen), measure_log(trilat_net.simulate(chosen)))
+
+
+def test_the_figures_are_what_their_definitions_say() -> None:
+    chosen = scenario(**{"expect.synchronised_rad": 0.3})
+    found, log = measure_virtual_run(chosen), trilat_net.simulate(chosen)
+    errors = {name: np.abs(log[name].e) for name in log.sites}
+    end = log["m1"].t_s > log["m1"].t_s[-1] - 1.0
+    poses = np.array([log[name].q[end] for name in log.sites])
+    assert found.simulated_s == 2.5
+    assert found.peak_error_rad == max(e.max() for e in errors.values())
+    assert found.end_error_rad == max(e[end].max() for e in errors.values())
+    assert found.end_spread_rad == (poses.max(axis=0) - poses.min(axis=0)).max()
+    assert found.end_pose_rad == {name: tuple(log[name].q[-1]) for name in log.sites}
+    apart = [t for name in log.sites for t in log[name].t_s[errors[name].max(axis=1) >= 0.3]]
+    assert 0.0 < max(apart) < 2.4
+    assert found.synchronised_at_s == max(apart)
+    assert found.ages["m1->s"].mean_ms == found.ages["m1->s"].max_ms == 20.0
+    assert (found.late_samples, found.missing, found.end.diverged_at_s) == (0, 0, None)
+
+
+def test_what_never_came_together_has_no_time_of_it() -> None:
+    assert (
+        measure_virtual_run(scenario(**{"expect.synchronised_rad": 1e-6})).synchronised_at_s
+        is None
+    )
+
+
+def test_a_link_without_samples_has_no_age() -> None:
+    found = measure_virtual_run(scenario(links={"m1->s": {"delay_ms": 9000.0}}))
+    assert found.ages["m1->s"].mean_ms is found.ages["m1->s"].max_ms is None
+    assert found.ages["m2->s"].max_ms == 20.0
+
+
+def test_a_run_that_diverged_says_when() -> None:
+    found = measure_virtual_run(scenario(**{"limits.qd_limit_rad_s": 0.3}))
+    assert found.end.diverged_at_s is not None
+    assert found.simulated_s == pytest.approx(found.end.diverged_at_s, abs=0.01)
+    assert found.missing == 0
+
+
+def test_every_missing_record_of_a_log_is_counted() -> None:
+    whole = recorded("free")
+    assert measure_log(opened(whole)).missing == 0
+    assert measure_log(opened(edited(whole, record=without("s", {3, 4, 100})))).missing == 3
+    assert (
+        measure_log(opened(edited(whole, record=without("s", set(range(60, 120)))))).missing
+        == 60
+    )
+    assert measure_log(opened(edited(whole, record=lambda _: None))).missing == 360
+    none = measure_log(opened(edited(whole, record=without("s", set(range(120))))))
+    assert none.missing == 120
+    assert none.synchronised_at_s is none.end_spread_rad is none.ages["m1->s"].mean_ms is None
+
+
+PERIOD_NS = 10_000_000
+TALLIED = 400
+BUCKET_NS = 50_000_000
+RATES = {"sites.m1.rate_hz": 100, "sites.m2.rate_hz": 50, "sites.s.rate_hz": 100}
+HEARD = load_scenario("free", {**RATES, "expect.synchronised_rad": 1.0})
+
+
+def records(seed: int) -> RecordBatch:
+    """Four seconds at 100 Hz with peers at 100 and 50 Hz; the second is heard of from tick 20 on."""
+    rng = np.random.default_rng(seed)
+    k = np.arange(TALLIED)
+    used = np.array([k - 5, np.where(k < 20, -1, k // 2 - rng.integers(2, 9, TALLIED))]).T
+    return RecordBatch(k * PERIOD_NS, *rng.normal(size=(5, TALLIED, 2)), np.maximum(used, -1))
+
+
+def tallied(rows: RecordBatch, cuts: list[int]) -> SiteStats:
+    tally = SiteStats(HEARD, "s")
+    edges = [0, *sorted(cuts), TALLIED]
+    for first, last in pairwise(edges):
+        tally.add(RecordBatch(*(part[first:last] for part in rows)))
+    return tally
+
+
+@given(seed=st.integers(0, 1000), cuts=st.lists(st.integers(0, TALLIED), max_size=12))
+def test_the_cut_into_blocks_changes_no_statistics_of_a_site(
+    seed: int, cuts: list[int]
+) -> None:
+    rows = records(seed)
+    cut, whole = tallied(rows, cuts), tallied(rows, [])
+    for figure in (
+        "records",
+        "peak_error_rad",
+        "peak_torque_nm",
+        "peak_speed_rad_s",
+        "unsynchronised_ns",
+        "last_ns",
+    ):
+        assert getattr(cut, figure) == getattr(whole, figure)
+    assert cut.age_max_ms.tolist() == whole.age_max_ms.tolist()
+    assert cut.buckets.tolist() == whole.buckets.tolist()
+    assert cut.rms_error_rad == pytest.approx(whole.rms_error_rad)
+    for one, other in zip(cut.link_ages, whole.link_ages, strict=True):
+        assert one.mean_ms == pytest.approx(other.mean_ms)
+    end, end_of_whole = cut.end(cut.last_ns), whole.end(whole.last_ns)
+    assert all(np.array_equal(a, b) for a, b in zip(end, end_of_whole, strict=True))
+
+
+@given(seed=st.integers(0, 1000))
+def test_statistics_of_a_site_are_those_of_all_records(seed: int) -> None:
+    rows = records(seed)
+    tally = tallied(rows, [37, 38, 290])
+    error = np.abs(rows.e)
+    assert tally.peak_error_rad == error.max()
+    assert tally.peak_torque_nm == np.abs(rows.tau).max()
+    assert tally.peak_speed_rad_s == np.abs(rows.qd).max()
+    assert tally.rms_error_rad == pytest.approx(
+        max(np.sqrt(np.mean(error[:, j] ** 2)) for j in (0, 1))
+    )
+    apart = [t for t, e in zip(rows.t_ns, error, strict=True) if e.max() >= 1.0]
+    assert tally.unsynchronised_ns == (apart[-1] if apart else -1)
+    assert tally.end(tally.last_ns).t_ns.tolist() == rows.t_ns[-100:].tolist()
+    ages = [(rows.t_ns[k] - rows.used[k, 1] * 20_000_000) * 1e-6 for k in range(20, TALLIED)]
+    assert tally.link_ages[1].mean_ms == pytest.approx(np.mean(ages))
+    assert tally.age_max_ms[1] == pytest.approx(max(ages))
+    for bucket, row in enumerate(tally.buckets):
+        inside = rows.t_ns // BUCKET_NS == bucket
+        peaks = (
+            error[inside].max(axis=0),
+            np.abs(rows.qd[inside]).max(axis=0),
+            rows.q[inside][-1],
+        )
+        assert row.tolist() == np.concatenate(peaks).tolist()
+
+
+def test_what_it_keeps_does_not_grow_with_the_records() -> None:
+    tally, block = SiteStats(HEARD, "s"), records(1)
+    for n in range(30):
+        tally.add(block._replace(t_ns=block.t_ns + n * TALLIED * PERIOD_NS))
+    assert len(tally.end(0).t_ns) <= 2 * TALLIED
+    assert len(tally.end(tally.last_ns).t_ns) == 100
+
+
+def test_a_link_that_never_had_a_sample_has_no_age() -> None:
+    rows = records(1)
+    rows.used[:, 1] = -1
+    assert tallied(rows, [])._age_records[1] == 0
+    assert tallied(rows, []).link_ages[1].mean_ms is None
+
+
+def test_a_bucket_without_records_says_so() -> None:
+    rows = records(1)
+    keep = (rows.t_ns // BUCKET_NS) != 7
+    tally = SiteStats(HEARD, "s")
+    tally.add(RecordBatch(*(part[keep] for part in rows)))
+    assert [n for n, row in enumerate(tally.buckets) if row[0] < 0] == [7]
+
+
+WALL = {"kind": "wall", "point_m": [1.25, 0.0], "normal": [-2.0, 0.0], "stiffness_n_m": 2000.0}
+QUANTITIES = window_quantities(2)
+ASKED = {key: [-1e9, 1e9] for key in QUANTITIES}
+CHANGES = {
+    "duration_s": 2.0,
+    "link.delay_ms": 20.0,
+    "sites.m.hands": [{"kind": "pulse", "start_s": 0.0, "end_s": 2.0, "peak_nm": [0.0, -20.0]}],
+    "sites.s.environment": [{**WALL, "damping_n_s_m": 5.0}],
+}
+RECORDS = 200
+
+
+def windowed(**changes: Any) -> Scenario:
+    window = {"from_s": 0.5, "to_s": 1.5, "site": "s", **ASKED}
+    return load_scenario("contact", {**CHANGES, "expect": {"windows": [window]}, **changes})
+
+
+@pytest.fixture(scope="module")
+def log() -> Log:
+    return trilat_net.simulate(windowed())
+
+
+def rows(seed: int) -> RecordBatch:
+    """Two seconds at 100 Hz about the start pose, in and out of a wall."""
+    rng = np.random.default_rng(seed)
+    vectors = rng.normal(size=(5, RECORDS, 2))
+    vectors[0] = [-0.6, 1.8] + 0.02 * vectors[0]
+    return RecordBatch(
+        np.arange(RECORDS) * 10_000_000, *vectors, np.zeros((RECORDS, 1), dtype=np.int64)
+    )
+
+
+def stretched(records: RecordBatch, cuts: list[int], **window: Any) -> dict[str, Any]:
+    scenario = load_scenario("contact", {**CHANGES, "sites.s.rate_hz": 100})
+    made = WindowStats(ExpectWindow(**{"from_s": 0.5, "to_s": 1.5, **window}), scenario, "s")
+    for first, last in pairwise([0, *sorted(cuts), RECORDS]):
+        if first < last:
+            made.add(RecordBatch(*(column[first:last] for column in records)))
+    return made.compute_ranges()
+
+
+@given(seed=st.integers(0, 100), cuts=st.lists(st.integers(0, RECORDS), max_size=8))
+def test_the_cut_into_blocks_has_no_influence(seed: int, cuts: list[int]) -> None:
+    cut, whole = stretched(rows(seed), cuts), stretched(rows(seed), [])
+    for key in QUANTITIES:
+        assert cut[key] == pytest.approx(whole[key], rel=1e-12, abs=1e-12)
+
+
+@given(seed=st.integers(0, 100), outside=st.sampled_from([slice(0, 50), slice(150, RECORDS)]))
+def test_what_lies_outside_of_the_window_leaves_no_trace(seed: int, outside: slice) -> None:
+    records = rows(seed)
+    bent = RecordBatch(*(column.copy() for column in records))
+    for column in bent[1:6]:
+        column[outside] += 100.0
+    assert stretched(bent, []) == stretched(records, [])
+
+
+@pytest.mark.parametrize(
+    ("to_s", "known"), [(1.5, True), (2.0, True), (2.01, False), (5.0, False)]
+)
+def test_a_window_that_the_records_do_not_fill_tells_nothing(to_s: float, known: bool) -> None:
+    assert bool(stretched(rows(1), [], to_s=to_s)) == known
+
+
+def test_quantities_of_a_window_are_what_their_definitions_say(log: Log) -> None:
+    """The wall's force is the one whose torque J' F stands in the records."""
+    (found,) = measure_log(log).windows
+    site = log["s"]
+    inside = (site.t_s >= 0.5) & (site.t_s < 1.5)
+    force = np.zeros(len(site))
+    for k, q in enumerate(site.q):
+        J = np.array(end_effector_jacobian(np.ones(2), q))
+        force[k] = -np.linalg.solve(J.T, -site.tau_x[k])[0]
+    push, force = -site.tau_x[inside], force[inside]
+    wanted = {
+        "error_peak_rad": np.abs(site.e[inside]).max(),
+        "speed_peak_rad_s": np.abs(site.qd[inside]).max(),
+        "torque_peak_nm": np.abs(site.tau[inside]).max(),
+        "push1_mean_nm": push[:, 0].mean(),
+        "push2_mean_nm": push[:, 1].mean(),
+        "wall_mean_n": force.mean(),
+        "wall_deviation_n": force.std(),
+        "wall_peak_n": force.max(),
+        "wall_hits": np.sum((force[1:] > 1e-9) & (force[:-1] <= 1e-9)),
+    }
+    assert wanted["wall_hits"] >= 1
+    assert {key: found[key].least for key in wanted} == pytest.approx(wanted, abs=1e-9)
+    for joint, key in enumerate(("q1_rad", "q2_rad")):
+        assert found[key] == (site.q[inside, joint].min(), site.q[inside, joint].max())
+
+
+def test_a_run_and_its_log_have_the_same_windows(log: Log) -> None:
+    (run,), (logged,) = measure_virtual_run(log.scenario).windows, measure_log(log).windows
+    assert run.keys() == set(QUANTITIES)
+    for key in QUANTITIES:
+        assert run[key] == pytest.approx(logged[key], rel=1e-12)
+
+
+def test_a_window_of_all_sites_has_the_largest_of_them(log: Log) -> None:
+    everywhere = {
+        "from_s": 0.5,
+        "to_s": 1.5,
+        "error_peak_rad": [0.0, 1.0],
+        "torque_peak_nm": [0.0, 1.0],
+    }
+    (found,) = measure_virtual_run(windowed(expect={"windows": [everywhere]})).windows
+    inside = {name: (log[name].t_s >= 0.5) & (log[name].t_s < 1.5) for name in log.sites}
+    assert found["error_peak_rad"].most == max(
+        np.abs(log[n].e[k]).max() for n, k in inside.items()
+    )
+    assert found["torque_peak_nm"].least == max(
+        np.abs(log[n].tau[k]).max() for n, k in inside.items()
+    )
+
+
+def test_a_run_that_ended_before_measures_nothing() -> None:
+    assert measure_virtual_run(windowed(**{"limits.qd_limit_rad_s": 0.05})).windows == ({},)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        RANDOM,
+        {"sites.m2.rate_hz": 90, "sites.s.rate_hz": 333},
+        {"limits.qd_limit_rad_s": 0.3},
+    ],
+    ids=["plain", "random", "rates", "diverged"],
+)
+def test_the_compiled_loop_gives_the_records_of_the_ticks(changes: dict[str, Any]) -> None:
+    asked = scenario(**changes)
+    ticked: dict[str, list[RecordBatch]] = {name: [] for name in asked.names}
+    looped: dict[str, list[RecordBatch]] = {name: [] for name in asked.names}
+    diverged_at_s, _ = run_in_batches(
+        asked, {name: taken.append for name, taken in ticked.items()}
+    )
+    assert (
+        run_compiled_in_batches(
+            asked, {n: taken.append for n, taken in looped.items()}
+        ).diverged_s
+        == diverged_at_s
+    )
+    for name in asked.names:
+        one, other = join_batches(ticked[name]), join_batches(looped[name])
+        for field in ("t_ns", "q", "qd", "e", "tau", "tau_x"):
+            np.testing.assert_array_equal(getattr(one, field), getattr(other, field))
+
+
+def test_any_metric_may_be_expected_of_run_and_log() -> None:
+    """Equal to what `trilat compare` has of the whole run; what has no number does not hold, and says why."""
+    asked = {
+        "chatter_nm": [0.0, 1e-9],
+        "rms_error_rad": [0.0, 10.0],
+        "theta_error_last": [0.0, 1.0],
+    }
+    scenario = load_scenario("contact", {**CHANGES, "expect": {"metrics": asked}})
+    log = trilat_net.simulate(scenario)
+    compared = trilat_net.compare(log, log).metrics
+    run, logged = measure_virtual_run(scenario), measure_log(log)
+    assert run.metrics == logged.metrics
+    found = {one.key: one for one in evaluate_expectations(scenario.expect, run)}
+    assert [found[f"metrics.{key}"].held for key in asked] == [False, True, False]
+    assert found["metrics.chatter_nm"].value == compared.row("chatter_nm").values[0]
+    assert "nothing is learnt" in found["metrics.theta_error_last"].measured
+
+
+@pytest.mark.parametrize(
+    ("metrics", "said"),
+    [
+        (
+            {"chater_nm": [0, 1]},
+            "expect.metrics.chater_nm: there is no metric 'chater_nm'; did you mean 'chatter_nm'",
+        ),
+        (
+            {"chatter_nm": [2, 1]},
+            r"expect.metrics.chatter_nm: must be \[least, most\], but is \[2, 1\]",
+        ),
+        ({"chatter_nm": 1}, "expect.metrics"),
+    ],
+)
+def test_an_expected_metric_that_cannot_be_is_refused(
+    metrics: dict[str, Any], said: str
+) -> None:
+    with pytest.raises(ScenarioError, match=said):
+        trilat_net.trials("free", set={"expect": {"metrics": metrics}})

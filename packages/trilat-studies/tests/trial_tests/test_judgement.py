@@ -1,0 +1,243 @@
+"""Expectations: both directions, every key, what no metric can meet; and `stable` against theory."""
+
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from trilat_studies.measure_run import (
+    ExpectationResult,
+    Range,
+    evaluate_expectations,
+    measure_virtual_run,
+)
+
+from trilat_net.analysis.run_end import EndBehaviour, Stability
+from trilat_net.scenario import Expect, Scenario, load_scenario, parse_scenario
+from trilat_net.scenario.expect import ExpectWindow
+
+from .results import CALM, figures
+
+READINGS: dict[str, float] = {
+    "synchronised_by_s": 11.0,
+    "peak_error_max_rad": 0.9,
+    "peak_error_min_rad": 0.9,
+    "rms_error_max_rad": 0.1,
+    "end_error_max_rad": 0.003,
+    "end_error_min_rad": 0.003,
+    "end_spread_max_rad": 0.002,
+    "peak_torque_max_nm": 50.0,
+    "peak_speed_max_rad_s": 1.5,
+    "age_max_ms": 210.0,
+    "mean_age_max_ms": 200.0,
+    "mean_age_min_ms": 100.0,
+    "late_samples_max": 3,
+}
+"""What the calm run measured, by the key that asks for it."""
+
+OTHERS: dict[str, Any] = {"stable": True, "end_pose_rad": {"s": (0.1, 0.2)}, "no_gaps": True}
+TOLERANCES = {"synchronised_rad", "end_pose_within_rad"}
+
+
+def only(expect: Expect, **changes: Any) -> ExpectationResult:
+    outcomes = evaluate_expectations(expect, figures(**changes))
+    assert len(outcomes) == 1
+    return outcomes[0]
+
+
+def test_every_key_that_asks_is_answered_and_no_other() -> None:
+    tables = {"windows", "metrics"}
+    assert READINGS.keys() | OTHERS.keys() | TOLERANCES | tables == set(
+        Expect.__struct_fields__
+    )
+    assert evaluate_expectations(Expect(), CALM) == []
+    for key, value in {**READINGS, **OTHERS}.items():
+        assert only(Expect(**{key: value})).key.split(".")[0] == key
+
+
+@pytest.mark.parametrize("key", READINGS)
+@given(limit=st.floats(1e-4, 1e4))
+def test_a_limit_holds_just_where_the_figure_is_within_it(key: str, limit: float) -> None:
+    if key == "late_samples_max":
+        limit = int(limit)
+    outcome = only(Expect(**{key: limit}))
+    measured = READINGS[key]
+    assert outcome.held == (measured >= limit if "_min_" in key else measured <= limit)
+    if limit:
+        assert outcome.margin is not None
+        assert outcome.margin == pytest.approx(
+            abs(measured - limit) / limit * (1 if outcome.held else -1)
+        )
+
+
+@pytest.mark.parametrize("key", READINGS)
+def test_a_limit_itself_still_holds(key: str) -> None:
+    outcome = only(Expect(**{key: READINGS[key]}))
+    assert outcome.held
+    assert outcome.margin == 0.0
+
+
+@pytest.mark.parametrize(
+    ("key", "field"),
+    [("synchronised_by_s", "synchronised_at_s"), ("end_spread_max_rad", "end_spread_rad")],
+)
+def test_what_was_not_measured_does_not_hold(key: str, field: str) -> None:
+    outcome = only(Expect(**{key: 1e9}), **{field: None})
+    assert not outcome.held
+    assert outcome.measured == "never"
+
+
+def test_a_link_without_samples_meets_no_limit_of_age() -> None:
+    ages = {**CALM.ages, "m1->m2": type(CALM.ages["m1->s"])(None, None)}
+    for key in ("age_max_ms", "mean_age_max_ms"):
+        assert not only(Expect(**{key: 1e9}), ages=ages).held
+    assert not only(Expect(mean_age_min_ms=0.0), ages=ages).held
+
+
+@pytest.mark.parametrize("stable", [True, False])
+@pytest.mark.parametrize(
+    ("behaviour", "stability"),
+    [
+        (EndBehaviour.DECAYS, Stability.SETTLED),
+        (EndBehaviour.HARDLY, Stability.OPEN),
+        (EndBehaviour.BOUNDED, Stability.NOT_STABLE),
+    ],
+)
+def test_stable_asks_for_the_judgement_and_open_is_neither(
+    behaviour: EndBehaviour, stability: Stability, stable: bool
+) -> None:
+    end = CALM.end._replace(behaviour=behaviour)
+    outcome = only(Expect(stable=stable), end=end)
+    wanted = Stability.SETTLED if stable else Stability.NOT_STABLE
+    assert outcome.held is (stability is wanted)
+    assert outcome.measured == f"{stability}: {end.text}"
+    assert only(
+        Expect(stable=True), end=CALM.end._replace(reasons=("a reason",))
+    ).measured.startswith("open: ")
+
+
+@pytest.mark.parametrize("stable", [None, True, False])
+def test_a_run_that_diverged_fails_unless_that_was_expected(stable: bool | None) -> None:
+    end = CALM.end._replace(behaviour=EndBehaviour.DIVERGED, diverged_at_s=3.25)
+    outcome = only(Expect(stable=stable), end=end)
+    assert outcome.held == (stable is False)
+    assert "3.25 s" in outcome.measured
+
+
+@given(off=st.floats(-0.1, 0.1), within=st.floats(1e-3, 0.05))
+def test_a_pose_is_met_within_its_tolerance_in_every_joint(off: float, within: float) -> None:
+    for wanted in ((0.1 + off, 0.2), (0.1, 0.2 - off)):
+        outcome = only(Expect(end_pose_rad={"s": wanted}, end_pose_within_rad=within))
+        assert outcome.margin is not None
+        assert outcome.held == (outcome.margin >= 0.0)
+        if abs(abs(off) - within) > 1e-9:
+            assert outcome.held == (abs(off) < within)
+
+
+def test_every_site_with_pose_has_outcome_of_its_own() -> None:
+    outcomes = evaluate_expectations(
+        Expect(end_pose_rad={"m1": (0.1, 0.2), "s": (0.5, 0.2)}), CALM
+    )
+    assert [(o.key, o.held) for o in outcomes] == [
+        ("end_pose_rad.m1", True),
+        ("end_pose_rad.s", False),
+    ]
+    assert not only(Expect(end_pose_rad={"s": (0.1, 0.2)}), end_pose_rad={}).held
+
+
+def test_gaps_are_counted() -> None:
+    assert not only(Expect(no_gaps=True)).held
+    assert only(Expect(no_gaps=True), missing=0).held
+    assert evaluate_expectations(Expect(no_gaps=False), CALM) == []
+
+
+SPANS = {
+    "error_peak_rad": Range(0.5, 0.5),
+    "speed_peak_rad_s": Range(2.0, 2.0),
+    "q1_rad": Range(-0.2, 0.4),
+}
+
+
+def window(**limits: Any) -> Expect:
+    return Expect(windows=(ExpectWindow(from_s=9.0, to_s=15.5, site="s", **limits),))
+
+
+@given(least=st.floats(-1.0, 1.0), width=st.one_of(st.just(0.0), st.floats(1e-6, 1.0)))
+def test_a_windows_quantity_holds_wholly_between_its_limits(least: float, width: float) -> None:
+    most = least + width
+    for key, low, high in (("error_peak_rad", 0.5, 0.5), ("q1_rad", -0.2, 0.4)):
+        outcome = only(window(**{key: (least, most)}), windows=(SPANS,))
+        assert outcome.key == f"{key} s 9-15.5 s"
+        assert outcome.held == (least <= low and high <= most)
+        if most > least:
+            assert outcome.margin is not None
+            assert outcome.held == (outcome.margin >= 0.0)
+
+
+def test_window_that_run_did_not_reach_does_not_hold() -> None:
+    outcome = only(window(error_peak_rad=(0.0, 1e9)), windows=({},))
+    assert (outcome.held, outcome.measured, outcome.limit) == (False, "never", "0 to 1e+09 rad")
+
+
+def test_a_window_names_units_and_all_sites() -> None:
+    asked = ExpectWindow(
+        from_s=0.0, to_s=1.0, error_peak_rad=(0.0, 1.0), speed_peak_rad_s=(0.0, 1.0)
+    )
+    outcomes = evaluate_expectations(Expect(windows=(asked,)), figures(windows=(SPANS,)))
+    assert [o.key for o in outcomes] == ["error_peak_rad 0-1 s", "speed_peak_rad_s 0-1 s"]
+    assert [o.limit for o in outcomes] == ["0 to 1 rad", "0 to 1 rad/s"]
+
+
+RODS = {"lc1_m": 0.5, "I1_kg_m2": 1.0 / 12.0, "lc2_m": 0.5, "I2_kg_m2": 1.0 / 12.0}
+
+TWO = """
+name = "two"
+[sites.m]
+role = "master"
+q0_rad = [0.6, -0.4]
+[sites.s]
+role = "slave"
+q0_rad = [-0.5, 0.8]
+[dominance]
+m = { s = 1.0 }
+s = { m = 1.0 }
+"""
+
+
+def held(three: bool, d: float, stable: bool, **link: object) -> bool:
+    """Whether `stable` holds of 40 s of free motion at 200 Hz, links of 200 ms unless said."""
+    changes = {
+        "rate_hz": 200,
+        "duration_s": 40.0,
+        "arm": RODS,
+        "limits.qd_limit_rad_s": 10.0,  # that of the rods, as in `jitter`
+        "control": {"law": "p_d", "K": 10.0, "d": d},
+        "link": link or {"delay_ms": 200.0},
+        "expect": {"stable": stable},
+    }
+    scenario: Scenario = (
+        load_scenario("free", changes) if three else parse_scenario(TWO, "two", changes)
+    )
+    (outcome,) = evaluate_expectations(scenario.expect, measure_virtual_run(scenario))
+    return outcome.held
+
+
+@pytest.mark.parametrize(
+    ("three", "below", "above"),
+    [pytest.param(True, 0.9, 1.3, marks=pytest.mark.long), (False, 1.8, 2.5)],
+)
+def test_the_verdict_changes_at_the_margin_of_theory(
+    three: bool, below: float, above: float
+) -> None:
+    assert held(three, below, stable=False)
+    assert not held(three, below, stable=True)
+    assert held(three, above, stable=True)
+    assert not held(three, above, stable=False)
+
+
+@pytest.mark.long
+def test_jitter_decays_where_constant_delay_grows_and_play_out_diverges() -> None:
+    jitter = {"model": "uniform", "delay_ms": 200.0, "half_width_ms": 200.0}
+    assert held(True, 0.6, stable=True, **jitter)
+    assert held(True, 0.6, stable=False, delay_ms=200.0)
+    assert held(True, 0.6, stable=False, **jitter, playout_ms=400.0)

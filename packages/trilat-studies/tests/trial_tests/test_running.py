@@ -1,0 +1,144 @@
+"""Many trials: the same results in the same order; the shipped scenarios, and the recipe for pytest."""
+
+import os
+import subprocess
+import sys
+import textwrap
+import xml.etree.ElementTree as Xml
+from pathlib import Path
+
+import pytest
+import trilat_studies.trials
+from trilat_studies.trials import TrialResult, run_trials
+
+import trilat_net
+from trilat_net.scenario import list_shipped, load_scenario
+
+from .results import TOO_MUCH, quick
+
+
+def facts(results: list[TrialResult]) -> list[tuple[int, list[tuple[str, str]], float]]:
+    return [
+        (r.trial.scenario.seed, [(o.key, o.measured) for o in r.outcomes], r.simulated_s)
+        for r in results
+    ]
+
+
+@pytest.mark.long
+def test_two_processes_give_results_of_one_in_same_order() -> None:
+    batch = trilat_net.trials(quick(), [5, 2, 9, 4])
+    told: list[TrialResult] = []
+    report = run_trials(batch, 2, told.append)
+    assert facts(report.results) == facts(run_trials(batch, 1).results)
+    assert sorted(facts(told)) == sorted(facts(report.results))
+    assert report.held
+    assert report.wall_s > 0.0
+
+
+def test_check_returns_the_results_or_tells_all_that_failed(quick_file: Path) -> None:
+    assert trilat_net.check(quick_file, [1, 2], jobs=1).held
+    with pytest.raises(AssertionError) as failed:
+        trilat_net.check(quick_file, [1, 2], TOO_MUCH, jobs=1)
+    text = str(failed.value)
+    assert "FAIL" in text
+    assert "0/2" in text
+    for seed in (1, 2):
+        assert f"trilat test {quick_file} --seeds {seed} " in text
+
+
+SCRIPT = """
+import sys
+import trilat_net
+assert "second" not in sys.argv, "ran twice"
+sys.argv.append("second")
+print(len(trilat_net.check(sys.argv[1], seeds=[1, 2, 3], jobs=2).results), "held")
+"""
+
+
+@pytest.mark.long
+def test_it_works_in_a_script_without_a_guarded_main_part(
+    quick_file: Path, tmp_path: Path
+) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT)
+    assert printed(script, quick_file, cwd=tmp_path) == "3 held\n"
+
+
+def printed(script: Path, *arguments: str | Path, cwd: Path) -> str:
+    done = subprocess.run(
+        [sys.executable, str(script), *map(str, arguments)],
+        cwd=cwd,
+        env={
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join([str(Path.cwd()), os.environ.get("PYTHONPATH", "")]),
+        },
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+TICKS = {
+    name: sum(map(load_scenario(name).ticks, load_scenario(name).names))
+    for name in list_shipped()
+}
+
+
+@pytest.mark.parametrize(
+    ("most", "left_out", "least"),
+    [
+        (45_000, {"seven_joints", "unlike_arms"}, 3),
+        pytest.param(10**9, set(), 7, marks=pytest.mark.long),
+    ],
+)
+def test_every_shipped_scenario_expects_something_and_it_holds(
+    most: int, left_out: set[str], least: int
+) -> None:
+    assert all(load_scenario(name).expect.has_expectations for name in TICKS)
+    names = [name for name, ticks in TICKS.items() if ticks <= most and name not in left_out]
+    batch = [trial for name in names for trial in trilat_net.trials(name)]
+    assert len(batch) >= least
+    report = run_trials(batch)
+    assert report.held, report.summary()
+
+
+RECIPE = textwrap.dedent(
+    str(trilat_studies.trials.__doc__).split("per seed:\n")[1].split("\nAll seeds")[0]
+)
+
+
+@pytest.mark.long
+def test_recipe_gives_test_per_seed_that_fails_with_figures(
+    quick_file: Path, tmp_path: Path
+) -> None:
+    """The same lines on a scenario that holds, and on one that does not."""
+    assert len(RECIPE.strip().splitlines()) <= 10
+    for good in (True, False):
+        source = tmp_path / f"scenario_{good}.toml"
+        source.write_text(
+            quick_file.read_text().replace(
+                "max_ms = 100.0", f"max_ms = {100.0 if good else 1.0}"
+            )
+        )
+        (tmp_path / f"test_{good}.py").write_text(RECIPE.replace('"jitter"', repr(str(source))))
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--junitxml=out.xml"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(Path(trilat_net.__path__[0]).parent)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 1, done.stdout + done.stderr
+    cases = list(Xml.parse(tmp_path / "out.xml").iter("testcase"))
+    failed = {
+        (case.get("classname"), case.get("name"))
+        for case in cases
+        if case.find("failure") is not None
+    }
+    assert len(cases) == 10
+    assert failed == {("test_False", f"test_jitter[quick-seed{seed}]") for seed in range(1, 6)}
+    assert "mean_age_max_ms: " in done.stdout
+    assert "trilat sim " in done.stdout

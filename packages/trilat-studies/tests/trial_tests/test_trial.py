@@ -1,0 +1,192 @@
+"""Which trials a scenario has, what one says when it fails, and the command that repeats it.
+
+A live trial, judged by its log: by the same expectations, and by what only a log shows.
+"""
+
+import shlex
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from trilat_studies.trials import Trial, evaluate_live_log
+
+import trilat_net
+from tests.log_editing import edited, recorded, without
+from trilat_net.errors import ScenarioError
+from trilat_net.scenario import apply_overrides, load_scenario
+from trilat_net.work.study_folder import list_assignments
+
+from .results import TOO_MUCH, quick
+
+CONSTANT = {"link": {"model": "constant", "delay_ms": 60.0}}
+
+
+def test_a_random_scenario_has_a_trial_per_seed(quick_file: Path) -> None:
+    batch = trilat_net.trials(quick_file, [3, 1, 3, 2])
+    assert [trial.scenario.seed for trial in batch] == [3, 1, 2]
+    assert len({trial.scenario.sha256 for trial in batch}) == 3
+    assert [str(trial) for trial in batch] == ["quick-seed3", "quick-seed1", "quick-seed2"]
+    assert len({trial.run().outcomes[-1].measured for trial in batch}) == 3
+
+
+def test_without_chance_or_network_one_run_tells_all() -> None:
+    constant = quick(**CONSTANT)
+    assert [trial.scenario.seed for trial in trilat_net.trials(constant, range(4, 9))] == [4]
+    assert len(trilat_net.trials(constant, range(4, 9), live=True)) == 5
+
+
+@pytest.mark.parametrize("seed", [-1, 2**63])
+def test_a_seed_out_of_range_is_refused(seed: int) -> None:
+    with pytest.raises(ScenarioError, match="seed"):
+        trilat_net.trials(quick(), [seed])
+
+
+def test_scenario_that_expects_nothing_is_refused_with_what_to_add(quick_file: Path) -> None:
+    quick_file.write_text(quick_file.read_text().partition("[expect]")[0])
+    for source in (quick_file, load_scenario(quick_file)):
+        with pytest.raises(ScenarioError, match=r"quick.*\[expect\].*stable = true"):
+            trilat_net.trials(source)
+
+
+def test_an_expectation_of_an_unreached_time_is_refused() -> None:
+    with pytest.raises(ScenarioError, match=r"synchronised_by_s.*0\.5 s"):
+        trilat_net.trials(quick(), set={"expect.synchronised_by_s": 0.5})
+    window = {"from_s": 0.4, "to_s": 0.6, "error_peak_rad": [0.0, 1.0]}
+    with pytest.raises(ScenarioError, match=r"expect\.windows\[0\]\.to_s: .*0\.5 s, not 0\.6"):
+        trilat_net.trials(quick(), set={"expect.windows": [window]})
+
+
+def test_a_trial_that_holds_returns_what_held(quick_file: Path) -> None:
+    result = trilat_net.trials(quick_file)[0].check()
+    assert result.held
+    assert result.simulated_s == 0.5
+    assert [outcome.key for outcome in result.outcomes] == [
+        "peak_error_max_rad",
+        "mean_age_max_ms",
+    ]
+
+
+def test_a_failed_trial_says_by_how_much(quick_file: Path) -> None:
+    (trial,) = trilat_net.trials(quick_file, [7], TOO_MUCH)
+    with pytest.raises(AssertionError) as failed:
+        trial.check()
+    lines = [line.strip() for line in str(failed.value).splitlines()]
+    assert lines[0].startswith("quick-seed7: mean_age_max_ms: ")  # the line of pytest's summary
+    assert lines[0].endswith(" ms, expected ≤ 1 ms")
+    assert lines[1:] == [
+        f"trilat test {quick_file} --seeds 7 --set expect.mean_age_max_ms=1",
+        f"trilat sim {quick_file} --seed 7 -o quick-seed7.mcap --set expect.mean_age_max_ms=1",
+    ]
+
+
+words = st.sampled_from(["it's", "a b", '"x"', "", "=", "é", "true", "a\nb\t"])
+values = st.one_of(st.integers(-5, 5), st.floats(-1e3, 1e3), st.booleans(), words)
+tables = st.dictionaries(
+    st.sampled_from(["a", "b.c", "d.e-f"]),
+    st.one_of(values, st.lists(values, max_size=3)),
+    max_size=3,
+)
+
+
+@given(overrides=tables)
+def test_the_command_line_means_the_same_overrides(overrides: dict[str, Any]) -> None:
+    by_text: dict[str, Any] = {}
+    by_value: dict[str, Any] = {}
+    apply_overrides(by_text, shlex.split(shlex.join(list_assignments(overrides))))
+    apply_overrides(by_value, overrides)
+    assert by_text == by_value
+
+
+def test_a_table_as_an_override_is_told_key_by_key() -> None:
+    (trial,) = trilat_net.trials(quick(), set=CONSTANT)
+    assert shlex.split(trial.again)[-4:] == [
+        "--set",
+        'link.model="constant"',
+        "--set",
+        "link.delay_ms=60",
+    ]
+
+
+def test_a_scenario_in_memory_is_called_by_a_file_name() -> None:
+    assert trilat_net.trials(quick())[0].again == "trilat test ./quick.toml --seeds 1"
+
+
+LIMITS = {"expect": {"peak_error_max_rad": 2.0, "no_gaps": True}}
+
+
+@pytest.fixture
+def trial() -> Trial:
+    (made,) = trilat_net.trials(
+        load_scenario("free", {"duration_s": 0.12, "link.delay_ms": 20.0, **LIMITS}), live=True
+    )
+    return made
+
+
+def written(folder: Path, data: bytes) -> Path:
+    path = folder / "run.mcap"
+    path.write_bytes(data)
+    return path
+
+
+def test_session_that_ended_in_order_is_judged_by_its_records(
+    trial: Trial, tmp_path: Path
+) -> None:
+    log = written(tmp_path, recorded("free"))
+    result = evaluate_live_log(trial, log, [], 1.0)
+    assert result.held
+    assert [o.key for o in result.outcomes] == [
+        "peak_error_max_rad",
+        "no_gaps",
+        "session",
+        "executed again",
+    ]
+    assert result.log == log
+    assert result.simulated_s == pytest.approx(0.12)
+
+
+def test_a_problem_of_the_session_fails_it(trial: Trial, tmp_path: Path) -> None:
+    result = evaluate_live_log(
+        trial, written(tmp_path, recorded("free")), ["s was killed by SIGKILL"], 1.0
+    )
+    assert [o.key for o in result.outcomes if not o.held] == ["session"]
+    assert "SIGKILL" in result.failures[0]
+
+
+def test_missing_records_fail_it(trial: Trial, tmp_path: Path) -> None:
+    log = written(tmp_path, edited(recorded("free"), record=without("s", {50})))
+    assert [o.key for o in evaluate_live_log(trial, log, [], 1.0).outcomes if not o.held] == [
+        "no_gaps",
+        "executed again",
+    ]
+
+
+def test_record_that_is_not_what_its_inputs_give_fails_it(trial: Trial, tmp_path: Path) -> None:
+    def bent(record: dict) -> dict:  # type: ignore[type-arg]
+        return (
+            {**record, "tau": [0.0, 1.0]}
+            if (record["site"], record["tick"]) == ("s", 50)
+            else record
+        )
+
+    log = written(tmp_path, edited(recorded("free"), record=bent))
+    assert [o.key for o in evaluate_live_log(trial, log, [], 1.0).outcomes if not o.held] == [
+        "executed again"
+    ]
+
+
+@pytest.mark.parametrize("content", [None, b"no log", "empty"])
+def test_without_records_there_is_no_result_and_reason_is_told(
+    content: bytes | str | None, trial: Trial, tmp_path: Path
+) -> None:
+    log = tmp_path / "run.mcap"
+    if content == "empty":
+        written(tmp_path, edited(recorded("free"), record=lambda _: None))
+    elif isinstance(content, bytes):
+        written(tmp_path, content)
+    result = evaluate_live_log(trial, log, ["m1 ended with code 2"], 1.0)
+    assert not result.held
+    assert "m1 ended with code 2" in result.error
+    assert "run.mcap" in result.error
+    assert (result.log is None) == (content is None)

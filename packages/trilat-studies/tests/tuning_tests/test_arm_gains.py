@@ -1,0 +1,323 @@
+"""The largest gains that an arm bears: the edge by roots, the margins, and runs that confirm both."""
+
+import json
+import math
+import random
+import re
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from trilat_studies.arm_gains import SHARES, ArmGains, tune_arm
+
+import trilat_net as tn
+from tests.chains import robot_files
+from tests.cli.running import trilat
+from tests.sites.visits import ping_sites
+from trilat_net.errors import TrilatError
+from tuning_tests.mode_count import count_growing
+from tuning_tests.odd_arms import ELBOW, ODD_ARMS, SHOULDER, write_arm
+
+GOLDEN = Path(__file__).parents[4] / "tests" / "golden"
+MAKERS = {
+    "UR5": ("ur_description/urdf/ur5_robot.urdf", "tool0"),
+    "Panda": ("panda_description/urdf/panda.urdf", "panda_hand_tcp"),
+    "Jaco": ("kinova_description/robots/kinova.urdf", "j2s6s200_end_effector"),
+    "TwoDofs": ("asr_twodof_description/urdf/TwoDofs.urdf", "Tip"),
+    "Z1": ("b1_description/urdf/b1-z1.urdf", "gripperMover"),
+}
+"""By name a file of `example-robot-data` and its end link."""
+ARMS = ("arm6.urdf", "arm7.urdf", *MAKERS, *ODD_ARMS)
+DELAYS = ("0", "20ms", "100ms", "jitter")
+
+
+def write_jitter(
+    path: Path, swing_ms: float = 15.0, jitter_ms: float = 3.0, every_s: float = 0.01
+) -> Path:
+    """A trace of 2 s about 40 ms: a queue that fills and empties, and what is drawn anew in intervals."""
+    chance = random.Random(3)
+    rows = []
+    for n in range(round(2.0 / every_s)):
+        delay_ms = (
+            40.0
+            + swing_ms * math.sin(math.pi * n * every_s)
+            + chance.uniform(-jitter_ms, jitter_ms)
+        )
+        rows.append(f"{every_s * n:.2f},{delay_ms:.3f}")
+    path.write_text("\n".join(["t_s,delay_ms", *rows]), encoding="utf-8")
+    return path
+
+
+def tune(name: str, delay: str, folder: Path, **more: object) -> ArmGains:
+    """The gains of an arm of one's own, of a shipped one, or of a maker's."""
+    arm, tip = Path(name), ""
+    if name in ODD_ARMS:
+        arm = folder / "odd.urdf"
+        arm.write_text(ODD_ARMS[name], encoding="utf-8")
+    if name in MAKERS:
+        pytest.importorskip("pinocchio", reason="robots are not installed: make test-long")
+        file, tip = MAKERS[name]
+        arm = robot_files()[file]
+    known = str(write_jitter(folder / "jitter.csv")) if delay == "jitter" else delay
+    return tune_arm(arm, known, tip=tip, **more)  # type: ignore[arg-type]
+
+
+def assert_confirmed(found: ArmGains) -> None:
+    """Below the edge the runs decay, beyond it they grow, and at the gains they decay."""
+    stable = {run["share"]: run["stable"] for run in found.runs}
+    assert stable == {None: True, SHARES[0]: True, SHARES[1]: False}, found.summary()
+    assert found.agree
+
+
+def assert_proven(found: ArmGains) -> None:
+    """At a margin of 2 P+d meets d > K T, which suffices whatever the masses."""
+    assert (gains(found, "d") > gains(found, "K") * 1e-3 * found.age_ms).all()
+
+
+@pytest.mark.parametrize("delay", ["0", "20ms"])
+@pytest.mark.parametrize("name", ["one joint", "slide"])
+def test_runs_confirm_the_edge(name: str, delay: str, tmp_path: Path) -> None:
+    found = tune(name, delay, tmp_path, poses=2)
+    assert_confirmed(found)
+    assert_proven(found)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("delay", DELAYS)
+@pytest.mark.parametrize("name", ARMS)
+def test_runs_confirm_the_edge_of_every_arm(name: str, delay: str, tmp_path: Path) -> None:
+    found = tune(name, delay, tmp_path)
+    assert_confirmed(found)
+    assert_proven(found)
+
+
+def gains(found: ArmGains, name: str) -> np.ndarray:
+    """One gain of every joint."""
+    return np.array([joint[name] for joint in found.joints])
+
+
+@pytest.fixture
+def one_joint(tmp_path: Path) -> Path:
+    """An arm of one joint."""
+    path = tmp_path / "one.urdf"
+    path.write_text(write_arm([SHOULDER]), encoding="utf-8")
+    return path
+
+
+def test_the_edge_of_one_joint_is_that_of_its_equation(one_joint: Path) -> None:
+    """M w^2 = K (1 + cos w T) and d w = K sin w T, with d = 2 zeta sqrt(K M)."""
+    found = tune_arm(one_joint, "60ms", poses=1, margin=2.0, damping=0.7)
+    zeta = 0.7 / math.sqrt(2.0)
+    w = math.sqrt(2.0 - 4.0 * zeta**2)
+    k = (math.acos(w * w - 1.0) / w / 0.06) ** 2
+    assert found.edge["continuous_per_s2"] == pytest.approx(k, rel=1e-3)
+    assert found.edge["k_per_s2"] == pytest.approx(k, rel=1e-2)
+    M = 3.0 * 0.5**2 / 3.0
+    assert gains(found, "inertia") == pytest.approx([M], rel=1e-6)
+    assert gains(found, "K") == pytest.approx([k * M / 2.0], rel=1e-2)
+    assert gains(found, "d") == pytest.approx(
+        2.0 * 0.7 * np.sqrt(gains(found, "K") * M), rel=2e-3
+    )
+
+
+@pytest.mark.parametrize("name", ["slide", pytest.param("arm6.urdf", marks=pytest.mark.long)])
+def test_modes_begin_to_grow_where_the_edge_is(name: str, tmp_path: Path) -> None:
+    found = tune(name, "20ms", tmp_path, poses=3, set={"arm.g_m_s2": 0})
+    arm = str(tmp_path / "odd.urdf") if name in ODD_ARMS else name
+    loop = {
+        "name": "loop",
+        "duration_s": 1.0,
+        "arm": {"urdf": arm, "stops": False},
+        "sites": {"m": {}, "s": {"role": "slave"}},
+        "dominance": {"m": {"s": 1.0}, "s": {"m": 1.0}},
+        "link": {"delay_ms": 20.0},
+        "control": {"law": "p_d", "K": 1e-6, "d": 1e-6},
+    }
+    M = tn.load_scenario(loop).arms["m"].inertia(np.array(found.edge["pose"]))
+    for share, grows in ((0.99, False), (1.01, True)):
+        k = share * found.edge["k_per_s2"]
+        m, zeta = gains(found, "inertia"), 0.7 / math.sqrt(2.0)
+        assert (count_growing(M, k * m, 2.0 * zeta * math.sqrt(k) * m, 20, 1e-3) > 0) is grows
+
+
+@cache
+def tune_shoulder(share: float) -> ArmGains:
+    """The gains of an arm of one joint with so much of its mass."""
+    text = write_arm([SHOULDER._replace(mass=share * SHOULDER.mass)])
+    return tune_arm("arm", "30ms", poses=1, set={"urdf": {"arm": text}})
+
+
+@settings(max_examples=3)
+@given(st.floats(0.05, 20.0))
+def test_gains_scale_with_all_masses(c: float) -> None:
+    found = [tune_shoulder(1.0), tune_shoulder(c)]
+    for name in ("K", "d"):
+        assert gains(found[1], name) == pytest.approx(c * gains(found[0], name), rel=5e-3)
+
+
+def test_the_edge_falls_with_the_delay(one_joint: Path) -> None:
+    k = [tune_arm(one_joint, ms, poses=1).edge["k_per_s2"] for ms in (5, 20, 80)]
+    assert k[0] > 3.0 * k[1] > 9.0 * k[2]
+
+
+def test_beyond_some_rate_the_delay_alone_counts(one_joint: Path) -> None:
+    slow, fast, faster = (
+        tune_arm(one_joint, "50ms", poses=1, rate_hz=hz) for hz in (20, 500, 2000)
+    )
+    assert fast.edge["bound"] == faster.edge["bound"] == "delay"
+    assert gains(faster, "K") == pytest.approx(gains(fast, "K"), rel=1e-2)
+    assert slow.edge["bound"] == "tick rate"
+
+
+@pytest.mark.long
+def test_with_enough_damping_no_delay_bounds_the_stiffness(one_joint: Path) -> None:
+    """No root of one joint crosses at any delay where d^2 >= 2 K M."""
+    bounded, free = (
+        tune_arm(one_joint, "50ms", poses=1, damping=ratio) for ratio in (0.95, 1.05)
+    )
+    assert bounded.edge["bound"] == "delay"
+    assert free.edge["continuous_per_s2"] is None
+    assert free.edge["bound"] == "tick rate"
+    assert_confirmed(free)
+
+
+@pytest.mark.parametrize("margin", [1.5, pytest.param(4.0, marks=pytest.mark.long)])
+def test_damping_keeps_the_margin_to_its_limit(margin: float, tmp_path: Path) -> None:
+    found = tune("slide", "1ms", tmp_path, poses=1, margin=margin)
+    assert found.edge["used_per_s2"] <= found.edge["limit_per_s2"] / margin**2 * (1.0 + 1e-9)
+    assert found.edge["used_per_s2"] <= found.edge["k_per_s2"]
+    m = gains(found, "inertia")
+    assert gains(found, "K") == pytest.approx(found.edge["used_per_s2"] * m / margin, rel=1e-3)
+    assert found.runs[0]["stable"]
+
+
+@pytest.mark.long
+def test_the_longest_delays_lower_the_gains(one_joint: Path, tmp_path: Path) -> None:
+    jitter = write_jitter(tmp_path / "jitter.csv")
+    largest, median = (tune_arm(one_joint, jitter, poses=1, quantile=q) for q in (1.0, 0.5))
+    assert largest.age_ms > median.age_ms
+    assert largest.edge["k_per_s2"] == pytest.approx(median.edge["k_per_s2"], rel=1e-2)
+    assert (gains(largest, "K") < gains(median, "K")).all()
+
+
+@pytest.mark.long
+def test_over_slow_jitter_growth_begins_more_than_once(one_joint: Path, tmp_path: Path) -> None:
+    """Delays that change every 50 ms swing the loop as a child does: it grows below the edge too.
+
+    The gains are those of the constant delay, which is the tighter bound, and they are stable.
+    """
+    found = tune_arm(one_joint, write_jitter(tmp_path / "jitter.csv", 0.0, 20.0, 0.05), poses=1)
+    assert found.agree
+    assert [run["stable"] for run in found.runs] == [True, False, False]
+    assert (
+        found.edge["used_per_s2"]
+        == found.edge["constant_per_s2"]
+        < 0.5 * found.edge["k_per_s2"]
+    )
+
+
+def test_delays_are_taken_from_a_log(one_joint: Path) -> None:
+    found = tune_arm(one_joint, f"measured:{GOLDEN / 'live-4g.mcap'}", poses=1)
+    assert re.fullmatch(r"the delays of \w+->\w+ in live-4g.mcap", found.delay)
+    assert found.runs[0]["stable"]
+
+
+def test_a_session_has_the_delay_of_its_slowest_link(
+    one_joint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    report = ping_sites()  # of a party on the party's clock
+    monkeypatch.setattr("trilat_net.app.session_ping.ping_session", lambda *_, **__: report)
+    words = ("tune", "--arm", one_joint.name, "--delay", "measured:paper", "--json")
+    told = json.loads(trilat(*words, cwd=tmp_path).succeeds())
+    assert told["delay"] == f"{1e-3 * report.links[0]['delay_us']:g} ms each way"
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("law", ["pd_d", "saturated_pd"])
+def test_laws_with_stiffness_are_tuned_at_three_sites(law: str, tmp_path: Path) -> None:
+    assert_confirmed(tune("slide and elbow", "20ms", tmp_path, law=law, sites=3, poses=2))
+
+
+@pytest.mark.long
+def test_gains_of_several_joints_scale_with_all_masses() -> None:
+    heavy = [one._replace(mass=7.0 * one.mass) for one in (SHOULDER, ELBOW)]
+    texts = [write_arm(arm) for arm in ([SHOULDER, ELBOW], heavy)]
+    found = [tune_arm("arm", "30ms", set={"urdf": {"arm": text}}) for text in texts]
+    for name in ("K", "d"):
+        assert gains(found[1], name) == pytest.approx(7.0 * gains(found[0], name), rel=5e-3)
+
+
+def test_a_digital_controller_bears_less(one_joint: Path) -> None:
+    held = tune_arm(one_joint, "5ms", poses=1, set={"scheme": "digital"})
+    assert_confirmed(held)
+    assert held.edge["k_per_s2"] < tune_arm(one_joint, "5ms", poses=1).edge["k_per_s2"]
+
+
+SCENARIO = """name = "mine"
+duration_s = 0.1
+{line}
+arm = {{ urdf = "one.urdf" }}
+link = {{ delay_ms = 40 }}
+sites = {{ m = {{}}, s = {{ role = "slave" }} }}
+dominance = {{ m = {{ s = 1.0 }}, s = {{ m = 1.0 }} }}
+"""
+
+
+def test_the_line_is_one_of_a_scenario(one_joint: Path, tmp_path: Path) -> None:
+    words = ("tune", "--arm", one_joint.name, "--delay", "40ms", "--json")
+    told = json.loads(trilat(*words, cwd=tmp_path).succeeds())
+    (tmp_path / "mine.toml").write_text(SCENARIO.format(line=told["line"]), encoding="utf-8")
+    control = tn.load_scenario(tmp_path / "mine.toml").sites["m"].control
+    assert list(control.K) == [joint["K"] for joint in told["joints"]]
+    assert told["agree"] is True
+
+
+def test_the_command_draws_and_prints(one_joint: Path, tmp_path: Path) -> None:
+    words = ("tune", "--arm", one_joint.name, "--delay", "40ms", "--figure", "gains.png")
+    printed = trilat(*words, cwd=tmp_path).succeeds()
+    assert "effort limit" in printed
+    assert re.search(r"ok +run of .* at 0.95 of the edge: decays", printed)
+    assert re.search(r"ok +run of .* at 1.1 of the edge: grows", printed)
+    assert (tmp_path / "gains.png").read_bytes().startswith(b"\x89PNG")
+
+
+REFUSED = {
+    "no such file": (("--arm", "none.urdf"), "none.urdf cannot be read"),
+    "no delay": (
+        ("--delay", "soon"),
+        "--delay must be a time such as 40ms, a log such as measured:run.mcap",
+    ),
+    "too long a delay": (("--delay", "20s"), "delay_ms"),
+    "no such log": (("--delay", "measured:none.mcap"), "none.mcap"),
+    "a trace without points": (("--delay", "empty.csv"), "has no points"),
+    "a law without stiffness": (
+        ("--law", "adaptive"),
+        "--law must be one of p_d, pd_d, saturated_pd",
+    ),
+    "no such law": (("--law", "pid"), "--law must be one of p_d, pd_d, saturated_pd"),
+    "no such tip": (("--tip", "hand"), "there is no link 'hand'"),
+    "four sites": (("--sites", "4"), "--sites must be 2 or 3, not 4"),
+    "no rate": (("--rate", "0"), "rate_hz"),
+    "no margin": (("--margin", "0.5"), "margin must be from 1 to 100, not 0.5"),
+    "half of gravity": (("--set", "control.gravity=0.5"), "gravity must be exact here"),
+}
+
+
+@pytest.mark.parametrize("kind", REFUSED)
+def test_bad_input_is_refused_with_what_is_right(
+    kind: str, one_joint: Path, tmp_path: Path
+) -> None:
+    more, fact = REFUSED[kind]
+    (tmp_path / "empty.csv").write_text("t_s,delay_ms\n", encoding="utf-8")
+    words = {"--arm": one_joint.name, "--delay": "40ms", **dict([more])}
+    trilat("tune", *(word for pair in words.items() for word in pair), cwd=tmp_path).refuses(
+        fact
+    )
+
+
+def test_python_names_its_arguments(one_joint: Path) -> None:
+    with pytest.raises(TrilatError, match=r"^margin must be from 1 to 100"):
+        tune_arm(one_joint, 40, margin=0.5)

@@ -1,0 +1,256 @@
+"""q*, against the linear systems whose rest it is said to be.
+
+A score against the plain sums over a trajectory, and against what must be zero.
+"""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import expm
+from trilat_studies.tuning.candidate import (
+    CandidateClass,
+    CandidateScore,
+    build_twin,
+    check_comparable,
+    compute_consensus_pose,
+    measure_candidate,
+)
+
+from tests.virtual_runs import trajectories
+from trilat_net.errors import ScenarioError
+from trilat_net.scenario import Scenario, load_scenario, parse_scenario
+
+from .experiments import trio
+
+PULSE = 'sites.m1.hands=[{kind = "pulse", start_s = 0.2, end_s = 0.8, peak_nm = [3.0, 0.0]}]'
+WALL = 'sites.s.environment=[{kind = "wall", point_m = [1.5, 0.0], normal = [-1.0, 0.0], stiffness_n_m = 99.0}]'
+
+
+def hand(
+    site: str,
+    to: tuple[float, float],
+    K: tuple[float, float],
+    start: float = 0.0,
+    end: float = 9.0,
+) -> str:
+    return (
+        f'sites.{site}.hands=[{{kind = "spring", to_rad = {list(to)}, stiffness_nm_rad = {list(K)}, '
+        f"start_s = {start}, end_s = {end}}}]"
+    )
+
+
+def at_end(scenario: Scenario) -> np.ndarray:
+    return compute_consensus_pose(scenario, np.array([0.0, scenario.duration_s]))[-1]
+
+
+@given(a=st.floats(0.05, 0.95), b=st.floats(0.05, 0.95), c=st.floats(0.05, 0.95))
+def test_without_hands_it_is_where_linear_consensus_comes_to(
+    a: float, b: float, c: float
+) -> None:
+    """X' = (alpha - I) x, by the matrix exponential."""
+    rows = [
+        f"dominance={{m1 = {{m2 = {a!r}, s = {1 - a!r}}}, m2 = {{m1 = {b!r}, s = {1 - b!r}}}, "
+        f"s = {{m1 = {c!r}, m2 = {1 - c!r}}}}}"
+    ]
+    scenario = trio(*rows)
+    start = np.array([spec.q0_rad for spec in scenario.sites.values()])
+    rest = expm((scenario.alpha - np.eye(3)) * 1e4) @ start
+    assert at_end(scenario) == pytest.approx(rest[0], abs=1e-9)
+    assert at_end(scenario) == pytest.approx(rest[2], abs=1e-9)
+
+
+@settings(max_examples=20)
+@given(K1=st.floats(1.0, 300.0), K2=st.floats(1.0, 300.0), x=st.floats(-1.0, 1.0))
+def test_hands_take_it_where_stiff_arms_rest(K1: float, K2: float, x: float) -> None:
+    """K_i (x_i - q_i) = k (q_i - sum_j alpha_ij q_j) with k far above K, solved as it stands."""
+    # alike enough to be no conflict
+    scenario = trio(hand("m1", (x, 0.0), (K1, K1)), hand("m2", (x + 0.01, 0.0), (K2, K2)))
+    K = np.diag([K1, K2, 0.0])
+    matrix = K + 1e7 * (np.eye(3) - scenario.alpha)
+    rest = np.linalg.solve(matrix, K @ [x, x + 0.01, 0.0])
+    assert at_end(scenario)[0] == pytest.approx(rest.mean(), abs=1e-4)
+
+
+def test_a_joint_that_nobody_holds_stays() -> None:
+    scenario = trio(hand("m1", (0.5, 0.7), (100.0, 0.0), start=0.5, end=1.0))
+    before, held, after = compute_consensus_pose(scenario, np.array([0.2, 0.7, 1.9]))
+    free = compute_consensus_pose(trio(), np.array([0.0]))[0]
+    assert before == pytest.approx(free)
+    assert held == pytest.approx([0.5, free[1]])
+    assert after == pytest.approx([0.5, free[1]])
+
+
+def test_a_hand_moves_it_along_a_minimum_jerk_path() -> None:
+    """Half way in the middle; the spring's target in `box`-like moves is checked in the core."""
+    scenario = trio(
+        'sites.m1.hands=[{kind = "spring", from_rad = [0.0, 0.0], to_rad = [1.0, 2.0], '
+        "move_start_s = 0.5, move_end_s = 1.5, stiffness_nm_rad = 50.0}]".replace(
+            "50.0", "[50.0, 50.0]"
+        )
+    )
+    path = compute_consensus_pose(scenario, np.array([0.4, 0.75, 1.0, 1.6]))
+    quarter = 10 * 0.25**3 - 15 * 0.25**4 + 6 * 0.25**5
+    assert path[:, 0] == pytest.approx([0.0, quarter, 0.5, 1.0])
+    assert path[:, 1] == pytest.approx(2.0 * path[:, 0])
+
+
+def test_twin_has_no_torque_without_target_and_no_wall() -> None:
+    assert build_twin(trio()) is None
+    assert build_twin(trio(hand("m1", (0.3, -0.2), (9.0, 9.0)))) is None
+    for setting in (PULSE, WALL):
+        alone = build_twin(trio(setting))
+        assert alone is not None
+        assert alone.sites == trio().sites
+
+
+def test_two_hands_that_disagree_are_refused_with_the_site() -> None:
+    with pytest.raises(
+        ScenarioError,
+        match=r"training: sites\.m1\.hands: at 0 s .* keep only one of the operators",
+    ):
+        check_comparable(load_scenario("training"))
+
+
+@pytest.mark.parametrize(
+    ("setting", "word"),
+    [
+        (
+            "link.model=measured",
+            "links.m2->m1.model: is 'measured', the delay of a real network",
+        ),
+        (
+            "task.space=position",
+            "task.space: laws are compared by the distance between joint angles",
+        ),
+        (
+            "sites.m2.plant=external",
+            "sites.m2.plant: is external: a scenario with an external arm can only run live",
+        ),
+    ],
+)
+def test_a_scenario_without_common_angles_is_refused(setting: str, word: str) -> None:
+    with pytest.raises(ScenarioError) as refused:
+        check_comparable(
+            load_scenario("free", [setting, 'task.axes=["x", "y"]'][: 1 + ("task" in setting)])
+        )
+    assert word in str(refused.value)
+
+
+def test_two_closed_groups_have_no_common_pose() -> None:
+    text = "\n".join(
+        [
+            'name = "pairs"',
+            "[link]",
+            "delay_ms = 9.0",
+            *(f'[sites.{n}]\nrole = "master"' for n in "abcd"),
+            "[dominance]",
+        ]
+        + [f"{i} = {{ {j} = 1.0 }}" for i, j in ("ab", "ba", "cd", "dc")]
+    )
+    with pytest.raises(ScenarioError, match="a, b and c, d"):
+        check_comparable(parse_scenario(text))
+
+
+FIRM = (
+    "control.law=pd_d",
+    "control.K=20.0",
+    "control.d=9.0",
+    "control.Kd=0.5",
+    "duration_s=4.0",
+)
+
+
+def scored(scenario: Scenario, alone: Scenario | None = None) -> CandidateScore:
+    return measure_candidate(scenario.text, None if alone is None else alone.text)
+
+
+def test_error_and_effort_are_the_sums_that_the_docs_print() -> None:
+    scenario = trio(*FIRM)
+    found = scored(scenario)
+    run = trajectories(scenario)
+    q, tau = run.stack("q"), run.stack("tau")
+    # shares of the first peers: beta = (1 - s->.. ) by the paper's minors
+    a, b, c = (
+        0.2,
+        0.5,
+        0.6,
+    )
+    beta = np.array([1.0 - (1.0 - b) * (1.0 - c), 1.0 - (1.0 - a) * c, 1.0 - a * b])
+    pose = beta @ q[:, 0] / beta.sum()
+    inner, outer = 2.0 * 9.81 * np.cos(q[..., 0]), 9.81 * np.cos(q[..., 0] + q[..., 1])
+    gravity = np.stack([inner + outer, outer], axis=-1)
+    assert found.error_rad == pytest.approx(np.sqrt(np.mean((q - pose) ** 2)), rel=1e-9)
+    assert found.effort_nm == pytest.approx(np.sqrt(np.mean((tau - gravity) ** 2)), rel=1e-9)
+    assert found.spread_rad == pytest.approx(np.sqrt(np.mean(q.var(axis=0))), rel=1e-9)
+    assert found.pose_rad == pytest.approx(
+        np.sqrt(np.mean((q.mean(axis=0) - pose) ** 2)), rel=1e-9
+    )
+    e = np.abs(q - run.stack("q_des")).max(axis=(0, 2))
+    assert found.settled_s == pytest.approx(0.01 * np.flatnonzero(e >= 0.01)[-1])
+
+
+def test_arms_that_start_together_and_know_gravity_do_nothing() -> None:
+    still = trio(
+        "control.law=p_d", *(f"sites.{name}.q0_rad=[0.2, 0.3]" for name in ("m1", "m2", "s"))
+    )
+    found = scored(still)
+    assert found.outcome is CandidateClass.SETTLED
+    assert found.error_rad == pytest.approx(0.0, abs=1e-12)
+    assert found.effort_nm == pytest.approx(0.0, abs=1e-12)
+    assert found.settled_s == 0.0
+
+
+def test_hanging_arms_have_strayed_and_err_by_the_fall() -> None:
+    """They end in step, with e = 0 and no torque at all, and that makes them no better."""
+    hanging = scored(trio(*FIRM, "control.gravity=0.0", "duration_s=20.0"))
+    standing = scored(trio(*FIRM, "duration_s=20.0"))
+    assert hanging.settled_s is not None  # all that e says
+    assert hanging.outcome is CandidateClass.STRAYED
+    assert standing.outcome is CandidateClass.SETTLED
+    assert (hanging.error_rad or 0.0) > 10.0 * (standing.error_rad or np.inf)
+    assert (hanging.pose_rad or 0.0) > 1.0
+
+
+def test_arms_that_sink_slowly_drift_before_they_hang() -> None:
+    """Damping holds them up for a while: 5 % of gravity, some 1.5 N m, against 100 N m s/rad."""
+    sinking = (
+        *FIRM,
+        "rate_hz=1000",
+        "control.d=100.0",
+        "control.K=400.0",
+        "control.gravity=0.95",
+    )
+    found = scored(trio(*sinking, "duration_s=15.0"))
+    assert 0.02 < (found.pose_rad or 0.0) < 0.15
+    assert found.outcome is CandidateClass.OSCILLATED
+
+
+def test_what_diverged_has_no_error() -> None:
+    found = scored(trio(*FIRM, "limits.qd_limit_rad_s=0.2"))
+    assert found.outcome is CandidateClass.DIVERGED
+    assert found.error_rad is None
+    assert found.effort_nm is None
+    assert found.diverged_s is not None
+
+
+def test_sites_of_other_rates_are_compared_at_one_instant() -> None:
+    """A slave at a quarter of the rate moves the score by its coarser steps, and no more."""
+    alike, mixed = (
+        scored(trio(*FIRM, "rate_hz=400", *more)) for more in ((), ("sites.s.rate_hz=100",))
+    )
+    assert mixed.spread_rad == pytest.approx(alike.spread_rad, rel=0.1)
+    assert mixed.effort_nm == pytest.approx(alike.effort_nm, rel=0.2)
+
+
+def test_with_a_twin_the_pose_is_the_twins() -> None:
+    push = (
+        'sites.m1.hands=[{kind = "pulse", start_s = 0.2, end_s = 1.2, peak_nm = [20.0, 0.0]}]'
+    )
+    pushed, alone = trio(*FIRM, push), trio(*FIRM)
+    both = scored(pushed, alone)
+    assert both.pose_rad == scored(alone).pose_rad
+    assert both.spread_rad == scored(pushed).spread_rad
+    assert both.error_rad == pytest.approx(
+        np.hypot(both.spread_rad or 0.0, both.pose_rad or 0.0)
+    )

@@ -1,0 +1,116 @@
+"""How a run ended by its posture: the class of a candidate, and warnings on a log."""
+
+from pathlib import Path
+
+import msgspec
+import pytest
+from trilat_studies.tuning.candidate import (
+    CLASS_MEANINGS,
+    CandidateClass,
+    check_final_posture,
+    classify_candidate,
+)
+
+from trilat_net.analysis.run_end import EndBehaviour, RunEnd, Stability
+from trilat_net.analysis.twins.envelope_trend import EnvelopeFit, EnvelopeTrend
+from trilat_net.app.api import simulate
+from trilat_net.execution.virtual import record_virtual
+from trilat_net.log.log_reader import open_log
+
+from .experiments import trio
+
+FIT = EnvelopeFit(EnvelopeTrend.DECAYS, -0.2)
+CALM = RunEnd(EndBehaviour.CONVERGED, FIT, FIT, 0.0, 0.0)
+
+
+def ended(behaviour: EndBehaviour, **more: object) -> RunEnd:
+    return CALM._replace(behaviour=behaviour, **more)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("end", "fall_rad", "apart_rad", "outcome"),
+    [
+        (CALM, 0.0, 0.0, CandidateClass.SETTLED),
+        (ended(EndBehaviour.DECAYS), 0.0, 0.0, CandidateClass.SETTLED),
+        (ended(EndBehaviour.HARDLY), 0.0, 0.0, CandidateClass.OPEN),
+        (ended(EndBehaviour.UNDECIDED), 0.0, 0.0, CandidateClass.OPEN),
+        (ended(EndBehaviour.GROWS, operator_acts=True), 0.0, 0.0, CandidateClass.OPEN),
+        (ended(EndBehaviour.BOUNDED), 0.0, 0.0, CandidateClass.OSCILLATED),
+        (ended(EndBehaviour.DRIFTS), 1.6, 0.0, CandidateClass.OSCILLATED),
+        (ended(EndBehaviour.GROWS), 0.0, 0.0, CandidateClass.OSCILLATED),
+        (ended(EndBehaviour.DIVERGED), 1.6, 0.5, CandidateClass.DIVERGED),
+        (CALM, 1.6, 0.5, CandidateClass.STRAYED),
+        (ended(EndBehaviour.UNDECIDED), 1.6, 0.5, CandidateClass.STRAYED),
+        (CALM, 0.1, 0.5, CandidateClass.APART),
+    ],
+)
+def test_class_is_judgement_of_run_and_pose(
+    end: RunEnd, fall_rad: float, apart_rad: float, outcome: CandidateClass
+) -> None:
+    assert classify_candidate((end, end), fall_rad, apart_rad) is outcome
+    assert classify_candidate((end, CALM), fall_rad, apart_rad) is outcome
+    assert classify_candidate((CALM, end), fall_rad, apart_rad) is outcome
+
+
+def test_a_class_that_the_judgement_decides_bears_its_word() -> None:
+    words = {one: one.word for one in CandidateClass}
+    assert words[CandidateClass.SETTLED] == Stability.STABLE
+    assert words[CandidateClass.OSCILLATED] == Stability.NOT_STABLE
+    assert words[CandidateClass.OPEN] == Stability.OPEN
+    assert len(set(words.values())) == len(words)
+
+
+def test_every_outcome_has_a_meaning() -> None:
+    assert list(CLASS_MEANINGS) == list(CandidateClass)
+
+
+FIRM = ("control.law=pd_d", "control.K=20.0", "control.d=9.0", "control.Kd=0.5")
+
+
+def test_arms_that_stand_need_no_word() -> None:
+    assert check_final_posture(simulate(trio(*FIRM))) == []
+
+
+def test_arms_that_hang_are_named() -> None:
+    (line,) = check_final_posture(
+        simulate(trio(*FIRM, "control.gravity=0.0", "duration_s=15.0"))
+    )
+    assert line.startswith("m1, m2, s hang at the end")
+
+
+def test_arms_that_sank_are_told_how_far() -> None:
+    (line,) = check_final_posture(
+        simulate(trio(*FIRM, "control.gravity=0.8", "duration_s=2.0"))
+    )
+    assert "from where a weightless consensus would stand: they sank, or drifted" in line
+
+
+def test_arms_that_were_pushed_did_not_sink() -> None:
+    push = (
+        'sites.m1.hands=[{kind = "pulse", start_s = 0.1, end_s = 1.5, peak_nm = [40.0, 0.0]}]'
+    )
+    assert check_final_posture(simulate(trio(*FIRM, push))) == []
+
+
+def test_a_site_that_diverged_is_named() -> None:
+    (line,) = check_final_posture(simulate(trio(*FIRM, "limits.qd_limit_rad_s=0.1")))
+    assert "diverged: its figures end there" in line
+
+
+def test_arms_that_began_hanging_do_not_fall() -> None:
+    down = (-1.5707963, 0.0)
+    scenario = trio(*FIRM)
+    sites = {
+        name: msgspec.structs.replace(spec, q0_rad=down)
+        for name, spec in scenario.sites.items()
+    }
+    assert check_final_posture(simulate(msgspec.structs.replace(scenario, sites=sites))) == []
+
+
+def test_a_log_that_was_cut_says_where(tmp_path: Path) -> None:
+    path = tmp_path / "cut.mcap"
+    assert record_virtual(trio(*FIRM, "duration_s=40.0"), path)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) * 3 // 5])
+    (line,) = check_final_posture(open_log(path))
+    assert "s of 40 s: its figures are of a shorter run" in line

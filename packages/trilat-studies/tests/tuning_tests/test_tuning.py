@@ -1,0 +1,245 @@
+"""The procedure as a whole: small budgets, short runs."""
+
+import json
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+from trilat_studies.tuning import TuningResult, plan_tuning
+from trilat_studies.tuning.candidate import (
+    CandidateClass,
+    CandidateScore,
+    measure_candidate,
+)
+from trilat_studies.tuning.search_space import SEARCH_SPACES
+from trilat_studies.tuning.tuning_plan import CandidateSearch, Objective, find_pareto_front
+from trilat_studies.tuning.tuning_report import tabulate_front, tabulate_laws, write_tuning
+
+from trilat_net.errors import ScenarioError, UsageError
+from trilat_net.scenario import load_scenario
+
+from .experiments import asked, dominates
+
+LAWS = ("adaptive", "p_d", "known")
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> TuningResult:
+    """Three laws, six candidates each."""
+    return asked(tmp_path_factory.mktemp("tuned"), laws=LAWS, budget=6, seed=7).run(jobs=1)
+
+
+@pytest.mark.long
+def test_same_request_makes_same_result_whatever_number_of_processes(
+    found: TuningResult, tmp_path: Path
+) -> None:
+    again = asked(tmp_path, laws=LAWS, budget=6, seed=7).run(jobs=2)
+    assert [one.tried for one in again.found] == [one.tried for one in found.found]
+    assert [one.scores for one in again.found] == [one.scores for one in found.found]
+    assert [one.score for one in again.printed] == [one.score for one in found.printed]
+
+
+def test_every_law_has_its_budget_and_every_run_one_outcome(found: TuningResult) -> None:
+    for one in found.found:
+        assert len(one.tried) == len(one.scores) == sum(one.outcomes.values()) == 6
+
+
+def test_clamp_and_all_but_law_are_same_for_every_candidate(found: TuningResult) -> None:
+    shared = set()
+    for one in found.found:
+        for place in range(len(one.tried)):
+            scenario = found.candidate(one, place).scenario
+            limits = tuple(site.limits for site in scenario.sites.values())
+            starts = tuple(
+                (site.q0_rad, repr(site.arm), site.rate_hz, site.hands)
+                for site in scenario.sites.values()
+            )
+            shared.add(
+                (limits, starts, scenario.seed, scenario.duration_s, repr(scenario.links))
+            )
+    assert len(shared) == 1
+    assert next(iter(shared))[0][0].tau_limit_nm == 60.0
+
+
+def test_a_front_is_dominated_by_no_law(found: TuningResult) -> None:
+    points = {
+        one.space.law: [found.plan.objective.point(score) for score in one.scores]
+        for one in found.found
+    }
+    every = [point for law in points.values() for point in law if point is not None]
+    for one in found.found:
+        own = points[one.space.law]
+        assert one.front == find_pareto_front(own)
+        shared = found.list_overall_front(one)
+        assert set(shared) <= set(one.front)
+        for place in one.front:
+            point = own[place]
+            assert point is not None
+            assert (place in shared) == (not any(dominates(other, point) for other in every))
+
+
+def test_a_points_command_runs_what_was_measured(found: TuningResult) -> None:
+    for one in found.found:
+        for place in one.front:
+            words = shlex.split(found.candidate(one, place).command)
+            assert words[:2] == ["trilat", "sim"]
+            assert words[3::2] == ["--set"] * (len(words[3:]) // 2)
+            assert (
+                measure_candidate(load_scenario(words[2], words[4::2]).text, None)
+                == one.scores[place]
+            )
+
+
+def test_printed_gains_are_measured_and_never_searched(found: TuningResult) -> None:
+    told, untold = found.printed
+    assert [told.name, untold.name] == ["as printed", "as printed, told nothing"]
+    controls = [one.candidate.scenario.sites["s"].control.gains(None) for one in (told, untold)]  # type: ignore[arg-type]
+    assert [tuple(c.Lambda) for c in controls] == [(1.0, 1.0)] * 2
+    assert [tuple(c.theta_hat0) for c in controls] == [(0.0, 0.0, 0.0, 2.0, 1.0), (0.0,) * 5]
+    every = {tuple(gains.values()) for one in found.found for gains in one.tried}
+    assert (1.0, 1.0, 3.0, 1.0) not in every
+
+
+def test_runs_that_failed_are_in_the_facts_and_counted(tmp_path: Path) -> None:
+    """A speed limit that nothing keeps: no front, and no silence about it."""
+    found = asked(tmp_path, "limits.qd_limit_rad_s=0.001", laws=["p_d"], budget=4).run(jobs=1)
+    law = found.to_dict()["laws"]["p_d"]
+    assert law["outcomes"] == {
+        word.value: 4 * (word is CandidateClass.DIVERGED) for word in CandidateClass
+    }
+    assert law["front"] == []
+    assert [one["outcome"] for one in law["candidates"]] == ["diverged"] * 4
+    assert found.list_edge_gains(found.found[0]) == []
+
+
+def test_hanging_arms_are_on_no_front_of_a_real_search(tmp_path: Path) -> None:
+    """Gravity is told for half of what it is: no law that only knows it can stand, some that learn it can."""
+    settings = ("duration_s=10.0", "control.Kd=1")
+    found = asked(
+        tmp_path, *settings, laws=["adaptive", "pd_d"], budget=8, gravity_percent=50.0
+    ).run(jobs=1)
+    learns, knows = found.found
+    assert knows.front == []
+    assert knows.outcomes[CandidateClass.STRAYED] >= 1
+    assert knows.outcomes[CandidateClass.SETTLED] == 0
+    for place in learns.front:
+        assert learns.scores[place].outcome is CandidateClass.SETTLED
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (
+            {"budget": 0},
+            "budget, the number of candidates per law, must be from 1 to 100000, not 0",
+        ),
+        ({"budget": 10**6}, "1 to 100000, not 1000000"),
+        ({"seed": -1}, "seed must be from 0"),
+        ({"objective": "rank"}, "objective must be error or settling, not 'rank'"),
+        ({"gravity_percent": 0.0}, "gravity_percent must be from 50 to 150"),
+        ({"laws": ["p_dd"]}, "no law 'p_dd' to tune; did you mean"),
+    ],
+)
+def test_what_cannot_be_asked_is_refused(
+    tmp_path: Path, settings: dict[str, object], words: str
+) -> None:
+    with pytest.raises(UsageError) as refused:
+        asked(tmp_path, **settings)
+    assert words in str(refused.value)
+
+
+def test_a_search_that_would_take_days_is_refused() -> None:
+    with pytest.raises(
+        ScenarioError, match="duration_s: a candidate would take 259200000 ticks"
+    ):
+        plan_tuning("free", ["duration_s=86400"])
+
+
+def test_time_is_told_before_and_is_of_right_order(tmp_path: Path) -> None:
+    few = asked(tmp_path, laws=["p_d"], budget=8)
+    assert 0.0 < few.estimate_s(1) < 600.0
+    assert few.runs == 10
+    assert asked(tmp_path, 'sites.s.environment=[{kind = "wall", point_m = [9.0, 0.0], normal = [-1.0, 0.0], '
+                 "stiffness_n_m = 1.0}]", laws=["p_d"], budget=8).runs == 20  # fmt: skip
+
+
+def with_front(law: str, gains: dict[str, float], points: int) -> CandidateSearch:
+    """A search of which so many candidates, all of the same gains, are on the front, the others on none."""
+    search = CandidateSearch(SEARCH_SPACES[law], 6, 1, Objective.ERROR)
+    outcomes = [CandidateClass.SETTLED] * points + [CandidateClass.OPEN] * (6 - points)
+    scores = [
+        CandidateScore(one, 1.0 / n, 0.1, 0.1, float(n), None, 0.0)
+        for n, one in enumerate(outcomes, 1)
+    ]
+    search.record_scores([gains] * 6, scores)
+    return search
+
+
+def test_tables_name_the_edge_of_what_was_searched(found: TuningResult) -> None:
+    knob = SEARCH_SPACES["p_d"].knobs[0]
+    assert found.list_edge_gains(with_front("p_d", {"K": knob.high, "d": 10.0}, 1)) == ["K"]
+
+
+@pytest.fixture(scope="module")
+def written(found: TuningResult, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the result."""
+    folder = tmp_path_factory.mktemp("written")
+    names = sorted(path.name for path in write_tuning(found, folder))
+    assert names == ["front.json", "front.md", "front.pdf", "front.png"]
+    return folder
+
+
+def test_the_folder_holds_the_result(written: Path) -> None:
+    result = json.loads((written / "front.json").read_text())
+    assert result["procedure"]["candidates_per_law"] == 6
+    assert result["scenario"]["tau_limit_nm"] == {"m1": 60.0, "m2": 60.0, "s": 60.0}
+    for law in ("p_d", "known"):
+        assert (
+            len(result["laws"][law]["candidates"])
+            == sum(result["laws"][law]["outcomes"].values())
+            == 6
+        )
+        for point in result["laws"][law]["front"]:
+            assert point["command"].startswith("trilat sim ")
+            assert point["outcome"] == "settled"
+
+
+def test_the_figure_is_a_vector_one_column_wide(written: Path) -> None:
+    """3.5 in are 252 pt, and 700 pixels at 200 to the inch."""
+    box = re.search(
+        rb"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]", (written / "front.pdf").read_bytes()
+    )
+    assert box is not None
+    assert float(box[1]) == pytest.approx(252.0)
+    header = (written / "front.png").read_bytes()[16:20]
+    assert int.from_bytes(header, "big") == 700
+
+
+def test_the_page_tells_procedure_search_and_commands(
+    found: TuningResult, written: Path
+) -> None:
+    text = (written / "front.md").read_text()
+    assert "every law gets the exact gravity parameters" in text
+    assert "torques clamped at 60 N m" in text
+    assert "| p_d | K | N m/rad | 1 | 1000 | gravity |" in text
+    assert "AND inertia exactly: more than the others" in text
+    assert text.count("trilat sim ") == sum(len(one.front) for one in found.found) + 2
+    assert "as printed, told nothing" in text
+
+
+def test_the_table_of_laws_counts_every_run(found: TuningResult) -> None:
+    table = tabulate_laws(found)
+    places = [table.headers.index(outcome.word) for outcome in CandidateClass]
+    for row in table.rows:
+        assert sum(int(row[place]) for place in places) == int(row[1]) == 6
+
+
+def test_a_long_front_is_shortened_to_points_with_both_ends(found: TuningResult) -> None:
+    one = with_front("adaptive", found.found[0].tried[0], 5)
+    shown = [row[0].rstrip("*") for row in tabulate_front(found, one, 3).rows]
+    assert shown == ["adaptive 1", "adaptive 3", "adaptive 5"]
+    assert len(tabulate_front(found, one).rows) == 5
+    assert (
+        tabulate_front(found, with_front("adaptive", found.found[0].tried[0], 0), 3).rows == []
+    )

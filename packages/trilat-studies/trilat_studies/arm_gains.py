@@ -1,0 +1,937 @@
+"""Finds the largest gains with which equal arms can follow each other over a delay.
+
+Two or three equal arms follow one another over links with a delay. Each joint has a stiffness
+K, a damping d of its velocity, and for some control laws a damping Kd of the velocity of its
+position error. One number k, in 1/s^2, determines all gains:
+
+    K = k m,    d + Kd = 2 zeta sqrt(k) m,
+
+where zeta is the damping ratio. For m, the module uses the largest inertia of the joint about
+its own axis that occurs in a set of poses.
+
+Two limits bound the gains, and the result keeps a margin to both:
+
+- Stability with the delay: the edge is the least k at which small motions of the sampled
+  control loop grow in one of the poses. The tuned stiffness is the stiffness at the edge
+  divided by the margin. Simulated runs check the edge.
+- Damping at the tick rate: a damping torque is constant during a control period (tick). If it
+  is too large, it reverses the velocity in every tick. This happens first in the direction in
+  which the arm has the least inertia. Where this limit requires it, m is chosen smaller.
+
+For a single joint at a wall, this edge is known: J. J. Gil, A. Avello, A. Rubio and J. Florez,
+"Stability analysis of a 1 DOF haptic interface using the Routh-Hurwitz criterion", IEEE Trans.
+Control Systems Technology 12 (2004); over delays, T. Hulin, C. Preusche and G. Hirzinger,
+"Stability boundary for haptic rendering: influence of physical damping", IROS 2006.
+
+Invariant:
+    - A result is a function of its arguments.
+    - Friction, joint stops and torque limits are left out. Friction only helps, and limits do
+      not act on small motions.
+"""
+
+import math
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from scipy.optimize import brentq
+
+from trilat_net.analysis.theory.characteristic_roots import CharacteristicRoot
+from trilat_net.analysis.theory.floquet import find_samples_in_use
+from trilat_net.analysis.theory.linear_edge import find_rightmost_root
+from trilat_net.analysis.theory.operating_point import (
+    Equilibrium,
+    OperatingConditions,
+    derive_operating_conditions,
+)
+from trilat_net.analysis.twins.envelope_trend import EnvelopeTrend, fit_envelopes
+from trilat_net.core.step.ticks import BUCKETS_PER_S
+from trilat_net.core.step.vectors import Array
+from trilat_net.errors import UsageError
+from trilat_net.execution.fused import FusedRun
+from trilat_net.log.log_reader import open_log, read_link_delays
+from trilat_net.presentation.result_text import MARKS, Block, MarkedText, TextTable
+from trilat_net.results import Result, finite_or_none
+from trilat_net.scenario import Scenario, load_scenario
+from trilat_net.scenario.arms import read_arm
+from trilat_net.scenario.laws import BUILT_IN
+from trilat_net.work.executor import Progress, ignore_progress
+
+TUNED_LAWS = tuple(
+    name
+    for name, law in BUILT_IN.items()
+    if {"K", "d"} <= law.tune.keys() and not getattr(law, "sends", ())
+)
+"""Control laws with a stiffness and a damping that send only the motion of their arm."""
+SHARES = (0.95, 1.1)
+"""Fractions of k at the edge with which runs confirm the edge, below and above it."""
+_PUSH = 1e-6
+"""Largest initial displacement of the joints of the first arm, in rad or m."""
+_SMALL = 1.0
+"""Speed above which a motion does not count as small, in rad/s."""
+_STILL = 1e-7
+"""Fraction of the largest speed below which a speed counts as a rounding error."""
+_SITES = {2: ("m", "s"), 3: ("m1", "m2", "s")}
+"""Names of the sites, by their number."""
+_SLACK = 0.05
+"""Fraction of the range of a joint, at either end, that the drawn poses avoid."""
+_HALF_TURN = math.pi
+"""Half of the range of a revolute joint without limits, in rad."""
+_HALF_SLIDE_M = 0.5
+"""Half of the range of a prismatic joint without limits, in m."""
+_SETTLES = 4.0
+"""First duration of a run, in time constants of its slowest motion."""
+_SHORTEST_S = 2.0
+"""Least first duration of a run, in s."""
+_LONGEST_S = 400.0
+"""Largest first duration of a run, in s."""
+_EXTENSIONS = 3
+"""Number of durations of a run that are tried, each twice as long as the one before."""
+_IS_STABLE = {EnvelopeTrend.GROWS: False, EnvelopeTrend.DECAYS: True}
+"""Whether a run is stable, by the trend of its speed. Other trends leave this undecided."""
+_NO_GAIN = 1e-6
+"""Negligible gain of the loop before its gains are set."""
+_CURVE_POINTS = 9
+"""Number of delays for which the edge is computed for a figure."""
+_EDGE_TOLERANCE = 1e-4
+"""Tolerance of ln k at the edge."""
+_FITTING_STEP = 0.9
+"""Least factor by which m is reduced in one step."""
+_NO_ROOT_PER_S = -1e3
+"""Real part that stands for a loop without roots, in 1/s."""
+_DELAY = re.compile(r"(\d+\.?\d*|\.\d+) ?(us|ms|s|)")
+"""A number with an optional unit, as in "40ms"."""
+_UNIT_MS = {"us": 1e-3, "ms": 1.0, "": 1.0, "s": 1e3}
+"""Units of a delay in ms. A number without a unit is in ms."""
+
+
+@dataclass(frozen=True, repr=False)
+class ArmGains(Result):
+    """The largest stable gains for an arm, reduced by a safety margin.
+
+    Two or three equal arms follow one another over links with a delay. The gains grow together
+    along a ray: the stiffness is K = k m for each joint, where m is the inertia of the joint
+    and k a common parameter in 1/s^2. The edge of stability is the k above which small motions
+    grow. `tune_arm` creates this object. The keys in JSON equal the attributes.
+
+    Attributes:
+        arm: File name of the arm's URDF.
+        law: Name of the control law.
+        sites: Number of arms.
+        rate_hz: Tick rate of the control loop, in Hz.
+        delay: Description of the delay of the links, in words.
+        age_ms: Constant age of samples that stands for the delay, in ms.
+        margin: Factor by which the stiffness lies below the edge.
+        damping: Damping ratio of the gains.
+        joints: For each joint, the inertia m, the gains with their unit, and the position error
+            at which the effort limit of the joint is reached.
+        edge: Values of k at the edge, in 1/s^2. There are three: of the sampled loop with the
+            delays in use, of the sampled loop with a constant delay, and in continuous time.
+            None means that there is no edge. Further entries are the k from which the damping
+            makes a motion swing from tick to tick; the frequency, motion and pose at the edge;
+            and whether the delay or the tick rate limits K.
+        runs: Simulated runs that check the gains. The entry `share` is None for the gains
+            themselves. For the other runs it is the value of k as a fraction of that at the
+            edge. Each run has two growth rates: one that was measured from the largest speed,
+            which is None if the motions were not small, and one that the roots of the loop
+            predict.
+        agree: True if all runs behave as the roots predict, and the run with the gains decays.
+        line: The gains as a line to paste above the tables of a scenario.
+        curve: Pairs of a delay, in s, and k at the edge in the same pose. Empty unless
+            requested.
+    """
+
+    arm: str
+    law: str
+    sites: int
+    rate_hz: int
+    delay: str
+    age_ms: float
+    margin: float
+    damping: float
+    joints: list[dict[str, Any]]
+    edge: dict[str, Any]
+    runs: list[dict[str, Any]]
+    agree: bool
+    line: str
+    curve: list[tuple[float, float]]
+
+    def to_rows(self) -> list[dict[str, Any]]:
+        """Returns a row per joint of the arm: its inertia and tuned gains, for a CSV file."""
+        return self.joints
+
+    def blocks(self) -> Iterator[Block]:
+        """Yields the parts of the text that the command `trilat tune` prints.
+
+        The parts are a description of the control loop, a table of the joints and their gains,
+        the limit of stability, the simulated runs that check it, and a line with the gains. A
+        user can paste this line into a scenario, the file that describes an experiment.
+        """
+        yield (
+            f"{self.arm}: {self.sites} equal arms, {self.law}, {self.rate_hz} Hz, "
+            f"{self.delay}, damping ratio {self.damping:g}, margin {self.margin:g}"
+        )
+        first_joint = self.joints[0]
+        header = [key.replace("_", " ") for key in first_joint]
+        rows = []
+        for joint in self.joints:
+            row = [_format_cell(value) for value in joint.values()]
+            rows.append(row)
+        yield TextTable(header, rows, align="lr")
+        yield from self._describe_edge()
+        for run in self.runs:
+            outcome = "ok" if run["agrees"] else "fail"
+            mark = MARKS[outcome]
+            yield MarkedText(mark, _describe_run(run))
+        yield "to paste above the first table of a scenario:"
+        yield self.line
+
+    def _describe_edge(self) -> Iterator[str]:
+        """Yields the lines about the limits of k, where the stiffness is K = k m.
+
+        m is the inertia of a joint, and k has the unit 1/s^2. The limits, see the attribute
+        `edge`, are the values of k from which on
+
+        - small motions grow: in the loop as it is, with a constant delay, and in continuous
+          time ("none" if they never grow there). This is the edge of stability;
+        - the damping, which grows with sqrt(k), reverses a velocity in every tick (control
+          period).
+
+        The lines also tell which joints move at the edge, with which frequency, in which pose
+        the edge is lowest, and which of the two limits bounds the stiffness.
+        """
+        edge = self.edge
+        # Only the text about the moving states is needed: the value of the root is arbitrary.
+        moving_states = tuple(edge["moves"])
+        motion = CharacteristicRoot(s=0j, multiplicity=1, states=moving_states).description
+        yield (
+            f"edge: K = {edge['k_per_s2']:.4g} /s^2 times inertia "
+            f"({motion}; {edge['omega_rad_s']:.4g} rad/s)"
+        )
+        continuous_text = "none"
+        continuous_per_s2 = edge["continuous_per_s2"]
+        if continuous_per_s2 is not None:
+            continuous_text = f"{continuous_per_s2:.4g}"
+        yield (
+            f"  {edge['constant_per_s2']:.4g} with a constant delay of {self.age_ms:.4g} ms; "
+            f"{continuous_text} in continuous time; the {edge['bound']} bounds K"
+        )
+        yield f"  damping swings from tick to tick from {edge['limit_per_s2']:.4g} on"
+        pose_text = ", ".join(f"{q:.3g}" for q in edge["pose"])
+        yield f"  least in the pose {pose_text}"
+
+
+def _format_cell(value: Any) -> str:
+    """Returns the text of a table cell: a number with four digits, a text, or "-" if empty."""
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return value or "-"
+
+
+def _describe_run(run: Mapping[str, Any]) -> str:
+    """Returns a sentence on a run that confirms the edge or the gains.
+
+    Args:
+        run: The run, as in `ArmGains.runs`.
+    """
+    share = run["share"]
+    gains = "these gains" if share is None else f"{share:g} of the edge"
+    behaviours = {None: "is undecided", True: "decays", False: "grows"}
+    result = behaviours[run["stable"]]
+    rate_per_s = run["rate_per_s"]
+    if rate_per_s:
+        result += f" {rate_per_s:+.3g} /s"
+    predicted = f"by its roots {run['predicted_per_s']:+.3g} /s"
+    return f"run of {run['ran_s']:.4g} s at {gains}: {result}; {predicted}"
+
+
+def _read_delay(delay: str | float) -> tuple[dict[str, Any], str]:
+    """Reads the delay for which gains are wanted.
+
+    Args:
+        delay: A number with an optional unit, a table of delays, or a log. Of a log, the link
+            with the longest median delay is used.
+
+    Returns:
+        The table [link] of a scenario with this delay, and a description for the user.
+
+    Raises:
+        UsageError: The text is not a delay, or the delays of the log cannot be used.
+    """
+    text = str(delay).strip()
+    match = _DELAY.fullmatch(text)
+    if match:
+        unit_ms = _UNIT_MS[match[2]]
+        delay_ms = float(match[1]) * unit_ms
+        return {"delay_ms": delay_ms}, f"{delay_ms:g} ms each way"
+
+    path = Path(text.removeprefix("measured:"))
+    if path.suffix not in (".csv", ".mcap"):
+        raise UsageError(
+            "--delay must be a time such as 40ms, a log such as measured:run.mcap, or a table "
+            f"of t_s,delay_ms such as run.csv, not {text!r}"
+        )
+    link = {"model": "trace", "file": str(path), "at_end": "loop"}
+    if path.suffix == ".csv":
+        return link, f"the delays of {path.name}"
+
+    medians_ms = {}
+    try:
+        log = open_log(path)
+        for name in log.scenario.links:
+            delays_ms = [delay_ms for _, delay_ms in read_link_delays(path, name)]
+            medians_ms[name] = float(np.median(delays_ms))
+    except ValueError as error:
+        raise UsageError(f"--delay {text}: {error}") from None
+    longest = max(medians_ms, key=lambda name: medians_ms[name])
+    return {**link, "of": longest}, f"the delays of {longest} in {path.name}"
+
+
+def _build_loop(
+    arm: str | Path,
+    link: Mapping[str, Any],
+    law: str,
+    overrides: Any,
+    *,
+    sites: int,
+    tip: str,
+    rate_hz: int,
+) -> Scenario:
+    """Builds a scenario of equal arms without friction that follow one another.
+
+    The gains are negligible; the search replaces them. The limits of the arms are so wide that
+    they do not act on small motions.
+
+    Args:
+        arm: Path of a URDF, or the name of a shipped file.
+        link: Table [link], which contains the delay.
+        law: Name of the control law.
+        overrides: Overrides of the scenario.
+        sites: Number of arms.
+        tip: Name of the end link.
+        rate_hz: Tick rate, in Hz.
+
+    Raises:
+        UsageError: The law, the number of sites or an override is not valid.
+    """
+    if law not in TUNED_LAWS:
+        known = ", ".join(TUNED_LAWS)
+        raise UsageError(
+            f"--law must be one of {known}, which have a stiffness K and a damping d that "
+            f"acts on motion only, not {law}"
+        )
+    if sites not in _SITES:
+        raise UsageError(f"--sites must be 2 or 3, not {sites}")
+
+    names = _SITES[sites]
+    tuned_gains = BUILT_IN[law].tune
+    gains = {gain: _NO_GAIN for gain in ("K", "d", "Kd") if gain in tuned_gains}
+    peer_count = sites - 1
+    dominance_factor = 1.0 / peer_count
+    roles = {}
+    dominance = {}
+    for name in names:
+        role = "slave" if name == "s" else "master"
+        roles[name] = {"role": role}
+        peers = [peer for peer in names if peer != name]
+        dominance[name] = dict.fromkeys(peers, dominance_factor)
+    tables = {
+        "name": "tune",
+        "duration_s": _SHORTEST_S,
+        "rate_hz": rate_hz,
+        "arm": {"urdf": str(arm), "tip": tip, "stops": False},
+        "control": {"law": law, **gains},
+        "limits": {"tau_limit_nm": 1e9, "qd_limit_rad_s": _SMALL},
+        "link": dict(link),
+        "sites": roles,
+        "dominance": dominance,
+    }
+    scenario = load_scenario(tables, overrides)
+    control = scenario.controls[0]
+    if getattr(control, "gravity", 1.0) != 1.0:
+        raise UsageError(
+            "--set control.gravity: gravity must be exact here, because only then is every "
+            "pose an equilibrium"
+        )
+
+    # Friction and damping of the joints are the attributes of the URDF's <dynamics>.
+    without_friction = {}
+    for name, text in scenario.urdf.items():
+        without_friction[name] = re.sub(r"<dynamics\b[^>/]*", "<dynamics", text)
+    return msgspec.structs.replace(scenario, urdf=without_friction)
+
+
+def _draw_poses(scenario: Scenario, count: int, seed: int) -> Array:
+    """Draws random poses within the limits of the joints.
+
+    A joint without limits, or with wide ones, stays within half a turn or half a metre of the
+    position that is closest to 0.
+
+    Args:
+        scenario: Scenario with the arm.
+        count: Number of poses.
+        seed: Seed of the random numbers.
+
+    Returns:
+        Joint angles or positions, shape (count, n), in rad or m.
+    """
+    ranges = []
+    first_site = scenario.sites[scenario.names[0]]
+    model = read_arm(first_site.arm, scenario.urdf)
+    for joint in model.joints:
+        half_range = _HALF_SLIDE_M if joint.kind == "prismatic" else _HALF_TURN
+        at_least_lower = max(joint.lower, 0.0)
+        middle = min(at_least_lower, joint.upper)
+        lower = max(joint.lower, middle - half_range)
+        upper = min(joint.upper, middle + half_range)
+        ranges.append((lower, upper))
+    low, high = np.transpose(ranges)
+    bits = np.random.Philox(seed)
+    random = np.random.Generator(bits)
+    shape = (count, len(low))
+    fractions = random.uniform(_SLACK, 1.0 - _SLACK, shape)
+    width = high - low
+    return np.asarray(low + width * fractions)
+
+
+class _GainSearch:
+    """Search for the edge of stability of equal arms whose gains grow along a ray.
+
+    The stiffness is K = k m for each joint, where m is the inertia of the joint and k a common
+    parameter in 1/s^2. The edge is the least k at which small motions of the linearised loop
+    grow.
+
+    Args:
+        scenario: Scenario of the loop, see `_build_loop`.
+        poses: Poses in which the loop is analysed, shape (count, n).
+        margin: Factor by which the stiffness lies below the edge.
+        damping: Damping ratio of the gains.
+        quantile: Quantile of varying sample ages that stands for a constant age.
+
+    Attributes:
+        conditions: Linearised conditions of the loop.
+        constant_conditions: The same conditions with the constant sample age `age_s`. They are
+            equal to `conditions` if the ages do not vary.
+        rate_hz: Tick rate, in Hz.
+        age_s: Constant age of samples, in s.
+        inertia: Inertia m of each joint, shape (n,).
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        poses: Array,
+        margin: float,
+        damping: float,
+        quantile: float,
+    ) -> None:
+        self._scenario = scenario
+        self._poses = poses
+        self._margin = margin
+        # Damping ratio at the edge, where the damping is the same and K larger by the margin.
+        self._damping = damping / math.sqrt(margin)
+
+        self.conditions = derive_operating_conditions(scenario)
+        self.constant_conditions = self.conditions
+        self.rate_hz = self.conditions.sites[0].rate_hz
+        if self.conditions.varying:
+            used = find_samples_in_use(self.conditions).used.values()
+            ages_by_link = [np.arange(len(samples)) - samples for samples in used]
+            ages = np.concatenate(ages_by_link)
+            age_ticks = float(np.quantile(ages, quantile, method="higher"))
+            self.constant_conditions = self.fix_age(age_ticks / self.rate_hz)
+        largest_age_s = self.constant_conditions.age_s.max()
+        self.age_s = float(largest_age_s)
+        # The heaviest mass is stable up to k = (2 zeta / T)^2, where T is the age. At this k
+        # the damping must keep its margin to the sampled-data limit.
+        omega_rad_s = 2.0 * self._damping / self.age_s
+        self._least_k = omega_rad_s**2
+
+        first_site = scenario.names[0]
+        model = scenario.arms[first_site]
+        largest_factor = 1.0 if scenario.scheme == "second_order" else 2.0
+        # A motion swings from tick to tick if its damping per inertia exceeds this value.
+        self._largest_damping_per_s = largest_factor * self.rate_hz
+        self._M = [model.inertia(q) for q in poses]
+        diagonals = [np.diag(M) for M in self._M]
+        self.inertia: Array = np.max(diagonals, axis=0)
+        self._fit_inertia()
+
+    def _fit_inertia(self) -> None:
+        """Reduces the inertias m of the joints, so that the damping suits the tick rate.
+
+        The gains are proportional to the inertia m of a joint, about its own axis: the damping
+        is 2 zeta sqrt(k) m, in N m s/rad. A motion of several joints together can have a
+        smaller inertia than m. Relative to this inertia, the damping is larger by a ratio r,
+        the largest eigenvalue of m M^-1, where M is the inertia matrix:
+
+            damping per inertia = 2 zeta sqrt(k) r, in 1/s
+
+        Above the sampled-data limit (one or two times the tick rate), the motion would swing
+        from tick to tick. The method reduces m until r is so small that the damping keeps its
+        margin to this limit, at the least k that the search considers.
+
+        Only those joints matter that take part in the lightest motion, the one with the ratio
+        r. The m of the joint with the largest participation is multiplied by a factor below 1,
+        and that of another joint by the factor to the power of its relative participation.
+        Since another motion may then be the lightest, this is repeated in small steps.
+        """
+        damping_per_inertia_per_s = 2.0 * self._damping * math.sqrt(self._least_k)
+        damping_with_margin_per_s = damping_per_inertia_per_s * self._margin
+        allowed_ratio = self._largest_damping_per_s / damping_with_margin_per_s
+        ratio, participation = self._find_lightest()
+        largest_ratio = allowed_ratio * (1.0 + _EDGE_TOLERANCE)
+        while ratio > largest_ratio:
+            relative_participation = participation / participation.max()
+            factor = max(allowed_ratio / ratio, _FITTING_STEP)
+            self.inertia = self.inertia * factor**relative_participation
+            ratio, participation = self._find_lightest()
+
+    def _find_lightest(self) -> tuple[float, Array]:
+        """Finds the motion that is lightest in relation to the inertias m of its joints.
+
+        Returns:
+            The largest eigenvalue of m M^-1 over the poses, where M is the inertia matrix; and
+            the participation of each joint in that motion, shape (n,), with the sum 1.
+        """
+        # m M^-1 has the eigenvalues of the symmetric matrix m^(1/2) M^-1 m^(1/2).
+        root = np.sqrt(self.inertia)
+        decompositions = []
+        for M in self._M:
+            scaled = root * np.linalg.inv(M) * root[:, np.newaxis]
+            decompositions.append(np.linalg.eigh(scaled))
+        values, vectors = max(decompositions, key=lambda pair: float(pair[0][-1]))
+        largest_ratio = float(values[-1])
+        lightest_motion = vectors[:, -1]
+        return largest_ratio, lightest_motion**2
+
+    def fix_age(self, age_s: float) -> OperatingConditions:
+        """Returns the linear model of the loop with the same delay for all received data.
+
+        The age of a sample (a state that one arm sent to another) is the time from its sending
+        until its use. A varying delay makes the ages vary. The returned model has a constant
+        age instead, where the analysis needs a single number.
+
+        Args:
+            age_s: The age of all samples, in s.
+        """
+        has_delay = self.conditions.age_s > 0.0
+        ages_s: Array = np.where(has_delay, age_s, 0.0)
+        return self.conditions._replace(age_s=ages_s, varying=False)
+
+    def build_law(self, k: float, stiffness_divisor: float = 1.0) -> Any:
+        """Returns the control law with the gains that belong to a gain parameter k.
+
+        A joint with the inertia m gets the following gains, where K is the stiffness, d the
+        damping of the velocity, Kd the damping of the velocity error, and zeta the damping
+        ratio:
+
+            K = k m,    d + Kd = 2 zeta sqrt(k) m
+
+        The ratio of d and Kd is the same as in the default gains of the law. All gains are
+        rounded to four digits.
+
+        Args:
+            k: The gain parameter, in 1/s^2.
+            stiffness_divisor: Number by which K is divided. The damping stays the same.
+        """
+        law: Any = self._scenario.controls[0]
+        default_damping = {}
+        for name in ("d", "Kd"):
+            if name in law.kind.tune:
+                defaults = getattr(law.kind, name)
+                default_damping[name] = defaults[0]
+        default_sum = sum(default_damping.values())
+        damping_sum = 2.0 * self._damping * math.sqrt(k) * self.inertia
+        damping_scale = damping_sum / default_sum
+
+        stiffness = k / stiffness_divisor * self.inertia
+        gains = {"K": stiffness}
+        for name, default in default_damping.items():
+            gains[name] = default * damping_scale
+        rounded = {}
+        for name, values in gains.items():
+            texts = [f"{value:.4g}" for value in values]
+            rounded[name] = tuple(map(float, texts))
+        return msgspec.structs.replace(law, **rounded)
+
+    def find_root(
+        self, law: Any, pose: Array, loop: OperatingConditions, *, sampled: bool = True
+    ) -> CharacteristicRoot:
+        """Returns the characteristic root of the linearised loop with the largest real part.
+
+        The loop is linearised about a rest in the given pose. The real part of the root is the
+        rate, in 1/s, at which small motions grow. A negative value means that they decay.
+
+        Args:
+            law: Control law with its gains.
+            pose: Pose of all arms, shape (n,), in rad or m, for n joints.
+            loop: Linear model of the arms, their tick rates and the delays between them.
+            sampled: True to analyse the sampled loop, False to analyse it in continuous time.
+
+        Returns:
+            The root. If the loop has no roots, a root with a large negative real part.
+        """
+        sites = []
+        for site in loop.sites:
+            gains = law.linear_gains(site.theta)
+            sites.append(site._replace(gains=gains))
+        poses = np.tile(pose, (len(sites), 1))
+        theta = np.array([site.theta for site in sites])
+        rest = Equilibrium(poses, theta, "a pose", 0.0)
+        loop_with_gains = loop._replace(sites=tuple(sites))
+        root = find_rightmost_root(loop_with_gains, rest, sampled=sampled)
+        if root is None:
+            return CharacteristicRoot(complex(_NO_ROOT_PER_S), 1, ())
+        return root
+
+    def find_least_edge(
+        self,
+        loop: OperatingConditions,
+        poses: Iterable[Array],
+        start: float,
+        *,
+        sampled: bool = True,
+    ) -> tuple[float, Array]:
+        """Finds the least k at which small motions grow in one of several poses.
+
+        In each pose, k is raised from `start` until motions grow. Then the edge below that k is
+        located with Brent's method. A later pose is searched only if motions already grow there
+        just below the least edge so far.
+
+        Under varying delays, motions may grow, decay and grow again as k rises. Therefore the
+        first steps of the search are small in this case.
+
+        Args:
+            loop: Conditions of the loop.
+            poses: The poses.
+            start: First k of the search, in 1/s^2.
+            sampled: True to analyse the sampled loop, False to analyse it in continuous time.
+
+        Returns:
+            The least k, and the pose in which motions grow. k is infinite if motions grow in no
+            pose.
+
+        Raises:
+            UsageError: In one of the poses motions grow even for tiny gains.
+        """
+        edge = math.inf
+        worst_pose = self._poses[0]
+        log_steps = np.arange(24) * math.log(2.0)
+        if loop.varying:
+            small_steps = np.arange(15) * math.log(1.1)
+            large_steps = math.log(4.0) + log_steps
+            log_steps = np.append(small_steps, large_steps)
+
+        for pose in poses:
+
+            def growth(log_k: float, pose: Array = pose) -> float:
+                law = self.build_law(math.exp(log_k))
+                root = self.find_root(law, pose, loop, sampled=sampled)
+                return root.s.real
+
+            candidates: Iterable[float] = math.log(start) + log_steps
+            if edge != math.inf:
+                # Only a pose whose edge is lower than the least edge so far matters.
+                candidates = [math.log(edge) - 10.0 * _EDGE_TOLERANCE]
+            high = next((log_k for log_k in candidates if growth(log_k) > 0.0), None)
+            if high is None:
+                continue
+            lower_candidates = high - log_steps[1:]
+            low = next((log_k for log_k in lower_candidates if growth(log_k) <= 0.0), None)
+            if low is None:
+                raise UsageError(f"--arm: no gains are stable in the pose {pose.tolist()}")
+            log_edge = brentq(growth, low, high, xtol=_EDGE_TOLERANCE)
+            edge = math.exp(log_edge)
+            worst_pose = pose
+        return edge, worst_pose
+
+    def find_edge(self) -> dict[str, Any]:
+        """Finds the largest gains with which small motions of the arms still decay.
+
+        The stiffness of each joint is K = k m, where m is the inertia of the joint. The edge of
+        stability is the least k, in 1/s^2, at which small motions grow. First, the pose with
+        the least edge is found with a constant delay. The edges with the varying delay and in
+        continuous time are then computed in this pose only.
+
+        Returns:
+            The edge values, as described for `ArmGains.edge`. The further entry `used_per_s2`
+            is the k of the tuned gains before the stiffness is divided by the margin.
+        """
+        constant, pose = self.find_least_edge(
+            self.constant_conditions, self._poses, self._least_k
+        )
+
+        varies = self.conditions.varying
+        if varies:
+            delay_s = self.age_s
+        else:
+            link = next(iter(self._scenario.links.values()))
+            delay_s = 1e-3 * link.moments().mean_ms
+        continuous = math.inf
+        if delay_s > 0.0:  # without a delay the loop is passive in continuous time
+            fixed = self.fix_age(delay_s)
+            continuous, _ = self.find_least_edge(
+                loop=fixed,
+                poses=[pose],
+                start=self._least_k,
+                sampled=False,
+            )
+        k = constant
+        if varies:
+            k, _ = self.find_least_edge(self.conditions, [pose], 0.5 * constant)
+
+        lightest, _ = self._find_lightest()
+        damping_factor = 2.0 * self._damping * lightest
+        limit = (self._largest_damping_per_s / damping_factor) ** 2
+        law = self.build_law(k)
+        root = self.find_root(law, pose, self.conditions)
+        limit_with_margin = limit / self._margin**2
+        lower_edge = min(k, constant)
+        # m was fitted to the limit at the least k, up to rounding.
+        tick_rate_bounds = limit_with_margin < 1.001 * max(self._least_k, lower_edge)
+        return {
+            "k_per_s2": k,
+            "constant_per_s2": constant,
+            "continuous_per_s2": finite_or_none(continuous),
+            "limit_per_s2": limit,
+            "used_per_s2": min(lower_edge, limit_with_margin),
+            "omega_rad_s": root.s.imag,
+            "moves": list(root.states),
+            "pose": pose.tolist(),
+            "bound": "tick rate" if tick_rate_bounds else "delay",
+        }
+
+    def trace_edge(self, pose: Array) -> list[tuple[float, float]]:
+        """Computes how the largest stable gains depend on the delay, for a figure.
+
+        For each delay, the result is the least k at which small motions of the sampled control
+        loop grow, where the stiffness of each joint is k times its inertia. The delays are
+        whole numbers of ticks (control periods) on a geometric scale, from one tick up to four
+        times the delay of the loop, but at least up to eight ticks.
+
+        Args:
+            pose: Pose of all arms, shape (n,), in rad or m, for n joints.
+
+        Returns:
+            Pairs of a delay, in s, and the value of k, in 1/s^2.
+        """
+        longest_ticks = max(4.0 * self.age_s * self.rate_hz, 8.0)
+        geometric_ticks = np.geomspace(1.0, longest_ticks, _CURVE_POINTS)
+        delays_ticks = np.round(geometric_ticks)
+        delays_s = np.unique(delays_ticks) / self.rate_hz
+        curve = []
+        for delay_s in delays_s:
+            loop = self.fix_age(delay_s)
+            # Up to k = (2 zeta / delay)^2, even the heaviest mass is stable, see `__init__`. So
+            # the search starts there.
+            stable_k = (2.0 * self._damping / delay_s) ** 2
+            edge_k, _ = self.find_least_edge(loop, [pose], stable_k)
+            curve.append((float(delay_s), edge_k))
+        return curve
+
+    def confirm(
+        self, law: Any, share: float | None, pose: Array, push: Array
+    ) -> dict[str, Any]:
+        """Simulates arms with given gains, to check whether small motions grow as predicted.
+
+        The first arm starts slightly displaced from the pose of the others. The run lasts a few
+        time constants of the slowest motion. As long as it is not clear whether the motions
+        grow or decay, the duration is doubled, up to a limit.
+
+        Args:
+            law: Control law with its gains.
+            share: The gains of `law` as a fraction of the largest stable gains: their parameter
+                k divided by the least k at which motions grow, where the stiffness is k times
+                the inertia. None for the tuned gains. The value is only copied into the result.
+            pose: Pose of all arms, shape (n,), in rad or m, for n joints.
+            push: Displacement of the first arm, shape (n,), in rad or m.
+
+        Returns:
+            The run as an entry of `ArmGains.runs`, with the simulated and the predicted growth
+            rate.
+        """
+        root = self.find_root(law, pose, self.conditions)
+        predicted_per_s = root.s.real
+        sites = {}
+        for n, (name, spec) in enumerate(self._scenario.sites.items()):
+            is_first = n == 0
+            start = pose + push * is_first  # only the first arm is displaced
+            q0_rad = tuple(start.tolist())
+            sites[name] = msgspec.structs.replace(spec, control=law, q0_rad=q0_rad)
+        scenario = msgspec.structs.replace(self._scenario, sites=sites)
+        run = FusedRun(scenario)
+
+        slowest_per_s = max(abs(predicted_per_s), _SETTLES / _LONGEST_S)
+        first_s = max(_SHORTEST_S, _SETTLES / slowest_per_s)
+        durations_s = first_s * 2.0 ** np.arange(_EXTENSIONS)
+        for end_s in durations_s.tolist():
+            run.advance_to(end_s)
+            speeds = [site[:, 1] for site in run.maxima]
+            speed = np.max(speeds, axis=0)
+            t_s = np.arange(len(speed)) / BUCKETS_PER_S
+            floor = _STILL * speed.max()
+            speed_column = speed[:, np.newaxis]
+            fits = fit_envelopes(t_s, speed_column, floor, falls_first=True)
+            fit = fits[0]
+            diverged = run.diverged_s is not None
+            if diverged or fit.trend in _IS_STABLE:
+                break
+
+        stable = False if diverged else _IS_STABLE.get(fit.trend)
+        rate_per_s = None if diverged else finite_or_none(fit.rate_per_s)
+        predicts_decay = predicted_per_s < 0.0
+        return {
+            "share": share,
+            "predicted_per_s": predicted_per_s,
+            "rate_per_s": rate_per_s,
+            "ran_s": run.ran_s,
+            "stable": stable,
+            "agrees": stable is predicts_decay,
+        }
+
+
+def tune_arm(
+    arm: str | Path,
+    delay: str | float,
+    law: str = "p_d",
+    set: Mapping[str, Any] | Sequence[str] = (),  # noqa: A002 - the command's --set, by its name
+    *,
+    tip: str = "",
+    sites: int = 2,
+    rate_hz: int = 1000,
+    margin: float = 2.0,
+    damping: float = 0.7,
+    quantile: float = 1.0,
+    poses: int = 16,
+    seed: int = 1,
+    curve: bool = False,
+    progress: Progress = ignore_progress,
+) -> ArmGains:
+    """Finds the largest gains with which equal arms follow one another stably over a delay.
+
+    The command is `trilat tune`.
+
+    >>> tuned = tn.tune_arm("arm6.urdf", "40ms", poses=2)
+    >>> tuned.agree, len(tuned.joints)
+    (True, 6)
+
+    Args:
+        arm: Path of a URDF, or the name of a shipped file.
+        delay: Delay of each link: a text such as "40ms", a number of ms, a table with the
+            columns t_s,delay_ms, or a log, as in "measured:run.mcap".
+        law: Name of the control law: p_d, pd_d or saturated_pd.
+        set: Overrides of the loop, as in `{"arm.armature_kg_m2": 0.1}`.
+        tip: Name of the end link. Empty stands for the only link without a child.
+        sites: Number of arms: 2, or 3 that follow their two peers equally.
+        rate_hz: Tick rate, in Hz.
+        margin: Factor by which K lies below the edge, and the damping below its sampled-data
+            limit.
+        damping: Damping ratio of the inertia m against a peer that stands still.
+        quantile: Quantile of varying delays for which the edge of a constant delay is computed.
+        poses: Number of random poses within the limits of the joints.
+        seed: Seed of the poses.
+        curve: True to compute the edge as a function of the delay too, for a figure.
+        progress: Function that is called with the number of finished steps and of all steps.
+            The steps are the edge and each run.
+
+    Raises:
+        ScenarioError: The URDF, its tip or an override is not valid.
+        UsageError: Another argument is not valid.
+    """
+    ranges = {
+        "margin": (margin, 1.0, 100.0),
+        "damping": (damping, 0.01, 10.0),
+        "poses": (poses, 1, 1000),
+        "quantile": (quantile, 0.0, 1.0),
+    }
+    for name, (value, low, high) in ranges.items():
+        if not low <= value <= high:
+            raise UsageError(f"{name} must be from {low:g} to {high:g}, not {value:g}")
+
+    link, delay_text = _read_delay(delay)
+    scenario = _build_loop(arm, link, law, set, sites=sites, tip=tip, rate_hz=rate_hz)
+    search = _GainSearch(
+        scenario=scenario,
+        poses=_draw_poses(scenario, poses, seed),
+        margin=margin,
+        damping=damping,
+        quantile=quantile,
+    )
+    edge = search.find_edge()
+    pose = np.array(edge["pose"])
+    tuned_law = search.build_law(edge["used_per_s2"], margin)
+
+    bits = np.random.Philox(seed)
+    random = np.random.Generator(bits)
+    relative_push = random.uniform(0.5, 1.0, len(pose))
+    push = _PUSH * relative_push
+    laws: list[tuple[float | None, Any]] = [(None, tuned_law)]
+    for share in SHARES:
+        law_near_edge = search.build_law(share * edge["k_per_s2"])
+        laws.append((share, law_near_edge))
+    runs = list[dict[str, Any]]()
+    steps = 1 + len(laws)
+    for run_share, run_law in laws:
+        progress(1 + len(runs), steps)
+        run = search.confirm(run_law, run_share, pose, push)
+        runs.append(run)
+
+    gains = {}
+    assignments = []
+    for name in ("K", "Kd", "d"):
+        if name in tuned_law.kind.tune:
+            values = list(getattr(tuned_law, name))
+            gains[name] = values
+            text = msgspec.json.encode(values).decode()
+            assignments.append(f"{name} = {text}")
+    tuned_run = runs[0]
+    tuned_is_stable = tuned_run["stable"] is True
+    agree = tuned_is_stable and all(run["agrees"] for run in runs)
+    return ArmGains(
+        arm=Path(arm).name,
+        law=law,
+        sites=sites,
+        rate_hz=search.rate_hz,
+        delay=delay_text,
+        age_ms=1e3 * search.age_s,
+        margin=margin,
+        damping=damping,
+        joints=_tabulate_joints(scenario, search.inertia, gains),
+        edge=edge,
+        runs=runs,
+        agree=agree,
+        line=f'control = {{ law = "{law}", {", ".join(assignments)} }}',
+        curve=search.trace_edge(pose) if curve else [],
+    )
+
+
+def _tabulate_joints(
+    scenario: Scenario, inertia: Array, gains: Mapping[str, list[float]]
+) -> list[dict[str, Any]]:
+    """Returns one row per joint, see `ArmGains.joints`.
+
+    Args:
+        scenario: Scenario with the arm.
+        inertia: Inertia m of each joint, shape (n,).
+        gains: Values of each gain, one per joint, by the name of the gain.
+    """
+    first_site = scenario.names[0]
+    model = scenario.arms[first_site]
+    errors = np.divide(model.efforts, gains["K"]).tolist()
+    effort_units = model.joint_units("N m")
+    angle_units = model.joint_units("rad")
+    units = zip(effort_units, angle_units, strict=True)
+    columns = {
+        "joint": model.joint_names,
+        "inertia": inertia.tolist(),
+        **gains,
+        "unit": ["/".join(pair) for pair in units],
+        "error_at_effort_limit": [finite_or_none(error) for error in errors],
+    }
+    rows = zip(*columns.values(), strict=True)
+    return [dict(zip(columns, row, strict=True)) for row in rows]

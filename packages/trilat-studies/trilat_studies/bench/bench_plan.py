@@ -1,0 +1,1044 @@
+"""Plans the benchmark of control laws: which law runs in which task, over which link.
+
+The benchmark consists of cells. A cell is one control law in one task over one link (the delay
+and loss between the arms). It runs once per random seed. A task and a link are sets of
+overrides of a scenario that is shipped with the program, so `trilat sim` can reproduce every
+run.
+
+One procedure, `trilat bench --tune`, tunes the gains of all laws and stores them in a file. It
+selects the gains with the smallest error among the choices that also stay stable if all delays
+grow by the factor `TUNING_MARGIN`. A study is a named selection of tasks, laws and links.
+
+The tuning of each law at each round trip is stored as soon as it has finished, so that an
+interrupted tuning continues.
+
+Invariant:
+    - Gains are never set by hand. They come from `trilat bench --tune` only.
+    - Gains carry a fingerprint of the scenario for which they were tuned, and of the motion of
+      the arms under the law. If the fingerprint differs today, the user is told so.
+    - If no tried gains of a law stay stable with longer delays, the law gets no gains and does
+      not run.
+    - A selection that cannot run is refused before the first run.
+"""
+
+import hashlib
+import json
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+
+from trilat_net.errors import UsageError, suggest_nearest
+from trilat_net.files import write_whole
+from trilat_net.laws.six_channel import complementary_shares
+from trilat_net.scenario.laws import BUILT_IN
+from trilat_net.scenario.resolve import GRID_LOSSES_PERCENT, GRID_ROUND_TRIPS_MS
+from trilat_net.work.executor import Progress, Workers, ignore_progress
+from trilat_net.work.study_folder import format_toml_value
+
+from ..tuning.candidate import (
+    CandidateClass,
+    TuningScenario,
+    load_tuning_scenario,
+    measure_candidate,
+)
+from ..tuning.search_space import SEARCH_SPACES, ModelInformation, SearchSpace
+from ..tuning.tuning_plan import CandidateSearch, plan_tuning
+
+Settings = Mapping[str, Any]
+"""Overrides of a scenario by key."""
+
+BASES = {"three": "_bench_three", "two": "_bench_two", "level": "_bench_two"}
+"""Name of the scenario of each form of the suite.
+
+The form "three" has two masters and a slave, "two" has a master and a slave. The form "level"
+has the same two sites, but the arms lie in a level plane, so gravity does not act on them.
+"""
+_OUT = (-0.4557864690179811, 1.3957985827210313)
+"""Joint angles in rad at which the end effector is 0.30 m further out than at the start.
+
+Its height is that of the start.
+"""
+_LESS_OUT = (-0.4901506797631161, 1.484043235051833)
+"""Joint angles in rad at which the end effector is only 0.24 m further out.
+
+In contact, the pose is 0.09 m behind the wall, compared to 0.15 m for `_OUT`.
+"""
+_LEFT = (-0.4, 1.8)
+"""Joint angles in rad to which the first of two users moves."""
+_RIGHT = (-0.8, 1.8)
+"""Joint angles in rad to which the second of two users moves."""
+_HAND = {"kind": "spring", "stiffness_nm_rad": 50.0, "damping_nm_s_rad": 5.0}
+"""Scenario table of an operator that pulls an arm with a spring and a damper."""
+_WALL = {
+    "kind": "wall",
+    "point_m": [1.3376933693863516, 0.0],
+    "normal": [-1.0, 0.0],
+    "stiffness_n_m": 2000.0,
+}
+_CUT_S = (2.0, 5.0)
+"""Start and end of the outage in the task `outage`, in s."""
+_BURST_SAMPLES = 100.0
+"""Mean number of samples that are lost in succession."""
+_FIRST = 0.75
+"""Parameter a of the dominance factors that lets the first user lead, as before a handover."""
+_SECOND = 0.25
+"""Parameter a of the dominance factors that lets the second user lead, as after a handover."""
+
+
+def _build_hand(
+    to_rad: Sequence[float], move_start_s: float = 1.0, **keys: Any
+) -> dict[str, Any]:
+    """Returns the scenario table of an operator that moves an arm to a pose within 2 s.
+
+    Args:
+        to_rad: Joint angles of the pose, in rad.
+        move_start_s: Time at which the motion starts, in s.
+        keys: Further keys of the table.
+    """
+    return {
+        **_HAND,
+        "to_rad": list(to_rad),
+        "move_start_s": move_start_s,
+        "move_end_s": move_start_s + 2.0,
+        **keys,
+    }
+
+
+def _build_dominance(a: float) -> dict[str, dict[str, float]]:
+    """Returns the scenario table of the dominance factors of two users and a slave.
+
+    A dominance factor is the weight with which an arm follows another arm.
+
+    Args:
+        a: Dominance factor of the first user over the slave. The second user has 1 - a.
+
+    Returns:
+        The factors other than 0, by the name of the arm and by the name of the arm that it
+        follows.
+    """
+    names = ("m1", "m2", "s")
+    dominance = {}
+    for name, row in zip(names, complementary_shares(a).tolist(), strict=True):
+        factors_by_peer = zip(names, row, strict=True)
+        dominance[name] = {peer: factor for peer, factor in factors_by_peer if factor}
+    return dominance
+
+
+class BenchTask(NamedTuple):
+    """A task of the benchmark: what the operators do, and what the slave arm touches.
+
+    Attributes:
+        about: Description of the task for the user.
+        settings: Overrides of a shipped scenario. With them, the scenario describes the task.
+        users: Number of users that the task needs.
+        cut_s: Time interval, in s, during which the slave arm has no connection to any other
+            arm. None if no connection fails.
+        duration_s: Time from the start over which errors and efforts are measured, in s. A run
+            lasts at least as long.
+        gravity: Factor by which the gravity parameters that the laws get differ from the true
+            ones.
+    """
+
+    about: str
+    settings: Settings
+    users: int = 1
+    cut_s: tuple[float, float] | None = None
+    duration_s: float = 20.0
+    gravity: float = 1.0
+
+
+_HANDOVER: dict[str, Any] = {
+    "sites.m1.hands": [_build_hand(_LEFT, end_s=8.0)],
+    "sites.m2.hands": [_build_hand(_RIGHT, 10.0, from_rad=list(_LEFT), start_s=8.0)],
+    "dominance": _build_dominance(_FIRST),
+    "timeline": [
+        {"at_s": 7.0, "dominance": site, "to": row, "ramp_s": 2.0}
+        for site, row in _build_dominance(_SECOND).items()
+    ],
+}
+TASKS = {
+    "free": BenchTask(
+        "a user moves the slave by 0.3 m", {"sites.m1.hands": [_build_hand(_OUT)]}
+    ),
+    "contact": BenchTask(
+        "as free, but after half of the way the slave meets a wall of 2000 N/m",
+        {"sites.m1.hands": [_build_hand(_OUT)], "sites.s.environment": [_WALL]},
+    ),
+    "handover": BenchTask(
+        "the first user lets go while dominance passes to the second",
+        _HANDOVER,
+        users=2,
+        duration_s=24.0,
+    ),
+    "disagree": BenchTask(
+        "two users hold poses 0.4 rad apart; the first user leads",
+        {
+            "sites.m1.hands": [_build_hand(_LEFT)],
+            "sites.m2.hands": [_build_hand(_RIGHT)],
+            "dominance": _build_dominance(_FIRST),
+        },
+        users=2,
+    ),
+    "outage": BenchTask(
+        "during free motion, all links of the slave fail for 3 s",
+        {"sites.m1.hands": [_build_hand(_OUT)]},
+        cut_s=_CUT_S,
+    ),
+    "gravity-90": BenchTask(
+        "as free, but the laws get 90 % of the true gravity parameters",
+        {"sites.m1.hands": [_build_hand(_OUT)]},
+        gravity=0.9,
+    ),
+}
+
+
+def _build_constant_links() -> dict[str, Settings]:
+    """Returns the links with a constant delay, with and without losses.
+
+    Returns:
+        The keys of each link, by a name such as "rtt68-loss50": a round trip of 68 ms, in which
+        half of the samples are lost.
+    """
+    links: dict[str, Settings] = {}
+    for percent in GRID_LOSSES_PERCENT:
+        for rtt_ms in GRID_ROUND_TRIPS_MS:
+            name = f"rtt{rtt_ms}"
+            keys: dict[str, Any] = {"model": "constant", "delay_ms": rtt_ms / 2}
+            if percent:
+                name += f"-loss{percent}"
+                # at 1 kHz a single lost sample costs a site only one tick
+                keys |= {"loss": percent / 100, "loss_burst": _BURST_SAMPLES}
+            links[name] = keys
+    return links
+
+
+LINKS: dict[str, Settings] = _build_constant_links()
+"""Keys of all links, by name. Losses come in bursts of 0.1 s."""
+LINKS |= {name: {"preset": name} for name in ("4g", "5g", "geo")}
+LINKS["trace"] = {"model": "trace", "file": "busy_machine.csv", "at_end": "loop"}
+
+_MEAN_MS = {"geo": 300.0}
+"""Mean one-way delays, in ms, of presets with long delays.
+
+Over these links `ROUND_TRIPS` round trips take longer than the tasks, so the runs are longer.
+"""
+
+SHORTER_REACH: Settings = {"sites.m1.hands": [_build_hand(_LESS_OUT)]}
+"""Overrides that give the task `contact` a shorter reach.
+
+The stiffness at the hand follows from the difference between both reaches.
+"""
+
+EQUAL_LAWS = {"six_channel": "four_channel"}
+"""Laws that the suite leaves out, and the law of the suite that computes the same torque.
+
+`six_channel` is `four_channel` with a check that the dominance factors follow from one factor.
+The factors of all tasks do, because a task has the same factors for all laws. With other
+factors, `six_channel` would be another task and not another law.
+"""
+_ROLES = ("master", "master", "slave")
+_TUNED_LAWS = {
+    name: law for name, law in BUILT_IN.items() if law.tune and name not in EQUAL_LAWS
+}
+LAWS_OF_ANY = tuple(name for name, law in _TUNED_LAWS.items() if not law.explain_misfit(_ROLES))
+"""Names of the tuned laws that fit two users and a slave."""
+LAWS_OF_TWO = tuple(name for name in _TUNED_LAWS if name not in LAWS_OF_ANY)
+"""Names of the tuned laws that fit two sites only."""
+TUNED_ROUND_TRIPS_MS = (68, 272, 1088)
+"""Round trips at which every law is tuned, in ms."""
+TUNING_TASK = "contact"
+"""The task in which laws are tuned.
+
+The tuning also runs it without the wall, as free motion.
+"""
+_OTHER_TUNING_TASKS = {("three", "sync"): "free"}
+"""Laws that are tuned in another task, by the form of the suite and the name of the law.
+
+Under gravity the arms of `sync` rest at q = 0 only. The wall keeps the slave away from it, so
+no gains come to rest in `contact`.
+"""
+
+
+class BenchStudy(NamedTuple):
+    """A named part of the benchmark: a selection of tasks, control laws and links.
+
+    The study runs every law in every task over every link, except where a law does not fit a
+    task.
+
+    Attributes:
+        about: Purpose of the study.
+        tasks: Names of the tasks.
+        laws: Names of the control laws. The keys name the kind of scenario in which the laws
+            run, such as "two" for two arms, and are keys of `BASES`.
+        links: Names of the links, keys of `LINKS`.
+        seeds: Number of runs of a law in a task over a link with random delays or losses. Over
+            a link without randomness, the law runs once.
+    """
+
+    about: str
+    tasks: tuple[str, ...]
+    laws: Mapping[str, tuple[str, ...]]
+    links: tuple[str, ...]
+    seeds: int
+
+
+_ALL_LAWS = {"three": LAWS_OF_ANY, "two": LAWS_OF_TWO}
+_GRID = tuple(name for name in LINKS if name.startswith("rtt"))
+_LOSSY = ("rtt68-loss50", "rtt136-loss50", "rtt544-loss50")
+_COARSE = tuple(name for name in LINKS if "-loss" not in name or name in _LOSSY)
+FULL_SEEDS = 1
+"""Runs over a random link in the large studies: two cores then take about an hour."""
+STUDIES = {
+    "full": BenchStudy(
+        about="all laws in all tasks",
+        tasks=tuple(TASKS),
+        laws=_ALL_LAWS,
+        links=_COARSE,
+        seeds=FULL_SEEDS,
+    ),
+    "small": BenchStudy(
+        about="all laws in all tasks, over three links",
+        tasks=tuple(TASKS),
+        laws=_ALL_LAWS,
+        links=("rtt68", "rtt136-loss50", "4g"),
+        seeds=2,
+    ),
+    "round-trips": BenchStudy(
+        about="after Rodriguez-Seda, Lee and Spong (2009): wave variables, a Smith predictor, "
+        "synchronisation, and P+d with its relatives, between two level arms, over a grid of "
+        "round trips and losses",
+        tasks=("free", "contact"),
+        laws={"level": ("wave", "smith", "sync", "adaptive", "p_d", "pd_d", "lee_spong")},
+        links=_GRID,
+        seeds=FULL_SEEDS,
+    ),
+}
+
+
+ROUND_TRIPS = 40
+"""Least duration of a run, in round trips of its link."""
+
+
+def build_settings(form: str, task: str, link: str, seed: int | None = None) -> dict[str, Any]:
+    """Returns the scenario overrides for a run of the benchmark, apart from the control law.
+
+    The overrides turn one of the shipped scenarios into the requested task over the requested
+    link. They also set a duration of at least `ROUND_TRIPS` round trips of the link.
+
+    Args:
+        form: Kind of shipped scenario, a key of `BASES`. It determines the number of arms and
+            whether gravity acts on them.
+        task: Name of the task, a key of `TASKS`.
+        link: Name of the delay and loss between the arms, a key of `LINKS`.
+        seed: Seed of the run. None keeps the seed of the scenario.
+    """
+    bench_task = TASKS[task]
+    link_keys = dict(LINKS[link])
+    delay_ms = link_keys.get("delay_ms", _MEAN_MS.get(link, 0.0))
+    # 2e-3: a round trip is two delays, which are in ms
+    round_trips_s = 2e-3 * ROUND_TRIPS * delay_ms
+    settings = {
+        **bench_task.settings,
+        "link": link_keys,
+        "duration_s": max(bench_task.duration_s, round_trips_s),
+    }
+
+    if bench_task.cut_s is not None:
+        link_keys["outages_s"] = [list(bench_task.cut_s)]
+        if form == "three":
+            # the outage is that of the slave: the users still receive each other
+            settings["links.m1->m2.outages_s"] = []
+            settings["links.m2->m1.outages_s"] = []
+    if form == "level":
+        settings["arm.g_m_s2"] = 0.0
+    if seed is not None:
+        settings["seed"] = seed
+    return settings
+
+
+GAINS_FILE = Path(str(resources.files("trilat_studies.bench") / "bench_gains.json"))
+"""File of the tuned gains, which is part of the program."""
+KNOWLEDGE = ModelInformation()
+"""What the laws know about the arms while they are tuned: gravity exactly, for all laws."""
+TUNING_BUDGET = 16
+"""Number of candidates per gain of a law, at each round trip."""
+TUNING_MARGIN = 1.5
+"""Factor by which delays may grow without making the selected gains unstable."""
+MARGIN_LENGTHS = 3.0
+"""Factor by which the run with longer delays is longer than the tuning run.
+
+Without it, a law that comes to rest slowly would appear to be unstable.
+"""
+
+
+class TunedGains(msgspec.Struct, frozen=True):
+    """The gains of a law in a form of the suite, tuned at one round trip.
+
+    The procedure tries `tried` candidates. Of those that come to rest at the pose of the task,
+    and still do so when delays grow by `TUNING_MARGIN`, it selects the candidate with the
+    smallest error.
+
+    Attributes:
+        form: Kind of scenario in which the law runs, a key of `BASES`.
+        law: Name of the control law.
+        round_trip_ms: The round trip, in ms.
+        gains: The selected gains by name. Empty if no candidate had the margin.
+        settled: Number of candidates that came to rest at the pose.
+        tried: Number of all candidates.
+        passed: Number of candidates that came to rest with a smaller error than the selected
+            candidate, but lack the margin.
+        error_rad: Error of the selected candidate, in rad. None if no candidate was selected.
+        effort_nm: Effort of the selected candidate, in N m. None if no candidate was selected.
+        fingerprint: Fingerprint of the scenario and of the law, see `fingerprint_tuning`.
+    """
+
+    form: str
+    law: str
+    round_trip_ms: int
+    gains: dict[str, float]
+    settled: int
+    tried: int
+    passed: int
+    error_rad: float | None
+    effort_nm: float | None
+    fingerprint: str
+
+    @property
+    def key(self) -> tuple[str, str, int]:
+        """Identifier of these gains in the file of all tuned gains.
+
+        It consists of the kind of scenario (`form`), the name of the control law, and the round
+        trip of the links in ms.
+        """
+        return self.form, self.law, self.round_trip_ms
+
+    def __str__(self) -> str:
+        return f"{self.law} ({self.form}, {self.round_trip_ms} ms)"
+
+
+def format_settings(settings: Settings) -> list[str]:
+    """Converts overrides to strings KEY=VALUE, in the form that the command line accepts.
+
+    Args:
+        settings: Values by key of the scenario.
+    """
+    return [f"{key}={format_toml_value(value)}" for key, value in settings.items()]
+
+
+def load_tuning_task(form: str, law: str, round_trip_ms: int) -> TuningScenario:
+    """Loads the scenario in which the benchmark tunes a control law for a round trip.
+
+    Args:
+        form: Kind of scenario, a key of `BASES`, such as "two" for two arms.
+        law: Name of the control law. The scenario does not contain it yet.
+        round_trip_ms: Round trip of the links between the arms, in ms.
+    """
+    task = _OTHER_TUNING_TASKS.get((form, law), TUNING_TASK)
+    settings = build_settings(form, task, f"rtt{round_trip_ms}")
+    return load_tuning_scenario(BASES[form], format_settings(settings))
+
+
+TUNING_VERSION = 2
+"""Number of the procedure. Gains that an earlier procedure has tuned are out of date.
+
+Since the second procedure, a law may define its own objective.
+"""
+
+
+def _probe_law(task: TuningScenario, space: SearchSpace) -> str:
+    """Returns the error and the effort of a law in a tuning task, with gains that never change.
+
+    They tell whether the law still moves the arms as it did when its gains were tuned. The text
+    of its source code would not do: it also changes when a sentence, a name or an import does.
+
+    Args:
+        task: The task in which the law was tuned.
+        space: The law and the ranges of its gains. Each gain has the middle of its range, on a
+            logarithmic scale if the range does not begin at zero.
+    """
+    gains = {
+        knob.name: math.sqrt(knob.low * knob.high) if knob.low > 0 else 0.5 * knob.high
+        for knob in space.knobs
+    }
+    score = measure_candidate(*task.with_gains(space, KNOWLEDGE, gains).texts)
+    if score.error_rad is None or score.effort_nm is None:  # the run diverged
+        return f"{score.outcome.name} at {score.diverged_s} s"
+    return f"{score.outcome.name}: {score.error_rad:.9g} rad, {score.effort_nm:.9g} N m"
+
+
+@cache
+def fingerprint_tuning(form: str, law: str, round_trip_ms: int) -> str:
+    """Returns a digest of everything on which tuned gains depend.
+
+    These are the scenario, the motion under the law, the ranges in which its gains are
+    searched, and the procedure. If stored gains have another fingerprint, they were tuned for
+    another experiment or another version of the law.
+
+    Args:
+        form: Kind of scenario in which the law runs, a key of `BASES`.
+        law: Name of the control law.
+        round_trip_ms: Round trip of the tuning, in ms.
+    """
+    space = SEARCH_SPACES[law]
+    task = load_tuning_task(form, law, round_trip_ms)
+    ranges = json.dumps([knob._asdict() for knob in space.knobs])
+    procedure = f"{TUNING_VERSION} {TUNING_BUDGET} {TUNING_MARGIN} {MARGIN_LENGTHS}"
+    content = "\0".join([task.scenario.text, _probe_law(task, space), ranges, procedure])
+    return hashlib.sha256(content.encode()).hexdigest()[:16]
+
+
+def read_gains(path: Path = GAINS_FILE) -> dict[tuple[str, str, int], TunedGains]:
+    """Reads gains that were tuned before from a file.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The gains by form, law and round trip in ms. Empty if there is no file.
+    """
+    if not path.exists():
+        return {}
+    entries = msgspec.json.decode(path.read_bytes(), type=list[TunedGains])
+    return {gains.key: gains for gains in entries}
+
+
+def find_stale(entries: Iterable[TunedGains]) -> list[str]:
+    """Lists the tuned gains that are out of date.
+
+    They are those whose law or scenario has changed since they were tuned, see
+    `fingerprint_tuning`.
+
+    Args:
+        entries: The gains to check.
+
+    Returns:
+        A string for each, such as "wave (three, 68 ms)". Empty if all are up to date.
+    """
+    return [
+        str(gains) for gains in entries if fingerprint_tuning(*gains.key) != gains.fingerprint
+    ]
+
+
+def choose_round_trip(mean_ms: float) -> int:
+    """Returns the tuned round trip, in ms, whose gains a link with a given round trip uses.
+
+    It is the shortest tuned round trip that is not shorter than that of the link. A link that
+    is longer than all of them uses the longest.
+
+    Args:
+        mean_ms: Mean round trip of the link, in ms.
+    """
+    for tuned_ms in TUNED_ROUND_TRIPS_MS:
+        if tuned_ms >= mean_ms:
+            return tuned_ms
+    return TUNED_ROUND_TRIPS_MS[-1]
+
+
+def _has_margin(form: str, round_trip_ms: int, search: CandidateSearch, candidate: int) -> bool:
+    """Returns True if a candidate comes to rest at the pose even if delays are longer.
+
+    Delays are multiplied by `TUNING_MARGIN`, and the run lasts `MARGIN_LENGTHS` times as long.
+
+    Args:
+        form: Kind of scenario in which the law runs, a key of `BASES`.
+        round_trip_ms: Round trip of the tuning, in ms.
+        search: The search that tried the candidate.
+        candidate: Index of the candidate in the search. Its gains are used unchanged.
+    """
+    base = load_tuning_task(form, search.space.law, round_trip_ms)
+    controls = search.space.controls(base.scenario, KNOWLEDGE, search.tried[candidate])
+    longer_delays = {
+        "link.delay_ms": 0.5 * TUNING_MARGIN * round_trip_ms,
+        "duration_s": MARGIN_LENGTHS * base.scenario.duration_s,
+    }
+    overrides = (*base.overrides, *format_settings(longer_delays))
+    experiment = load_tuning_scenario(base.source, overrides).with_controls(controls)
+    score = measure_candidate(*experiment.texts)
+    return score.outcome is CandidateClass.SETTLED
+
+
+def tune_laws(
+    laws_by_form: Mapping[str, Sequence[str]],
+    jobs: int | None = None,
+    on: Workers = None,
+    progress: Progress = ignore_progress,
+    budget: int = TUNING_BUDGET,
+    known: Iterable[TunedGains] = (),
+    store: Callable[[TunedGains], None] = lambda _: None,
+) -> list[TunedGains]:
+    """Tunes control laws for the benchmark, at each of several round trips of the links.
+
+    The round trips are `TUNED_ROUND_TRIPS_MS`. Gains that are known and up to date are not
+    tuned again, so that an interrupted tuning continues.
+
+    Args:
+        laws_by_form: Names of the laws to tune, by the kind of scenario in which they run, such
+            as "two" for two arms. The keys are keys of `BASES`.
+        jobs: Number of processes, as for `trilat_net.tune`.
+        on: Cluster that tries the gains, as for `trilat_net.tune`.
+        progress: Function that is called with the number of finished tunings and of all
+            tunings.
+        budget: Number of choices of gains to try, per gain of a law. A law with three gains
+            gets three times this number.
+        known: Gains that were tuned before. Those that are out of date are ignored.
+        store: Function that is called with the gains of each law at each round trip as soon as
+            they are tuned. It is not called for known gains.
+
+    Returns:
+        The gains of every law at every round trip.
+    """
+    known_by_key = {gains.key: gains for gains in known if not find_stale([gains])}
+    tuned: list[TunedGains] = []
+    total = len(TUNED_ROUND_TRIPS_MS) * sum(map(len, laws_by_form.values()))
+    for form, laws in laws_by_form.items():
+        for round_trip_ms in TUNED_ROUND_TRIPS_MS:
+            for law in laws:
+                gains = known_by_key.get((form, law, round_trip_ms))
+                if gains is None:
+                    gains = _tune_law(form, law, round_trip_ms, jobs, on, budget)
+                    store(gains)
+                tuned.append(gains)
+                progress(len(tuned), total)
+    return tuned
+
+
+def _tune_law(
+    form: str, law: str, round_trip_ms: int, jobs: int | None, on: Workers, budget: int
+) -> TunedGains:
+    """Tunes a law at one round trip.
+
+    Args:
+        form: Kind of scenario in which the law runs, a key of `BASES`.
+        law: Name of the law.
+        round_trip_ms: Round trip of the links, in ms.
+        jobs: Number of processes.
+        on: Cluster that tries the gains.
+        budget: Number of choices of gains to try, per gain of the law.
+    """
+    base = load_tuning_task(form, law, round_trip_ms)
+    gain_count = len(SEARCH_SPACES[law].knobs)
+    plan = plan_tuning(
+        base.source,
+        base.overrides,
+        laws=[law],
+        budget=gain_count * budget,
+    )
+    (search,) = plan.run(jobs, on=on).found
+    return _select_gains(form, round_trip_ms, search)
+
+
+def _select_gains(form: str, round_trip_ms: int, search: CandidateSearch) -> TunedGains:
+    """Selects the gains of a search: the smallest error among the candidates with the margin.
+
+    Args:
+        form: Kind of scenario in which the law runs, a key of `BASES`.
+        round_trip_ms: Round trip of the tuning, in ms.
+        search: The finished search of one law.
+    """
+    law = search.space.law
+    scores = search.scores
+    settled = [n for n, score in enumerate(scores) if score.outcome is CandidateClass.SETTLED]
+    settled.sort(key=lambda n: scores[n].error_rad or 0.0)
+
+    # The margin costs another run, so it is checked in the order of the errors until a
+    # candidate has it.
+    selected = None
+    passed = 0
+    for candidate in settled:
+        if _has_margin(form, round_trip_ms, search, candidate):
+            selected = candidate
+            break
+        passed += 1
+
+    return TunedGains(
+        form=form,
+        law=law,
+        round_trip_ms=round_trip_ms,
+        gains={} if selected is None else search.tried[selected],
+        settled=len(settled),
+        tried=len(search.tried),
+        passed=passed,
+        error_rad=None if selected is None else scores[selected].error_rad,
+        effort_nm=None if selected is None else scores[selected].effort_nm,
+        fingerprint=fingerprint_tuning(form, law, round_trip_ms),
+    )
+
+
+def write_gains(tuned: Sequence[TunedGains], path: Path = GAINS_FILE) -> None:
+    """Writes tuned gains into a file, and keeps the other gains of the file.
+
+    Args:
+        tuned: The gains to write. They replace gains in the file that were tuned for the same
+            kind of scenario, the same control law and the same round trip.
+        path: The file, in JSON.
+    """
+    entries = read_gains(path)
+    for gains in tuned:
+        entries[gains.key] = gains
+    rows = [json.dumps(msgspec.to_builtins(entries[key])) for key in sorted(entries)]
+    write_whole(path, "[\n" + ",\n".join(rows) + "\n]\n")
+
+
+MAX_BENCH_SEEDS = 1000
+"""Largest number of seeds that a user may request."""
+
+
+class BenchCell(NamedTuple):
+    """A cell of the suite: a control law in a task over a link, with its gains and seeds.
+
+    The suite compares control laws in several tasks and over links with different delays and
+    losses.
+
+    Attributes:
+        task: A key of `TASKS`.
+        law: Name of the control law.
+        link: A key of `LINKS`.
+        form: Kind of scenario in which the law runs, a key of `BASES`.
+        tuned: Gains of the law for this link.
+        seeds: Seeds of the runs, one run each.
+    """
+
+    task: str
+    law: str
+    link: str
+    form: str
+    tuned: TunedGains
+    seeds: tuple[int, ...]
+
+    @property
+    def name(self) -> str:
+        """Name of the cell in results, as in "contact/wave/rtt272"."""
+        return f"{self.task}/{self.law}/{self.link}"
+
+    @property
+    def inputs(self) -> str:
+        """Digest of everything that determines these runs: base scenario, task, link and gains.
+
+        Stored runs with another digest are out of date and are not used.
+        """
+        parts = (
+            _load_base_text(self.form),
+            build_settings(self.form, self.task, self.link),
+            TASKS[self.task].gravity,
+            self.tuned,
+        )
+        return hashlib.sha256(repr(parts).encode()).hexdigest()[:12]
+
+    @property
+    def key(self) -> str:
+        """Name of this law, task and link in the journal of finished runs.
+
+        The name contains the digest `inputs` of the scenario and the gains. Therefore runs with
+        other gains are not mistaken for these runs.
+        """
+        return f"{self.name} {self.inputs}"
+
+    def build(self, seed: int) -> TuningScenario:
+        """Returns the scenario of one run: a law with its tuned gains in a task over a link.
+
+        Args:
+            seed: Seed of the run.
+        """
+        settings = build_settings(self.form, self.task, self.link, seed)
+        base = load_tuning_scenario(BASES[self.form], format_settings(settings))
+        knowledge = ModelInformation(TASKS[self.task].gravity)
+        return base.with_gains(SEARCH_SPACES[self.law], knowledge, self.tuned.gains)
+
+
+class BenchPlan(NamedTuple):
+    """All runs of a benchmark of control laws, or of a selected part, ready to be executed.
+
+    Attributes:
+        study: Name of the study, which is a selection of tasks, laws and links.
+        cells: The combinations of a task, a control law and a link that run, in the order in
+            which they run.
+        laws: Pairs of a selected law and the kind of scenario in which it runs (a key of
+            `BASES`). A law without any run still has a row in the tables, without numbers.
+        without: Tunings of selected laws that found no stable gains. These laws do not run over
+            the links for which they were tuned there.
+    """
+
+    study: str
+    cells: list[BenchCell]
+    laws: Sequence[tuple[str, str]]
+    without: Sequence[TunedGains] = ()
+
+    @property
+    def tasks(self) -> list[str]:
+        """Names of the tasks that run in the benchmark, each once, in running order."""
+        return list(dict.fromkeys(cell.task for cell in self.cells))
+
+    @property
+    def links(self) -> list[str]:
+        """Names of the links over which the benchmark runs, each once, in running order."""
+        return list(dict.fromkeys(cell.link for cell in self.cells))
+
+    @property
+    def runs(self) -> int:
+        """Number of runs of all cells."""
+        return sum(len(cell.seeds) for cell in self.cells)
+
+    def cell(self, name: str) -> BenchCell:
+        """Returns the cell with a name.
+
+        Args:
+            name: Name of the cell, as in "contact/wave/rtt272": task, law and link.
+
+        Raises:
+            UsageError: No cell has that name.
+        """
+        cells = {cell.name: cell for cell in self.cells}
+        if name not in cells:
+            hint = suggest_nearest(name, list(cells)) or f"; the first is {next(iter(cells))}"
+            raise UsageError(f"there is no cell {name!r}{hint}")
+        return cells[name]
+
+
+@cache
+def _load_base_text(form: str) -> str:
+    """Returns the TOML text of a form's scenario, with all defaults written out."""
+    return load_tuning_scenario(BASES[form]).scenario.text
+
+
+def plan_bench(
+    study: str = "full",
+    *,
+    tasks: Sequence[str] = (),
+    laws: Sequence[str] = (),
+    links: Sequence[str] = (),
+    seeds: int | None = None,
+) -> BenchPlan:
+    """Plans a study of the suite, or a part of it.
+
+    Args:
+        study: A key of `STUDIES`.
+        tasks: Names of the selected tasks. Empty selects all tasks of the study.
+        laws: Names of the selected laws. Empty selects all laws of the study.
+        links: Names of the selected links, which may be any keys of `LINKS`. Empty selects all
+            links of the study.
+        seeds: Number of seeds. None uses the number of the study.
+
+    Returns:
+        The checked plan, ready to run.
+
+    Raises:
+        UsageError: A name is unknown, a law has not been tuned, or no cell can run.
+    """
+    bench_study = STUDIES[_check_name("study", study, list(STUDIES))]
+    if seeds is None:
+        seeds = bench_study.seeds
+    elif not 1 <= seeds <= MAX_BENCH_SEEDS:
+        raise UsageError(f"--seeds must be a number from 1 to {MAX_BENCH_SEEDS}, not {seeds}")
+    all_laws = [law for form_laws in bench_study.laws.values() for law in form_laws]
+    for law in laws:
+        if law in EQUAL_LAWS:
+            equal = EQUAL_LAWS[law]
+            raise UsageError(
+                f"--law: {law} computes the torque of {equal} in all tasks of the suite; "
+                f"choose {equal}"
+            )
+    tasks = _select_names("task", tasks, default=bench_study.tasks)
+    laws = _select_names("law", laws, default=all_laws)
+    links = _select_names("link", links, default=bench_study.links, known=list(LINKS))
+
+    tuned_cells = list(
+        _list_cells(study=bench_study, tasks=tasks, laws=laws, links=links, seeds=seeds)
+    )
+    cells = [cell for cell in tuned_cells if cell.tuned.gains]
+    # by name, so that gains that several cells share are listed once
+    without = {str(cell.tuned): cell.tuned for cell in tuned_cells if not cell.tuned.gains}
+    if not cells:
+        raise UsageError(_explain_no_cells(tasks, laws, list(without)))
+
+    rows = []
+    for form, form_laws in bench_study.laws.items():
+        rows += [(law, form) for law in form_laws if law in laws]
+    return BenchPlan(study, cells, rows, list(without.values()))
+
+
+def _explain_no_cells(tasks: Sequence[str], laws: Sequence[str], without: list[str]) -> str:
+    """Returns the error text for a selection of which no cell can run.
+
+    Args:
+        tasks: Names of the selected tasks.
+        laws: Names of the selected laws.
+        without: Tunings of these laws that found no gains. Empty if the laws do not fit the
+            tasks.
+    """
+    law_names = ", ".join(laws)
+    if without:
+        return (
+            f"{law_names}: no candidate was stable for {', '.join(without)}; "
+            "choose another link or law"
+        )
+    return (
+        f"{law_names} cannot run in {', '.join(tasks)}: two users, a handover or wrong gravity "
+        "parameters are more than the law supports; choose another task or law"
+    )
+
+
+NO_GAINS = "no gains"
+"""Reason for a missing cell: the tuning of the law found no gains."""
+
+
+def explain_no_cell(law: str, form: str, task: str) -> str:
+    """Returns why the benchmark has no run of a control law in a task, as the tables print it.
+
+    Args:
+        law: Name of the control law.
+        form: Kind of scenario in which the law runs, a key of `BASES`. For example, the form
+            "three" has two users and a slave arm, and the form "two" has a single user.
+        task: Name of the task, a key of `TASKS`.
+
+    Returns:
+        - "-" if the task needs two users, and the form has a single user.
+        - "no handover" if one user hands the control over to the other in this task, and the
+          law cannot change how much each user leads.
+        - "exact model" if the gravity parameters are wrong in this task, and the law takes the
+          exact model of the arm instead.
+        - `NO_GAINS` otherwise. In this case, the tuning of the law found no stable gains.
+    """
+    bench_task = TASKS[task]
+    if bench_task.users > 1 and form != "three":
+        return "-"
+    if "timeline" in bench_task.settings and BUILT_IN[law].Settings.fixed_shares:
+        return "no handover"
+    if bench_task.gravity != 1.0 and not _gets_gravity(form, law):
+        return "exact model"
+    return NO_GAINS
+
+
+@cache
+def _gets_gravity(form: str, law: str) -> bool:
+    """Returns True if the settings of a law depend on the gravity parameters that it gets.
+
+    Args:
+        form: Kind of scenario in which the law runs, a key of `BASES`.
+        law: Name of the control law.
+    """
+    space = SEARCH_SPACES[law]
+    scenario = load_tuning_scenario(BASES[form]).scenario
+    gains = {knob.name: knob.low for knob in space.knobs}
+    exact = space.controls(scenario, KNOWLEDGE, gains)
+    return space.controls(scenario, ModelInformation(0.9), gains) != exact
+
+
+def _list_cells(
+    study: BenchStudy,
+    tasks: Sequence[str],
+    laws: Sequence[str],
+    links: Sequence[str],
+    seeds: int,
+) -> Iterator[BenchCell]:
+    """Yields the cells of the selected tasks, laws and links, with or without gains.
+
+    Tasks that a law does not fit are left out.
+
+    Args:
+        study: The study.
+        tasks: Names of the selected tasks.
+        laws: Names of the selected laws.
+        links: Names of the selected links.
+        seeds: Number of runs of a cell whose link is random. Any other cell runs once.
+
+    Raises:
+        UsageError: A law has not been tuned for one of the links.
+    """
+    gains = read_gains()
+    link_properties = {link: _analyse_link(link) for link in links}
+    for form, form_laws in study.laws.items():
+        for law in form_laws:
+            if law not in laws:
+                continue
+            for task in tasks:
+                if explain_no_cell(law, form, task) != NO_GAINS:
+                    continue
+                for link, (is_random, mean_ms) in link_properties.items():
+                    run_count = seeds if is_random else 1
+                    yield BenchCell(
+                        task=task,
+                        law=law,
+                        link=link,
+                        form=form,
+                        tuned=_find_gains(gains, form, law, mean_ms),
+                        seeds=tuple(range(1, 1 + run_count)),
+                    )
+
+
+def _find_gains(
+    gains: Mapping[tuple[str, str, int], TunedGains], form: str, law: str, delay_ms: float
+) -> TunedGains:
+    """Returns the gains of a law for a link.
+
+    Args:
+        gains: All tuned gains, by form, law and round trip in ms.
+        form: Kind of scenario in which the law runs, a key of `BASES`.
+        law: Name of the control law.
+        delay_ms: Mean one-way delay of the link, in ms.
+
+    Raises:
+        UsageError: The law has not been tuned at that delay.
+    """
+    round_trip_ms = choose_round_trip(2.0 * delay_ms)
+    tuned = gains.get((form, law, round_trip_ms))
+    if tuned is None:
+        raise UsageError(
+            f"{law} has no gains for a round trip of {round_trip_ms} ms; tune the law with: "
+            f"trilat bench --tune --law {law}"
+        )
+    return tuned
+
+
+def _analyse_link(link: str) -> tuple[bool, float]:
+    """Determines if a link draws random numbers, and how long its delay is.
+
+    Args:
+        link: A key of `LINKS`.
+
+    Returns:
+        True if its delays or losses are random, and its mean one-way delay in ms.
+    """
+    settings = format_settings({"link": dict(LINKS[link])})
+    scenario = load_tuning_scenario(BASES["two"], settings).scenario
+    first = next(iter(scenario.links.values()))
+    return scenario.random, first.moments().mean_ms
+
+
+def _select_names(
+    option: str,
+    names: Sequence[str],
+    *,
+    default: Sequence[str],
+    known: Sequence[str] | None = None,
+) -> list[str]:
+    """Returns the checked names of an option, or the default if the user gave no names.
+
+    Args:
+        option: The option, without its dashes.
+        names: Names from the user.
+        default: Names that replace an empty selection.
+        known: Names that exist. None if these are the names in `default`.
+
+    Raises:
+        UsageError: A name is unknown.
+    """
+    if known is None:
+        known = default
+    return [_check_name(option, name, known) for name in names] or list(default)
+
+
+def _check_name(option: str, name: str, known: Sequence[str]) -> str:
+    """Returns the name from an option if it is known.
+
+    Raises:
+        UsageError: The name is unknown. The message suggests a similar name.
+    """
+    if name not in known:
+        hint = suggest_nearest(name, list(known)) or f"; available: {', '.join(known)}"
+        raise UsageError(f"--{option}: no {option} {name!r} is available{hint}")
+    return name

@@ -1,0 +1,830 @@
+"""Summarises the results of the benchmark as tables, Markdown, CSV and JSON.
+
+The benchmark runs control laws in tasks over links with different delays and losses. A cell is
+one law in one task over one link, and has one run per random seed. For each law, the tables
+show over how many links the law is stable, which properties its runs have, and the means of the
+measured quantities.
+
+Invariant:
+    - The output depends on the runs alone. It contains no time of day, so equal results give
+      equal bytes.
+    - A mean or share over at least `LEAST_SEEDS` seeds has its 95 % confidence interval.
+    - Every run that is not stable is visible in the tables.
+    - Laws are not ranked.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+
+from trilat_net.analysis.run_end import EndBehaviour, Stability
+from trilat_net.errors import count_nouns
+from trilat_net.presentation.result_text import Block, TextTable, format_number
+from trilat_net.results import Result
+from trilat_net.work.intervals import MeanInterval, mean_interval, wilson_interval
+from trilat_net.work.study_folder import encode_csv
+
+from .bench_plan import STUDIES, TASKS, BenchCell, BenchPlan, TunedGains, explain_no_cell
+
+LEAST_CONTACT_N = 1.0
+"""Smallest mean force of the wall, in N, at which the slave counts as touching it.
+
+The mean is taken over the last quarter of the task.
+"""
+PASSIVE_J = -1e-3
+"""Limit of `BenchRun.energy_j`, in J, at or above which a run counts as passive.
+
+It is not 0, because the energy is a numerical integral.
+"""
+CONFIRMATION_LENGTHS = 2.0
+"""Duration of the repetition of a run that is not stable, in durations of the run."""
+LEAST_SEEDS = 20
+"""Smallest number of runs for which an interval is computed."""
+
+
+def name_run(key: str, to_s: float) -> str:
+    """Returns the name of a cell's runs in the journal of finished runs.
+
+    Args:
+        key: Key of the cell, see `BenchCell.key`.
+        to_s: Duration in s of runs that are repeated over a longer time, which is part of their
+            name. 0 for the first runs.
+    """
+    return f"{key} to {to_s:g} s" if to_s else key
+
+
+class BenchRun(msgspec.Struct, frozen=True):
+    """A finished run of the suite, with its judgement and its measured numbers.
+
+    A worker process creates it, and the journal of the suite stores it. The numbers from
+    `error_rad` on are None if the run diverged.
+
+    Attributes:
+        name: Name of the cell, as in "contact/wave/rtt272".
+        inputs: Digest of everything that determines the runs of the cell.
+        seed: Seed of the run.
+        random: True if another seed would give another run.
+        sha256: Digest of the scenario of the run.
+        stability: Judgement of the run by its end and by its twins, which are repeated runs
+            with a small disturbance (docs/reference/stability.md).
+        behaviour: How the run ended, for example at rest or diverged.
+        text: Explanation of the judgement.
+        length_s: Duration of the judged run, in s.
+        to_s: Requested duration, in s, of a run that was repeated because it was not stable. 0
+            for a first run.
+        at_limit: True if the run would have needed more ticks than the safety limit allows.
+        confirmed: True if the repeated run was not stable either. False if it was, so that it
+            refuted the first run. None if there is no repeated run, because the first run was
+            not judged "not stable", or diverged.
+        bounded: True if no joint exceeded the velocity `BOUND_RAD_S`, or moved more than
+            `THROWN_RAD` away from its start.
+        energy_j: Smallest value over time of the energy that operators, friction and wall had
+            put into the arms until then, in J.
+        settled_s: Time from which all arms stay at their final poses, in s. None if there is no
+            such time within the run.
+        error_rad: RMS over time and joints of the difference between the slave and the average
+            of the users, weighted with the dominance factors and without delay, in rad.
+        effort_nm: RMS of tau - G(q), the torque without gravity, over sites and joints, in N m.
+        hand_nm: RMS torque of the operators over the joints of the arms that have an operator,
+            in N m.
+        wall_n: Mean force of the wall in the last quarter of the task, in N. None without a
+            wall.
+        force_peak_n: Largest force of the wall, in N. None without a wall.
+        stiffness_n_m: Stiffness that the user feels 2 s after contact, in N/m, from two runs
+            with different reaches. None without such contact in both.
+        impedance_n_s_m: |Z| at 1 Hz that the user feels in contact minus that in free motion,
+            in N s/m. None without contact.
+        free_impedance_n_s_m: |Z| at 1 Hz that the user feels in free motion, in N s/m. It is
+            measured in the task `contact` only.
+    """
+
+    name: str
+    inputs: str
+    seed: int
+    random: bool
+    sha256: str
+    stability: Stability
+    behaviour: EndBehaviour
+    text: str
+    length_s: float = 0.0
+    to_s: float = 0.0
+    at_limit: bool = False
+    confirmed: bool | None = None
+    bounded: bool = False
+    energy_j: float | None = None
+    settled_s: float | None = None
+    error_rad: float | None = None
+    effort_nm: float | None = None
+    hand_nm: float | None = None
+    wall_n: float | None = None
+    force_peak_n: float | None = None
+    stiffness_n_m: float | None = None
+    impedance_n_s_m: float | None = None
+    free_impedance_n_s_m: float | None = None
+
+    @property
+    def cell(self) -> str:
+        """Name that identifies this run in the journal of finished runs, with its seed.
+
+        The name consists of the task, the law, the link, and a digest of the scenario and the
+        gains. If this run repeats a first run over a longer time, the name also contains the
+        duration.
+        """
+        return name_run(f"{self.name} {self.inputs}", self.to_s)
+
+    @property
+    def needs_confirmation(self) -> bool:
+        """True if this run was judged not stable, but a longer run might be stable.
+
+        False if the run diverged, which means that the motion grew without bound: a longer run
+        would end at the same time. Also false if this run is itself a repetition.
+        """
+        diverged = self.behaviour is EndBehaviour.DIVERGED
+        is_first = not self.to_s
+        return self.stability is Stability.NOT_STABLE and not diverged and is_first
+
+    @property
+    def confirmation_s(self) -> float:
+        """Duration of the repetition that confirms or refutes this run, in s."""
+        return CONFIRMATION_LENGTHS * self.length_s
+
+    @property
+    def masked(self) -> bool:
+        """True if the slave should touch a wall but did not.
+
+        The numbers of such a run are those of free motion. They would look better than those of
+        a run with contact, so that they are not shown.
+        """
+        return self.wall_n is not None and self.wall_n < LEAST_CONTACT_N
+
+
+QUANTITIES = {
+    "error_rad": "RMS distance of the slave from its users, rad",
+    "effort_nm": "effort, RMS of tau - G(q), N m",
+    "hand_nm": "RMS torque of the hands, N m",
+    "force_peak_n": "largest force of the wall, N",
+    "stiffness_n_m": "stiffness at the user's hand 2 s after contact, N/m",
+    "impedance_n_s_m": "|Z| at 1 Hz at the user's hand in contact, minus free motion, N s/m",
+    "free_impedance_n_s_m": "|Z| at 1 Hz at the user's hand in free motion, N s/m",
+    "settled_s": "time from which all arms stay at their final poses, s",
+}
+"""Labels of the quantities that are averaged over the seeds of a cell."""
+_QUANTITIES_OF_ALL = ("error_rad", "effort_nm", "settled_s")
+_QUANTITIES_BY_TASK = {
+    "free": ["hand_nm"],
+    "disagree": ["hand_nm"],
+    "contact": [
+        "stiffness_n_m",
+        "impedance_n_s_m",
+        "free_impedance_n_s_m",
+        "force_peak_n",
+    ],
+}
+_JUDGEMENTS = (
+    Stability.STABLE,
+    Stability.SETTLED,
+    Stability.OPEN,
+    Stability.NOT_STABLE,
+)
+
+
+class BenchCellResult(NamedTuple):
+    """Results of a cell of the suite: a control law in a task over a link.
+
+    A cell has one run for each of its seeds.
+
+    Attributes:
+        cell: The law, task, link and gains of the runs.
+        runs: The runs, in the order of the seeds.
+    """
+
+    cell: BenchCell
+    runs: Sequence[BenchRun]
+
+    @property
+    def stable(self) -> int:
+        """Number of runs of the cell that are judged stable."""
+        return self.count(Stability.STABLE)
+
+    def count(self, stability: Stability) -> int:
+        """Counts the runs with a given judgement of their stability.
+
+        Args:
+            stability: The judgement to count, for example `Stability.NOT_STABLE`.
+        """
+        return sum(run.stability is stability for run in self.runs)
+
+    @property
+    def judgement(self) -> Stability:
+        """Whether the control law is stable in all runs of this task over this link.
+
+        The value is the worst judgement of the runs: not stable if a run is not stable,
+        otherwise open if a run could not be decided, otherwise settled if a run only came to
+        rest, otherwise stable.
+        """
+        from_worst = (Stability.NOT_STABLE, Stability.OPEN, Stability.SETTLED)
+        present = [stability for stability in from_worst if self.count(stability)]
+        return present[0] if present else Stability.STABLE
+
+    @property
+    def masked(self) -> bool:
+        """True if the slave arm should touch a wall, but did not touch it in at least one run.
+
+        The numbers of these runs are not shown, because they do not describe the task.
+        """
+        return any(run.masked for run in self.runs)
+
+    @property
+    def is_passive(self) -> bool:
+        """True if the control law never generated energy in these runs.
+
+        This means that at no time the arms had returned more energy to the operators and the
+        other surroundings than they had received from them. False if a run diverged, which
+        means that the motion grew without bound.
+        """
+        return self.energy_j is not None and self.energy_j >= PASSIVE_J
+
+    @property
+    def energy_j(self) -> float | None:
+        """Lowest net energy that the environment had put into the arms at any time, in J.
+
+        The environment is the operators, the friction and the wall. The value is the minimum
+        over time and over all runs of this law in this task over this link. It is negative if
+        the arms gave back more energy than they had received, so the control law generated
+        energy.
+
+        None if a run diverged.
+        """
+        values = [run.energy_j for run in self.runs if run.energy_j is not None]
+        return min(values) if len(values) == len(self.runs) else None
+
+    @property
+    def interval(self) -> tuple[float, float] | None:
+        """95 % confidence interval of the fraction of stable runs, by Wilson's method.
+
+        None for fewer than `LEAST_SEEDS` runs.
+        """
+        if len(self.runs) < LEAST_SEEDS:
+            return None
+        return wilson_interval(self.stable, len(self.runs))
+
+    def compute_mean(self, quantity: str) -> float | MeanInterval | None:
+        """Computes the mean of a measured quantity over the runs, which differ in their seeds.
+
+        Args:
+            quantity: Name of the quantity, a key of `QUANTITIES`.
+
+        Returns:
+            The mean. With at least `LEAST_SEEDS` runs, it has a 95 % confidence interval. None
+            if a run lacks the quantity, or if the slave should touch a wall but missed it in a
+            run.
+        """
+        values = [getattr(run, quantity) for run in self.runs]
+        if None in values or self.masked:
+            return None
+        if len(values) >= LEAST_SEEDS:
+            return mean_interval(values)
+        return float(np.mean(values))
+
+
+class BenchResults(Result):
+    """The results of a suite, or of a part of it, as tables and as text.
+
+    The suite runs control laws in several tasks over several links. A cell is a law in a task
+    over a link, and has one run per seed.
+
+    Attributes:
+        plan: Plan of the suite.
+        places: The results of all cells, in the order of the plan.
+        runs: All runs, in the same order.
+    """
+
+    def __init__(self, plan: BenchPlan, runs: dict[tuple[str, int], BenchRun]) -> None:
+        self.plan = plan
+        self.places: list[BenchCellResult] = []
+        for cell in plan.cells:
+            cell_runs = [_confirm_run(runs, cell, seed) for seed in cell.seeds]
+            self.places.append(BenchCellResult(cell, cell_runs))
+        self.runs = [run for result in self.places for run in result.runs]
+
+    def blocks(self) -> Iterator[Block]:
+        """Yields the parts of the text that describes the results of the benchmark.
+
+        The parts are a description of the study, and a table that counts the stable runs of
+        each control law. Then each task has a table of the properties of its runs, and a table
+        for each measured quantity, such as the error. In the study "round-trips", a last table
+        has the effects of delay and loss.
+        """
+        yield from _describe_bench(self)
+        yield ""
+        yield _tabulate_verdicts(self)
+        for task in self.plan.tasks:
+            yield _tabulate_properties(self, task)
+        for task, quantity in _list_quantities(self):
+            if quantity != "effort_nm":
+                yield ""
+                yield f"{task}: {QUANTITIES[quantity]}"
+                yield _tabulate_quantity(self, task, quantity)
+        if self.plan.study == "round-trips":
+            yield _tabulate_round_trips(self)
+
+    def headline(self) -> str:
+        """Returns a sentence with the study's name and its numbers of cells and runs.
+
+        A cell is a control law in a task over a link.
+        """
+        cells = count_nouns(len(self.places), "cell")
+        runs = count_nouns(len(self.runs), "run")
+        return f"{self.plan.study}: {cells}, {runs}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Converts the results to plain values, as `trilat bench --json` prints them."""
+        entries = [
+            msgspec.to_builtins(gains) | {"outcome": "settled"}
+            for gains in _list_used_gains(self)
+        ]
+        return {"study": self.plan.study, "gains": entries, "places": self.to_rows()}
+
+    def to_rows(self) -> list[dict[str, Any]]:
+        """Returns the results as a table of plain values, one row per cell of the suite."""
+        return list(map(_build_row, self.places))
+
+    def select(self, task: str, law: str = "", link: str = "") -> Iterator[BenchCellResult]:
+        """Yields the results of a task: one for each control law and link that ran in it.
+
+        Args:
+            task: Name of the task, such as "contact".
+            law: Name of the control law to select. Empty selects all laws.
+            link: Name of the link to select. Empty selects all links.
+        """
+        for result in self.places:
+            cell = result.cell
+            if cell.task == task and law in ("", cell.law) and link in ("", cell.link):
+                yield result
+
+    def find(self, task: str, law: str, link: str) -> BenchCellResult | None:
+        """Returns the result of one cell of the suite.
+
+        Args:
+            task: Name of the task.
+            law: Name of the control law.
+            link: Name of the link.
+
+        Returns:
+            The result. None if the plan does not contain the cell.
+        """
+        return next(self.select(task, law, link), None)
+
+
+def _list_used_gains(results: BenchResults) -> list[TunedGains]:
+    """Returns the gains of all cells, without repetitions."""
+    return list({str(cell.tuned): cell.tuned for cell in results.plan.cells}.values())
+
+
+def _confirm_run(runs: dict[tuple[str, int], BenchRun], cell: BenchCell, seed: int) -> BenchRun:
+    """Returns a run of a cell, or its repetition over twice its length if there is one.
+
+    A run that is not stable is repeated. The longer run decides, and its numbers count.
+
+    Args:
+        runs: All runs by name of their cell in the journal, and by seed.
+        cell: The law, task, link and gains of the runs.
+        seed: Seed of the run.
+    """
+    run = runs[cell.key, seed]
+    if not run.needs_confirmation:
+        return run
+    repeated = runs.get((name_run(cell.key, run.confirmation_s), seed))
+    if repeated is None:
+        return run
+    return msgspec.structs.replace(
+        repeated,
+        text=f"of {repeated.length_s:g} s: {repeated.text}",
+        confirmed=repeated.stability is Stability.NOT_STABLE,
+    )
+
+
+_PRINTED_LINKS = (
+    "rtt8",
+    "rtt136",
+    "rtt544",
+    "rtt1088",
+    "rtt136-loss50",
+    "4g",
+    "5g",
+    "geo",
+    "trace",
+)
+"""Links that tables show if there are too many links for the width of a page."""
+OPEN_MARK = "?"
+"""Mark of a cell in tables: the stability of at least one run is open."""
+UNSTABLE_MARK = "!"
+"""Mark of a cell in tables: at least one run is not stable."""
+
+
+def _list_quantities(results: BenchResults) -> list[tuple[str, str]]:
+    """Lists which measured quantities are printed for which task.
+
+    Args:
+        results: Results of the benchmark or of a part of it.
+
+    Returns:
+        Pairs of the name of a task that ran and the name of a quantity, a key of `QUANTITIES`.
+        Each pair is printed as a table.
+    """
+    tasks = results.plan.tasks
+    pairs = [(task, quantity) for quantity in _QUANTITIES_OF_ALL for task in tasks]
+    for task in tasks:
+        pairs += [(task, quantity) for quantity in _QUANTITIES_BY_TASK.get(task, [])]
+    return pairs
+
+
+def name_law(law: str, form: str) -> str:
+    """Returns the name of a control law for tables, with a note if only two arms take part.
+
+    Args:
+        law: Name of the control law.
+        form: Kind of scenario in which the law runs, a key of `BASES`. The form "three" has two
+            users and a slave arm. All other forms have two arms.
+    """
+    return law if form == "three" else f"{law} (two sites)"
+
+
+def _tabulate_verdicts(results: BenchResults) -> TextTable:
+    """Returns a table of how many links each law copes with: a row per law, a column per task.
+
+    An entry counts the links over which the law is stable, those over which it only settles,
+    those over which this is undecided (open), and those over which it is not stable.
+
+    Args:
+        results: Results of the suite or of a part of it.
+    """
+    tasks = results.plan.tasks
+    rows = []
+    for law, form in results.plan.laws:
+        cells = [_count_verdicts(results, law, form, task) for task in tasks]
+        rows.append([name_law(law, form), *cells])
+    verdicts = " / ".join(_JUDGEMENTS)
+    return TextTable((f"links: {verdicts}", *tasks), rows, align="lr")
+
+
+def _count_verdicts(results: BenchResults, law: str, form: str, task: str) -> str:
+    """Returns the numbers of links by verdict as an entry of the table of verdicts.
+
+    Args:
+        results: Results of the suite or of a part of it.
+        law: Name of the control law.
+        form: Form in which the law runs.
+        task: Name of the task.
+
+    Returns:
+        A text such as "12 / 0 / 1 / 3" for stable, settled, open and not stable links. If the
+        law did not run in the task, the reason.
+    """
+    verdicts = [result.judgement for result in results.select(task, law)]
+    if not verdicts:
+        return explain_no_cell(law, form, task)
+    return " / ".join(str(verdicts.count(judgement)) for judgement in _JUDGEMENTS)
+
+
+def _tabulate_properties(results: BenchResults, task: str) -> TextTable:
+    """Returns a table of the properties of a task's runs: a row per law.
+
+    There is a column per property, such as passivity. An entry such as 3/12 means that all runs
+    over 3 of the 12 links have the property. Two more columns have the smallest energy, and the
+    number of links over which the slave did not touch the wall.
+
+    Args:
+        results: Results of the suite or of a part of it.
+        task: A task that ran.
+    """
+    headers = (
+        task,
+        "bounded",
+        "passive",
+        "least energy, J",
+        "converged",
+        "stable",
+        "no contact",
+    )
+    rows = []
+    for law, form in results.plan.laws:
+        name = name_law(law, form)
+        law_results = list(results.select(task, law))
+        if law_results:
+            rows.append([name, *_describe_properties(law_results)])
+        else:
+            rows.append([name, explain_no_cell(law, form, task)])
+    return TextTable(headers, rows, align="lr")
+
+
+def _describe_properties(law_results: Sequence[BenchCellResult]) -> list[str]:
+    """Returns the entries of a law's row in the table of properties, without its name.
+
+    Args:
+        law_results: The results of the law in the task, one per link.
+    """
+    bounded = 0
+    passive = 0
+    converged = 0
+    stable = 0
+    masked = 0
+    for result in law_results:
+        bounded += all(run.bounded for run in result.runs)
+        passive += result.is_passive
+        converged += all(run.settled_s is not None for run in result.runs)
+        stable += result.judgement is Stability.STABLE
+        masked += result.masked
+    link_count = len(law_results)
+    return [
+        f"{bounded}/{link_count}",
+        f"{passive}/{link_count}",
+        _format_least_energy(law_results),
+        f"{converged}/{link_count}",
+        f"{stable}/{link_count}",
+        str(masked),
+    ]
+
+
+def _format_least_energy(law_results: Sequence[BenchCellResult]) -> str:
+    """Returns the smallest energy of some results in J, as an entry of a table.
+
+    Returns:
+        The energy as text. A dash if all cells have a run that diverged.
+    """
+    energies_j = [result.energy_j for result in law_results if result.energy_j is not None]
+    if not energies_j:
+        return "-"
+    least_j = min(energies_j)
+    if least_j >= -1e-9:
+        # A negative energy this small is a rounding error of the sum over a run.
+        least_j = 0.0
+    return f"{least_j:.2g}"
+
+
+def _tabulate_quantity(results: BenchResults, task: str, quantity: str) -> TextTable:
+    """Returns a table of the mean of a quantity: a row per control law, a column per link.
+
+    The mean is over the runs of the law with different random seeds. An entry has a mark if not
+    all of its runs are stable. A law that cannot run in the task has no row. If there are many
+    links, only some of them have a column.
+
+    Args:
+        results: Results of the benchmark or of a part of it.
+        task: Name of a task that ran.
+        quantity: Name of the quantity, a key of `QUANTITIES`.
+    """
+    links = results.plan.links
+    if len(links) > len(_PRINTED_LINKS):
+        links = [link for link in links if link in _PRINTED_LINKS]
+    rows = []
+    for law, form in results.plan.laws:
+        reason = explain_no_cell(law, form, task)
+        if reason == "-":
+            continue
+        row = [name_law(law, form)]
+        for link in links:
+            result = results.find(task, law, link)
+            row.append(reason if result is None else _describe_result(result, quantity))
+        rows.append(row)
+    return TextTable((task, *links), rows, align="lr")
+
+
+def _describe_result(result: BenchCellResult, quantity: str) -> str:
+    """Returns the mean of a quantity as an entry of a table, or the reason why it has no mean.
+
+    Args:
+        result: The result of a cell.
+        quantity: A key of `QUANTITIES`.
+    """
+    marks = {Stability.NOT_STABLE: UNSTABLE_MARK, Stability.OPEN: OPEN_MARK}
+    mark = marks.get(result.judgement, "")
+    if result.masked:
+        return f"no contact{mark}"
+    if any(run.behaviour is EndBehaviour.DIVERGED for run in result.runs):
+        return f"diverged{mark}"
+
+    mean = result.compute_mean(quantity)
+    if mean is None:
+        if quantity == "settled_s":
+            longest_s = max(run.length_s for run in result.runs)
+            return f"not within {longest_s:g}{mark}"
+        return mark or "none"
+    text = str(mean) if isinstance(mean, MeanInterval) else f"{mean:.4g}"
+    return text + mark
+
+
+def _tabulate_round_trips(results: BenchResults) -> TextTable:
+    """Returns a table of how the error of each law grows with delay and with losses.
+
+    A row is a task and a control law. Its columns are the error at the shortest round trip,
+    the error at the longest round trip divided by the error at the shortest, and the error
+    with losses divided by the error without losses. The published study that the study
+    "round-trips" repeats reports the same effects.
+
+    Args:
+        results: Results of the benchmark or of a part of it.
+    """
+    rows = []
+    for task in results.plan.tasks:
+        for law, _ in results.plan.laws:
+            short = _find_error(results, task, law, "rtt8")
+            medium = _find_error(results, task, law, "rtt272")
+            long = _find_error(results, task, law, "rtt1088")
+            lossy = _find_error(results, task, law, "rtt272-loss50")
+            rows.append(
+                [
+                    task,
+                    law,
+                    format_number(short, 4),
+                    _format_ratio(long, short),
+                    _format_ratio(lossy, medium),
+                ]
+            )
+    headers = (
+        "task",
+        "law",
+        "error at 8 ms, rad",
+        "1088 ms / 8 ms",
+        "272 ms, half lost / none lost",
+    )
+    return TextTable(headers, rows, align="llr")
+
+
+def _find_error(results: BenchResults, task: str, law: str, link: str) -> float | None:
+    """Returns the mean error of a cell, in rad. None if the cell did not run or has no mean."""
+    result = results.find(task, law, link)
+    mean = None if result is None else result.compute_mean("error_rad")
+    return mean.mean if isinstance(mean, MeanInterval) else mean
+
+
+def _format_ratio(numerator: float | None, denominator: float | None) -> str:
+    """Returns a ratio as an entry of a table.
+
+    The entry is a dash if a number is missing, or if the denominator is 0.
+    """
+    if numerator is None or not denominator:
+        return "-"
+    return f"{numerator / denominator:.3g}"
+
+
+def _describe_bench(results: BenchResults) -> Iterator[str]:
+    """Yields lines that introduce the results.
+
+    They name the study, its runs, its tasks, and the laws that did not run.
+
+    Args:
+        results: Results of the suite or of a part of it.
+    """
+    plan = results.plan
+    cells = count_nouns(len(plan.cells), "cell")
+    runs = count_nouns(len(results.runs), "run")
+    seeds = max(len(cell.seeds) for cell in plan.cells)
+    yield f"{plan.study}: {STUDIES[plan.study].about}"
+    yield f"{cells}, {runs}: one per cell without randomness, otherwise {seeds}"
+
+    unstable = [run for run in results.runs if run.stability is Stability.NOT_STABLE]
+    diverged = sum(run.behaviour is EndBehaviour.DIVERGED for run in unstable)
+    confirmed = sum(bool(run.confirmed) for run in unstable)
+    refuted = sum(run.confirmed is False for run in results.runs)
+    yield (
+        f"not stable: {count_nouns(len(unstable), 'run')}, of which {diverged} diverged; runs "
+        f"of twice the length confirmed {confirmed}, and refuted {refuted} more"
+    )
+    limited = sum(run.at_limit for run in results.runs)
+    if limited:
+        yield f"ended by the safety limit of ticks: {count_nouns(limited, 'run')}"
+
+    for task in plan.tasks:
+        yield f"{task}: {TASKS[task].about}"
+    for law, form in plan.laws:
+        if form == "two":
+            yield f"{law} is a law for two sites: it runs only in the tasks for one user"
+    if plan.without:
+        names = ", ".join(map(str, plan.without))
+        yield f"no runs, because no candidate was stable at the pose with the margin: {names}"
+
+
+def _tabulate_gains(results: BenchResults) -> TextTable:
+    """Returns a table of the gains of each law at each round trip, and how they were selected.
+
+    The column "stable" has the number of stable candidates and of all candidates. The column
+    "without margin" has the number of candidates with smaller errors that were rejected,
+    because they are not stable when delays grow.
+
+    Args:
+        results: Results of the suite or of a part of it.
+    """
+    tunings = {str(gains): gains for gains in _list_used_gains(results)}
+    tunings |= {str(gains): gains for gains in results.plan.without}
+    rows = []
+    for tuned in tunings.values():
+        gains = ", ".join(f"{name} {value:g}" for name, value in tuned.gains.items())
+        rows.append(
+            [
+                name_law(tuned.law, tuned.form),
+                str(tuned.round_trip_ms),
+                gains or "none",
+                f"{tuned.settled}/{tuned.tried}",
+                str(tuned.passed),
+            ]
+        )
+    headers = ("law", "tuned at, ms", "gains", "stable", "without margin")
+    return TextTable(headers, rows, align="lrlrr")
+
+
+def build_bench_page(
+    results: BenchResults, command: str, pictures: Mapping[str, str] = {}
+) -> str:
+    """Builds the page of the results in Markdown.
+
+    Args:
+        results: Results of the suite or of a part of it.
+        command: The command that writes the page, which is shown at its top.
+        pictures: Subject of each picture, by the name of its file in the folder of the page.
+    """
+    parts = [
+        f"# The suite: {results.plan.study}",
+        f"    {command}",
+        "\n".join(f"- {line}" for line in _describe_bench(results)),
+        _tabulate_verdicts(results).markdown(),
+        f"{OPEN_MARK}: some run is open. {UNSTABLE_MARK}: some run is not stable. "
+        "+-: 95 % interval over the seeds of a link.",
+    ]
+    parts += [f"![{text}]({name})" for name, text in pictures.items()]
+    for task in results.plan.tasks:
+        parts.append(f"## {task}: properties")
+        parts.append(_tabulate_properties(results, task).markdown())
+    for task, quantity in _list_quantities(results):
+        parts.append(f"## {task}: {QUANTITIES[quantity]}")
+        parts.append(_tabulate_quantity(results, task, quantity).markdown())
+    if results.plan.study == "round-trips":
+        parts.append("## Delay against loss")
+        parts.append(_tabulate_round_trips(results).markdown())
+    parts.append("## Gains")
+    parts.append(_tabulate_gains(results).markdown())
+    return "\n\n".join(parts) + "\n"
+
+
+def encode_runs(results: BenchResults) -> str:
+    """Encodes all runs as a CSV table, one line per run.
+
+    Args:
+        results: Results of the suite or of a part of it.
+    """
+    cells = {cell.name: cell for cell in results.plan.cells}
+    rows = [
+        _build_cell_columns(cells[run.name]) | msgspec.to_builtins(run) for run in results.runs
+    ]
+    return encode_csv(rows, [*_CELL_COLUMNS, *BenchRun.__struct_fields__])
+
+
+_FORMER_KEYS = ("reflected", "reflected_half", "observed", "least_j")
+"""Keys of quantities that are no longer measured.
+
+They stay in the JSON with the value null, because keys are never removed
+(docs/reference/json.md).
+"""
+_CELL_COLUMNS = ("task", "law", "link", "form")
+
+
+def _build_cell_columns(cell: BenchCell) -> dict[str, Any]:
+    """Returns the columns that identify a cell: task, law, link and form."""
+    return {name: getattr(cell, name) for name in _CELL_COLUMNS}
+
+
+def _build_row(result: BenchCellResult) -> dict[str, Any]:
+    """Returns the row of a cell in JSON and CSV. Unknown numbers are None."""
+    share_low = None
+    share_high = None
+    if result.interval is not None:
+        share_low, share_high = result.interval
+    row = _build_cell_columns(result.cell)
+    row["runs"] = len(result.runs)
+    for stability in Stability:
+        row[stability.value.replace(" ", "_")] = result.count(stability)
+    row["share_low"] = share_low
+    row["share_high"] = share_high
+
+    for quantity in QUANTITIES:
+        mean = result.compute_mean(quantity)
+        if isinstance(mean, MeanInterval):
+            row[quantity] = mean.mean
+            row[f"{quantity}_half"] = mean.half
+        else:
+            row[quantity] = mean
+            row[f"{quantity}_half"] = None
+
+    row |= dict.fromkeys(_FORMER_KEYS)  # with the value None
+    row |= {
+        "judgement": result.judgement.value,
+        "bounded": all(run.bounded for run in result.runs),
+        "energy_j": result.energy_j,
+        "length_s": max(run.length_s for run in result.runs),
+        "contact": not result.masked,
+        "confirmed": sum(run.confirmed is True for run in result.runs),
+        "refuted": sum(run.confirmed is False for run in result.runs),
+    }
+    return row

@@ -1,0 +1,840 @@
+"""Executes the runs of the benchmark suite: judges and measures each run, and stores it.
+
+A run is judged as its stability certificate would judge it (`analysis.judge`): by its
+end, by the characteristic roots of its loop, and by its twins where they matter. A twin is a
+repetition of the run with a small disturbance, which shows whether disturbances grow.
+A run is made longer if its judgement needs more time: it then lasts for `TIME_CONSTANTS` of its
+slowest time constants. A run that is not stable is repeated over twice its length. Errors,
+efforts and forces are measured over the time of the task only, from the same records that
+`trilat sim` writes.
+
+Invariant:
+    - The numbers of a run depend on its scenario alone. The number of processes, their order
+      and interruptions have no influence.
+    - A run that is in the journal of the folder is not executed again. A run with other gains
+      counts as another run, and so does the repetition of a run over twice its length.
+    - The duration of a run has no limit except `MAX_RUN_TICKS`. If this limit ends a run, its
+      text says so.
+    - A folder contains only runs of one version of the program on one kind of arithmetic, see
+      `describe_program`.
+"""
+
+import json
+import math
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+
+from trilat_net.analysis.arm_rows import build_arm_rows
+from trilat_net.analysis.dominance_history import evaluate_ramps, list_scripted_ramps
+from trilat_net.analysis.judge import judge_virtual_run
+from trilat_net.analysis.run_end import THROWN_RAD, EndBehaviour, RunEnd, Stability
+from trilat_net.analysis.site_signals import SETTLED_ERROR_RAD
+from trilat_net.analysis.stability_decision import LoopRoots
+from trilat_net.analysis.torque_sources import list_walls, wall_force
+from trilat_net.analysis.twins.twin_growth import TwinGrowth
+from trilat_net.core.step.ticks import NS_PER_S
+from trilat_net.core.step.vectors import Array
+from trilat_net.errors import UsageError
+from trilat_net.files import make_results_folder, refuse_link, write_whole
+from trilat_net.scenario import Scenario
+from trilat_net.scenario.operators.kernel_operators import ViscousEnvironment
+from trilat_net.work.executor import Progress, Workers, ignore_progress, open_worker_pool
+from trilat_net.work.study_folder import (
+    RunJournal,
+    StudyFolder,
+    build_resume_hint,
+    describe_program,
+)
+
+from ..measure_run import RecordBatch, run_whole
+from ..tuning.candidate import load_tuning_scenario
+from .bench_plan import (
+    SHORTER_REACH,
+    TASKS,
+    BenchCell,
+    BenchPlan,
+    Settings,
+    format_settings,
+)
+from .bench_results import BenchResults, BenchRun, name_run
+
+SLAVE = "s"
+USER = "m1"
+BOUND_RAD_S = 5.0
+"""Largest joint velocity of a bounded run, in rad/s.
+
+In addition, no joint of such a run moves more than `THROWN_RAD` away from its start.
+"""
+REST_S = 2.0
+"""Shortest time, in s, for which the arms of a converged run stay at their final poses.
+
+All joints stay within `SETTLED_ERROR_RAD` of their final angles.
+"""
+TIME_CONSTANTS = 6.0
+"""Duration of a run whose judgement needs more time, in units of its slowest time constant."""
+MAX_RUN_TICKS = 3_000_000
+"""Largest number of ticks to which a run is made longer, over all sites.
+
+It is a safety limit for the memory: three sites at 1 kHz reach it after 1000 s, when their
+records take a quarter of a gigabyte. A repetition over twice the length may take twice as many.
+"""
+STIFFNESS_S = 2.0
+"""Time after the first contact at which the stiffness is measured, in s.
+
+Laws that integrate an error in contact become stiffer with time, so a later measurement would
+be one of the duration of the run.
+"""
+STIFFNESS_WINDOW_S = 0.2
+"""Duration over which positions and forces are averaged for the stiffness, in s."""
+IMPEDANCE_HZ = 1.0
+"""Frequency at which the impedance is measured, in Hz."""
+IMPEDANCE_PERIODS = 4
+"""Number of periods over which the impedance is measured."""
+SHAKING_N = 0.5
+"""Amplitude of the force with which the user's arm is shaken for the impedance, in N.
+
+It is half of the least force of the wall that counts as contact, so the slave keeps contact.
+"""
+
+
+class BenchRunItem(NamedTuple):
+    """One run of the benchmark, as it is sent to a worker process. It can be pickled.
+
+    Attributes:
+        cell: The task, control law and link of the run, with the tuned gains.
+        seed: Seed of the run.
+        to_s: Duration in s, if the run repeats a first run over twice its length to check that
+            it is not stable. 0 for a first run.
+    """
+
+    cell: BenchCell
+    seed: int
+    to_s: float = 0.0
+
+    def __str__(self) -> str:
+        return f"{self.cell.name}, seed {self.seed}"
+
+
+class JudgedRun(NamedTuple):
+    """A run of the suite with all of its records, and the judgement whether it is stable.
+
+    The judgement takes twins into account where they matter: repeated runs with a small
+    disturbance, which show whether disturbances grow.
+
+    Attributes:
+        scenario: Scenario of the run. Its duration is that of the run.
+        records: All records of the run, by site.
+        end: Analysis of the end of the run.
+        twins: Growth of the small disturbances of the twins. None if the roots decide without
+            them.
+        roots: Characteristic roots of the loop at the end of the run.
+        stability: The judgement.
+        text: Explanation of the judgement.
+        at_limit: True if the run would have needed more than `MAX_RUN_TICKS` ticks.
+        rests_on: What the judgement rests on, as in the stability certificate.
+    """
+
+    scenario: Scenario
+    records: dict[str, RecordBatch]
+    end: RunEnd
+    twins: TwinGrowth | None
+    roots: LoopRoots
+    stability: Stability
+    text: str
+    at_limit: bool = False
+    rests_on: str = ""
+
+    @property
+    def diverged(self) -> bool:
+        """True if a site exceeded its limits, which ended the run."""
+        return self.end.diverged_at_s is not None
+
+
+def run_bench_task(item: BenchRunItem) -> BenchRun:
+    """Simulates a run of the benchmark, judges its stability, and measures its performance.
+
+    The function needs nothing but its argument. Therefore any worker process can call it.
+
+    Args:
+        item: The run to execute.
+
+    Returns:
+        The finished run, ready for the journal. It has the judgement of its stability and
+        measured numbers such as error and effort. A run that diverged has no such numbers.
+    """
+    cell = item.cell
+    scenario = cell.build(item.seed).scenario
+    is_repeated = item.to_s > 0.0
+    if is_repeated:
+        judged = judge_bench_run(scenario, item.to_s)
+    else:
+        judged = judge_bench_run(scenario, scenario.duration_s)
+        judged = lengthen_run(judged)
+
+    run = BenchRun(
+        name=cell.name,
+        inputs=cell.inputs,
+        seed=item.seed,
+        random=scenario.random,
+        sha256=scenario.sha256,
+        stability=judged.stability,
+        behaviour=judged.end.behaviour,
+        text=judged.text,
+        length_s=judged.scenario.duration_s,
+        to_s=item.to_s,
+        at_limit=judged.at_limit,
+    )
+    if judged.diverged:
+        # Errors and efforts of a run that ended early cannot be compared with those of others.
+        return run
+
+    task = TASKS[cell.task]
+    run = _measure(run, judged, task.duration_s)
+    if cell.task == "contact" and not run.masked:
+        run = _measure_contact(run, item, judged)
+    return run
+
+
+def judge_bench_run(scenario: Scenario, length_s: float) -> JudgedRun:
+    """Executes a scenario, and judges the run as its certificate would.
+
+    Args:
+        scenario: The scenario. Its own duration is ignored.
+        length_s: Duration of the run, in s.
+    """
+    scenario = msgspec.structs.replace(scenario, duration_s=length_s)
+    records, end, run = run_whole(scenario)
+    judged = judge_virtual_run(scenario, run, end)
+    decision = judged.decision
+    return JudgedRun(
+        scenario=scenario,
+        records=records,
+        end=end,
+        twins=judged.twins,
+        roots=judged.roots,
+        stability=decision.stability,
+        text="; ".join(decision.reasons) or decision.rests_on or end.text,
+        rests_on=decision.rests_on,
+    )
+
+
+def lengthen_run(judged: JudgedRun) -> JudgedRun:
+    """Repeats a run over a longer time if its judgement needs more time.
+
+    A run that is stable or settled, and whose arms are at rest at its end, is long enough. Any
+    other run must last for `TIME_CONSTANTS` of its slowest time constants.
+
+    Args:
+        judged: The run.
+
+    Returns:
+        The longer run, or the same run if it is long enough.
+    """
+    if judged.diverged:
+        return judged
+    is_decided = judged.stability in (Stability.STABLE, Stability.SETTLED)
+    if is_decided and judged.end.behaviour is EndBehaviour.CONVERGED:
+        return judged
+
+    length_s = judged.scenario.duration_s
+    required_s = TIME_CONSTANTS * _find_slowest_s(judged)
+    limit_s = _compute_longest_s(judged.scenario)
+    longer_s = float(math.ceil(min(required_s, limit_s)))
+    if longer_s > length_s:
+        judged = judge_bench_run(judged.scenario, longer_s)
+    if required_s <= limit_s or judged.diverged:
+        return judged
+    limit_text = (
+        f"ended after {judged.scenario.duration_s:.4g} s by the safety limit of "
+        f"{MAX_RUN_TICKS} ticks, but {TIME_CONSTANTS:g} of its slowest time constants are "
+        f"{required_s:.4g} s"
+    )
+    return judged._replace(text=f"{judged.text}; {limit_text}", at_limit=True)
+
+
+def _compute_longest_s(scenario: Scenario) -> float:
+    """Returns the duration at which a run reaches the safety limit `MAX_RUN_TICKS`, in s.
+
+    Args:
+        scenario: The scenario, whose sites have tick rates.
+    """
+    ticks_per_s = sum(site.rate_hz for site in scenario.sites.values())
+    return MAX_RUN_TICKS / ticks_per_s
+
+
+def _find_slowest_s(judged: JudgedRun) -> float:
+    """Returns the slowest time constant of a run, in s. 0 if nothing decays.
+
+    It is that of the slowest root of the loop. If the loop has no roots, it is that of the
+    slowest decay of an envelope of the motion, or of a push in a twin.
+    """
+    root_per_s = judged.roots.rate_per_s
+    if root_per_s is not None:
+        return -1.0 / root_per_s if root_per_s < 0.0 else 0.0
+    end = judged.end
+    rates_per_s = [end.error.rate_per_s, end.speed.rate_per_s]
+    pushes = () if judged.twins is None else judged.twins.pushes
+    rates_per_s += [push.rate_per_s for push in pushes if push.factor > 0.0]
+    # A rate below 0 means decay. Its time constant is the inverse.
+    time_constants_s = [-1.0 / rate for rate in rates_per_s if rate < 0.0]
+    return max(time_constants_s, default=0.0)
+
+
+def _measure(run: BenchRun, judged: JudgedRun, duration_s: float) -> BenchRun:
+    """Measures the errors, efforts, forces and energies of a run.
+
+    Args:
+        run: The run without these numbers.
+        judged: The same run with its records.
+        duration_s: Time over which errors, efforts and forces are measured, in s.
+
+    Returns:
+        The run with the numbers, see `BenchRun`.
+    """
+    scenario = judged.scenario
+    whole = judged.records
+    task_end_ns = round(duration_s * NS_PER_S)
+    records = {name: batch.between(0, task_end_ns) for name, batch in whole.items()}
+
+    squared_efforts = []
+    squared_hand_torques = []
+    wall_forces = []
+    for name, record in records.items():
+        spec = scenario.sites[name]
+        arm = build_arm_rows(scenario, name)
+
+        effort = record.tau - arm.gravity_torque(record.q)
+        squared_efforts.append(np.mean(effort**2))
+        if spec.hands:
+            hand_torque = _compute_hand_torque(scenario, name, record)
+            squared_hand_torques.append(np.mean(hand_torque**2))
+
+        tip = arm.place_end_effector(record.q, record.qd)
+        t_s = record.t_ns / NS_PER_S
+        wall_forces += [wall_force(wall, t_s, tip) for wall in list_walls(spec)]
+
+    # There are no maxima if the task has no wall.
+    peaks_n = [float(force.max()) for force in wall_forces]
+    final_means_n = []
+    for force in wall_forces:
+        start = 3 * len(force) // 4
+        last_quarter = force[start:]
+        final_means_n.append(float(last_quarter.mean()))
+    effort_nm = np.sqrt(np.mean(squared_efforts))
+    hand_nm = np.sqrt(np.mean(squared_hand_torques))
+    return msgspec.structs.replace(
+        run,
+        bounded=_is_bounded(scenario, whole),
+        energy_j=find_least_energy(whole),
+        settled_s=_find_settled_s(whole),
+        error_rad=_measure_error_rad(scenario, records),
+        effort_nm=float(effort_nm),
+        hand_nm=float(hand_nm),
+        wall_n=max(final_means_n, default=None),
+        force_peak_n=max(peaks_n, default=None),
+    )
+
+
+def _is_bounded(scenario: Scenario, records: dict[str, RecordBatch]) -> bool:
+    """Returns True if all joints stayed slower than `BOUND_RAD_S` and near their start.
+
+    Args:
+        scenario: The scenario, which has the start angles.
+        records: All records of the run, by site.
+    """
+    for name, record in records.items():
+        start_rad = scenario.sites[name].q0_rad
+        distance_rad = np.abs(record.q - start_rad)
+        speed_rad_s = np.abs(record.qd)
+        is_thrown = distance_rad.max() > THROWN_RAD
+        is_too_fast = speed_rad_s.max() > BOUND_RAD_S
+        if is_thrown or is_too_fast:
+            return False
+    return True
+
+
+def _compute_hand_torque(scenario: Scenario, name: str, record: RecordBatch) -> Array:
+    """Computes the torque of the operators on the joints of an arm.
+
+    The records have -tau_x, the sum of all torques from outside. It also contains the viscous
+    friction -D qd of the joints, which is removed by adding D qd. Walls are not removed: the
+    function is meant for arms that touch none.
+
+    Args:
+        scenario: The scenario.
+        name: Name of the arm's site.
+        record: The records of the site.
+
+    Returns:
+        The torque in N m, shape (records, joints).
+    """
+    torque: Array = -record.tau_x
+    for source in scenario.sites[name].environment:
+        if isinstance(source, ViscousEnvironment):
+            damping = np.array(source.damping_nm_s_rad)
+            torque = torque + damping * record.qd
+    return torque
+
+
+def find_least_energy(records: dict[str, RecordBatch]) -> float:
+    """Computes the minimum over time of the net energy that the arms received from outside.
+
+    The net energy that the arms received until time t is the integral of -sum_i tau_x_i' qd_i
+    from the start to t, computed with the trapezoidal rule. Here -tau_x_i is the torque from
+    outside on arm i, in N m, which the records contain with the opposite sign. qd_i is the
+    joint velocity of the arm, in rad/s.
+
+    All arms start at rest. If network and controllers are passive, the arms cannot return more
+    energy than they received, so the net energy never falls below 0, apart from numerical
+    errors. A negative result shows that energy was generated.
+
+    Args:
+        records: All records of the run, by the name of the arm.
+
+    Returns:
+        The minimum, in J. It is at most 0, because the net energy is 0 at the start.
+    """
+    arm_powers = []
+    for record in records.values():
+        joint_power = record.tau_x * record.qd
+        arm_powers.append(-np.sum(joint_power, axis=1))
+    power = sum(arm_powers)
+    first_times_ns = records[SLAVE].t_ns[:2]
+    h_s = 1e-9 * np.diff(first_times_ns)[0]
+    power_sums = power[1:] + power[:-1]
+    work = 0.5 * h_s * power_sums
+    energy = np.cumsum(np.concatenate([[0.0], work]))
+    return float(energy.min())
+
+
+def _find_settled_s(records: dict[str, RecordBatch]) -> float | None:
+    """Finds the time from which every joint stays at its final angle.
+
+    Args:
+        records: All records of the run, by site.
+
+    Returns:
+        The time in s. None if it is less than `REST_S` before the end of the run, because the
+        arms may then still be moving.
+    """
+    settled_s = 0.0
+    for record in records.values():
+        from_end_rad = np.abs(record.q - record.q[-1])
+        distance_rad = from_end_rad.max(axis=1)
+        moving = np.flatnonzero(distance_rad > SETTLED_ERROR_RAD)
+        if len(moving):
+            last_moving_s = record.t_ns[moving[-1]] / NS_PER_S
+            settled_s = max(settled_s, last_moving_s)
+    end_s = records[SLAVE].t_ns[-1] / NS_PER_S
+    return float(settled_s) if settled_s <= end_s - REST_S else None
+
+
+def _measure_contact(run: BenchRun, item: BenchRunItem, far: JudgedRun) -> BenchRun:
+    """Measures what the user feels of the wall: a stiffness and an impedance.
+
+    Args:
+        run: The run without these numbers.
+        item: The run of the task `contact`, as it was executed.
+        far: The same run with its records.
+
+    Returns:
+        The run with the numbers that could be measured.
+    """
+    contact_s = _find_contact_s(far.scenario, far.records)
+    if contact_s is None:
+        return run
+    stiffness_n_m = _estimate_stiffness(item, far, contact_s)
+    impedances = _estimate_impedance(item, far, contact_s)
+    if impedances is None:
+        return msgspec.structs.replace(run, stiffness_n_m=stiffness_n_m)
+    in_contact, in_free_motion = impedances
+    return msgspec.structs.replace(
+        run,
+        stiffness_n_m=stiffness_n_m,
+        impedance_n_s_m=in_contact - in_free_motion,
+        free_impedance_n_s_m=in_free_motion,
+    )
+
+
+def _find_contact_s(scenario: Scenario, records: dict[str, RecordBatch]) -> float | None:
+    """Returns the time at which the slave first touches a wall, in s. None if it does not."""
+    record = records[SLAVE]
+    tip = build_arm_rows(scenario, SLAVE).place_end_effector(record.q, record.qd)
+    t_s = record.t_ns / NS_PER_S
+    contact_times_s = []
+    for wall in list_walls(scenario.sites[SLAVE]):
+        touching = np.flatnonzero(wall_force(wall, t_s, tip) > 0.0)
+        if len(touching):
+            contact_times_s.append(float(t_s[touching[0]]))
+    return min(contact_times_s, default=None)
+
+
+def _run_variant(
+    item: BenchRunItem, settings: Settings, duration_s: float
+) -> tuple[Scenario, dict[str, RecordBatch]] | None:
+    """Executes a run with other settings, without a judgement.
+
+    Args:
+        item: The run.
+        settings: Overrides of its scenario.
+        duration_s: Duration, in s.
+
+    Returns:
+        The scenario and its records. None if the run diverged.
+    """
+    built = item.cell.build(item.seed)
+    overrides = (*built.overrides, *format_settings(settings))
+    scenario = load_tuning_scenario(built.source, overrides).scenario
+    scenario = msgspec.structs.replace(scenario, duration_s=duration_s)
+    records, end, _ = run_whole(scenario)
+    return None if end.diverged_at_s is not None else (scenario, records)
+
+
+def _estimate_stiffness(item: BenchRunItem, far: JudgedRun, contact_s: float) -> float | None:
+    """Estimates the stiffness that the user feels along the normal of the wall.
+
+    The same run is executed with a shorter reach of the user. The stiffness is the difference
+    of the forces, divided by the difference of the positions of the user's arm. In each run,
+    they are measured `STIFFNESS_S` after its first contact.
+
+    Args:
+        item: The run with the longer reach.
+        far: The same run with its records.
+        contact_s: Time of the first contact of the longer reach, in s.
+
+    Returns:
+        The stiffness in N/m. None if one of the runs has no contact for so long.
+    """
+    variant = _run_variant(item, SHORTER_REACH, TASKS[item.cell.task].duration_s)
+    if variant is None:
+        return None
+    near_scenario, near_records = variant
+    near_contact_s = _find_contact_s(near_scenario, near_records)
+    if near_contact_s is None:
+        return None
+    near = _measure_push(near_scenario, near_records, near_contact_s + STIFFNESS_S)
+    longer = _measure_push(far.scenario, far.records, contact_s + STIFFNESS_S)
+    if near is None or longer is None:
+        return None
+    distance_m = longer.position_m - near.position_m
+    force_n = longer.force_n - near.force_n
+    return float(force_n / distance_m) if distance_m else None
+
+
+class _Push(NamedTuple):
+    """Where and how hard the user pushes, along the normal of the wall.
+
+    Attributes:
+        position_m: Position of the user's end effector along x, in m.
+        force_n: Force of the user on it along x, in N.
+    """
+
+    position_m: float
+    force_n: float
+
+
+def _measure_push(
+    scenario: Scenario, records: dict[str, RecordBatch], time_s: float
+) -> _Push | None:
+    """Measures how far and how hard the user pushes at a time.
+
+    Args:
+        scenario: The scenario.
+        records: All records of the run, by site.
+        time_s: The time, in s. Numbers are averaged over `STIFFNESS_WINDOW_S` around it.
+
+    Returns:
+        The position and the force. None if the run ends before.
+    """
+    window_s = (time_s - 0.5 * STIFFNESS_WINDOW_S, time_s + 0.5 * STIFFNESS_WINDOW_S)
+    motion = _measure_tip(scenario, records, window_s)
+    if motion is None:
+        return None
+    return _Push(float(motion.position_m.mean()), float(motion.force_n.mean()))
+
+
+class _TipMotion(NamedTuple):
+    """Motion of the user's end effector along the normal of the wall, over K records.
+
+    Attributes:
+        q: Joint angles, shape (K, n), in rad.
+        position_m: Position, shape (K,), in m.
+        speed_m_s: Velocity, shape (K,), in m/s.
+        force_n: Force of the user, shape (K,), in N.
+    """
+
+    q: Array
+    position_m: Array
+    speed_m_s: Array
+    force_n: Array
+
+
+def _measure_tip(
+    scenario: Scenario, records: dict[str, RecordBatch], window_s: tuple[float, float]
+) -> _TipMotion | None:
+    """Computes the motion of the user's end effector, and the force on it, within a window.
+
+    The force F of the operator on the end effector follows from the torque tau of the operator
+    on the joints: J' F = tau, where J is the Jacobian of the end effector.
+
+    Args:
+        scenario: The scenario.
+        records: All records of the run, by site.
+        window_s: Start and end of the window, in s.
+
+    Returns:
+        The motion along x. None if the run ends within the window.
+    """
+    start_ns, end_ns = (round(time_s * NS_PER_S) for time_s in window_s)
+    if records[USER].t_ns[-1] < end_ns - NS_PER_S // scenario.sites[USER].rate_hz:
+        return None
+    record = records[USER].between(start_ns, end_ns)
+    arm = build_arm_rows(scenario, USER)
+    tip = arm.place_end_effector(record.q, record.qd)
+    torque = _compute_hand_torque(scenario, USER, record)
+    J_transposed = np.swapaxes(tip.J, 1, 2)
+    torque_columns = torque[:, :, np.newaxis]
+    force = np.linalg.solve(J_transposed, torque_columns).astype(np.float64)
+    return _TipMotion(
+        q=record.q,
+        position_m=tip.position[:, 0],
+        speed_m_s=tip.speed[:, 0],
+        force_n=force[:, 0, 0],
+    )
+
+
+def _estimate_impedance(
+    item: BenchRunItem, far: JudgedRun, contact_s: float
+) -> tuple[float, float] | None:
+    """Estimates the impedance |Z| at `IMPEDANCE_HZ` that the user feels, with and without wall.
+
+    The user's arm is shaken by a small sine of force along the normal of the wall. Z is the
+    ratio of the phasors of the user's force and of the velocity, both along the normal. Each
+    phasor is that of the difference between the shaken run and the same run without the sine,
+    so that slow changes of the motion do not count. The run in free motion lacks the wall, and
+    its user moves to the pose that the user has in contact, so that the inertia of the arm is
+    the same.
+
+    Args:
+        item: The run of the task `contact`.
+        far: The same run with its records.
+        contact_s: Time of the first contact, in s.
+
+    Returns:
+        |Z| in contact and in free motion, in N s/m. None if a run is too short or diverges.
+    """
+    start_s = contact_s + STIFFNESS_S
+    end_s = start_s + IMPEDANCE_PERIODS / IMPEDANCE_HZ
+    window_s = (start_s, end_s)
+    still = _measure_tip(far.scenario, far.records, window_s)
+    if still is None:
+        return None
+
+    pose_rad = still.q.mean(axis=0)
+    no_motion = np.zeros_like(pose_rad)
+    arm = build_arm_rows(far.scenario, USER)
+    J = arm.place_end_effector(pose_rad[np.newaxis], no_motion[np.newaxis]).J[0]
+    shaking = {
+        "kind": "multisine",
+        "amplitude_nm": (SHAKING_N * J[0]).tolist(),
+        "frequencies_hz": [IMPEDANCE_HZ],
+    }
+    (hand,) = TASKS[item.cell.task].settings[f"sites.{USER}.hands"]
+    hand_to_pose = {**hand, "to_rad": pose_rad.tolist()}
+    no_wall: dict[str, Any] = {f"sites.{SLAVE}.environment": []}
+    in_contact = _run_window(item, {f"sites.{USER}.hands": [hand, shaking]}, window_s)
+    free_hands = {f"sites.{USER}.hands": [hand_to_pose]}
+    free_shaken_hands = {f"sites.{USER}.hands": [hand_to_pose, shaking]}
+    free = _run_window(item, no_wall | free_hands, window_s)
+    free_shaken = _run_window(item, no_wall | free_shaken_hands, window_s)
+    if in_contact is None or free is None or free_shaken is None:
+        return None
+    return _compute_impedance(in_contact, still), _compute_impedance(free_shaken, free)
+
+
+def _run_window(
+    item: BenchRunItem, settings: Settings, window_s: tuple[float, float]
+) -> _TipMotion | None:
+    """Executes a run with other settings, and returns the user's motion within a window.
+
+    Args:
+        item: The run.
+        settings: Overrides of its scenario.
+        window_s: Start and end of the window, in s. The run ends just after the window.
+    """
+    variant = _run_variant(item, settings, window_s[1] + STIFFNESS_WINDOW_S)
+    return None if variant is None else _measure_tip(*variant, window_s)
+
+
+def _compute_impedance(shaken: _TipMotion, still: _TipMotion) -> float:
+    """Computes |Z| from a shaken run and the same run without the sine, in N s/m."""
+    count = len(shaken.force_n)
+    turns = IMPEDANCE_PERIODS * np.arange(count) / count
+    wave = np.exp(-2j * np.pi * turns)
+    force = np.dot(wave, shaken.force_n - still.force_n)
+    speed = np.dot(wave, shaken.speed_m_s - still.speed_m_s)
+    return float(np.abs(force) / np.abs(speed))
+
+
+def _measure_error_rad(scenario: Scenario, records: dict[str, RecordBatch]) -> float:
+    """Computes the RMS difference between the slave and the average of its users, in rad.
+
+    The average is weighted with the dominance factors of the slave, which may change during the
+    run. It uses the joint angles of the users at the same time, without the delay of the links.
+
+    Args:
+        scenario: The scenario.
+        records: Records by site, all over the same times.
+    """
+    slave = records[SLAVE]
+    t_s = slave.t_ns / NS_PER_S
+    period_s = 1.0 / scenario.sites[SLAVE].rate_hz
+    start, ramps = list_scripted_ramps(scenario, SLAVE)
+    alpha = evaluate_ramps(start, ramps, t_s, period_s).alpha  # dominance factors
+    reference: Array = np.zeros_like(slave.q)
+    for index, peer in enumerate(scenario.peers(SLAVE)):
+        weight = alpha[:, index, None]
+        reference = reference + weight * records[peer].q
+    error_rad = slave.q - reference
+    return float(np.sqrt(np.mean(error_rad**2)))
+
+
+ORIGIN_NAME = "origin.json"
+JOURNAL_NAME = "runs.journal"
+
+
+BenchFolder = StudyFolder[BenchPlan, BenchRun]
+
+
+def prepare_bench_folder(plan: BenchPlan, path: Path | None = None) -> BenchFolder:
+    """Creates the folder of a benchmark, or opens an existing folder with finished runs.
+
+    Args:
+        plan: Plan of the benchmark.
+        path: The folder. None uses a folder that is named after the study, as in
+            runs/bench-full.
+
+    Raises:
+        UsageError: The folder cannot be made, or has other content. The same error is raised
+            if its runs come from another version of the program, or from a machine that
+            computes with other rounding, because these results must not be mixed.
+    """
+    if path is None:
+        path = Path("runs") / f"bench-{plan.study}"
+        refuse_link(path)
+    arithmetic, versions = describe_program()
+    facts = {"arithmetic": arithmetic, **versions}
+    origin = json.dumps(facts, indent=2) + "\n"
+    origin_file = path / ORIGIN_NAME
+    if origin_file.exists():
+        _check_origin(path, origin_file.read_text(encoding="utf-8"), origin)
+    else:
+        make_results_folder(path, "", force=None)
+        write_whole(origin_file, origin)
+    remedy = build_resume_hint("bench", "--study", plan.study, "--out", str(path))
+    journal_file = path / JOURNAL_NAME
+    return StudyFolder(
+        path=path,
+        plan=plan,
+        facts=facts,
+        remedy=remedy,
+        journal=lambda: RunJournal(journal_file, origin, BenchRun, remedy),
+    )
+
+
+def _check_origin(path: Path, folder_origin: str, origin: str) -> None:
+    """Refuses a folder whose runs come from another version or arithmetic.
+
+    Args:
+        path: The folder.
+        folder_origin: JSON text that describes the program that made the folder.
+        origin: JSON text that describes this program.
+
+    Raises:
+        UsageError: The texts differ.
+    """
+    if folder_origin == origin:
+        return
+    folder_text = " ".join(folder_origin.split())
+    local_text = " ".join(origin.split())
+    raise UsageError(
+        f"{path}: the runs in this folder were made with {folder_text}, but this program is "
+        f"{local_text}; results from both cannot be mixed: choose another folder with --out"
+    )
+
+
+def run_bench(
+    folder: BenchFolder,
+    jobs: int | None = None,
+    on: Workers = None,
+    progress: Progress = ignore_progress,
+    *,
+    confirm: bool = False,  # noqa: ARG001
+) -> BenchResults:
+    """Executes the runs of a benchmark that are not finished yet.
+
+    Args:
+        folder: Folder of the benchmark. Its journal contains the finished runs.
+        jobs: Number of processes, as for `trilat_net.bench`.
+        on: Cluster that executes the runs, as for `trilat_net.bench`.
+        progress: Function that is called with the number of finished runs and of all runs.
+        confirm: Accepted for older programs, and has no effect: every run that is not stable is
+            repeated over twice its length, because a longer run may show that it is stable.
+
+    Returns:
+        The results of all runs.
+
+    Raises:
+        RunFailed: A run ended its worker process, or the connection to the cluster is lost.
+            Finished runs are kept in the journal.
+    """
+    plan = folder.plan
+    items = [BenchRunItem(cell, seed) for cell in plan.cells for seed in cell.seeds]
+    with folder.journal() as journal:
+        _run_pending(journal, items, jobs, on, progress)
+
+        repeated = []
+        for item in items:
+            run = journal.done[item.cell.key, item.seed]
+            if run.needs_confirmation:
+                repeated.append(item._replace(to_s=run.confirmation_s))
+        _run_pending(journal, repeated, jobs, on, progress)
+        return BenchResults(plan, journal.done)
+
+
+def _run_pending(
+    journal: RunJournal[BenchRun],
+    items: list[BenchRunItem],
+    jobs: int | None,
+    on: Workers,
+    progress: Progress,
+) -> None:
+    """Executes the runs that the journal lacks, and adds each to the journal when it ends.
+
+    Args:
+        journal: The finished runs.
+        items: All runs that are needed.
+        jobs: Number of processes.
+        on: Cluster that executes the runs.
+        progress: Function that is called with the number of finished runs and of all runs.
+    """
+    pending = []
+    for item in items:
+        key = name_run(item.cell.key, item.to_s)
+        if (key, item.seed) not in journal.done:
+            pending.append(item)
+    if not pending:
+        return
+    hint = "; finished runs are kept: the same command continues"
+    with open_worker_pool(jobs, on, most=len(pending), hint=hint) as pool:
+        journal.run_pending(
+            pool,
+            run_bench_task,
+            pending,
+            done=len(items) - len(pending),
+            total=len(items),
+            show=progress,
+        )

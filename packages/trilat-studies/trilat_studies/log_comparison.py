@@ -1,0 +1,344 @@
+"""Compares recorded runs: the differences of their experiments, their metrics, and remarks.
+
+A log is the record of a run. Its scenario, the description of the experiment, is stored in it.
+
+Invariant:
+    - The comparison states numbers and ranks nothing.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+from trilat_net.analysis.judge import certify_run
+from trilat_net.analysis.metrics.log_metrics import (
+    ComparisonRow,
+    MetricComparison,
+    compare_metrics,
+    comparison_to_json,
+)
+from trilat_net.errors import UsageError, count_nouns, join_words
+from trilat_net.log.log_reader import Log, open_log
+from trilat_net.presentation.certificate_text import describe_judgement
+from trilat_net.presentation.result_text import Block, MarkedText, TextTable, format_number
+from trilat_net.results import Result
+from trilat_net.scenario.code_consent import may_run_user_laws
+from trilat_net.scenario.describe import ScenarioDifference, compare_scenarios
+from trilat_net.scenario.scenario_reader import reseed_scenario
+from trilat_net.work.intervals import MeanInterval, mean_interval
+
+from .tuning.candidate import check_final_posture
+
+_MOST_REASONS = 6
+"""Largest number of reasons for missing metrics that the text lists."""
+MOST_METRICS = 10
+"""Largest number of metrics in the short text."""
+_ROUNDING_KEYS = ("unaccounted_j",)
+"""Keys of metrics that consist of rounding errors."""
+_SUBJECTS = {
+    "max": "largest of {}s",
+    "sum": "sum of {}s",
+}
+"""How the number of a run follows from those of its sites, links or walls, by `reduction`."""
+
+
+@dataclass(frozen=True, repr=False)
+class LogComparison(Result):
+    """Comparison of the metrics and the scenarios of several logs, created by `compare`.
+
+    Attributes:
+        logs: The logs.
+        metrics: The metrics, with one row per quantity and one column per log.
+        differences: Differences of the scenarios. Empty if all scenarios are the same.
+        means: Mean of each row, if the logs differ in the seeds of their random numbers only.
+            Empty otherwise.
+        remarks: For each column, the judgement of the run and remarks on its end.
+    """
+
+    logs: tuple[Log, ...]
+    metrics: MetricComparison
+    differences: list[ScenarioDifference]
+    means: Sequence[MeanInterval | None]
+    remarks: dict[str, list[str]]
+
+    def headline(self) -> str:
+        """Returns a sentence that names the compared logs and the number of quantities."""
+        quantities = count_nouns(len(self.metrics.rows), "quantity")
+        return f"{', '.join(self.metrics.columns)}: {quantities}"
+
+    def blocks(self) -> Iterator[Block]:
+        """Yields the parts of the text that `trilat compare` prints.
+
+        The parts are the differences of the experiments, a table of the metrics, notes on how
+        each run ended, and reasons for missing values.
+        """
+        yield from self._compose_differences()
+        yield ""
+        yield _tabulate_quantities(self.metrics.rows, self.metrics.columns, self.means)
+        yield ""
+        for name, lines in self.remarks.items():
+            for line in lines:
+                yield MarkedText("[bold]note[/bold]", f"{name}: {line}")
+
+        reasons = list(self._explain_missing_values())
+        yield from reasons[:_MOST_REASONS]
+        hidden = len(reasons) - _MOST_REASONS
+        if hidden > 0:
+            yield f"and {hidden} more, which --json names"
+
+    def brief_blocks(self) -> Iterator[Block]:
+        """Yields the short text that `trilat compare` prints without --all.
+
+        The parts are the differences of the experiments, the judgement of each run, a table of
+        the metrics that differ most, and a sentence that sums up.
+        """
+        yield from self._compose_differences()
+        yield ""
+        for name, lines in self.remarks.items():
+            for line in lines:
+                yield MarkedText("[bold]note[/bold]", f"{name}: {line}")
+
+        rows = select_most_different(self.metrics.rows)
+        if rows:
+            chosen = set(rows)
+            means = [
+                mean
+                for row, mean in zip(self.metrics.rows, self.means, strict=False)
+                if row in chosen
+            ]
+            yield ""
+            yield _tabulate_quantities(rows, self.metrics.columns, means)
+        yield ""
+        yield self._sum_up(rows)
+        count = count_nouns(len(self.metrics.rows), "metric")
+        yield f"--all prints all {count}, and why numbers are missing"
+
+    def _compose_differences(self) -> Iterator[Block]:
+        """Yields the differences of the experiments, as a table or as a sentence."""
+        names = {log.scenario.name for log in self.logs}
+        if len(names) > 1:
+            sorted_names = ", ".join(sorted(names))
+            yield f"logs of different scenarios: {sorted_names}"
+        if self.differences:
+            header = ("differs", *self.metrics.columns)
+            rows = [(str(difference), *difference.values) for difference in self.differences]
+            yield ""
+            yield TextTable(header, rows)
+        else:
+            yield "the same experiment"
+
+    def _sum_up(self, rows: Sequence[ComparisonRow]) -> str:
+        """Returns the judgements and the largest difference of the runs in one sentence.
+
+        Args:
+            rows: The metrics that differ most.
+        """
+        verdicts = [
+            f"{name} is {lines[0].partition(':')[0]}" for name, lines in self.remarks.items()
+        ]
+        text = f"in short: {join_words(verdicts)}"
+        if not rows:
+            return f"{text}; no metric differs"
+        most = max(rows, key=lambda row: measure_difference(row.values))
+        values = [format_number(value, 4) for value in most.values]
+        unit = f" {most.quantity.unit}" if most.quantity.unit else ""
+        return (
+            f"{text}; the largest difference: {most.quantity.name}, {join_words(values)}{unit}"
+        )
+
+    def _explain_missing_values(self) -> Iterator[str]:
+        """Yields a sentence for each metric that applies to a log but has no value."""
+        for row in self.metrics.rows:
+            for name, entry in zip(self.metrics.columns, row.entries, strict=True):
+                is_missing = entry.value is None
+                if is_missing and entry.applies:
+                    yield f"{name}: no {row.quantity.name}: {entry.why}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Converts the comparison to plain values, as `trilat compare --json` prints it."""
+        logs = []
+        for name, log in zip(self.metrics.columns, self.logs, strict=True):
+            entry = {
+                "name": name,
+                "file": log.source,
+                "scenario": log.scenario.name,
+                "sha256": log.scenario.sha256,
+            }
+            logs.append(entry)
+
+        comparison: dict[str, Any] = {
+            "logs": logs,
+            "differences": [difference._asdict() for difference in self.differences],
+            "remarks": self.remarks,
+            **comparison_to_json(self.metrics),
+        }
+        if self.means:
+            means = {}
+            for row, mean in zip(self.metrics.rows, self.means, strict=True):
+                if mean is not None:
+                    means[row.quantity.key] = mean._asdict()
+            comparison["means"] = means
+        return comparison
+
+    def to_rows(self) -> list[dict[str, Any]]:
+        """Returns the metrics as a table of plain values, one row per quantity.
+
+        A row has the value of each log under the name of the log's column.
+        """
+        rows = []
+        for row in self.metrics.rows:
+            quantity = row.quantity
+            values = dict(zip(self.metrics.columns, row.values, strict=True))
+            cells = {"key": quantity.key, "unit": quantity.unit, **values}
+            rows.append(cells)
+        return rows
+
+
+def compare(*logs: str | Path | Log) -> LogComparison:
+    """Compares the metrics of logs, and the scenarios from which the logs come.
+
+    The command is `trilat compare`.
+
+    >>> logs = [tn.simulate("two_sites", {"control.Kd": Kd}, duration_s=0.1) for Kd in (3, 5)]
+    >>> len(tn.compare(*logs).metrics.row("rms_error_rad").values)
+    2
+
+    Args:
+        logs: Logs or their paths, at least two.
+
+    Raises:
+        UsageError: There are fewer than two logs.
+        LogError: A log cannot be read.
+    """
+    opened = [log if isinstance(log, Log) else open_log(log) for log in logs]
+    if len(opened) < 2:
+        raise UsageError(
+            "name at least two logs; or a scenario, as in: trilat compare --tune free"
+        )
+    files = [Path(log.sources[0]) for log in opened]
+    names = _name_columns(files)
+    remarks = {}
+    for name, log in zip(names, opened, strict=True):
+        judgement = certify_run(log, own_laws=may_run_user_laws(log.scenario))
+        verdict = describe_judgement(judgement)
+        remarks[name] = [verdict, *check_final_posture(log)]
+    metrics = compare_metrics(opened, names)
+    scenarios = [log.scenario for log in opened]
+
+    return LogComparison(
+        logs=tuple(opened),
+        metrics=metrics,
+        differences=list(compare_scenarios(scenarios)),
+        means=_average_repeats(opened, metrics),
+        remarks=remarks,
+    )
+
+
+def measure_difference(values: Sequence[float | None]) -> float:
+    """Returns how far values are apart, as a share of the largest of them.
+
+    Args:
+        values: Values of one metric. None where it is missing.
+
+    Returns:
+        The range divided by the largest absolute value. 0 if fewer than two values are known,
+        or if all of them are zero.
+    """
+    known = [value for value in values if value is not None]
+    largest = max(map(abs, known), default=0.0)
+    return (max(known) - min(known)) / largest if largest > 0.0 else 0.0
+
+
+def select_most_different(rows: Sequence[ComparisonRow]) -> list[ComparisonRow]:
+    """Returns the metrics that differ most between runs, in their order.
+
+    Errors of the computation, which are rounding of different size in every run, are left out.
+
+    Args:
+        rows: The metrics of the runs.
+    """
+    differences = {}
+    for index, row in enumerate(rows):
+        difference = measure_difference(row.values)
+        if difference > 0.0 and row.quantity.key not in _ROUNDING_KEYS:
+            differences[index] = difference
+    ranked = sorted(differences, key=lambda index: (-differences[index], index))
+    return [rows[index] for index in sorted(ranked[:MOST_METRICS])]
+
+
+def _name_columns(files: Sequence[Path]) -> list[str]:
+    """Returns a short and distinct name for the column of each log.
+
+    The name is the file's name without its suffix, preceded by as many of its folders as are
+    needed to distinguish all files.
+
+    Args:
+        files: Paths of the logs.
+    """
+    most_parts = max(len(file.parts) for file in files)
+    for depth in range(1, most_parts + 1):
+        names = []
+        for file in files:
+            parts = file.with_suffix("").parts
+            name = "/".join(parts[-depth:])
+            names.append(name)
+        if len(set(names)) == len(names):
+            return names
+    # Some files are the same, or differ only in their suffix.
+    return [f"{n}: {file}" for n, file in enumerate(files, 1)]
+
+
+def _average_repeats(
+    logs: Sequence[Log], metrics: MetricComparison
+) -> list[MeanInterval | None]:
+    """Averages each quantity over logs that repeat one experiment with different seeds.
+
+    Args:
+        logs: The logs.
+        metrics: Their metrics.
+
+    Returns:
+        The mean of each row, or None if it cannot be computed. The list is empty if the logs
+        differ in more than their seeds.
+    """
+    first = logs[0].scenario
+    seeds = {log.scenario.seed for log in logs}
+    if len(seeds) < len(logs):
+        return []
+    if any(reseed_scenario(log.scenario, first.seed) != first for log in logs):
+        return []
+    return [mean_interval(row.values) for row in metrics.rows]
+
+
+def _tabulate_quantities(
+    metrics: Sequence[ComparisonRow],
+    columns: Sequence[str],
+    means: Sequence[MeanInterval | None],
+) -> TextTable:
+    """Returns a table with one row per quantity and one column per log, in groups.
+
+    Args:
+        metrics: The metrics.
+        columns: Names of the logs.
+        means: Mean of each row, for another column. Empty if there is no such column.
+    """
+    rows: list[list[str]] = []
+    mean_by_row = dict(zip(metrics, means, strict=True)) if means else {}
+    for group, members in groupby(metrics, key=lambda row: row.quantity.group):
+        rows.append([group])
+        for row in members:
+            quantity = row.quantity
+            subject = ""
+            if quantity.of != "run":
+                subject = _SUBJECTS[quantity.reduction].format(quantity.of)
+            cells = [f"  {quantity.name}", quantity.unit or "-", subject]
+            cells += [format_number(value, 4) for value in row.values]
+            if means:
+                cells.append(str(mean_by_row[row] or "-"))
+            rows.append(cells)
+    header = ["", "unit", "over", *columns]
+    if means:
+        header.append("mean, 95 %")
+    return TextTable(tuple(header), rows, align="lllr")

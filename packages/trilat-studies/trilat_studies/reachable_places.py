@@ -1,0 +1,110 @@
+"""Decides which positions an arm can reach with its end effector.
+
+For a planar arm with two links, the answer follows from the lengths of the links. For a chain
+of more joints, a pose within the joint limits is searched numerically.
+
+Invariant:
+    - A position that counts as reachable can be reached.
+    - The converse does not hold: the search may miss a position that a chain can reach.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from trilat_net.core.step.vectors import Array
+from trilat_net.scenario.arms import ArmModel
+
+PLANAR_MARGIN = 0.01
+"""Fraction of a planar arm's length by which a position must lie inside its reach, so that no
+goal requires a straight arm.
+"""
+FOUND_WITHIN_M = 1e-3
+"""Distance from the position at which the search succeeds, in m."""
+_STEPS = 40
+"""Largest number of steps of the search."""
+_PROBE_RAD = 1e-6
+"""Step of the numerical derivative, in rad or m."""
+_DAMPING = 1e-3
+"""Damping of the least squares, in m^2."""
+_LARGEST_STEP_RAD = 0.5
+"""Largest change of a joint in one step, in rad or m."""
+
+
+def can_reach(arm: ArmModel, start_rad: Sequence[float] | Array, position_m: Array) -> bool:
+    """Tells whether the end effector of an arm can reach a position.
+
+    Args:
+        arm: Model of the arm.
+        start_rad: Joint angles from which the search for a pose of a chain starts, shape (n,),
+            in rad.
+        position_m: The position, in the coordinates of `ArmModel.end_effector`, in m.
+    """
+    if arm.chain is not None:
+        start = np.array(start_rad, dtype=np.float64)
+        target_m = np.asarray(position_m)
+        return _find_pose(arm, start, target_m)
+    first_m, second_m = arm.lengths_m
+    length_m = first_m + second_m
+    farthest_m = length_m - PLANAR_MARGIN * length_m
+    nearest_m = abs(first_m - second_m)
+    distance_m = math.hypot(*position_m)
+    return nearest_m <= distance_m <= farthest_m
+
+
+def _find_pose(arm: ArmModel, q: Array, position_m: Array) -> bool:
+    """Searches a pose within the joint limits whose end effector is at a position.
+
+    Each step moves the joints by damped least squares (Wampler 1986): with the Jacobian J and
+    the distance e from the position, the step is J' (J J' + d I)^-1 e. The damping d keeps the
+    step finite near singular poses. Then the joints are clipped to their limits.
+
+    Args:
+        arm: A chain.
+        q: Joint positions from which the search starts, shape (n,).
+        position_m: The position, in m.
+
+    Returns:
+        True if a pose was found.
+    """
+    assert arm.chain is not None
+    joints = arm.chain.joints
+    lower = np.array([joint.lower for joint in joints])
+    upper = np.array([joint.upper for joint in joints])
+    for _ in range(_STEPS):
+        end_effector_m = np.array(arm.end_effector(q.tolist()))
+        error_m = position_m - end_effector_m
+        distance_m = float(np.linalg.norm(error_m))
+        if distance_m <= FOUND_WITHIN_M:
+            return True
+
+        J = _compute_jacobian(arm, q, end_effector_m)
+        identity = np.eye(len(end_effector_m))
+        damped = J @ J.T + _DAMPING * identity
+        step = J.T @ np.linalg.solve(damped, error_m)
+        largest_rad = float(np.abs(step).max())
+        largest_rad = max(largest_rad, 1e-12)  # avoids a division by zero
+        step *= min(1.0, _LARGEST_STEP_RAD / largest_rad)
+        q = np.clip(q + step, lower, upper)
+    return False
+
+
+def _compute_jacobian(arm: ArmModel, q: Array, end_effector_m: Array) -> Array:
+    """Computes the Jacobian of a chain's end effector by forward differences, shape (m, n).
+
+    Args:
+        arm: A chain.
+        q: Joint positions, shape (n,).
+        end_effector_m: Position of the end effector at `q`, shape (m,), in m.
+    """
+    joint_count = len(q)
+    shape = (len(end_effector_m), joint_count)
+    jacobian = np.empty(shape)
+    for joint in range(joint_count):
+        probe = q.copy()
+        probe[joint] += _PROBE_RAD
+        probe_m = np.array(arm.end_effector(probe.tolist()))
+        motion_m = probe_m - end_effector_m
+        jacobian[:, joint] = motion_m / _PROBE_RAD
+    return jacobian

@@ -1,0 +1,278 @@
+"""The functions of the Python interface that need many runs, as `trilat_net.sweep`.
+
+Invariant:
+    - These functions only convert their arguments, and call the modules that do the work.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from trilat_net.app.api import AnyScenario, Overrides
+from trilat_net.work.study_folder import list_assignments
+
+if TYPE_CHECKING:
+    from trilat_net.work.executor import Workers
+
+    from .bench import BenchResults
+    from .sweep.margin_search import SweepMargins
+    from .sweep.sweep_results import SweepResults
+    from .tuning.tuning_plan import TuningResult
+
+Axes = str | Sequence[str] | Mapping[str, Any]
+
+
+def _list_override_texts(overrides: Overrides, duration_s: float | None) -> list[str]:
+    """Returns overrides as texts KEY=VALUE, as the command line has them.
+
+    Args:
+        overrides: Overrides by key, or a text or texts KEY=VALUE.
+        duration_s: Duration of the run in s, which becomes the last override. None adds none.
+    """
+    texts: list[Any]
+    if isinstance(overrides, Mapping):
+        texts = list(list_assignments(overrides))
+    elif isinstance(overrides, list | tuple):
+        texts = list(overrides)
+    else:
+        texts = [overrides]
+    if duration_s is not None:
+        texts.append(f"duration_s={duration_s}")
+    return texts
+
+
+def sweep(
+    scenario: AnyScenario,
+    over: Axes = (),
+    set: Overrides = (),  # noqa: A002 - the command's --set, by its name
+    *,
+    seeds: int | Sequence[int] = 1,
+    laws: Sequence[str | type] = (),
+    duration_s: float | None = None,
+    longest_s: float | None = None,
+    judge: str = "verdict",
+    metrics: Sequence[str] = (),
+    out: str | Path | None = None,
+    jobs: int | None = None,
+    on: "Workers" = None,
+) -> "SweepResults":
+    """Runs a scenario over a grid of values of its keys, and judges the stability of each.
+
+    The command is `trilat sweep`.
+
+    >>> axes = {"control.d": [0.3, 3.0]}
+    >>> found = tn.sweep("p_d_margin", axes, duration_s=2, out="grid", jobs=1)
+    >>> len(found.rows)
+    2
+
+    Args:
+        scenario: The scenario, which describes the experiment: the name of a shipped scenario,
+            a path, a TOML text, its tables, or a `Scenario`.
+        over: Axes of the grid: lists or arrays of values by key, as in
+            `{"link.delay_ms": range(0, 1601, 50)}`, or texts, as in
+            `["link.delay_ms=0:1600:50"]`.
+        set: Settings that replace those of the scenario in all cells of the grid, as in
+            `{"control.Kd": 5}`.
+        seeds: Number of seeds of random delays and losses, or the seeds. Each cell, a point of
+            the grid, has one run per seed.
+        laws: Names or classes of control laws, which are a further axis of the grid.
+        duration_s: First duration of the runs of a cell, in s.
+        longest_s: Longest duration of the runs of a cell whose stability is still open, in s.
+            By default eight times `duration_s`, or `duration_s` if `judge` is "twins".
+        judge: "verdict" or "twins". Twins are two runs that differ by a small disturbance. With
+            "twins", the exponent with which the disturbance grows is measured in each cell, in
+            addition to its verdict.
+        metrics: Keys of docs/reference/metrics.md that are measured in each run. They become
+            columns of the rows.
+        out: Folder of the results. A sweep in it is continued. By default the next free
+            runs/sweep-NAME-N.
+        jobs: Number of processes. None uses one per core.
+        on: Address of a Dask scheduler, or an executor, that executes the runs instead.
+
+    Returns:
+        The verdict and the metrics of each cell.
+
+    Raises:
+        ScenarioError: The scenario, an axis or one of its values is not valid.
+        UsageError: The folder contains something else.
+    """
+    from .sweep import plan_sweep, prepare_sweep_folder, run_sweep
+
+    plan = plan_sweep(
+        scenario,
+        _list_override_texts(set, duration_s),
+        over=over,
+        seeds=seeds,
+        laws=laws,
+        longest_s=longest_s,
+        judge=judge,
+        metrics=metrics,
+    )
+    folder = prepare_sweep_folder(plan, None if out is None else Path(out))
+    return run_sweep(folder, jobs, on=on).results
+
+
+def margin(
+    scenario: AnyScenario,
+    along: str,
+    over: Axes = (),
+    set: Overrides = (),  # noqa: A002 - the command's --set, by its name
+    *,
+    tolerance: float = 0.005,
+    seeds: int | Sequence[int] = 1,
+    laws: Sequence[str | type] = (),
+    duration_s: float | None = None,
+    jobs: int | None = None,
+    on: "Workers" = None,
+) -> "SweepMargins":
+    """Searches the edge of stability along a key; the command is `trilat sweep --margin`.
+
+    The edge is the value of the key at which runs change from stable to not stable.
+
+    >>> found = tn.margin("p_d_margin", "control.d=0.2:3", tolerance=0.2, duration_s=4, jobs=1)
+    >>> [search.margin.spans[0].stable_below for search in found.found]
+    [False]
+
+    Args:
+        scenario: The scenario, which describes the experiment: the name of a shipped scenario,
+            a path, a TOML text, its tables, or a `Scenario`.
+        along: The key and its range, as in "control.d=0.2:3".
+        over: Axes of a grid at whose points the edge is searched, as in `sweep`:
+            `{"link.delay_ms": [100, 200]}`.
+        set: Settings that replace those of the scenario in all runs.
+        tolerance: Largest width of the interval that contains an edge, relative to its value.
+        seeds: Number of seeds of random delays and losses, or the seeds.
+        laws: Names or classes of control laws, which are a further axis of the grid.
+        duration_s: First duration of a run, in s.
+        jobs: Number of processes. None uses one per core.
+        on: Address of a Dask scheduler, or an executor, that executes the runs instead.
+
+    Returns:
+        For each point of the grid, the intervals of the key that contain an edge.
+
+    Raises:
+        ScenarioError: The scenario or one of the values is not valid.
+        UsageError: The range is not of the form KEY=LOW:HIGH.
+    """
+    from .sweep import plan_sweep
+    from .sweep.margin_search import (
+        SweepMargins,
+        format_range_axis,
+        parse_search_range,
+        search_margins,
+    )
+    from .sweep.sweep_plan import list_axes
+
+    search_range = parse_search_range(along, tolerance)
+    axes = [*list_axes(over), format_range_axis(search_range)]
+    overrides = _list_override_texts(set, duration_s)
+    plan = plan_sweep(scenario, overrides, over=axes, seeds=seeds, laws=laws)
+    edges = search_margins(plan, search_range, jobs, on=on)
+    return SweepMargins(plan, search_range, edges)
+
+
+def tune(
+    scenario: AnyScenario,
+    laws: Sequence[str | type] = (),
+    set: Overrides = (),  # noqa: A002 - the command's --set, by its name
+    *,
+    budget: int = 64,
+    seed: int = 1,
+    seeds: int = 1,
+    objective: str = "error",
+    gravity_percent: float = 100.0,
+    duration_s: float | None = None,
+    jobs: int | None = None,
+    on: "Workers" = None,
+) -> "TuningResult":
+    """Compares control laws that one procedure tunes; the command is `trilat compare --tune`.
+
+    The procedure tries the same number of candidates for the gains of each law.
+
+    >>> found = tn.tune("free", ["p_d"], budget=2, duration_s=2, jobs=1)
+    >>> [law.space.law for law in found.found]
+    ['p_d']
+
+    Args:
+        scenario: The scenario, which describes the experiment: the name of a shipped scenario,
+            a path, a TOML text, its tables, or a `Scenario`.
+        laws: Names or classes of the laws. Empty selects all laws for any number of sites.
+        set: Settings that replace those of the scenario, as in `{"link.delay_ms": 100}`.
+        budget: Number of candidates per law.
+        seed: Seed of the search, which draws the candidates.
+        seeds: Number of seeds of the scenario over which each candidate is averaged.
+        objective: What the search minimises besides the effort of the arms: "error", the
+            tracking error, or "settling", the settling time.
+        gravity_percent: Gravity that all laws assume, in % of the true gravity.
+        duration_s: Duration of a run, in s. By default that of the scenario.
+        jobs: Number of processes. None uses one per core.
+        on: Address of a Dask scheduler, or an executor, that executes the runs instead.
+
+    Returns:
+        The candidates of each law, with their gains and results.
+
+    Raises:
+        ScenarioError: The scenario is not valid, or laws cannot be compared in it.
+        UsageError: Another argument is not valid.
+    """
+    from .tuning import plan_tuning
+
+    plan = plan_tuning(
+        scenario,
+        _list_override_texts(set, duration_s),
+        laws=laws,
+        budget=budget,
+        seed=seed,
+        objective=objective,
+        gravity_percent=gravity_percent,
+        seeds=seeds,
+    )
+    return plan.run(jobs, on=on)
+
+
+def bench(
+    study: str = "small",
+    *,
+    tasks: Sequence[str] = (),
+    laws: Sequence[str] = (),
+    links: Sequence[str] = (),
+    seeds: int | None = None,
+    confirm: bool = False,
+    out: str | Path | None = None,
+    jobs: int | None = None,
+    on: "Workers" = None,
+) -> "BenchResults":
+    """Runs the benchmark suite, which compares control laws in the same tasks and links.
+
+    The command is `trilat bench`, which also writes tables and figures.
+
+    >>> cell = {"tasks": ["free"], "laws": ["p_d"], "links": ["rtt68"]}
+    >>> found = tn.bench(**cell, seeds=1, out="suite", jobs=1)
+    >>> len(found.runs)
+    1
+
+    Args:
+        study: Part of the suite: full, small or round-trips.
+        tasks: Names of the selected tasks. Empty selects all tasks of the study.
+        laws: Names of the selected laws. Empty selects all laws of the study.
+        links: Names of the selected links (network conditions), as in "rtt68-loss10" or "4g".
+            Empty selects all links of the study.
+        seeds: Number of seeds of random delays and losses. By default that of the study.
+        confirm: Has no effect any more: every run that is not stable is repeated over twice
+            its length, which confirms or refutes the verdict.
+        out: Folder of the results. A suite in it is continued. By default runs/bench-STUDY.
+        jobs: Number of processes. None uses one per core.
+        on: Address of a Dask scheduler, or an executor, that executes the runs instead.
+
+    Returns:
+        The runs of all combinations of tasks, laws and links, with their results.
+
+    Raises:
+        UsageError: There is no such study, task, law or link, or the folder contains something
+            else.
+    """
+    from .bench import plan_bench, prepare_bench_folder, run_bench
+
+    plan = plan_bench(study, tasks=tasks, laws=laws, links=links, seeds=seeds)
+    folder = prepare_bench_folder(plan, None if out is None else Path(out))
+    return run_bench(folder, jobs, on, confirm=confirm)

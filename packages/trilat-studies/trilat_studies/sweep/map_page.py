@@ -1,0 +1,858 @@
+"""Draws a stability map and writes its page: map.png, map.svg, map.pdf and map.md.
+
+A stability map shows for which parameters a scenario is stable. The figure has a coloured cell
+for each combination of two parameters. Limits of stability from theory are drawn as lines. The
+colour of a cell depends on the runs of the sweep:
+
+- With one run per cell, the colour shows how the run ended, for example converged or diverged.
+- With several random seeds per cell, it shows the fraction of runs that are stable. Undecided
+  runs are left out.
+- If growth exponents were measured, which are the rates at which small disturbances grow, it
+  shows the exponent. White stands for zero.
+
+Invariant:
+    - The page contains only results, lines and commands. Equal results give equal bytes.
+    - The colour of a cell depends on its own results alone.
+    - A cell is hatched if half or more of its runs are undecided, or if it should have an
+      exponent and has none.
+    - Vector files contain the cells as an image, because viewers show seams between adjacent
+      shapes.
+    - The colours of the classes differ in lightness, for grey print and colour-blind readers.
+"""
+
+import math
+import textwrap
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import BoundaryNorm, LinearSegmentedColormap, ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.patheffects import Normal, Stroke
+from matplotlib.ticker import FixedFormatter, FixedLocator, MaxNLocator
+
+from trilat_net.core.step.vectors import Array
+from trilat_net.files import write_whole
+from trilat_net.presentation import style
+from trilat_net.presentation.appearance import COLUMN_IN, FigureSize, make_print_size
+from trilat_net.presentation.result_text import TextTable
+
+from .fixed_gains import FAIR_COMPARISON
+from .stability_map import (
+    CELL_CLASSES,
+    MapLine,
+    MapPanel,
+    MapPlane,
+    PlaneAxis,
+    StabilityEdge,
+    StabilityMap,
+    find_map_edges,
+)
+from .sweep_cell import CellClass
+
+CLASS_COLOURS = {
+    CellClass.CONVERGED: "#d3e4f3",
+    CellClass.BOUNDED: "#e6b84c",
+    CellClass.DIVERGED: "#a23b53",
+    CellClass.UNDECIDED: "#ffffff",
+}
+"""Colours of the classes: light, medium and dark; undecided cells are white and hatched."""
+_EMPTY_COLOUR = "#f4f4f4"
+"""Colour of cells without runs."""
+# Look of the hatching of undecided cells.
+_HATCHED: Any = {
+    "facecolor": "none",
+    "edgecolor": "#8a8a8a",
+    "linewidth": 0.0,
+    "hatch": "/////",
+}
+# Styles of the lines, by `MapLine.rank`.
+_LINE_STYLES: tuple[dict[str, Any], ...] = (
+    {"color": "#000000", "linestyle": "-", "linewidth": 1.2},
+    {"color": "#000000", "linestyle": (0, (4, 1.6)), "linewidth": 1.2},
+    # The last style is that of measured lines, which lie below the others.
+    {"color": "#ddaa33", "linestyle": "-", "linewidth": 2.6},
+)
+# Look of the measured edges of the classes on a map of growth exponents.
+_VERDICT_EDGE: dict[str, Any] = {"color": "#6b6b6b", "linewidth": 1.6, "alpha": 0.6}
+_EXPONENTS = LinearSegmentedColormap.from_list(
+    "exponents", ["#004488", "#ffffff", "#a23b53"], 257
+)
+_SHARES = LinearSegmentedColormap.from_list(
+    "share",
+    [
+        CLASS_COLOURS[CellClass.DIVERGED],
+        CLASS_COLOURS[CellClass.BOUNDED],
+        CLASS_COLOURS[CellClass.CONVERGED],
+    ],
+)
+"""Colours of stable shares: dark if nothing is stable, lighter with a larger share."""
+_HALO_PT = 2.6
+"""Width of the white halo around a line."""
+_COUNT_PT = 5.0
+"""Font size of the counts in cells."""
+_DIGIT_WIDTH = 0.62
+"""Width of a digit, relative to the font size."""
+_TITLE_LETTERS_PER_IN = 13
+"""Letters per inch of a panel title; a longer title is broken, to keep clear of its neighbour.
+"""
+_FULL_HEIGHT_IN = 2.3
+"""Height of a panel that has a row to itself."""
+_SHARED_HEIGHT_IN = 1.75
+"""Height of a panel that shares its row."""
+_STRIP_HEIGHT_IN = 0.7
+"""Height of a panel of a map with a single axis."""
+_CAPTION_PT = 5.5
+"""Font size of the caption."""
+_CAPTION_LINE_IN = 0.1
+"""Height of a line of the caption."""
+_CAPTION_LETTERS_PER_IN = 25
+"""Letters of the caption per inch."""
+_SHARED_LABEL_IN = 0.14
+"""Height of the label that all panels share."""
+_COLOUR_BAR_IN = 0.6
+"""Width of the colour bar with its labels."""
+
+
+def draw_stability_map(
+    plane: MapPlane,
+    lines: Sequence[Sequence[MapLine]],
+    form: FigureSize,
+    fixed: Sequence[str] = (),
+) -> Figure:
+    """Draws a stability map, which shows with which parameters a scenario is stable.
+
+    The map is a coloured grid. A sweep with more than two parameters has several panels, each
+    with the same two axes.
+
+    Args:
+        plane: Axes of the map, and the results of the runs in each panel.
+        lines: For each panel, the lines that separate stable from unstable parameters, such as
+            limits from theory.
+        form: Width, type sizes and resolution of the figure.
+        fixed: Gains that all runs have in common, one text per control law, for the caption.
+    """
+    count = len(plane.panels)
+    columns = _count_columns(count, form)
+    rows = math.ceil(count / columns)
+    caption = _wrap_caption(fixed, form)
+    panel_height_in = _choose_panel_height_in(plane, columns)
+    caption_height_in = _CAPTION_LINE_IN * len(caption)
+    height_in = 0.95 + rows * panel_height_in + caption_height_in
+    shares_labels = columns * rows > 1
+    has_colour_bar = plane.judged_by_twins or plane.seeds > 1
+
+    with style.styled_figure(form, height_in) as figure:
+        x_label_options: dict[str, Any] = {}
+        if caption:
+            caption_top = _write_caption(figure, caption, height_in, shares_labels)
+            x_label_options = {"y": caption_top, "va": "bottom"}
+        panel_grid = style.add_panels(figure, rows, columns, sharex=True, sharey=True)
+        grid: list[Any] = list(panel_grid.flat)
+        for axes in grid[count:]:
+            axes.set_axis_off()  # positions of the grid without a panel
+
+        titles_in = form.width_in - _COLOUR_BAR_IN * has_colour_bar
+        title_letters = round(titles_in * _TITLE_LETTERS_PER_IN / columns)
+        for axes, panel, panel_lines in zip(grid, plane.panels, lines, strict=False):
+            _draw_panel(axes, plane, panel, panel_lines)
+            title = panel.title
+            if len(title) > title_letters:
+                title = title.replace(", ", ",\n")
+            axes.set_title(title)
+        has_y_axis = bool(plane.y.key)
+        for n, axes in enumerate(grid[:count]):
+            _set_scale(axes, plane)
+            is_left = n % columns == 0
+            is_bottom = n + columns >= count
+            axes.tick_params(labelleft=is_left and has_y_axis)
+            axes.tick_params(labelbottom=is_bottom)
+
+        if shares_labels:
+            figure.supxlabel(plane.x.label, fontsize=8.0, **x_label_options)
+            figure.supylabel(plane.y.label, fontsize=8.0)
+        else:
+            first_axes = grid[0]
+            first_axes.set_xlabel(plane.x.label)
+            first_axes.set_ylabel(plane.y.label)
+        if has_colour_bar:
+            _draw_colour_bar(figure, grid, plane)
+        _draw_legend(figure, plane, lines)
+
+        # Drawing computes the layout. The resulting size of a cell decides whether the counts
+        # fit into it.
+        canvas = FigureCanvasAgg(figure)
+        figure.draw(canvas.get_renderer())  # type: ignore[no-untyped-call]
+        shows_shares = plane.seeds > 1 and not plane.judged_by_twins
+        if shows_shares:
+            for axes, panel in zip(grid, plane.panels, strict=False):
+                _draw_counts(axes, plane, panel)
+    return figure
+
+
+def _count_columns(panels: int, form: FigureSize) -> int:
+    """Returns the number of columns in which the panels of a figure are arranged.
+
+    Args:
+        panels: Number of panels.
+        form: Width, type sizes and resolution of the figure.
+    """
+    if panels == 1:
+        return 1
+    if form.narrow:
+        return 2
+    if panels <= 3:
+        return panels
+    return 4 if panels in (4, 7, 8) else 3
+
+
+def _choose_panel_height_in(plane: MapPlane, columns: int) -> float:
+    """Returns the height of a panel, in inches.
+
+    Args:
+        plane: The map. If only one axis is drawn, its panels are low strips.
+        columns: Number of columns. A panel that has a row to itself is higher.
+    """
+    if not plane.y.key:
+        return _STRIP_HEIGHT_IN
+    return _FULL_HEIGHT_IN if columns == 1 else _SHARED_HEIGHT_IN
+
+
+def _wrap_caption(fixed: Sequence[str], form: FigureSize) -> list[str]:
+    """Returns the lines of the caption, which names the gains that were not swept.
+
+    Args:
+        fixed: Gains that were not swept, one text per control law.
+        form: Size of the figure, from which the length of a line follows.
+    """
+    if not fixed:
+        return []
+    width = round(_CAPTION_LETTERS_PER_IN * form.width_in)
+    gains = "; ".join(fixed)
+    gain_lines = textwrap.wrap(f"not swept: {gains}", width)
+    comparison_lines = textwrap.wrap(FAIR_COMPARISON, width)
+    return [*gain_lines, *comparison_lines]
+
+
+def _write_caption(
+    figure: Figure, caption: Sequence[str], height_in: float, shares_labels: bool
+) -> float:
+    """Writes the caption at the bottom of a figure, and reserves the space for it.
+
+    Args:
+        figure: The Matplotlib figure.
+        caption: Lines of the caption.
+        height_in: Height of the figure, in inches.
+        shares_labels: True if the panels share a label. The layout engine moves panels but not
+            this label, so that the space for the label is reserved here.
+
+    Returns:
+        The position of the top of the caption, as a fraction of the height.
+    """
+    caption_height_in = _CAPTION_LINE_IN * len(caption) + 0.04
+    top = caption_height_in / height_in
+    reserved = top
+    if shares_labels:
+        reserved += _SHARED_LABEL_IN / height_in
+    panel_rectangle = (0.0, reserved, 1.0, 1.0 - reserved)
+    engine: Any = figure.get_layout_engine()
+    engine.set(rect=panel_rectangle)
+    figure.text(
+        x=0.01,
+        y=0.02 / height_in,
+        s="\n".join(caption),
+        va="bottom",
+        fontsize=_CAPTION_PT,
+        color=style.REFERENCE,
+    )
+    return top
+
+
+def _draw_panel(axes: Axes, plane: MapPlane, panel: MapPanel, lines: Sequence[MapLine]) -> None:
+    """Draws the cells of a panel, hatches the undecided ones, and draws the lines on top.
+
+    Args:
+        axes: Where to draw.
+        plane: The measured part of the map.
+        panel: Panel of the map, a grid of runs over x and y.
+        lines: Lines of the panel.
+    """
+    axes.grid(visible=False)
+    axes.set_facecolor(_EMPTY_COLOUR)
+    _draw_cells(axes, plane, panel)
+    if plane.judged_by_twins:
+        _draw_verdict_edges(axes, plane, panel)
+    _hatch_undecided(axes, plane, panel)
+    for line in lines:
+        _draw_line(axes, plane, line)
+
+
+def _draw_cells(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
+    """Draws the coloured cells of a panel.
+
+    The colour shows the growth exponent, the fraction of seeds with a stable run, or the class
+    of the single run.
+    """
+    colours: dict[str, Any]
+    values: Any
+    if plane.judged_by_twins:
+        limit = _find_exponent_limit(plane)
+        values = np.ma.masked_invalid(panel.exponents_per_s)
+        colours = {"cmap": _EXPONENTS, "vmin": -limit, "vmax": limit}
+    elif plane.seeds > 1:
+        values = np.ma.masked_invalid(panel.share)
+        colours = {"cmap": _SHARES, "vmin": 0.0, "vmax": 1.0}
+    else:
+        most_frequent = panel.counts.argmax(axis=2)
+        values = np.ma.masked_where(panel.runs == 0, most_frequent)
+        count = len(CELL_CLASSES)
+        class_colours = [CLASS_COLOURS[verdict] for verdict in CELL_CLASSES]
+        palette = ListedColormap(class_colours)
+        class_borders = np.arange(count + 1) - 0.5
+        norm = BoundaryNorm(class_borders, count)
+        colours = {"cmap": palette, "norm": norm}
+
+    x = _compute_borders(plane.x)
+    y = _compute_borders(plane.y)
+    axes.pcolormesh(x, y, values, rasterized=True, **colours)
+
+
+def _hatch_undecided(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
+    """Hatches the undecided cells. Neighbouring cells of a row form one rectangle."""
+    x = _compute_borders(plane.x)
+    y = _compute_borders(plane.y)
+    undecided_rows = _find_undecided(plane, panel)
+    for row, undecided in enumerate(undecided_rows):
+        bottom = y[row]
+        top = y[row + 1]
+        for first, stop in _list_stretches(undecided):
+            sides = [x[first], x[stop]]
+            axes.fill_between(sides, bottom, top, zorder=1.5, **_HATCHED)
+
+
+def _draw_verdict_edges(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
+    """Draws the measured edges of the classes in each column as vertical lines."""
+    for x_value, edge in find_map_edges(plane, panel):
+        x = _find_position(plane.x, x_value)
+        low = _find_position(plane.y, edge.low)
+        high = _find_position(plane.y, edge.high)
+        axes.vlines(x, low, high, **_VERDICT_EDGE)
+
+
+def _find_position(axis: PlaneAxis, value: float) -> float:
+    """Returns the position at which a value is drawn, interpolated between the axis values."""
+    position = np.interp(value, axis.values, axis.positions)
+    return float(position)
+
+
+def _list_stretches(flags: Array) -> list[tuple[int, int]]:
+    """Returns the ranges of consecutive True values in a row, as pairs (first, last + 1)."""
+    padded = np.concatenate([[False], flags, [False]])
+    is_change = padded[1:] != padded[:-1]
+    changes = np.flatnonzero(is_change).tolist()
+    firsts = changes[::2]
+    stops = changes[1::2]
+    return list(zip(firsts, stops, strict=True))
+
+
+def _draw_line(axes: Axes, plane: MapPlane, line: MapLine) -> None:
+    """Draws a line of a map as the zero contour of its quantity.
+
+    The quantity is known at the grid points, the centres of the cells. It is extrapolated
+    linearly, so that the line reaches the borders of the panel.
+
+    Args:
+        axes: Where to draw.
+        plane: The measured part of the map.
+        line: The line.
+    """
+    x = _extend_positions(plane.x)
+    y = _extend_positions(plane.y)
+    excess = _extrapolate_rows(line.excess, y)
+    excess = _extrapolate_rows(excess.T, x).T
+    # A border at zero may coincide with the first position. Only one of the two is kept.
+    keep_x = np.diff(x, append=np.inf) > 0.0
+    keep_y = np.diff(y, append=np.inf) > 0.0
+    kept_cells = np.ix_(keep_y, keep_x)
+    kept_excess = np.ma.masked_invalid(excess[kept_cells])
+
+    look = _find_line_style(line)
+    contour = axes.contour(
+        x[keep_x],
+        y[keep_y],
+        kept_excess,
+        levels=[0.0],
+        colors=look["color"],
+        linewidths=look["linewidth"],
+    )
+    halo = [Stroke(linewidth=_HALO_PT, foreground="#ffffff"), Normal()]
+    contour.set(linestyle=look["linestyle"], path_effects=halo)
+
+
+def _find_line_style(line: MapLine) -> dict[str, Any]:
+    """Returns the style of a line, which follows from its rank."""
+    style_index = line.rank % len(_LINE_STYLES)
+    return _LINE_STYLES[style_index]
+
+
+def _extend_positions(axis: PlaneAxis) -> Array:
+    """Returns the positions of the values of an axis, between the two borders of the panel."""
+    borders = _compute_borders(axis)
+    first_border = borders[:1]
+    last_border = borders[-1:]
+    return np.concatenate([first_border, axis.positions, last_border])
+
+
+def _extrapolate_rows(rows: Array, positions: Array) -> Array:
+    """Returns a field with an extrapolated row before the first and after the last row.
+
+    Args:
+        rows: The field, shape (n, m).
+        positions: Positions of the rows of the result, shape (n + 2,).
+    """
+    reversed_rows = rows[::-1]
+    reversed_positions = positions[::-1]
+    before = _extrapolate_row(rows[:2], positions[:3])
+    after = _extrapolate_row(reversed_rows[:2], reversed_positions[:3])
+    row_before = before[np.newaxis]
+    row_after = after[np.newaxis]
+    return np.concatenate([row_before, rows, row_after])
+
+
+def _extrapolate_row(rows: Array, positions: Array) -> Array:
+    """Returns a row outside of a field, on the straight line through the two nearest rows.
+
+    Args:
+        rows: The nearest row and the one behind it, shape (2, m).
+        positions: Positions of the new row and of these two rows, shape (3,).
+    """
+    outside, near, far = positions
+    near_row, far_row = rows
+    difference = far_row - near_row
+    offset = outside - near
+    spacing = far - near
+    extrapolated: Array = near_row + difference * offset / spacing
+    return extrapolated
+
+
+def _find_undecided(plane: MapPlane, panel: MapPanel) -> Any:
+    """Returns which cells have runs but no clear result and must be hatched.
+
+    These are the cells of which half or more of the runs are undecided. On a map of growth
+    exponents, they are the cells without an exponent.
+
+    Returns:
+        Flags, shape (y, x).
+    """
+    has_runs = panel.runs > 0
+    if plane.judged_by_twins:
+        return has_runs & np.isnan(panel.exponents_per_s)
+    class_index = CELL_CLASSES.index(CellClass.UNDECIDED)
+    undecided = panel.counts[:, :, class_index]
+    half_or_more = 2 * undecided >= panel.runs
+    return has_runs & half_or_more
+
+
+def _compute_borders(axis: PlaneAxis) -> Array:
+    """Returns the borders of the cells along an axis, halfway between the values.
+
+    If all values are at least zero, so are the borders: a delay of -100 ms does not exist.
+
+    Returns:
+        Positions, shape (n + 1,) for n values.
+    """
+    positions = axis.positions
+    first = positions[0]
+    if len(positions) == 1:
+        return np.array([first - 0.5, first + 0.5])
+    outer = positions[[0, -1]]
+    inner = positions[[1, -2]]
+    ends = 1.5 * outer - 0.5 * inner
+    middles = 0.5 * (positions[1:] + positions[:-1])
+    borders: Array = np.concatenate([ends[:1], middles, ends[1:]])
+    if axis.is_evenly_spaced and first >= 0.0:
+        return np.maximum(borders, 0.0)
+    return borders
+
+
+def _set_scale(axes: Axes, plane: MapPlane) -> None:
+    """Sets the limits and ticks of a panel.
+
+    Args:
+        axes: The panel in the figure.
+        plane: The measured part of the map.
+    """
+    x = _compute_borders(plane.x)
+    y = _compute_borders(plane.y)
+    axes.set_xlim(x[0], x[-1])
+    axes.set_ylim(y[0], y[-1])
+    _set_ticks(axes.xaxis, plane.x)
+    _set_ticks(axes.yaxis, plane.y)
+    if not plane.y.key:
+        axes.set_yticks([])
+    for spine in ("top", "right"):
+        axes.spines[spine].set_visible(True)
+
+
+def _set_ticks(axis: Axis, plane_axis: PlaneAxis) -> None:
+    """Sets the ticks of one axis of a panel.
+
+    If the values are equally spaced, the ticks are round numbers. Otherwise they are the values
+    themselves.
+    """
+    if plane_axis.is_evenly_spaced:
+        round_steps = [1, 2, 2.5, 4, 5, 10]
+        axis.set_major_locator(MaxNLocator(5, steps=round_steps))
+        return
+    positions = list(plane_axis.positions)
+    texts = [f"{value:g}" for value in plane_axis.values]
+    axis.set_major_locator(FixedLocator(positions))
+    axis.set_major_formatter(FixedFormatter(texts))
+
+
+def _find_exponent_limit(plane: MapPlane) -> float:
+    """Returns the exponent at which the colours end, in 1/s.
+
+    The limit is 1, 2 or 5 times a power of ten. Four fifths of the exponents do not exceed it,
+    so that a few large exponents do not make all others pale.
+    """
+    exponents = [panel.exponents_per_s.ravel() for panel in plane.panels]
+    magnitudes = np.abs(np.concatenate(exponents))
+    quantile = float(np.nanquantile(magnitudes, 0.8))
+    least = max(quantile, 1e-6)
+    power = math.floor(math.log10(least))
+    decade = 10.0**power
+    for step in (1.0, 2.0, 5.0):
+        limit = step * decade
+        if limit >= least * (1.0 - 1e-9):  # also if both are equal up to rounding
+            return limit
+    return 10.0 * decade
+
+
+def _draw_colour_bar(figure: Figure, grid: Sequence[Axes], plane: MapPlane) -> None:
+    """Draws the colour bar of growth exponents or of stable shares.
+
+    The pointed ends of the bar of exponents stand for all exponents beyond its limits.
+
+    Args:
+        figure: The Matplotlib figure.
+        grid: All panels, beside which the bar stands.
+        plane: The measured part of the map.
+    """
+    if plane.judged_by_twins:
+        limit = _find_exponent_limit(plane)
+        colours = ScalarMappable(cmap=_EXPONENTS)
+        colours.set_clim(-limit, limit)
+        label = "growth exponent of a push (1/s)"
+        pointed = "both"
+    else:
+        colours = ScalarMappable(cmap=_SHARES)
+        colours.set_clim(0.0, 1.0)
+        label = "share of stable runs"
+        pointed = "neither"
+
+    bar = figure.colorbar(
+        colours,
+        ax=list(grid),
+        fraction=0.05,
+        pad=0.02,
+        aspect=30,
+        extend=pointed,
+    )
+    if plane.judged_by_twins:
+        half = 0.5 * limit
+        bar.set_ticks([-limit, -half, 0.0, half, limit])
+    bar.set_label(label)
+    bar.outline.set_linewidth(0.6)
+
+
+def _draw_counts(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
+    """Writes the numbers of stable and of decided runs into the cells whose runs disagree.
+
+    Nothing is written if the numbers do not fit into a cell.
+    """
+    extent = axes.get_window_extent()
+    dpi = axes.figure.dpi
+    panel_width_pt = 72.0 * extent.width / dpi
+    panel_height_pt = 72.0 * extent.height / dpi
+    cell_width_pt = panel_width_pt / len(plane.x.values)
+    cell_height_pt = panel_height_pt / len(plane.y.values)
+    digits = len(str(plane.seeds))
+    letters = 2 * digits + 1
+    text_width_pt = letters * _DIGIT_WIDTH * _COUNT_PT
+    text_height_pt = 1.2 * _COUNT_PT
+    if cell_width_pt < text_width_pt or cell_height_pt < text_height_pt:
+        return
+
+    stable = panel.stable
+    decided = panel.decided
+    disagree = (stable > 0) & (stable < decided)
+    for i, j in np.argwhere(disagree):
+        axes.text(
+            x=plane.x.positions[j],
+            y=plane.y.positions[i],
+            s=f"{stable[i, j]}/{decided[i, j]}",
+            ha="center",
+            va="center",
+            fontsize=_COUNT_PT,
+            color="#000000",
+        )
+
+
+def _draw_legend(figure: Figure, plane: MapPlane, lines: Sequence[Sequence[MapLine]]) -> None:
+    """Draws the legend: the classes or the edge of the classes, the hatching, and the lines.
+
+    Args:
+        figure: The Matplotlib figure.
+        plane: The measured part of the map.
+        lines: Lines of each panel.
+    """
+    handles: list[Any] = []
+    if plane.judged_by_twins:
+        if any(find_map_edges(plane, panel) for panel in plane.panels):
+            edge_handle = Line2D([], [], label="edge of the verdicts", **_VERDICT_EDGE)
+            handles.append(edge_handle)
+    elif plane.seeds == 1:
+        handles += _list_class_handles(plane)
+
+    undecided_by_panel = [_find_undecided(plane, panel) for panel in plane.panels]
+    if any(undecided.any() for undecided in undecided_by_panel):
+        if plane.judged_by_twins:
+            label = "no exponent"
+        elif plane.seeds > 1:
+            label = "half or more undecided"
+        else:
+            label = CellClass.UNDECIDED.value
+        look = {**_HATCHED, "linewidth": 0.5}
+        handles.append(Patch(label=label, **look))
+
+    # Panels may share a line, which has one entry.
+    line_of_label = {}
+    for panel_lines in lines:
+        for line in panel_lines:
+            line_of_label[line.label] = line
+    for label, line in line_of_label.items():
+        look = _find_line_style(line)
+        handles.append(Line2D([], [], label=label, **look))
+    style.place_legend(figure, handles, handlelength=1.6)
+
+
+def _list_class_handles(plane: MapPlane) -> list[Patch]:
+    """Returns the legend entries of the classes that occur in a map, except "undecided"."""
+    counts_of_panels = [panel.counts.sum(axis=(0, 1)) for panel in plane.panels]
+    counts = sum(counts_of_panels)
+    handles = []
+    for verdict, count in zip(CELL_CLASSES, counts, strict=True):
+        is_decided = verdict is not CellClass.UNDECIDED
+        if count and is_decided:
+            patch = Patch(
+                label=verdict.value,
+                facecolor=CLASS_COLOURS[verdict],
+                edgecolor="#6b6b6b",
+                linewidth=0.5,
+            )
+            handles.append(patch)
+    return handles
+
+
+_DPI = 300
+"""Resolution of map.png, and of the cells in the other files, in pixels per inch."""
+
+
+def write_map(chart: StabilityMap, folder: Path, width_in: float = COLUMN_IN) -> list[Path]:
+    """Writes the figure and the Markdown page of a stability map into an existing folder.
+
+    A stability map shows with which parameters a scenario is stable.
+
+    Args:
+        chart: The results of the runs, the lines from theory, and the texts of the map.
+        folder: The folder.
+        width_in: Width of the figure, in inches.
+
+    Returns:
+        The paths of the three picture files and of the page.
+
+    Raises:
+        UsageError: A figure in print cannot have this width. It must be as wide as one or two
+            columns of a page.
+    """
+    form = make_print_size(width_in)
+    figure = draw_stability_map(chart.plane, chart.lines, form, chart.fixed)
+    picture_names = ("map.png", "map.svg", "map.pdf")
+    picture_paths = [folder / name for name in picture_names]
+    page_path = folder / "map.md"
+    for path in picture_paths:
+        style.write_figure(figure, path, _DPI)
+    page = build_map_page(chart, picture_names[0])
+    write_whole(page_path, page)
+    return [*picture_paths, page_path]
+
+
+def build_map_page(chart: StabilityMap, picture: str) -> str:
+    """Composes the Markdown page of a stability map.
+
+    The page has the commands that make the map, the picture, the number of runs of each class,
+    notes, and for each panel a table of the measured edges of stability.
+
+    Args:
+        chart: The map.
+        picture: File name of the picture.
+
+    Returns:
+        The text of the page.
+    """
+    commands = "\n".join(chart.commands)
+    class_table = tabulate_classes(chart.plane)
+    parts = [
+        f"# {chart.title}",
+        f"```sh\n{commands}\n```",
+        f"![map]({picture})",
+        class_table.markdown(),
+    ]
+    notes = _list_notes(chart)
+    if notes:
+        note_lines = [f"- {note}" for note in notes]
+        parts.append("\n".join(note_lines))
+    for panel, lines in zip(chart.plane.panels, chart.lines, strict=True):
+        table = tabulate_edges(chart.plane, panel, lines)
+        if table.rows:
+            if panel.title:
+                parts.append(f"## {panel.title}")
+            parts.append(table.markdown())
+    return "\n\n".join(parts) + "\n"
+
+
+def _list_notes(chart: StabilityMap) -> list[str]:
+    """Returns the notes of a map's page, on the lines and on the gains that were not swept."""
+    origins = []
+    for lines in chart.lines:
+        for line in lines:
+            origin = f"{line.text}: {line.about}"
+            origins.append(origin)
+    notes = [*dict.fromkeys(origins), *chart.remarks]
+    notes += [f"gains that were not swept: {text}" for text in chart.fixed]
+    if chart.fixed:
+        command = "trilat compare --tune"
+        comparison = FAIR_COMPARISON.replace(command, f"`{command}`")
+        notes.append(comparison)
+    return notes
+
+
+def tabulate_classes(plane: MapPlane) -> TextTable:
+    """Returns a table of how many runs of a stability map ended stable, diverged, and so on.
+
+    Args:
+        plane: Axes of the map, and the results of the runs in each panel. Each panel has a row.
+    """
+    rows = []
+    for panel in plane.panels:
+        title = panel.title or "all"
+        counts = panel.counts.sum(axis=(0, 1)).tolist()
+        count_texts = map(str, counts)
+        rows.append((title, *count_texts))
+    return TextTable(("runs", *CELL_CLASSES), rows)
+
+
+def tabulate_edges(plane: MapPlane, panel: MapPanel, lines: Sequence[MapLine]) -> TextTable:
+    """Returns a table that compares the measured edges of stability with theory.
+
+    The table has one row per measured edge of the panel. For each line from theory it has the
+    crossing that is nearest to the edge, and the difference of this crossing from the middle of
+    the edge, or "within" if the crossing lies within the edge.
+
+    On a map of growth exponents, the measured edges are the zeros of the exponent, and another
+    column has the nearest edge between stable and not stable runs. If only one axis is drawn,
+    the table is empty.
+
+    Args:
+        plane: The measured part of the map.
+        panel: Panel of the map, a grid of runs over x and y.
+        lines: Lines of the panel.
+    """
+    theory = [line for line in lines if line.rank >= 0]
+    heads = [plane.x.label, f"edge of {plane.y.label}", "stable is"]
+    if plane.judged_by_twins:
+        heads.append("edge of the verdicts")
+    for line in theory:
+        heads += [line.text, "difference"]
+
+    verdict_edges = find_map_edges(plane, panel)
+    edges = verdict_edges
+    if plane.judged_by_twins:
+        edges = []
+        for line in lines:
+            is_measured = line.rank < 0
+            if is_measured:
+                edges += _list_crossings(line, plane)
+
+    rows = []
+    for x, edge in edges:
+        stable_side = "below" if edge.stable_below else "above"
+        row = [f"{x:g}", _format_edge(edge), stable_side]
+        if plane.judged_by_twins:
+            column_edges = [other for other_x, other in verdict_edges if other_x == x]
+            nearest_text = _format_nearest_edge(edge.low, column_edges)
+            row.append(nearest_text)
+        column = plane.x.values.index(x)
+        for line in theory:
+            crossings = line.crossings(column, plane.y)
+            row += _compare_with_line(edge, crossings)
+        rows.append(tuple(row))
+    return TextTable(tuple(heads), rows)
+
+
+def _list_crossings(line: MapLine, plane: MapPlane) -> Iterator[tuple[float, StabilityEdge]]:
+    """Yields the crossings of a line with the columns of a map, as edges of zero width.
+
+    Each crossing comes with the value of x of its column.
+    """
+    for column, x in enumerate(plane.x.values):
+        crossings = line.crossings(column, plane.y)
+        for value in crossings:
+            above = int(np.searchsorted(plane.y.values, value))
+            below = max(above - 1, 0)
+            excess_below = line.excess[below, column]
+            stable_below = bool(excess_below > 0.0)
+            yield x, StabilityEdge(value, value, stable_below)
+
+
+def _format_edge(edge: StabilityEdge) -> str:
+    """Returns the text of an edge: its interval, or its value if the interval is empty."""
+    if edge.low == edge.high:
+        return f"{edge.low:.4g}"
+    return f"{edge.low:g} to {edge.high:g}"
+
+
+def _format_nearest_edge(value: float, edges: Sequence[StabilityEdge]) -> str:
+    """Returns the text of the edge that is nearest to a value, or "-" if there are no edges."""
+    if not edges:
+        return "-"
+    nearest = min(edges, key=lambda edge: abs(edge.middle - value))
+    return _format_edge(nearest)
+
+
+def _compare_with_line(edge: StabilityEdge, values: Sequence[float]) -> list[str]:
+    """Returns the table cells of a line: its crossing nearest to an edge, and the difference.
+
+    Args:
+        edge: The measured edge.
+        values: Values at which the line crosses the column of the edge.
+
+    Returns:
+        The value of the crossing, and its relative difference from the middle of the edge, or
+        "within" if the crossing lies within the edge. Both are "-" if there is no crossing.
+    """
+    if not values:
+        return ["-", "-"]
+    nearest = min(values, key=lambda value: abs(value - edge.middle))
+    if edge.low <= nearest <= edge.high:
+        return [f"{nearest:.4g}", "within"]
+    difference = 100.0 * (nearest / edge.middle - 1.0)
+    return [f"{nearest:.4g}", f"{difference:+.1f} %"]

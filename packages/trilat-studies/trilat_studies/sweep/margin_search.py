@@ -1,0 +1,610 @@
+"""Searches stability margins: the values of a scenario key at which stability begins or ends.
+
+A sweep runs one scenario on a grid of parameters. At each grid point, this module searches the
+edges of stability along one further key, such as "control.d". It runs the scenario at evenly
+spaced values of the key (the scan), and narrows each interval in which stability changes by
+bisection. The edges are reported beside those that theory predicts, as a table, a Markdown page
+and plain values.
+
+Invariant:
+    - An edge lies between two values that were run, one of them stable and the other not.
+    - Undecided values widen an edge, and count for neither side.
+    - All edges that the scan detects are kept.
+    - The margin of a grid point is a function of its scenario, its seed and the range.
+"""
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from trilat_net.analysis.theory.linear_edge import find_root_crossings
+from trilat_net.errors import ScenarioError, UsageError, count_nouns
+from trilat_net.files import write_whole
+from trilat_net.presentation.result_text import TextTable
+from trilat_net.results import Result
+from trilat_net.scenario import Scenario
+from trilat_net.scenario.code_consent import list_imported_code
+from trilat_net.work.executor import Progress, Workers, ignore_progress, open_worker_pool
+
+from . import sweep_cell
+from .fixed_gains import FAIR_COMPARISON, describe_fixed_gains
+from .stability_map import StabilityEdge, evaluate_criterion, find_criterion_edge
+from .sweep_plan import (
+    SweepCell,
+    SweepPlan,
+    build_sweep_command,
+    format_override,
+    format_override_value,
+    label_axis,
+)
+
+SCAN_POINTS = 9
+"""Number of values of the scan. It detects islands of stability that are wider than an eighth
+of the range.
+"""
+MARGIN_TOLERANCE = 0.005
+"""Default largest width of an edge, as a fraction of its value."""
+_MAX_HALVINGS = 60
+"""Largest number of steps of a bisection."""
+
+StabilityTest = Callable[[float], bool | None]
+"""Function that runs the scenario at a value of the key. It returns True if the run is stable,
+False if it is not stable, and None if it is undecided.
+"""
+
+
+class KeyMargin(NamedTuple):
+    """Limits of stability along one scenario key, found by running selected values of the key.
+
+    An edge is where neighbouring values change from stable to not stable or back.
+
+    Attributes:
+        spans: The edges in rising order. There may be several, for example if stability is lost
+            at one value and regained at a larger value.
+        stable: If there are no edges, True if all decided values are stable, and False if none
+            is stable. None if there are edges, or if no value was decided.
+        undecided: Number of values at which it remained open whether the run is stable.
+        runs: Number of values that were run.
+    """
+
+    spans: tuple[StabilityEdge, ...]
+    stable: bool | None
+    undecided: int
+    runs: int
+
+
+def search_key_margin(
+    stable: StabilityTest,
+    low: float,
+    high: float,
+    tolerance: float = MARGIN_TOLERANCE,
+    *,
+    whole: bool = False,
+) -> KeyMargin:
+    """Searches the limits of stability between two values of a scenario key.
+
+    The function runs a number of evenly spaced values, and then narrows each interval in which
+    stability changes by bisection.
+
+    Args:
+        stable: Function that runs the scenario at a value of the key. It returns True if the
+            run is stable, False if it is not stable, and None if it is undecided.
+        low: Lower end of the range.
+        high: Upper end of the range.
+        tolerance: Width of an interval, as a fraction of the value, at which the bisection
+            stops.
+        whole: True if the key accepts only whole numbers.
+
+    Returns:
+        The intervals that contain the limits. If there are none, the result states whether all
+        values are stable.
+    """
+    results: dict[float, bool | None] = {}
+
+    def classify(value: float) -> bool | None:
+        """Returns whether the scenario is stable at a value of the searched key.
+
+        The scenario is run only if the value has not been run before. None means that the run
+        is undecided.
+        """
+        if value not in results:
+            results[value] = stable(value)
+        return results[value]
+
+    scan = np.linspace(low, high, SCAN_POINTS)
+    if whole:
+        scan = np.round(scan)
+    values = list(dict.fromkeys(scan.tolist()))
+    decided = [value for value in values if classify(value) is not None]
+
+    spans = list[StabilityEdge]()
+    for below, above in pairwise(decided):
+        if results[below] != results[above]:
+            spans.append(_narrow_edge(classify, below, above, tolerance=tolerance, whole=whole))
+
+    stable_everywhere = results[decided[0]] if decided and not spans else None
+    undecided = sum(result is None for result in results.values())
+    return KeyMargin(tuple(spans), stable_everywhere, undecided, len(results))
+
+
+def _narrow_edge(
+    classify: StabilityTest, low: float, high: float, *, tolerance: float, whole: bool
+) -> StabilityEdge:
+    """Narrows the interval between a stable value and one that is not stable by bisection.
+
+    If undecided values lie between the two sides, both ends of this zone are searched.
+
+    Args:
+        classify: Function that returns whether a value is stable.
+        low: Decided value below the edge.
+        high: Decided value above the edge, with the opposite result.
+        tolerance: Largest width of the edge, as a fraction of its value.
+        whole: True if only whole numbers can be run.
+    """
+    low_stable = classify(low)
+    high_stable = classify(high)
+
+    def is_low_side(value: float) -> bool:
+        return classify(value) is low_stable
+
+    def is_not_high_side(value: float) -> bool:
+        return classify(value) is not high_stable
+
+    low, above = _bisect(is_low_side, low, high, tolerance=tolerance, whole=whole)
+    is_sharp = classify(above) is not None
+    if is_sharp:
+        high = above
+    else:
+        # `above` lies in an undecided zone, whose upper end is searched separately.
+        _, high = _bisect(is_not_high_side, above, high, tolerance=tolerance, whole=whole)
+    return StabilityEdge(low, high, low_stable is True, is_sharp)
+
+
+def _bisect(
+    holds: Callable[[float], bool], low: float, high: float, *, tolerance: float, whole: bool
+) -> tuple[float, float]:
+    """Narrows the interval between a value where a condition holds and one where it does not.
+
+    Args:
+        holds: The condition. It holds at `low` and does not hold at `high`.
+        low: Lower end of the interval.
+        high: Upper end of the interval.
+        tolerance: Largest width of the result, as a fraction of its larger end.
+        whole: True to use whole numbers only, down to a width of 1.
+
+    Returns:
+        A value where the condition holds, and a larger value where it does not.
+    """
+    for _ in range(_MAX_HALVINGS):
+        largest_width = 1.0 if whole else tolerance * max(abs(low), abs(high))
+        if high - low <= largest_width:
+            break
+        middle = 0.5 * (low + high)
+        middle = float(np.floor(middle)) if whole else middle
+        if holds(middle):
+            low = middle
+        else:
+            high = middle
+    return low, high
+
+
+class SearchRange(NamedTuple):
+    """Key of a scenario along which edges of stability are searched, and the searched range.
+
+    Attributes:
+        key: Scenario key along which edges are searched.
+        low: Lower end of the range.
+        high: Upper end of the range.
+        tolerance: Largest width of an edge, as a fraction of its value.
+    """
+
+    key: str
+    low: float
+    high: float
+    tolerance: float
+
+
+class MarginItem(NamedTuple):
+    """Task for a worker process: find the limits of stability at one grid point of a sweep.
+
+    The object can be pickled.
+
+    Attributes:
+        plan: The sweep: its scenario, axes, control laws and seeds.
+        cell: The grid point, a combination of the values of the other swept parameters.
+        seed: Seed of the runs.
+        range: Scenario key along which the limits are searched, and its range.
+    """
+
+    plan: SweepPlan
+    cell: SweepCell
+    seed: int
+    range: SearchRange
+
+    def __str__(self) -> str:
+        position = ", ".join(self.cell.overrides) or "the scenario"
+        return f"the search at {position}, seed {self.seed}"
+
+
+class GridPointMargin(NamedTuple):
+    """Limits of stability along one scenario key, at one grid point of a sweep.
+
+    A grid point is a combination of the other swept parameters. A limit is a value of the key
+    at which the arms change from stable to not stable or back.
+
+    Attributes:
+        cell: The grid point.
+        seed: Seed of its runs.
+        margin: The limits that were found by runs.
+        linear: The limits within the range at which the linearised loop becomes unstable, in
+            rising order.
+        remark: Remark on the linear analysis. Empty if there is none.
+        closed: The limit within the range according to a stability criterion in closed form.
+            None if no criterion applies, or if its limit lies outside.
+    """
+
+    cell: SweepCell
+    seed: int
+    margin: KeyMargin
+    linear: tuple[float, ...]
+    remark: str
+    closed: float | None
+
+
+def parse_search_range(text: str, tolerance: float = MARGIN_TOLERANCE) -> SearchRange:
+    """Parses the range of a search, such as "control.d=0.2:3".
+
+    Args:
+        text: Text of the form KEY=FROM:TO.
+        tolerance: Largest width of an edge, as a fraction of its value.
+
+    Raises:
+        UsageError: The text does not have this form, or the tolerance is not within (0, 1).
+    """
+    key, _, ends = text.partition("=")
+    low, colon, high = ends.partition(":")
+    try:
+        search_range = SearchRange(key.strip(), float(low), float(high), tolerance)
+    except ValueError:
+        raise UsageError(
+            f"--margin must have the form KEY=FROM:TO, as in control.d=0.2:3, not {text!r}"
+        ) from None
+    if not 0.0 < tolerance < 1.0:
+        raise UsageError(
+            f"--tolerance must be a fraction of the value at the edge, as in 0.005, "
+            f"not {tolerance:g}"
+        )
+    is_rising = -float("inf") < search_range.low < search_range.high < float("inf")
+    if not colon or not search_range.key or not is_rising:
+        form = "KEY=FROM:TO with FROM below TO, as in control.d=0.2:3"
+        raise UsageError(f"--margin must have the form {form}, not {text!r}")
+    return search_range
+
+
+def format_range_axis(search_range: SearchRange) -> str:
+    """Returns the text of a sweep axis with two values: the ends of the searched range.
+
+    If a sweep is planned with this axis, the scenario is checked at both ends before any run.
+
+    Args:
+        search_range: Scenario key along which limits of stability are searched, and its range.
+
+    Returns:
+        The text, as in "control.d=1,20".
+    """
+    low = format_override_value(search_range.low)
+    high = format_override_value(search_range.high)
+    return f"{search_range.key}={low},{high}"
+
+
+def search_margins(
+    plan: SweepPlan,
+    within: SearchRange,
+    jobs: int | None = None,
+    progress: Progress = ignore_progress,
+    on: Workers = None,
+) -> list[GridPointMargin]:
+    """Searches the limits of stability along one scenario key, at each grid point of a sweep.
+
+    A grid point is a combination of the other swept parameters. A limit, called edge, is a
+    value of the key at which runs change from stable to not stable or back.
+
+    Args:
+        plan: The sweep. Its last axis must be the searched key with two values, the ends of the
+            range, as from `format_range_axis`.
+        within: The searched key and its range.
+        jobs: Number of worker processes. None uses all cores.
+        progress: Function that is called with the number of finished grid points and of all
+            grid points.
+        on: Workers to use instead of processes of this computer.
+
+    Returns:
+        The edges of each grid point and random seed, in the order of the grid.
+
+    Raises:
+        ScenarioError: The scenario is not valid at a value of the range.
+        RunFailed: A worker process died.
+    """
+    searches = []
+    # The last axis changes fastest from cell to cell. It is the searched key with two values,
+    # the ends of the range, so each grid point of the other axes has two neighbouring cells.
+    for number in range(0, plan.cells, 2):
+        cell_at_low_end = plan.cell(number)
+        grid_point = cell_at_low_end._replace(
+            values=cell_at_low_end.values[:-1],  # without the value of the searched key
+            overrides=cell_at_low_end.overrides[:-1],
+        )
+        # If nothing is random, all seeds give the same result.
+        is_random = plan.scenario(*cell_at_low_end.overrides).random
+        seeds = plan.seeds if is_random else plan.seeds[:1]
+        searches += [MarginItem(plan, grid_point, seed, within) for seed in seeds]
+
+    # The workers need the files of control laws that users wrote.
+    laws = list_imported_code([plan.base])
+    with open_worker_pool(jobs, on, most=len(searches), laws=laws) as pool:
+        return pool.map(_search_margin_task, searches, progress)
+
+
+def _search_margin_task(task: MarginItem) -> GridPointMargin:
+    """Finds the limits of stability at one grid point of a sweep, by runs and by theory.
+
+    The function needs nothing but its argument. Therefore any worker process can call it.
+
+    Args:
+        task: The grid point (a combination of swept parameters), the seed of the runs, and the
+            scenario key along which the limits are searched, with its range.
+
+    Returns:
+        The limits from runs, from the linear analysis, and from a closed-form criterion.
+
+    Raises:
+        ScenarioError: The scenario is not valid at a value of the range.
+    """
+    key, low, high, tolerance = task.range
+
+    def load(value: float) -> Scenario:
+        """Returns the scenario with a value of the searched key.
+
+        Args:
+            value: Value of the scenario key along which the limit of stability is searched.
+        """
+        override = format_override(key, value)
+        return task.plan.scenario(*task.cell.overrides, override, f"seed={task.seed}")
+
+    def is_stable(value: float) -> bool | None:
+        """Runs the scenario with a value of the searched key, and returns whether it is stable.
+
+        None means that the run is undecided.
+        """
+        scenario = load(value)
+        longest_s = max(task.plan.longest_s, scenario.duration_s)
+        return sweep_cell.classify_cell(scenario.text, longest_s).verdict.stable
+
+    whole = False
+    try:
+        load(low + (high - low) / 3.0**0.5)  # an irrational number, never a whole one
+    except ScenarioError:
+        whole = True  # the key takes whole numbers only
+    margin = search_key_margin(is_stable, low, high, tolerance, whole=whole)
+    closed = find_criterion_edge(lambda value: evaluate_criterion(load(value)), low, high)
+    linear, remark = find_root_crossings(load(high), key, low, high)
+    return GridPointMargin(
+        cell=task.cell,
+        seed=task.seed,
+        margin=margin,
+        linear=linear,
+        remark=remark,
+        closed=closed,
+    )
+
+
+def _find_nearest(value: float, edges: Sequence[float]) -> float | None:
+    """Returns the edge that is nearest to a value. None if there are no edges."""
+    return min(edges, key=lambda edge: abs(edge - value), default=None)
+
+
+@dataclass(frozen=True, repr=False)
+class SweepMargins(Result):
+    """Result of a search for the limits of stability along one scenario key.
+
+    The search is repeated at each grid point of a sweep, which is a combination of other
+    parameters, and for each random seed.
+
+    Attributes:
+        plan: The sweep. Its last axis is the searched key with two values, the ends of the
+            range.
+        within: The searched key and its range.
+        found: The limits at each grid point and for each seed.
+    """
+
+    plan: SweepPlan
+    within: SearchRange
+    found: list[GridPointMargin]
+
+    @property
+    def command(self) -> str:
+        """Shell command that repeats this search for limits of stability.
+
+        The page with the results shows it.
+        """
+        low = format_override_value(self.within.low)
+        high = format_override_value(self.within.high)
+        tolerance = format_override_value(self.within.tolerance)
+        search_range = f"{self.within.key}={low}:{high}"
+        plan = self.plan._replace(axes=self.plan.axes[:-1])
+        return build_sweep_command(plan, "--margin", search_range, "--tolerance", tolerance)
+
+    def table(self) -> TextTable:
+        """Returns a table of the limits of stability along the searched key, one row per limit.
+
+        The columns are the values of the other swept parameters, the limit from runs, and the
+        limits from the linear analysis and from a closed-form stability criterion. Each limit
+        from theory also has its difference from the limit of the runs. If a combination of the
+        other parameters has no limit, it has a single row.
+        """
+        plan = self.plan
+        several_seeds = len({point.seed for point in self.found}) > 1
+        has_closed_form = any(point.closed is not None for point in self.found)
+
+        heads = [label_axis(axis.key, plan.base) for axis in plan.axes[:-1]]
+        if plan.laws:
+            heads.append("law")
+        if several_seeds:
+            heads.append("seed")
+        heads.append(f"edge of {label_axis(self.within.key, plan.base)}")
+        heads += ["stable is", "linear", "difference"]
+        if has_closed_form:
+            heads += ["closed form", "difference"]
+        heads.append("runs")
+
+        rows = []
+        for point in self.found:
+            position = [
+                value if isinstance(value, str) else f"{value:g}" for value in point.cell.values
+            ]
+            if plan.laws:
+                position.append(point.cell.law)
+            if several_seeds:
+                position.append(str(point.seed))
+            for span in point.margin.spans or (None,):
+                value = self.within.low if span is None else span.middle
+                linear = _find_nearest(value, point.linear)
+                row = [*position, *_format_edge(point.margin, span)]
+                row += _format_theory(span, linear)
+                if has_closed_form:
+                    row += _format_theory(span, point.closed)
+                row.append(str(point.margin.runs))
+                rows.append(tuple(row))
+        return TextTable(tuple(heads), rows)
+
+    def blocks(self) -> Iterator[TextTable]:
+        """Yields the table of the limits of stability, which is the printed text."""
+        yield self.table()
+
+    def headline(self) -> str:
+        """Returns a sentence with the number of limits of stability, and the searched range."""
+        edges = sum(len(point.margin.spans) for point in self.found)
+        low = self.within.low
+        high = self.within.high
+        return (
+            f"{self.plan.base.name}: {count_nouns(edges, 'edge')} of {self.within.key} "
+            f"from {low:g} to {high:g}"
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Converts the result to plain values, as `trilat sweep --margin --json` prints it."""
+        return {
+            "command": self.command,
+            "scenario_sha256": self.plan.base.sha256,
+            **self.within._asdict(),
+            "places": [self._describe_point(point) for point in self.found],
+        }
+
+    def _describe_point(self, point: GridPointMargin) -> dict[str, Any]:
+        """Returns the plain values of a grid point, for `to_dict`."""
+        margin = point.margin
+        position: dict[str, Any] = {}
+        for axis, value in zip(self.plan.axes[:-1], point.cell.values, strict=True):
+            position[axis.key] = value
+        if self.plan.laws:
+            position["law"] = point.cell.law
+        return position | {
+            "seed": point.seed,
+            "edges": [span._asdict() for span in margin.spans],
+            "stable_everywhere": margin.stable,
+            "undecided": margin.undecided,
+            "runs": margin.runs,
+            "linear": list(point.linear),
+            "closed_form": point.closed,
+            "remark": point.remark,
+        }
+
+    def to_rows(self) -> list[dict[str, Any]]:
+        """Returns a table of plain values, one row per limit of stability.
+
+        A combination of the other swept parameters without a limit has one row, too.
+        """
+        rows = list[dict[str, Any]]()
+        for point in self.to_dict()["places"]:
+            columns = {
+                key: value for key, value in point.items() if not isinstance(value, list)
+            }
+            edges = point["edges"] or [{}]
+            rows.extend({**columns, **edge} for edge in edges)
+        return rows
+
+    def page(self) -> str:
+        """Returns a Markdown page that reports the limits of stability along the searched key.
+
+        The page contains the command that repeats the search, a table of the limits, remarks of
+        the linear analysis, and the gains that the runs have in common.
+        """
+        base = self.plan.base
+        parts = [f"# {base.title or base.name}: margin", f"```sh\n{self.command}\n```"]
+        parts.append(self.table().markdown())
+        remarks = dict.fromkeys(point.remark for point in self.found if point.remark)
+        parts += [f"{remark[0].upper()}{remark[1:]}." for remark in remarks]
+        islands = sum(len(point.margin.spans) > 1 for point in self.found)
+        if islands:
+            points = count_nouns(len(self.found), "grid point")
+            parts.append(
+                f"Stability is not monotone at {islands} of {points}: several edges each."
+            )
+        fixed = "; ".join(describe_fixed_gains(self.plan))
+        advice = FAIR_COMPARISON.replace("trilat compare --tune", "`trilat compare --tune`")
+        parts.append(f"Gains that were not swept: {fixed}. {advice[0].upper()}{advice[1:]}.")
+        return "\n\n".join(parts) + "\n"
+
+    def write(self, folder: Path) -> list[Path]:
+        """Writes the results into an existing folder, as margin.json and margin.md.
+
+        Args:
+            folder: The folder.
+
+        Returns:
+            The paths of both files.
+        """
+        json_path = folder / "margin.json"
+        page_path = folder / "margin.md"
+        write_whole(json_path, json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n")
+        write_whole(page_path, self.page())
+        return [json_path, page_path]
+
+
+def _format_edge(margin: KeyMargin, span: StabilityEdge | None) -> list[str]:
+    """Returns the table cells of an edge and of its stable side.
+
+    Args:
+        margin: The edges of the grid point.
+        span: The edge. None if the grid point has no edges.
+    """
+    if span is None:
+        texts = {
+            True: "none: all stable",
+            False: "none: nothing stable",
+            None: "none: nothing decided",
+        }
+        return [texts[margin.stable], "-"]
+    if span.sharp:
+        interval = f"{span.low:.5g} to {span.high:.5g}"
+    else:
+        interval = f"{span.low:.4g} to {span.high:.4g} (undecided between)"
+    return [interval, "below" if span.stable_below else "above"]
+
+
+def _format_theory(span: StabilityEdge | None, value: float | None) -> list[str]:
+    """Returns the table cells of an edge from theory, and of its relative difference.
+
+    Args:
+        span: The measured edge, or None.
+        value: The edge from theory, or None.
+    """
+    if value is None:
+        return ["-", "-"]
+    difference = "-" if span is None else f"{100.0 * (value / span.middle - 1.0):+.2f} %"
+    return [f"{value:.5g}", difference]

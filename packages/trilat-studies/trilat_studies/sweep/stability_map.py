@@ -1,0 +1,1167 @@
+"""Builds a stability map, which shows for which parameters a scenario is stable.
+
+A sweep runs one scenario, the description of an experiment, at every point of a grid of
+parameters, usually with several random seeds. The map draws the first two numeric parameters as
+axes x and y. Each combination of the other parameters and of the control law gets a panel. Each
+grid point of a panel shows how many of its runs were stable. A column is the set of grid points
+with the same x.
+
+Limits from theory are drawn as lines:
+
+- The closed-form line is where a stability criterion in closed form is just met. It is used
+  only if all assumptions of the criterion hold. For the proportional law with damping, P+d, the
+  line accounts for sampling.
+- The linear line is where the rightmost characteristic root of the linearised loop crosses the
+  imaginary axis. It accounts for sampling only with the integration scheme `digital`.
+
+Invariant:
+    - The measurements come from the results alone, and the lines from the plan alone.
+    - Every run is counted at exactly one grid point. The majority of the decided runs decides
+      whether a grid point is stable. A draw leaves the point undecided.
+    - A measured edge lies between two decided grid points of a column, one of them stable and
+      the other not. If undecided grid points lie between the two, the edge is wider.
+    - A line crosses a column between two neighbouring grid points, of which the theory calls
+      exactly one stable.
+    - The label of an axis names the scenario key with its unit. A gain has the unit that its
+      control law states.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trilat_net.analysis.arm_rows import PlacedArm
+from trilat_net.analysis.theory.linear_edge import GrowthColumn, compute_growth_column
+from trilat_net.core.step.vectors import Array
+from trilat_net.errors import ScenarioError, UsageError
+from trilat_net.fields import is_number
+from trilat_net.laws.adaptive import Adaptive
+from trilat_net.laws.conditions import COMMON_MOTION_SHARE, find_least_reversible
+from trilat_net.laws.p_d import PD
+from trilat_net.scenario import Scenario, SiteSpec
+from trilat_net.scenario.arms import ArmModel
+from trilat_net.scenario.delay_models import LinkBase
+from trilat_net.scenario.delay_models.kernel_delays import ConstantDelay, NoDelay
+from trilat_net.work.executor import Progress, Workers, ignore_progress, open_worker_pool
+
+from .fixed_gains import describe_fixed_gains
+from .sweep_cell import CellClass
+from .sweep_plan import SweepPlan, format_override, label_axis, label_setting
+from .sweep_results import SweepResults
+
+RunCounts = NDArray[np.int64]
+PanelSettings = tuple[tuple[str, Any], ...]
+"""Values of the axes that are not drawn, as pairs of a key and a value."""
+
+CELL_CLASSES = tuple(CellClass)
+"""Classes of a run, in the order of the last dimension of `MapPanel.counts`."""
+MAX_PANELS = 12
+"""Largest number of panels of a map, so that the panels remain legible."""
+
+
+class PlaneAxis(NamedTuple):
+    """One axis of a map: the values of a scenario key.
+
+    Attributes:
+        key: Scenario key that varies along the axis, such as "link.delay_ms". Empty for the
+            vertical axis of a map with a single numeric axis.
+        values: Values of the key in rising order, in the unit of the key.
+        label: Text at the axis, with the unit.
+    """
+
+    key: str
+    values: tuple[float, ...]
+    label: str
+
+    @property
+    def is_evenly_spaced(self) -> bool:
+        """True if the values are equally spaced, up to rounding."""
+        steps = np.diff(self.values)
+        if len(steps) < 2:
+            return True
+        tolerance = 1e-6 * np.abs(steps).max()
+        return bool(np.ptp(steps) <= tolerance)
+
+    @property
+    def positions(self) -> Array:
+        """Positions at which the values are drawn along the axis, shape (K,) for K values.
+
+        Equally spaced values are drawn at their own positions. Other values, as in 1, 10, 100,
+        are drawn at equal distances, at their indices.
+        """
+        if self.is_evenly_spaced:
+            return np.array(self.values)
+        return np.arange(len(self.values), dtype=np.float64)
+
+
+class MapPanel(NamedTuple):
+    """One panel of a stability map: a grid of runs over the two drawn axes.
+
+    A sweep may vary more keys than a picture has axes. All runs of a panel have the same
+    setting of these other keys.
+
+    Attributes:
+        title: The setting as a string, such as "p d, delay 200 ms". Empty if there are no such
+            axes.
+        settings: The setting as pairs of a key and a value. The key of a swept law is "law".
+        counts: Number of runs for each grid point and class, shape (y, x, 4). The classes are
+            in the order of `CELL_CLASSES`.
+        exponents_per_s: Growth exponent of each grid point, the mean over its seeds, in 1/s,
+            shape (y, x). It is the rate at which a small disturbance grows; NaN if it was not
+            measured.
+    """
+
+    title: str
+    settings: PanelSettings
+    counts: RunCounts
+    exponents_per_s: Array
+
+    @property
+    def runs(self) -> RunCounts:
+        """Number of all runs at each grid point, shape (y, x)."""
+        total: RunCounts = self.counts.sum(axis=2)
+        return total
+
+    @property
+    def stable(self) -> RunCounts:
+        """Number of stable runs per grid point, shape (y, x)."""
+        is_stable = [verdict.stable is True for verdict in CELL_CLASSES]
+        stable: RunCounts = self.counts[:, :, is_stable].sum(axis=2)
+        return stable
+
+    @property
+    def decided(self) -> RunCounts:
+        """Number of runs at each grid point that are stable or not stable, shape (y, x).
+
+        The other runs are undecided, for example because they were too short.
+        """
+        class_index = CELL_CLASSES.index(CellClass.UNDECIDED)
+        undecided = self.counts[:, :, class_index]
+        return self.runs - undecided
+
+    @property
+    def share(self) -> Array:
+        """Fraction of runs that are stable at each grid point of the panel.
+
+        Undecided runs, for example too short ones, are left out. NaN if all runs of a grid
+        point are undecided. The shape is (number of y values, number of x values).
+        """
+        stable = self.stable
+        decided = self.decided
+        share: Array = np.full(decided.shape, np.nan)
+        np.divide(stable, decided, out=share, where=decided > 0)
+        return share
+
+
+class MapPlane(NamedTuple):
+    """The measured part of a stability map: panels over the same two axes.
+
+    If only one swept axis has numeric values, the vertical axis y has an empty key and a single
+    value.
+
+    Attributes:
+        scenario: Name of the swept scenario.
+        x: Horizontal axis.
+        y: Vertical axis.
+        panels: One panel per setting of the axes that are not drawn.
+    """
+
+    scenario: str
+    x: PlaneAxis
+    y: PlaneAxis
+    panels: tuple[MapPanel, ...]
+
+    @property
+    def judged_by_twins(self) -> bool:
+        """True if the sweep measured growth exponents instead of judging the end of each run.
+
+        A growth exponent is the rate at which a small disturbance grows, in 1/s. It is measured
+        by twins: repeated runs with a small push.
+        """
+        return any(np.isfinite(panel.exponents_per_s).any() for panel in self.panels)
+
+    @property
+    def seeds(self) -> int:
+        """Largest number of runs at any grid point. Runs of a point differ in their seeds."""
+        return max(int(panel.runs.max()) for panel in self.panels)
+
+
+def build_plane(
+    rows: Sequence[Mapping[str, Any]], axes: Sequence[str], scenario: Scenario
+) -> MapPlane:
+    """Arranges the runs of a sweep for a map over two of the swept parameters.
+
+    The axes are the first two swept keys with numeric values. Each combination of the other
+    keys gets a panel of its own.
+
+    Args:
+        rows: One mapping per run. It has a value for each swept key, the result of the run
+            under the key "verdict", such as "converged", and possibly the rate at which a
+            disturbance grows under "exponent_per_s".
+        axes: The swept keys, in the order of the sweep. The key "law" stands for the control
+            law, if several laws were swept.
+        scenario: The swept scenario, from which the labels are taken.
+
+    Returns:
+        The axes and the panels.
+
+    Raises:
+        UsageError: There are no runs, no key is numeric, or there would be more than
+            `MAX_PANELS` panels.
+    """
+    if not rows:
+        raise UsageError("no cell has run: there is nothing to draw")
+    numeric_keys = [key for key in axes if all(is_number(row[key]) for row in rows)]
+    drawn_keys = numeric_keys[:2]
+    if not drawn_keys:
+        raise UsageError(
+            "a map needs a numeric axis, but these axes have values that are not numbers: "
+            f"{', '.join(axes)}"
+        )
+
+    values = {key: {row[key] for row in rows} for key in axes}
+    plane_axes = []
+    for key in drawn_keys:
+        axis_values = tuple(sorted(values[key]))
+        label = label_axis(key, scenario)
+        plane_axes.append(PlaneAxis(key, axis_values, label))
+    if len(plane_axes) == 1:
+        no_axis = PlaneAxis("", (0.0,), "")
+        plane_axes.append(no_axis)
+    x, y = plane_axes
+
+    other_keys = [key for key in axes if key not in drawn_keys]
+    panel_keys = [key for key in other_keys if len(values[key]) > 1]
+    rows_of_panel: dict[PanelSettings, list[Mapping[str, Any]]] = {}
+    for row in rows:
+        settings = tuple((key, row[key]) for key in panel_keys)
+        panel_rows = rows_of_panel.setdefault(settings, [])
+        panel_rows.append(row)
+    if len(rows_of_panel) > MAX_PANELS:
+        raise UsageError(
+            f"a map has at most {MAX_PANELS} panels, but {', '.join(panel_keys)} would give "
+            f"{len(rows_of_panel)}: sweep fewer values of the axes that are not drawn"
+        )
+
+    panels = []
+    for settings, panel_rows in rows_of_panel.items():
+        title = _format_panel_title(settings, scenario)
+        counts, exponents_per_s = _collect_runs(panel_rows, x, y)
+        panel = MapPanel(title, settings, counts, exponents_per_s)
+        panels.append(panel)
+    return MapPlane(scenario.name, x, y, tuple(panels))
+
+
+def _collect_runs(
+    rows: Sequence[Mapping[str, Any]], x: PlaneAxis, y: PlaneAxis
+) -> tuple[RunCounts, Array]:
+    """Counts the runs of a panel by grid point and class, and averages their growth exponents.
+
+    Args:
+        rows: Runs of the panel, as for `build_plane`.
+        x: Horizontal axis.
+        y: Vertical axis. Its key is empty if only one axis is drawn.
+
+    Returns:
+        The fields `counts` and `exponents_per_s` of `MapPanel`.
+    """
+    shape = (len(y.values), len(x.values))
+    counts_shape = (*shape, len(CELL_CLASSES))
+    counts: RunCounts = np.zeros(counts_shape, dtype=np.int64)
+    exponents_per_s: Array = np.zeros(shape)
+    column_of_x = {value: column for column, value in enumerate(x.values)}
+    row_of_y = {value: row for row, value in enumerate(y.values)}
+    index_of_class = {verdict.value: index for index, verdict in enumerate(CELL_CLASSES)}
+
+    for run in rows:
+        i = row_of_y[run[y.key]] if y.key else 0
+        j = column_of_x[run[x.key]]
+        class_index = index_of_class[run["verdict"]]
+        counts[i, j, class_index] += 1
+        exponent = run.get("exponent_per_s")
+        # A run without an exponent makes the mean of its grid point NaN.
+        exponents_per_s[i, j] += np.nan if exponent is None else exponent
+
+    runs = counts.sum(axis=2)
+    exponents_per_s /= np.maximum(runs, 1)
+    exponents_per_s[runs == 0] = np.nan
+    return counts, exponents_per_s
+
+
+def _format_panel_title(settings: PanelSettings, scenario: Scenario) -> str:
+    """Returns the title of a panel, such as "p d, delay 200 ms".
+
+    Numbers are given with the name and unit of their key. Other values are given alone, with
+    spaces for underscores, except for the name of a law, which stays as it is.
+    """
+    texts = []
+    for key, value in settings:
+        if not isinstance(value, str):
+            texts.append(label_setting(key, value, scenario))
+        elif key == "law":
+            texts.append(value)
+        else:
+            texts.append(value.replace("_", " "))
+    return ", ".join(texts)
+
+
+class StabilityEdge(NamedTuple):
+    """An edge of stability along one parameter: where stable and unstable values meet.
+
+    The edge is known only up to an interval, because the parameter has a finite number of
+    values.
+
+    Attributes:
+        low: Largest decided value below the edge.
+        high: Smallest decided value above the edge.
+        stable_below: True if the values below the edge are stable, False if those above are.
+        sharp: True if the interval contains no undecided value.
+    """
+
+    low: float
+    high: float
+    stable_below: bool
+    sharp: bool = True
+
+    @property
+    def middle(self) -> float:
+        """Centre of the interval in which the limit of stability lies.
+
+        It has the unit of the parameter along which the limit was searched.
+        """
+        return 0.5 * (self.low + self.high)
+
+
+def find_map_edges(plane: MapPlane, panel: MapPanel) -> list[tuple[float, StabilityEdge]]:
+    """Finds the measured limits of stability along the vertical axis of a stability map.
+
+    In each column, which is a value of x, the grid points are compared in the order of y. A
+    limit lies between two grid points if the majority of the runs is stable at one of them and
+    not stable at the other. Grid points without a majority are skipped.
+
+    Args:
+        plane: The two axes of the map.
+        panel: Part of the map with the counts of stable runs at each grid point.
+
+    Returns:
+        Pairs of the x value of a column and an interval of y that contains a limit. The limits
+        of a column are in rising order.
+    """
+    edges = []
+    y = plane.y.values
+    for x, stable_share in zip(plane.x.values, panel.share.T, strict=True):
+        is_decided = np.isfinite(stable_share) & (stable_share != 0.5)
+        decided = np.flatnonzero(is_decided)
+        is_stable = stable_share[decided] > 0.5
+
+        # Compare each decided grid point with the next decided one.
+        is_change = is_stable[1:] != is_stable[:-1]
+        for n in np.flatnonzero(is_change):
+            below, above = decided[n : n + 2].tolist()
+            edge = StabilityEdge(
+                low=y[below],
+                high=y[above],
+                stable_below=bool(is_stable[n]),
+                sharp=above == below + 1,  # no undecided grid point lies between
+            )
+            edges.append((x, edge))
+    return edges
+
+
+_GRAVITY = slice(3, 5)
+"""Indices of the arm parameters of Eq. (24) that appear in the gravity torque."""
+_ROUNDING = 1e-6
+"""Tolerance of rounding errors, of delays in ticks and of the relative position of an edge."""
+
+
+class StabilityCriterion(NamedTuple):
+    """A stability condition in closed form, evaluated for one scenario.
+
+    The condition is an inequality between parameters of the scenario, such as a gain and a
+    delay, which is known from theory.
+
+    Attributes:
+        symbol: Equation of the limit of the condition, in TeX, for the legend of a figure.
+        text: The same equation as plain text.
+        source: Origin of the condition, and whether it is necessary or sufficient.
+        excess: Difference of the two sides of the inequality, in its unit. Positive if the
+            condition is met.
+    """
+
+    symbol: str
+    text: str
+    source: str
+    excess: float
+
+
+def evaluate_criterion(scenario: Scenario) -> StabilityCriterion | None:
+    """Evaluates a stability condition in closed form, known from theory, for a scenario.
+
+    Args:
+        scenario: The scenario to which the condition is applied.
+
+    Returns:
+        The condition. None if the scenario violates a hypothesis of every known condition, for
+        example because it changes while it runs, or because a site stops following a peer
+        whose samples are too old.
+    """
+    stops_following = any(spec.on_stale.action != "use" for spec in scenario.sites.values())
+    if scenario.timeline or stops_following:
+        return None
+    if any(arm.shares_pose for arm in scenario.arms.values()):
+        return None
+
+    criterion = _evaluate_damping_criterion(scenario)
+    if criterion is not None:
+        return criterion
+    if any(arm.chain is not None for arm in scenario.arms.values()):
+        return None  # the other criterion holds only for the planar arm with two joints
+    return _evaluate_sampling_criterion(scenario)
+
+
+def _evaluate_damping_criterion(scenario: Scenario) -> StabilityCriterion | None:
+    """Evaluates the condition on the damping of the law P+d, which has gains K and d.
+
+    For two sites with delays T1 and T2, the loop is stable if
+
+        4 d1 d2 > (T1 + T2)^2 K1 K2.
+
+    For N equal sites with delay T, whose matrix of dominance factors alpha is reversible and
+    has the least eigenvalue lambda_min, the loop is stable if
+
+        d > max(abs(lambda_min), 0.2172) K T.
+
+    Under these conditions the loop has no root on the unit circle for all masses down to d h,
+    where h is the period of a tick. No damping stabilises lighter arms at this tick rate
+    (docs/theory/damping-conditions.md, 13).
+
+    Returns:
+        The condition. None if it does not cover the scenario.
+    """
+    if scenario.scheme != "second_order":
+        return None
+    delays_s = _list_delays_s(scenario)
+    rates_hz = {spec.rate_hz for spec in scenario.sites.values()}
+    if delays_s is None or len(rates_hz) > 1:
+        return None
+    rate_hz = rates_hz.pop()
+    K = []
+    d = []
+    for spec in scenario.sites.values():
+        gains = _find_scalar_gains(spec)
+        if gains is None:
+            return None
+        K.append(gains[0])
+        d.append(gains[1])
+    least_inertia = min(map(_bound_least_inertia, scenario.arms.values()))
+    if max(d) / rate_hz >= least_inertia:
+        return None  # an arm is lighter than d h
+
+    delays_ticks = []
+    for delay_s in delays_s:
+        delay_ticks = math.ceil(delay_s * rate_hz - _ROUNDING)
+        delays_ticks.append(max(1, delay_ticks))  # a sample is used in the next tick at best
+    if len(K) == 2:
+        mean_delay_ticks = 0.5 * sum(delays_ticks)
+        pair_excess = _compute_pair_excess(K, d, mean_delay_ticks, rate_hz)
+        return StabilityCriterion(
+            symbol=r"$4\,d_1 d_2 = (T_1 + T_2)^2 K_1 K_2$",
+            text="4 d1 d2 = (T1 + T2)² K1 K2",
+            source=_DAMPING_SOURCE,
+            excess=pair_excess,
+        )
+
+    are_equal = len({*K}) == len({*d}) == len({*delays_ticks}) == 1
+    least_eigenvalue = find_least_reversible(scenario.alpha)
+    if not are_equal or least_eigenvalue is None:
+        return None
+    common_delay_ticks = delays_ticks[0]
+    ratio = _compute_required_ratio(least_eigenvalue, common_delay_ticks)
+    required_d = K[0] * ratio * common_delay_ticks / rate_hz
+    excess = d[0] - required_d
+    if -least_eigenvalue < COMMON_MOTION_SHARE:
+        return StabilityCriterion(
+            symbol=r"$d = 0.2172\,K\,T$",
+            text="d = 0.2172 K T",
+            source=_DAMPING_SOURCE,
+            excess=excess,
+        )
+    return StabilityCriterion(
+        symbol=r"$d = |\lambda_{\min}(\alpha)|\,K\,T$",
+        text="d = abs(lambda_min(alpha)) K T",
+        source=_DAMPING_SOURCE,
+        excess=excess,
+    )
+
+
+_DAMPING_SOURCE = "P+d: sufficient whatever the arms weigh, and necessary for the worst masses"
+
+
+def _find_scalar_gains(spec: SiteSpec) -> tuple[float, float] | None:
+    """Returns the gains K and d of a site's P+d law, if they are the same for all joints.
+
+    Different gains are not covered by the criteria, because the arm couples its joints.
+
+    Returns:
+        K in N m/rad and d in N m s/rad. None if the site has another law, no full gravity
+        compensation, or joints with different gains.
+    """
+    law: Any = spec.control
+    if law.kind is not PD or law.gravity != 1.0:
+        return None
+    distinct_K = {*law.K}
+    distinct_d = {*law.d}
+    if len(distinct_K) > 1 or len(distinct_d) > 1:
+        return None
+    return law.K[0], law.d[0]
+
+
+_CIRCLE_POINTS = 400
+"""Number of points in each of the two parts of the sampled half circle."""
+
+
+def _sample_unit_circle(delay_ticks: float) -> tuple[Array, Array, Array]:
+    """Returns the frequencies at which the stability criteria of P+d are evaluated.
+
+    The loop is sampled with the tick period h. At its limit of stability, a root lies at
+    z = exp(i phi) on the unit circle, where phi = w h for the frequency w. For the integration
+    scheme "second_order", the equation of such a root contains two functions of t = tan(phi/2)
+    (docs/theory/damping-conditions.md, 13):
+
+    - the discrete frequency v = 2 t, in units of 1/h. For small phi it equals phi;
+    - the lag 2 t^3 / (1 + 3 t^2), by which the scheme reduces the damping.
+
+    The criteria take an extreme value over all phi, so the angles need no order. The first one
+    stands for the limit phi -> 0. Others lie densely within the first turn of the delay, where
+    phi * `delay_ticks` goes from 0 to 2 pi, and the rest between 0 and pi.
+
+    Args:
+        delay_ticks: Delay of the loop, in ticks.
+
+    Returns:
+        The angles phi in rad, the discrete frequencies v, and the lags, of equal shape.
+    """
+    almost_zero = 1e-7 / delay_ticks
+    first_turn_end = min(2.0 * np.pi / delay_ticks, 3.0)  # below pi, where t is infinite
+    first_turn = np.linspace(0.0, first_turn_end, _CIRCLE_POINTS)[1:]
+    half_circle = np.linspace(0.0, np.pi, _CIRCLE_POINTS)[1:-1]
+    phi = np.concatenate([[almost_zero], first_turn, half_circle])
+    t = np.tan(0.5 * phi)
+    denominator = 1.0 + 3.0 * t**2
+    lag = 2.0 * t**3 / denominator
+    discrete_frequency = 2.0 * t
+    return phi, discrete_frequency, lag
+
+
+def _compute_required_ratio(least_eigenvalue: float, delay_ticks: int) -> float:
+    """Returns how much damping equal sites with the law P+d need, relative to K T.
+
+    K is the stiffness, d the damping, and T = n h the delay, where h is the tick period. Let a
+    be a number between the least eigenvalue of the matrix of dominance factors (how strongly
+    the sites follow each other) and the largest one, 1. A root on the unit circle at the angle
+    phi, with the discrete frequency v and the lag of `_sample_unit_circle`, requires
+    (docs/theory/damping-conditions.md, 13):
+
+        d / (K T) = (lag (1 - a cos(n phi)) - a sin(n phi)) / (v n)
+
+    If d / (K T) exceeds the largest value of the right side, there is no such root, and the
+    loop is stable. The right side is linear in a, so only the two extreme values of a matter.
+
+    Args:
+        least_eigenvalue: Least eigenvalue of the matrix of dominance factors, which must be
+            reversible.
+        delay_ticks: Delay n, in ticks.
+
+    Returns:
+        The largest value of the right side, without a unit.
+    """
+    phi, discrete_frequency, lag = _sample_unit_circle(delay_ticks)
+    cosine = np.cos(delay_ticks * phi)
+    sine = np.sin(delay_ticks * phi)
+    ratios = []
+    for eigenvalue in (least_eigenvalue, 1.0):
+        lag_part = lag * (1.0 - eigenvalue * cosine)
+        numerator = lag_part - eigenvalue * sine
+        ratio = numerator / (discrete_frequency * delay_ticks)
+        ratios.append(ratio)
+    return float(np.max(ratios))
+
+
+def _compute_pair_excess(
+    K: list[float], d: list[float], mean_delay_ticks: float, rate_hz: float
+) -> float:
+    """Returns by how much two sites with the law P+d exceed the damping that they need.
+
+    In continuous time, the loop is stable if 2 sqrt(d1 d2) > (T1 + T2) sqrt(K1 K2), with
+    stiffnesses K, dampings d and delays T. In the sampled loop, two quantities depend on the
+    frequency (docs/theory/damping-conditions.md, 13). With the angle phi, the discrete
+    frequency v in 1/s, the lag of `_sample_unit_circle` and the mean delay of n ticks, they
+    are:
+
+        effective damping of a site = d - K lag / v, at least 0
+        effective mean delay = abs(sin(n phi) + lag cos(n phi)) / v
+
+    The difference of the two sides of the condition is computed with them, and the least value
+    over all frequencies counts. For phi -> 0, the effective quantities are d and
+    (T1 + T2) / 2.
+
+    Args:
+        K: Stiffnesses of the two sites, in N m/rad.
+        d: Dampings of the two sites, in N m s/rad.
+        mean_delay_ticks: The mean delay n, half of T1 + T2, in ticks.
+        rate_hz: Tick rate of both sites.
+
+    Returns:
+        The least difference, in N m s/rad. Positive if the loop is stable.
+    """
+    phi, discrete_frequency, lag = _sample_unit_circle(mean_delay_ticks)
+    frequency_per_s = discrete_frequency * rate_hz
+    K_1, K_2 = K
+    d_1, d_2 = d
+    damping_1 = np.maximum(d_1 - K_1 * lag / frequency_per_s, 0.0)
+    damping_2 = np.maximum(d_2 - K_2 * lag / frequency_per_s, 0.0)
+    delay_angle = mean_delay_ticks * phi
+    coupling = np.sin(delay_angle) + lag * np.cos(delay_angle)
+    mean_delay_s = np.abs(coupling) / frequency_per_s
+    mean_stiffness = math.sqrt(K_1 * K_2)
+    half_excess = np.sqrt(damping_1 * damping_2) - mean_stiffness * mean_delay_s
+    return float(2.0 * np.min(half_excess))  # doubled, because the delay is the mean of two
+
+
+def _bound_least_inertia(arm: ArmModel) -> float:
+    """Returns a lower bound of the eigenvalues of the inertia matrix M(q), in kg m^2.
+
+    The bound holds for all poses q. The planar arm with two joints has its least eigenvalue at
+    cos q2 = 1 or -1. Any other arm has at least the inertia of its drives.
+    """
+    if arm.chain is not None:
+        return min(joint.armature_kg_m2 for joint in arm.chain.joints)
+    poses = np.array([[0.0, 0.0], [0.0, np.pi]])
+    extreme_poses = PlacedArm(0.0, arm.lengths_m, poses)
+    inertia_kg_m2 = extreme_poses.inertia_matrix(arm.theta).T
+    eigenvalues = np.linalg.eigvalsh(inertia_kg_m2)
+    return float(eigenvalues.min())
+
+
+def _evaluate_sampling_criterion(scenario: Scenario) -> StabilityCriterion | None:
+    """Evaluates the condition on the tick period of the adaptive law.
+
+    The adaptive law estimates the parameters of its arm while it runs, with the adaptation gain
+    Gamma. If gravity is estimated too fast for the tick rate, the arm keeps swinging. The arms
+    come to rest if, for each site, approximately
+
+        Gamma g^2 h < Kp,
+
+    where g is the gravitational acceleration, h the period of a tick and Kp the damping gain of
+    the law. This is a rule for arms of about 1 m: a squared length of 1 m^2 is left out. It
+    holds for the integration scheme `digital`, and for delays of at most one tick.
+
+    Only the gains of the parameters in the gravity torque matter, of which the largest counts.
+
+    Returns:
+        The condition for the site with the smallest excess. The excess is Kp - Gamma g^2 h, and
+        is positive if the condition is met. None if a site has another law, or if the condition
+        does not cover the scenario for another reason.
+    """
+    delays_s = _list_delays_s(scenario)
+    if scenario.scheme != "digital" or delays_s is None:
+        return None
+
+    site_excess = []
+    for spec in scenario.sites.values():
+        law: Any = spec.control
+        tick_s = 1.0 / spec.rate_hz
+        has_adaptive_law = law.kind is Adaptive
+        if not has_adaptive_law or max(delays_s) > tick_s:
+            return None
+        largest_gravity_gain = max(law.Gamma[_GRAVITY])
+        required_kp = largest_gravity_gain * spec.arm.g_m_s2**2 * tick_s
+        site_excess.append(min(law.Kp) - required_kp)
+    return StabilityCriterion(
+        symbol=r"$\Gamma g^2 h = K_p$",
+        text="Gamma g² h = Kp",
+        source=(
+            "a rule for arms of about 1 m and no delay: "
+            "the estimate of gravity against the lag of a tick"
+        ),
+        excess=min(site_excess),
+    )
+
+
+def _list_delays_s(scenario: Scenario) -> list[float] | None:
+    """Returns the constant delays of all links whose samples influence an arm, in s.
+
+    Links with a dominance factor of 0 are left out: their samples have no effect.
+
+    Returns:
+        The delays. None if a delay is not constant, or if a link loses messages.
+    """
+    delays_s = []
+    for site in scenario.names:
+        dominance_factors = scenario.dominance[site]
+        for peer in scenario.peers(site):
+            if dominance_factors.get(peer, 0.0) == 0.0:
+                continue
+            link: LinkBase = scenario.links[f"{peer}->{site}"]
+            if not isinstance(link, ConstantDelay | NoDelay):
+                return None
+            if link.random or link.loss or link.outages_s:
+                return None
+            moments = link.moments()
+            delay_ms = max(moments.mean_ms, link.playout_ms)
+            delays_s.append(delay_ms / 1e3)
+    return delays_s
+
+
+PanelLoader = Callable[[float, float], Scenario]
+"""Function that returns the scenario of a panel at any values of x and y."""
+
+_MAX_ROOT_STEPS = 500
+"""Largest number of iterations of Brent's method."""
+LINEAR_ANALYSIS = "linear analysis"
+"""Name of the line of the linear analysis in the legend."""
+_ABOUT_ROOTS = "where the rightmost root of the linearised loop crosses the imaginary axis"
+"""Explanation of this line on the page of the map."""
+
+
+class MapLine(NamedTuple):
+    """A line on a stability map that separates stable from unstable parameters.
+
+    The line is where a quantity is zero. The quantity is given at the grid points, and is
+    interpolated linearly between neighbouring grid points with the same x.
+
+    Attributes:
+        label: Name of the line for a legend, possibly with TeX.
+        text: The same name as plain text.
+        about: Explanation of the origin of the line.
+        excess: The quantity at the grid points, shape (number of y values, number of x values).
+            It is positive on the stable side, and NaN where it is not known.
+        rank: Index of the line style. -1 is the style of measured lines.
+    """
+
+    label: str
+    text: str
+    about: str
+    excess: Array
+    rank: int
+
+    @property
+    def crosses_map(self) -> bool:
+        """True if this line lies between grid points of the map and is therefore visible.
+
+        This is so if somewhere four neighbouring grid points all have a value, and only some of
+        them are on the stable side of the line.
+        """
+        excess = self.excess
+        lower = excess[:-1]
+        upper = excess[1:]
+        lower_left = lower[:, :-1]
+        lower_right = lower[:, 1:]
+        upper_left = upper[:, :-1]
+        upper_right = upper[:, 1:]
+        corners = np.array([lower_left, lower_right, upper_left, upper_right])
+        has_values = np.isfinite(corners).all(axis=0)
+        stable = (corners > 0.0).sum(axis=0)
+        some_are_stable = (stable > 0) & (stable < len(corners))
+        crossed = has_values & some_are_stable
+        return bool(crossed.any())
+
+    def crossings(self, column: int, y: PlaneAxis) -> list[float]:
+        """Finds the values of y at which this line crosses a column of the map.
+
+        A column is the set of grid points with the same value of x.
+
+        Args:
+            column: Index of the column, from 0.
+            y: Vertical axis of the map.
+
+        Returns:
+            The values in rising order. Empty if the line does not cross the column.
+        """
+        values = y.values
+        excess = self.excess[:, column].tolist()
+        crossings = list[float]()
+        for n in _find_sign_changes(excess):
+            step = values[n + 1] - values[n]
+            change = excess[n] - excess[n + 1]
+            crossing = values[n] + step * excess[n] / change
+            crossings.append(crossing)
+        return crossings
+
+
+ZERO_EXPONENT = "exponent = 0"
+"""Name of the measured line of zero growth exponents."""
+_ABOUT_TWINS = (
+    "where a small push of the run neither grows nor dies away, straight from cell to cell"
+)
+"""Explanation of this line on the page of the map."""
+
+
+def _trace_zero_exponent(panel: MapPanel) -> MapLine | None:
+    """Finds the measured line on a map on which small disturbances neither grow nor die away.
+
+    On this line, the growth exponent is zero. The exponent is the rate, in 1/s, at which a
+    small disturbance grows.
+
+    Args:
+        panel: Part of the map with the measured exponent at each grid point.
+
+    Returns:
+        The line. None if it does not cross this part of the map.
+    """
+    line = MapLine(
+        label=ZERO_EXPONENT,
+        text=ZERO_EXPONENT,
+        about=_ABOUT_TWINS,
+        excess=-panel.exponents_per_s,
+        rank=-1,
+    )
+    return line if line.crosses_map else None
+
+
+def trace_closed_form(load: PanelLoader, x: PlaneAxis, y: PlaneAxis) -> MapLine | None:
+    """Finds the line on a map on which a closed-form stability condition is just met.
+
+    The condition comes from theory, see `evaluate_criterion`. Where it changes between two grid
+    points with the same x, the crossing in y is located with Brent's method, because the
+    condition may be nonlinear.
+
+    Args:
+        load: Function that returns the scenario at values of x and y.
+        x: Horizontal axis of the map.
+        y: Vertical axis of the map.
+
+    Returns:
+        The line. None if no condition is known for the scenario, or if the line does not cross
+        the map.
+    """
+    first_criterion: StabilityCriterion | None = None
+    columns = []
+    for x_value in x.values:
+
+        def evaluate(y_value: float, x_value: float = x_value) -> StabilityCriterion | None:
+            scenario = load(x_value, y_value)
+            return evaluate_criterion(scenario)
+
+        criteria = [evaluate(y_value) for y_value in y.values]
+        applicable = [criterion for criterion in criteria if criterion is not None]
+        if first_criterion is None and applicable:
+            first_criterion = applicable[0]
+        excess = []
+        for criterion in criteria:
+            value = np.nan if criterion is None else criterion.excess
+            excess.append(value)
+        edges: dict[int, float] = {}
+        for n in _find_sign_changes(excess):
+            edge = find_criterion_edge(evaluate, y.values[n], y.values[n + 1])
+            if edge is not None:
+                edges[n] = edge
+        column = _place_zeros(y.values, excess, edges)
+        columns.append(column)
+    if first_criterion is None:
+        return None
+
+    # Labels and source are the same in the whole panel; take those of the first criterion.
+    line = MapLine(
+        label=first_criterion.symbol,
+        text=first_criterion.text,
+        about=first_criterion.source,
+        excess=np.array(columns).T,
+        rank=0,
+    )
+    return line if line.crosses_map else None
+
+
+def trace_linear_analysis(
+    columns: Sequence[GrowthColumn], y: PlaneAxis
+) -> tuple[MapLine | None, list[str]]:
+    """Finds the line of the linear analysis, on one side of which the loop is stable.
+
+    On this line of a map panel, small motions of the linearised control loop neither grow nor
+    decay: the real part of the rightmost characteristic root is zero. The line is described by
+    the decay rate of the motions at the grid points, in 1/s, which is the negative of the
+    growth rate. It is positive on the stable side, see `MapLine.excess`.
+
+    Args:
+        columns: Linear analysis of each column of the panel (grid points with the same x), in
+            the order of x. It contains growth rates, and precise positions of the limit.
+        y: Vertical axis.
+
+    Returns:
+        The line, or None if it does not cross the panel; and remarks of the analysis for the
+        reader of the map, without duplicates.
+    """
+    decay_columns = []
+    all_remarks = list[str]()
+    for column in columns:
+        # A growth rate of -infinity means that nothing moves: the grid point is on no side.
+        decay_per_s = [np.nan if np.isinf(rate) else -rate for rate in column.growth_per_s]
+        # The drawn line must pass through the precise positions of the limit.
+        placed_decay_per_s = _place_zeros(y.values, decay_per_s, column.edges)
+        decay_columns.append(placed_decay_per_s)
+        all_remarks.extend(column.remarks)
+    distinct_remarks = list(dict.fromkeys(all_remarks))  # in their order
+    line = MapLine(
+        label=LINEAR_ANALYSIS,
+        text=LINEAR_ANALYSIS,
+        about=_ABOUT_ROOTS,
+        excess=np.array(decay_columns).T,
+        rank=1,  # line style; 0 is that of the closed form
+    )
+    return line if line.crosses_map else None, distinct_remarks
+
+
+def _find_sign_changes(values: Sequence[float]) -> list[int]:
+    """Returns the indices n at which the values n and n + 1 have different signs.
+
+    Zero counts as negative. Values that are not finite take part in no change of sign.
+    """
+    indices = list[int]()
+    for n, (value, following) in enumerate(pairwise(values)):
+        finite = np.isfinite([value, following]).all()
+        sign_changes = (value > 0.0) != (following > 0.0)
+        if finite and sign_changes:
+            indices.append(n)
+    return indices
+
+
+def _place_zeros(
+    values: Sequence[float], excess: Sequence[float], edges: Mapping[int, float]
+) -> Array:
+    """Changes a quantity along a column so that its linear interpolation is zero at the edges.
+
+    The lines of a map are drawn where the linear interpolation between grid points is zero. The
+    quantity may be nonlinear between two grid points. This zero would then differ from the true
+    zero, the edge. Therefore the value above each edge is changed. Let v be the value below the
+    edge, u the value above it, and f the position of the edge in the interval, from 0 to 1. The
+    linear interpolation is zero there if
+
+        v + f (u - v) = 0,   that is,   u = v (1 - 1/f).
+
+    u keeps its sign, which is opposite to that of v. The values are changed from the bottom to
+    the top. Therefore v is the value that may have been changed for an edge below it.
+
+    All other values stay. They decide where the line passes between this column and the next
+    one, if it is so steep that it crosses neither column nearby.
+
+    Args:
+        values: Values of the axis along the column, in rising order, shape (y,).
+        excess: The quantity at these values, shape (y,).
+        edges: Position of each edge, by the index n of the interval from value n to n + 1. An
+            edge that is missing is placed at the zero of the linear interpolation.
+
+    Returns:
+        The changed quantity, a column of `MapLine.excess`.
+    """
+    placed: Array = np.where(np.isfinite(excess), excess, np.nan)
+    placed[placed == 0.0] = -_ROUNDING  # zero counts as negative
+    for n in _find_sign_changes(excess):
+        if n in edges:
+            low = values[n]
+            width = values[n + 1] - low
+            fraction = (edges[n] - low) / width
+        else:
+            change = excess[n] - excess[n + 1]
+            fraction = excess[n] / change
+        # An edge exactly at a grid point would make a value 0 or infinite.
+        fraction = max(fraction, _ROUNDING)
+        fraction = min(fraction, 1.0 - _ROUNDING)
+        scale = 1.0 - 1.0 / fraction
+        placed[n + 1] = placed[n] * scale
+    return placed
+
+
+def find_criterion_edge(
+    criterion: Callable[[float], StabilityCriterion | None], low: float, high: float
+) -> float | None:
+    """Finds the value of a parameter at which a stability condition is just met.
+
+    The value is located with Brent's method.
+
+    Args:
+        criterion: Function that evaluates the criterion at a value. It may raise ScenarioError
+            for a value that is not valid, such as a fraction where a whole number is needed.
+        low: Lower end of the searched interval.
+        high: Upper end of the searched interval.
+
+    Returns:
+        The value. None if the criterion has the same sign at both ends, or if it does not apply
+        to a value between them.
+    """
+    # imported late: SciPy costs half a second, and most commands do not need it
+    from scipy.optimize import brentq
+
+    def excess(value: float) -> float:
+        evaluated = criterion(value)
+        if evaluated is None:
+            raise ScenarioError("no criterion covers it")
+        return evaluated.excess
+
+    tolerance = 1e-8 * (high - low)
+    try:
+        met_at_low = excess(low) > 0.0
+        met_at_high = excess(high) > 0.0
+        if met_at_low == met_at_high:
+            return None
+        edge = brentq(excess, low, high, xtol=tolerance, maxiter=_MAX_ROOT_STEPS)
+        return float(edge)
+    except ScenarioError:
+        return None
+
+
+LAW_AXIS = "law"
+"""Key of the axis of control laws."""
+
+
+class StabilityMap(NamedTuple):
+    """A complete stability map: the measurements and the lines from theory.
+
+    Attributes:
+        plane: The measurements, as panels.
+        lines: Lines of each panel, in the order of the panels.
+        remarks: Remarks on the lines for the reader of the map.
+        commands: Commands that make the map again.
+        title: Title of the map's page.
+        fixed: Gains that were not swept, one text per control law.
+    """
+
+    plane: MapPlane
+    lines: tuple[tuple[MapLine, ...], ...]
+    remarks: tuple[str, ...]
+    commands: tuple[str, ...]
+    title: str
+    fixed: tuple[str, ...] = ()
+
+
+def build_stability_map(
+    results: SweepResults,
+    commands: tuple[str, ...],
+    jobs: int | None = None,
+    progress: Progress = ignore_progress,
+    *,
+    linearly: bool = True,
+    on: Workers = None,
+) -> StabilityMap:
+    """Builds the stability map of a sweep: the results of its runs, and limits from theory.
+
+    The map shows with which values of two parameters a scenario is stable. Limits from theory
+    are drawn as lines. They are computed only if the map has two numeric axes.
+
+    Args:
+        results: Results of the sweep: its plan and one row per run.
+        commands: Commands that make the map. The page of the map shows them.
+        jobs: Number of worker processes for the linear analysis. None uses all cores.
+        progress: Function that is called while the linear analysis runs.
+        linearly: True to add the line on which the linearised loop becomes unstable. This line
+            takes most of the time.
+        on: Workers that compute the linear analysis. None starts processes on this computer.
+
+    Returns:
+        The map.
+
+    Raises:
+        UsageError: There is nothing to draw, or there would be too many panels.
+    """
+    plan = results.plan
+    keys = [axis.key for axis in plan.axes]
+    if len(plan.laws) > 1:
+        keys.insert(0, LAW_AXIS)
+    plane = build_plane(results.rows, keys, plan.base)
+    stability_map = StabilityMap(
+        plane=plane,
+        lines=((),) * len(plane.panels),
+        remarks=(),
+        commands=commands,
+        title=plan.base.title or plan.base.name,
+        fixed=tuple(describe_fixed_gains(plan)),
+    )
+    x = plane.x
+    y = plane.y
+    if not y.key or len(y.values) < 2:
+        return stability_map
+
+    loaders = [make_panel_loader(plan, panel, x.key, y.key) for panel in plane.panels]
+    panel_lines = []
+    for panel, load in zip(plane.panels, loaders, strict=True):
+        measured_line = _trace_zero_exponent(panel)
+        closed_form_line = trace_closed_form(load, x, y)
+        panel_lines.append([measured_line, closed_form_line])
+    remarks = list[str]()
+    if linearly:
+        tasks = [(load, x_value, y) for load in loaders for x_value in x.values]
+        with open_worker_pool(jobs, on, most=len(tasks)) as pool:
+            columns = iter(pool.map(_analyse_column, tasks, progress))
+        # The results come in the order of the tasks, panel by panel and column by column.
+        for lines in panel_lines:
+            panel_columns = [next(columns) for _ in x.values]
+            line, line_remarks = trace_linear_analysis(panel_columns, y)
+            lines.append(line)
+            remarks += line_remarks
+
+    crossing_lines = [tuple(filter(None, lines)) for lines in panel_lines]
+    distinct_remarks = tuple(dict.fromkeys(remarks))
+    return stability_map._replace(lines=tuple(crossing_lines), remarks=distinct_remarks)
+
+
+def _analyse_column(task: tuple[PanelLoader, float, PlaneAxis]) -> GrowthColumn:
+    """Computes the linear analysis of one column of a panel, in any worker process.
+
+    Args:
+        task: Function that loads scenarios of the panel, the column's value of x, and the
+            vertical axis.
+    """
+    load, x, y = task
+    scenarios = [load(x, y_value) for y_value in y.values]
+    return compute_growth_column(scenarios, y.key, y.values)
+
+
+def make_panel_loader(plan: SweepPlan, panel: MapPanel, x: str, y: str) -> PanelLoader:
+    """Returns a function that loads the scenario at any point of a panel.
+
+    The lines from theory need scenarios between the grid points of the sweep, too. The function
+    can be pickled, so that other processes can call it.
+
+    Args:
+        plan: The sweep: its scenario, axes, control laws and seeds.
+        panel: Panel of the map, a grid of runs over x and y.
+        x: Scenario key of the horizontal axis.
+        y: Scenario key of the vertical axis.
+
+    Returns:
+        Function of the values of x and y that returns the scenario.
+    """
+    settings = dict(panel.settings)
+    only_law = next(iter(plan.laws), "")
+    law = settings.pop(LAW_AXIS, only_law)
+    overrides = [*plan.laws.get(law, ())]
+    overrides += [format_override(key, value) for key, value in settings.items()]
+    return partial(load_grid_scenario, plan, tuple(overrides), x, y)
+
+
+def load_grid_scenario(
+    plan: SweepPlan, fixed: Sequence[str], x: str, y: str, x_value: float, y_value: float
+) -> Scenario:
+    """Returns the scenario of a sweep with given values of the two parameters on a map's axes.
+
+    The values may lie between the values that were swept, to locate a limit of stability more
+    precisely.
+
+    Args:
+        plan: The sweep: its scenario, axes, control laws and seeds.
+        fixed: Overrides KEY=VALUE of all other parameters.
+        x: Scenario key of the horizontal axis.
+        y: Scenario key of the vertical axis.
+        x_value: Value of the key `x`.
+        y_value: Value of the key `y`.
+
+    Raises:
+        ScenarioError: The scenario is not valid with these values.
+    """
+    x_override = format_override(x, x_value)
+    y_override = format_override(y, y_value)
+    return plan.scenario(*fixed, x_override, y_override)

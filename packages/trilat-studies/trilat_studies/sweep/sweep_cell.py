@@ -1,0 +1,391 @@
+"""Runs one cell of a sweep in virtual time, and classifies how the run ends.
+
+A sweep runs one scenario, the description of an experiment, on a grid of parameters. A cell is
+one combination of these parameters. Its run is classified as converged, oscillating, diverged
+or undecided. A run that is undecided at the end of its duration is extended and classified
+again.
+
+Invariant:
+    - A result is a function of the cell's scenario and of the longest allowed duration.
+    - A log of the same run gets the same decision, because a cell is judged by
+      `judge.judge_virtual_run`, and its roots are those of `loop_roots`.
+    - To save space, a run stores only how the text of its scenario differs from the text of the
+      sweep's scenario. The stored difference restores every text exactly.
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from enum import StrEnum
+from itertools import chain
+
+import msgspec
+
+from trilat_net.analysis.judge import judge_virtual_run
+from trilat_net.analysis.run_end import EndBehaviour, RunTrace, Stability, classify_run_end
+from trilat_net.analysis.site_signals import SETTLED_ERROR_RAD
+from trilat_net.analysis.theory.loop_roots import find_run_roots
+from trilat_net.analysis.twins.twin_growth import measure_virtual_twins
+from trilat_net.execution.fused import FusedRun, RunTotals, check_fusable
+from trilat_net.results import finite_or_none
+from trilat_net.scenario import Scenario, parse_scenario
+from trilat_net.scenario.validate import refuse_live_only
+
+
+class CellClass(StrEnum):
+    """Result of a run of a sweep in one word, such as stable or undecided.
+
+    The values are the texts in tables and on pages.
+    """
+
+    CONVERGED = "converged"
+    BOUNDED = "bounded oscillation"
+    DIVERGED = "diverged"
+    UNDECIDED = "undecided"
+
+    @property
+    def stable(self) -> bool | None:
+        """True if a run with this result is stable. False if it is not. None if undecided."""
+        if self is CellClass.UNDECIDED:
+            return None
+        return self is CellClass.CONVERGED
+
+
+def classify_decision(stability: Stability, behaviour: EndBehaviour) -> CellClass:
+    """Returns the class of a run of a sweep, given the decision whether the run is stable.
+
+    A run that is stable or settled counts as converged. A run that is not stable counts as
+    diverged if it left its limits, drifts or grows, and otherwise as bounded.
+
+    Args:
+        stability: The decision.
+        behaviour: How the run ends.
+    """
+    if stability in (Stability.STABLE, Stability.SETTLED):
+        return CellClass.CONVERGED
+    if stability is not Stability.NOT_STABLE:
+        return CellClass.UNDECIDED
+    return CellClass.DIVERGED if behaviour in _DIVERGING else CellClass.BOUNDED
+
+
+_DIVERGING = (EndBehaviour.DIVERGED, EndBehaviour.DRIFTS, EndBehaviour.GROWS)
+
+
+class CellResult(msgspec.Struct, frozen=True):
+    """Result of one run of a sweep: its class, and what was measured in it.
+
+    Below, e is the error of a site against its reference, and qd the velocity of a joint.
+
+    Attributes:
+        verdict: Class of the cell.
+        motion: Behaviour at the end, as in the stability certificate. It distinguishes growth
+            from divergence, and decay from convergence.
+        ran_s: Duration of the run, in s, including extensions. It is shorter than planned if an
+            arm left its limits.
+        extended: Number of times that the duration was doubled.
+        end_error_rad: Largest |e| of the last second, in rad, where e is the error of a site
+            against its reference.
+        end_speed_rad_s: Largest |qd| of the last second, in rad/s.
+        error_rate_per_s: Rate of the trend exp(rate t) of |e| over the second half of the run,
+            in 1/s. None without a trend.
+        speed_rate_per_s: Rate of the trend of |qd|, likewise.
+        peak_error_rad: Largest |e| of the run, in rad.
+        settled_s: Time from which |e| stays below 0.01 rad, in s. None if |e| is not below
+            0.01 rad at the end.
+        diverged_s: Time at which the first site left its limits, in s. None if no site did.
+        rms_error_rad: See `RunTotals`. This field and those down to `walls_j` cover the
+            scenario's duration without extensions.
+        effort_nm: See `RunTotals`.
+        force_peak_n: See `RunTotals`.
+        walls_j: See `RunTotals`.
+        reasons: Reasons why the run is undecided, as a string.
+        exponent_per_s: Growth exponent of the run's twins over the scenario's duration, in 1/s,
+            see `measure_exponent`. None without twins, or if no twin moved.
+        stability: The decision whether the run is stable, as in the stability certificate.
+            Empty in results of older versions.
+        rests_on: What the decision rests on, likewise.
+    """
+
+    verdict: CellClass
+    motion: EndBehaviour
+    ran_s: float
+    extended: int
+    end_error_rad: float
+    end_speed_rad_s: float
+    error_rate_per_s: float | None
+    speed_rate_per_s: float | None
+    peak_error_rad: float
+    settled_s: float | None
+    diverged_s: float | None
+    rms_error_rad: float | None = None
+    effort_nm: float | None = None
+    force_peak_n: float | None = None
+    walls_j: float | None = None
+    reasons: str = ""
+    exponent_per_s: float | None = None
+    stability: str = ""
+    rests_on: str = ""
+
+
+TWINS_OF_A_CELL = 4
+"""Number of twins of a run, repeated runs with a small push each. The pushes act on all joints
+at once, on single joints, and under the adaptive law on its estimates.
+"""
+FLAT_LOG_CHANGE = 0.02
+"""Largest change of the logarithm of an amplitude over half a run that counts as constant."""
+
+
+def check_sweepable(scenario: Scenario) -> None:
+    """Checks that a scenario can be run in a sweep.
+
+    A sweep runs in virtual time in the compiled loop. It refuses scenarios that need a live
+    network, or that this loop cannot run.
+
+    Args:
+        scenario: The scenario.
+
+    Raises:
+        ScenarioError: See `refuse_live_only` and `check_fusable`.
+    """
+    refuse_live_only(scenario)
+    check_fusable(scenario)
+
+
+def classify_cell(text: str, longest_s: float) -> CellResult:
+    """Runs a cell in virtual time and classifies the end of the run.
+
+    While a longer run might have another class (see `is_conclusive`), the duration is doubled
+    and the same run continues, at most up to `longest_s`. The decision of the stability
+    certificate about the whole run then gives the class, see `classify_decision`.
+
+    A run that chatters at a sampled wall, where its small motions grow, is not extended. Such
+    chatter may end after minutes, once the estimates of the law have drifted, but this does not
+    make the cell stable.
+
+    Args:
+        text: Canonical text of the cell's scenario. Its `duration_s` is the first duration.
+        longest_s: Longest duration of the run, in s. The run is not extended if this is not
+            longer than its first duration.
+    """
+    scenario = parse_scenario(text)
+    run = FusedRun(scenario, SETTLED_ERROR_RAD)
+    run.advance_to(scenario.duration_s)
+    totals = run.totals
+    extended = 0
+    outcome = _build_result(run, scenario, totals, extended)
+
+    end_s = scenario.duration_s
+    if end_s < longest_s and _chatters(scenario, run):
+        longest_s = end_s
+    while not is_conclusive(outcome) and end_s < longest_s:
+        end_s = min(2.0 * end_s, longest_s)
+        extended += 1
+        run.advance_to(end_s)
+        outcome = _build_result(run, scenario, totals, extended)
+
+    judged = judge_virtual_run(scenario, run)
+    decision = judged.decision
+    return msgspec.structs.replace(
+        outcome,
+        verdict=classify_decision(decision.stability, judged.end.behaviour),
+        reasons="; ".join(decision.reasons),
+        stability=decision.stability.value,
+        rests_on=decision.rests_on,
+    )
+
+
+def measure_exponent(scenario: Scenario) -> float | None:
+    """Measures the growth exponent of a run, the rate at which small disturbances grow.
+
+    A twin is a second execution of the run with a small push. The difference between the twin
+    and the run changes as exp(exponent t), where t is the time, see `analysis.twin_growth`.
+    Several twins are run, and the largest of their rates over the later part of the run, by
+    which runs are judged, is returned.
+
+    Args:
+        scenario: Scenario of the run.
+
+    Returns:
+        The exponent in 1/s, negative if disturbances decay. None if no push moved anything.
+    """
+    run = FusedRun(scenario, SETTLED_ERROR_RAD)
+    run.advance_to(scenario.duration_s)
+    end = classify_run_end(scenario, RunTrace(run.buckets, run.tau_x, run.diverged_s))
+    twins = measure_virtual_twins(scenario, end, run.ran_s, TWINS_OF_A_CELL)
+    rates_per_s = [push.rate_per_s for push in twins.pushes]
+    return max(filter(math.isfinite, rates_per_s), default=None)
+
+
+def _chatters(scenario: Scenario, run: FusedRun) -> bool:
+    """Returns True if small motions of a run grow in contact with a sampled wall.
+
+    The force of a sampled wall is computed once per tick and held. Such a wall can generate
+    energy.
+
+    Args:
+        scenario: Scenario of the run.
+        run: The run, up to the duration of the scenario.
+    """
+    environments = chain.from_iterable(spec.environment for spec in scenario.sites.values())
+    if not any(environment.actor.sampled for environment in environments):
+        return False
+    return find_run_roots(scenario, run).is_refutation
+
+
+def is_conclusive(outcome: CellResult) -> bool:
+    """Returns True if a longer run would very probably end in the same way.
+
+    This is so in each of the following cases:
+
+    - An arm left its limits, the arms came to rest, or they drift.
+    - The motion grows with a pronounced trend: over the second half of the run, the largest
+      speed doubled, or error and speed both halved.
+    - The motion is bounded and steady: over the second half of the run, the logarithms of the
+      largest error and of the largest speed changed by at most `FLAT_LOG_CHANGE`.
+
+    Decay is not conclusive. Near the limit of stability, a slowly growing motion can be hidden
+    by a decaying motion until the decaying motion has vanished.
+
+    Args:
+        outcome: Result of the run, with the largest errors and speeds of its two halves.
+    """
+    if outcome.motion is EndBehaviour.BOUNDED:
+        error_change, speed_change = _log_changes(outcome)
+        return max(abs(error_change), abs(speed_change)) <= FLAT_LOG_CHANGE
+    if outcome.motion is EndBehaviour.GROWS:
+        return _has_pronounced_trend(outcome)
+    return outcome.motion in (
+        EndBehaviour.DIVERGED,
+        EndBehaviour.CONVERGED,
+        EndBehaviour.DRIFTS,
+    )
+
+
+def _has_pronounced_trend(outcome: CellResult) -> bool:
+    """Returns True if the largest speed doubled over the second half of a run.
+
+    Also returns True if the largest error and the largest speed both halved.
+    """
+    error_change, speed_change = _log_changes(outcome)
+    doubled = speed_change >= math.log(2.0)
+    halved = max(error_change, speed_change) <= -math.log(2.0)
+    return doubled or halved
+
+
+def _log_changes(outcome: CellResult) -> tuple[float, float]:
+    """Returns the changes of log |e| and of log |qd| over the second half of a run."""
+    half_s = 0.5 * outcome.ran_s
+    error_change = half_s * (outcome.error_rate_per_s or 0.0)
+    speed_change = half_s * (outcome.speed_rate_per_s or 0.0)
+    return error_change, speed_change
+
+
+def _build_result(
+    run: FusedRun, scenario: Scenario, totals: RunTotals, extended: int
+) -> CellResult:
+    """Returns the result of a run up to the time that the run has reached.
+
+    Args:
+        run: The run.
+        scenario: Scenario of the run.
+        totals: Totals over the scenario's duration, without extensions.
+        extended: Number of times that the duration was doubled.
+    """
+    end = classify_run_end(scenario, RunTrace(run.buckets, run.tau_x, run.diverged_s))
+    return CellResult(
+        verdict=classify_decision(end.stability, end.behaviour),
+        motion=end.behaviour,
+        ran_s=run.ran_s,
+        extended=extended,
+        end_error_rad=end.end_error_rad,
+        end_speed_rad_s=end.end_speed_rad_s,
+        error_rate_per_s=finite_or_none(end.error.rate_per_s),
+        speed_rate_per_s=finite_or_none(end.speed.rate_per_s),
+        peak_error_rad=max(float(values[:, 0].max()) for values in run.maxima),
+        settled_s=run.settled_s,
+        diverged_s=end.diverged_at_s,
+        **totals._asdict(),
+        reasons="; ".join(end.reasons),
+    )
+
+
+LineDiff = tuple[str | tuple[int, int], ...]
+"""A text as differences from a base text. The parts are, in order, ranges (first, last) of line
+numbers of the base, and lines that the base does not contain.
+"""
+
+
+def diff_lines(text: str, base: str) -> LineDiff:
+    """Encodes a string by its differences from a similar string, to save space in a file.
+
+    `apply_diff` restores the text. The differences need not be minimal. Each line is looked up
+    in the base: first at the position after the previous line, and then at its first
+    occurrence.
+
+    Args:
+        text: The text.
+        base: The similar text.
+    """
+    base_lines = base.split("\n")
+    # In reversed order the first occurrence of a line is entered last, and so it is kept.
+    first_index = {line: index for index, line in reversed(list(enumerate(base_lines)))}
+    parts: list[str | tuple[int, int]] = []
+    expected = 0  # index in the base if the text continues line by line
+    for line in text.split("\n"):
+        continues = expected < len(base_lines) and base_lines[expected] == line
+        index = expected if continues else first_index.get(line)
+        if index is None:
+            parts.append(line)
+            expected += 1
+            continue
+
+        previous = parts[-1] if parts else None
+        if isinstance(previous, tuple) and previous[1] + 1 == index:
+            parts[-1] = (previous[0], index)  # the line extends the previous range
+        else:
+            parts.append((index, index))
+        expected = index + 1
+    return tuple(parts)
+
+
+def apply_diff(parts: Iterable[str | Sequence[int]], base: str) -> str:
+    """Restores a text from its differences from a base, as `diff_lines` encoded them.
+
+    Args:
+        parts: Differences, as `diff_lines` returns them.
+        base: The base text.
+    """
+    base_lines = base.split("\n")
+    lines = list[str]()
+    for part in parts:
+        if isinstance(part, str):
+            lines.append(part)
+        else:
+            first, last = part
+            lines.extend(base_lines[first : last + 1])
+    return "\n".join(lines)
+
+
+class CellRun(msgspec.Struct, frozen=True):
+    """A finished run of a sweep with its result, as the journal of the sweep stores it.
+
+    Attributes:
+        cell: Number of the cell.
+        seed: Seed of the run.
+        random: True if the run draws random numbers. Another seed then gives another run.
+        law: Control laws of the sites, without duplicates.
+        sha256: Digest of the run's scenario.
+        scenario: Canonical text of the run's scenario, as differences from the scenario of the
+            sweep.
+        outcome: Result of the run.
+        metrics: Further metrics of the sweep over the scenario's duration, by key. None for a
+            metric that the run does not have.
+    """
+
+    cell: int
+    seed: int
+    random: bool
+    law: str
+    sha256: str
+    scenario: LineDiff
+    outcome: CellResult
+    metrics: dict[str, float | None] = {}

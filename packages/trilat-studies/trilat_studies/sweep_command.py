@@ -1,0 +1,541 @@
+"""`trilat sweep`: runs a scenario over a grid of its keys, maps stability, and finds edges.
+
+A scenario is a TOML file that describes an experiment, and its keys are the values that can be
+varied, such as a gain or a delay. A cell of the grid is a combination of values of the keys. An
+edge is the value of a key at which runs change from stable to not stable.
+
+Invariant:
+    - Everything that is printed is also written to the result files. Runs that take place live
+      over a network are an exception: their results are in their logs.
+    - An interrupted sweep prints the command that resumes it.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from trilat_net.app.cli import options
+from trilat_net.app.cli.options import flag, value
+from trilat_net.app.cli.run_progress import run_in_own_folder, show_progress
+from trilat_net.errors import UsageError, count_nouns, format_wall_time, join_arguments
+from trilat_net.presentation import terminal_output as terminal
+
+from .study_commands import parse_seeds
+
+if TYPE_CHECKING:
+    from trilat_net.scenario import Scenario
+
+    from .sweep import FinishedSweep
+    from .sweep.margin_search import SearchRange
+    from .sweep.sweep_plan import SweepPlan
+    from .sweep.sweep_results import SweepResults
+    from .sweep.sweep_run import DurationEstimate, SweepFolder
+
+
+_option = partial(typer.Option, rich_help_panel="Maps and stability limits")
+
+
+def _check_modes(used_options: Sequence[str]) -> None:
+    """Refuses options that exclude each other.
+
+    Args:
+        used_options: The options that the user wrote on the command line.
+
+    Raises:
+        UsageError: Two options exclude each other, or an option lacks the option to which it
+            belongs.
+    """
+    modes = [
+        name for name in ("--map", "--margin", "--confirm", "--cell") if name in used_options
+    ]
+    if len(modes) > 1:
+        raise UsageError(f"{' and '.join(modes)} cannot be combined: give only one of them")
+    if "--width" in used_options and "--map" not in used_options:
+        raise UsageError("--width sets the width of a map: use --width with --map")
+    if "--tolerance" in used_options and "--margin" not in used_options:
+        raise UsageError(
+            "--tolerance sets the tolerance of a stability limit: use --tolerance with --margin"
+        )
+    for name in ("--judge", "--metric"):
+        if name in used_options and "--margin" in used_options:
+            raise UsageError(
+                f"{name} applies only to a sweep and the map of a sweep: leave out --margin"
+            )
+
+
+def _draw_map(
+    results: "SweepResults", folder: Path, width: float | None, jobs: int | None, on: str | None
+) -> None:
+    """Draws the stability map of a sweep, together with the edges that theory predicts.
+
+    Args:
+        results: The finished sweep.
+        folder: Folder of the files.
+        width: Width of the map, in inches. None uses one column of a paper.
+        jobs: Number of processes. None uses one per core.
+        on: Address of a Dask scheduler that computes the map instead.
+    """
+    from trilat_net.presentation.appearance import COLUMN_IN, make_print_size
+
+    from .sweep.fixed_gains import FAIR_COMPARISON
+    from .sweep.map_page import write_map
+    from .sweep.stability_map import build_stability_map
+    from .sweep.sweep_plan import build_sweep_command
+
+    size = make_print_size(COLUMN_IN if width is None else width)
+    width_option = [] if width is None else ["--width", f"{width:g}"]
+    command = build_sweep_command(results.plan, "--map", *width_option)
+    terminal.print_text("map: the lines of theory ...")
+    with show_progress(
+        "linear analysis", terminal.print_text, "columns of the map"
+    ) as progress:
+        stability_map = build_stability_map(results, (command,), jobs, progress, on=on)
+
+    terminal.print_texts(f"note: {remark}" for remark in stability_map.remarks)
+    terminal.print_text("map: drawing ...")
+    paths = write_map(stability_map, folder, size.width_in)
+    terminal.print_texts(f"not swept: {text}" for text in stability_map.fixed)
+    terminal.print_text(FAIR_COMPARISON)
+    terminal.print_paths(paths)
+
+
+def _search_margins(
+    plan: "SweepPlan",
+    search_range: "SearchRange",
+    folder: Path | None,
+    *,
+    jobs: int | None,
+    on: str | None,
+    as_json: bool,
+) -> None:
+    """Searches edges along one key, prints them, and writes the result files.
+
+    The edges that theory predicts are printed beside them.
+
+    Args:
+        plan: The sweep. Its last axis has the two ends of the range.
+        search_range: The key and the range in which edges are searched.
+        folder: Folder of margin.json and margin.md. None uses the next free one.
+        jobs: Number of processes. None uses one per core.
+        on: Address of a Dask scheduler that executes the runs instead.
+        as_json: True to print the result as JSON.
+    """
+    from trilat_net.files import make_results_folder
+
+    from .sweep.margin_search import SweepMargins, search_margins
+
+    results_folder = make_results_folder(folder, f"margin-{plan.base.name}", force=None)
+    with (
+        terminal.lines_aside(as_json),
+        show_progress("searching", terminal.print_text, "places") as progress,
+    ):
+        edges = search_margins(
+            plan=plan, within=search_range, jobs=jobs, progress=progress, on=on
+        )
+        margins = SweepMargins(plan, search_range, edges)
+
+    paths = margins.write(results_folder)
+    if not as_json:
+        terminal.out.print()
+    terminal.print_result(margins, as_json=as_json)
+    terminal.print_paths([] if as_json else paths)
+
+
+def _confirm_cells(results: "SweepResults", count: int) -> None:
+    """Runs cells next to the edges live, and compares their verdicts with the sweep.
+
+    Args:
+        results: The finished sweep.
+        count: Number of cells on each side of the edges.
+
+    Raises:
+        typer.Exit: A verdict differs.
+    """
+    from .sweep.live_confirmation import (
+        choose_cells_near_edges,
+        confirm_cell,
+        tabulate_confirmations,
+    )
+
+    keys = [axis.key for axis in results.plan.axes]
+    rows = choose_cells_near_edges(results.rows, keys, count)
+    name = f"confirm-{results.plan.base.name}"
+
+    def run_live(scenario: "Scenario", cell: str) -> "tuple[Path, Sequence[str]]":
+        """Runs one point of a parameter study in real time, with one process per robot arm.
+
+        Args:
+            scenario: Scenario with the parameters of this point.
+            cell: Name of the point, which is part of the name of its folder.
+
+        Returns:
+            The path of the log, and a sentence for each problem of the run.
+        """
+        outcome = run_in_own_folder(scenario, cell, f"{name}-{cell}")
+        return outcome.log, outcome.problems
+
+    confirmations = [confirm_cell(row, run_live) for row in rows]
+    terminal.out.print()
+    terminal.print_table(tabulate_confirmations(confirmations, keys))
+    same_count = sum(confirmation.same for confirmation in confirmations)
+    terminal.out.print(f"{same_count} of {len(confirmations)} verdicts are the same")
+    if same_count < len(confirmations):
+        raise typer.Exit(1)
+
+
+def _run_sweep(
+    new_plan: "SweepPlan | None",
+    path: Path | None,
+    jobs: int | None,
+    on: str | None,
+    *,
+    yes: bool,
+) -> "FinishedSweep":
+    """Runs a sweep, or the remaining runs of a sweep, and prints its summary.
+
+    A sweep that is too large is refused before its folder is created.
+
+    Args:
+        new_plan: The sweep. None uses the sweep in the folder.
+        path: Folder of a sweep to continue, or of a new sweep. None uses the next free folder.
+        jobs: Number of processes. None uses one per core.
+        on: Address of a Dask scheduler that executes the runs instead.
+        yes: True to run a sweep even if it is too large.
+
+    Returns:
+        The finished sweep.
+    """
+    from trilat_net.work.executor import count_workers
+
+    from .sweep import sweep_results, sweep_run
+
+    existing_folder = None
+    plan = new_plan
+    finished_runs = []
+    if path is not None and (plan is None or (path / sweep_results.PLAN_FILE).exists()):
+        existing_folder = sweep_run.open_sweep_folder(path, plan)
+        plan = existing_folder.plan
+        finished_runs = existing_folder.read_done()
+    assert plan is not None  # the caller gives a plan or a folder
+    terminal.print_texts(sweep_results.describe_sweep_plan(plan))
+    if existing_folder is not None:
+        done = count_nouns(len(finished_runs), "run is", "runs are")
+        terminal.print_text(f"  {done} done already")
+
+    workers = count_workers(jobs, on)
+    estimate = sweep_run.estimate_sweep(plan, finished_runs, workers)
+    if not yes:
+        sweep_run.refuse_oversized_sweep(plan, estimate, workers)
+
+    folder = existing_folder or sweep_run.prepare_sweep_folder(plan, path)
+    if estimate.seconds:
+        duration = format_wall_time(estimate.seconds)
+        terminal.print_text(f"  about {duration}, by some of its cells; into {folder.path}")
+    finished = _run_in_folder(folder, jobs, on, estimate)
+    was_complete = not (estimate.entries or finished.runs)
+    if was_complete:
+        terminal.out.print("nothing was left to run")
+    remarks = [sweep_run.describe_sweep_speed(finished)] if finished.runs else []
+    remarks.append(f"results: {folder.path / sweep_results.RESULTS_FILE}")
+    _print_results(finished.results, remarks, folder.path)
+    return finished
+
+
+def _run_in_folder(
+    folder: "SweepFolder", jobs: int | None, on: str | None, estimate: "DurationEstimate"
+) -> "FinishedSweep":
+    """Runs a sweep in its folder. On Ctrl-C it prints the command that resumes the sweep.
+
+    Args:
+        folder: Folder of the sweep.
+        jobs: Number of processes. None uses one per core.
+        on: Address of a Dask scheduler that executes the runs instead.
+        estimate: Estimate of the duration. The runs that it needed are not repeated.
+    """
+    from .sweep import run_sweep
+
+    try:
+        with show_progress("sweeping", terminal.print_text) as progress:
+            return run_sweep(
+                folder=folder, jobs=jobs, progress=progress, known=estimate.entries, on=on
+            )
+    except KeyboardInterrupt:
+        resume = join_arguments(["trilat", "sweep", "--resume", str(folder.path)])
+        done = count_nouns(len(folder.read_done()), "run is", "runs are")
+        terminal.err.print(
+            f"{done} done and kept; continue with: {resume}", markup=False, soft_wrap=True
+        )
+        raise
+
+
+def _print_results(results: "SweepResults", remarks: list[str], path: Path) -> None:
+    """Prints the summary of a sweep, remarks, and commands that are useful next.
+
+    Args:
+        results: The finished sweep.
+        remarks: Lines to print after the summary.
+        path: Folder of the sweep.
+    """
+    from .sweep.sweep_results import list_next_commands, summarize_sweep
+
+    terminal.print_texts(summarize_sweep(results))
+    terminal.print_texts(remarks)
+    terminal.print_texts(f"  {command}" for command in list_next_commands(path))
+
+
+def _print_cell_commands(path: Path, number: int, *, as_json: bool) -> None:
+    """Prints the commands that write logs of a cell of a finished sweep.
+
+    Args:
+        path: Folder of the sweep, or its table of results.
+        number: Number of the cell.
+        as_json: True to print the rows of the cell as JSON instead.
+    """
+    from .sweep import read_results
+    from .sweep.sweep_results import build_reproduce_command
+
+    results = read_results(path)
+    if as_json:
+        return terminal.print_json([dict(row) for row in results.of_cell(number)])
+    folder = path if path.is_dir() else path.parent
+    for row in results.of_cell(number):
+        command, note = build_reproduce_command(results, row, folder)
+        if note:
+            terminal.print_note(note)
+        terminal.print_line(command)
+    return None
+
+
+@options.command(
+    "p_d_margin --over link.delay_ms=0:1600:50 --over control.d=0.2:3:0.1",
+    "p_d_margin --over link.delay_ms=100,200,400 --margin control.d=0.2:3",
+    "runs/sweep-p_d_margin-001 --cell 17",
+    page="docs/studies/sweep.md",
+)
+def sweep_command(
+    context: typer.Context,
+    scenario: Annotated[
+        str | None,
+        typer.Argument(metavar="[SCENARIO|RESULTS]", autocompletion=options.complete_scenarios),
+    ] = None,
+    over: Annotated[list[str] | None, value("--over", "KEY=VALUES")] = None,
+    seeds: Annotated[str | None, value("--seeds", "N|LIST")] = None,
+    law: Annotated[str | None, value("--law", "LAW,LAW...")] = None,
+    duration: options.DurationOption = None,
+    longest: Annotated[float | None, value("--longest", "S")] = None,
+    judge: Annotated[str, value("--judge", "verdict|twins")] = "verdict",
+    metric: Annotated[list[str] | None, value("--metric", "KEY")] = None,
+    output: Annotated[Path | None, value("-o --out", "DIR")] = None,
+    resume: Annotated[
+        Path | None, value("--resume", "DIR", "Continue the interrupted sweep in this folder.")
+    ] = None,
+    cell: Annotated[int | None, value("--cell", "N")] = None,
+    jobs: options.JobsOption = None,
+    on: options.OnOption = None,
+    yes: Annotated[bool, flag("--yes", "Run the sweep even if it is very large.")] = False,
+    overrides: options.SetOption = None,
+    mapped: Annotated[
+        bool,
+        _option("--map", help="Draw the stability map, with the stability limits from theory."),
+    ] = False,
+    width: Annotated[float | None, _option("--width", metavar="3.5|7")] = None,
+    margin: Annotated[str | None, _option("--margin", metavar="KEY=FROM:TO")] = None,
+    tolerance: Annotated[float, _option("--tolerance", metavar="SHARE")] = 0.005,
+    confirm: Annotated[int | None, _option("--confirm", metavar="K", min=1)] = None,
+    as_json: options.JsonOption = False,
+) -> None:
+    """Maps where a scenario is stable, over a grid of settings.
+
+    Every run is simulated in virtual time. All cores are used. Finished runs are kept even if
+    the sweep is interrupted. To continue it, use --resume, or the same command with the same
+    -o. A cell is one combination of values in the grid.
+
+    Options:
+        scenario: Name of a shipped scenario, path of a TOML file, or folder (or results.csv) of
+            an earlier sweep.
+        over: Axis of the grid: a scenario key with its values, for example
+            link.delay_ms=0:1600:50 or link.order=newest,in_order; repeatable.
+        seeds: Number of seeds, or a list of seeds, for example 1..20; default: one.
+        law: Control laws, as a further axis of the grid; default: the law of the scenario.
+        longest: Longest run of a cell whose stability is still undecided, s; default: eight
+            times the duration, or the duration with --judge twins.
+        judge: Quantity in the map: stability classes (verdict), or growth exponents of runs
+            with a small push (twins), for which short runs suffice.
+        metric: Measure this metric of every run as well (docs/reference/metrics.md);
+            repeatable.
+        output: Folder for the results; a sweep that the folder already contains is continued.
+            Default: runs/sweep-NAME-N, or runs/margin-NAME-N with --margin.
+        cell: For an earlier sweep: print the commands that write the logs of this cell.
+        width: Width of the map in inches: one or two columns of a paper; default: one column.
+        margin: Instead of a full sweep, search for the stability limit in this range of a
+            scenario key, at every point of the grid.
+        tolerance: Largest uncertainty of a stability limit that --margin finds, relative to its
+            value.
+        confirm: For an earlier sweep: run up to this many cells on each side of the stability
+            limit as live sessions.
+    """
+    from .sweep import plan_sweep
+    from .sweep.margin_search import format_range_axis, parse_search_range
+
+    used_options = options.list_used_options(context)
+    _check_modes(used_options)
+    results = Path(scenario) if scenario is not None and _is_results(scenario) else None
+    draw = partial(_draw_map, width=width, jobs=jobs, on=on)
+
+    uses_finished_sweep = cell is not None or resume is not None or results is not None
+    if uses_finished_sweep:
+        _refuse_plan_options(used_options)
+    elif confirm is not None:
+        raise UsageError(
+            "--confirm needs the results of a sweep: use trilat sweep FOLDER --confirm 5"
+        )
+
+    if resume is not None:
+        if scenario is not None or cell is not None:
+            raise UsageError(
+                "--resume continues the sweep that is stored in the folder: leave out the "
+                "scenario and --cell"
+            )
+        with terminal.lines_aside(as_json):
+            finished = _run_sweep(None, resume, jobs, on, yes=yes)
+    elif cell is not None:
+        if scenario is None:
+            raise UsageError(
+                "--cell needs the results of a sweep: use trilat sweep FOLDER --cell N"
+            )
+        return _print_cell_commands(Path(scenario), cell, as_json=as_json)
+    elif results is not None:
+        return _show_results(results, confirm, draw if mapped else None, as_json=as_json)
+    elif scenario is None or not (over or law or seeds or margin):
+        raise UsageError(
+            "name a scenario and the keys to sweep, as in: --over link.delay_ms=0:1600:50"
+        )
+    else:
+        axes = list(over or [])
+        search_range = None
+        if margin is not None:
+            search_range = parse_search_range(margin, tolerance)
+            axes.append(format_range_axis(search_range))
+        plan = plan_sweep(
+            scenario,
+            options.list_overrides(overrides, duration),
+            over=axes,
+            seeds=parse_seed_count(seeds),
+            laws=options.split_names(law),
+            longest_s=longest,
+            judge=judge,
+            metrics=metric or (),
+        )
+        if search_range is not None:
+            return _search_margins(
+                plan, search_range, output, jobs=jobs, on=on, as_json=as_json
+            )
+        with terminal.lines_aside(as_json):
+            finished = _run_sweep(plan, output, jobs, on, yes=yes)
+
+    if mapped:
+        with terminal.lines_aside(as_json):
+            draw(finished.results, finished.folder.path)
+    if as_json:
+        terminal.print_json(finished.results.to_dict())
+    return None
+
+
+def _show_results(
+    path: Path,
+    confirm: int | None,
+    draw: "Callable[[SweepResults, Path], None] | None",
+    *,
+    as_json: bool,
+) -> None:
+    """Confirms cells of a finished sweep, draws its map, or prints its summary.
+
+    Args:
+        path: Folder of the sweep, or its table of results.
+        confirm: Number of cells on each side of the edges to run live. None runs no cell.
+        draw: Function that draws the map. None draws no map.
+        as_json: True to print the results as JSON in addition.
+    """
+    from .sweep.sweep_results import describe_sweep_plan, read_results
+
+    results = read_results(path)
+    with terminal.lines_aside(as_json):
+        if confirm is not None:
+            _confirm_cells(results, confirm)
+        elif draw is not None:
+            draw(results, path if path.is_dir() else path.parent)
+        else:
+            terminal.print_texts(describe_sweep_plan(results.plan))
+            _print_results(results, [], path)
+    if as_json:
+        terminal.print_json(results.to_dict())
+
+
+_PLAN_OPTIONS = (
+    "--over",
+    "--seeds",
+    "--law",
+    "-o",
+    "--longest",
+    "--judge",
+    "--metric",
+    "--set",
+    "--duration",
+)
+"""Options that define a sweep. For a finished or interrupted sweep they are fixed."""
+
+
+def _refuse_plan_options(used_options: Sequence[str]) -> None:
+    """Refuses options that would change a sweep that exists already.
+
+    Args:
+        used_options: The options that the user wrote on the command line.
+
+    Raises:
+        UsageError: One of the options defines a sweep.
+    """
+    for name in _PLAN_OPTIONS:
+        if name in used_options:
+            raise UsageError(f"{name} is already set by the sweep: leave out {name}")
+    if "--margin" in used_options:
+        raise UsageError("--margin starts a new search in a scenario: name the scenario")
+
+
+def parse_seed_count(text: str | None) -> int | list[int]:
+    """Parses the option --seeds of a sweep.
+
+    A string such as 10 is a number of seeds. Strings such as 1..20, 1,5,9 or 7, (with a comma)
+    are lists of seeds.
+
+    Args:
+        text: The text. None if the user did not use the option.
+
+    Returns:
+        The number of seeds, or the list of the seeds. 1 if there is no text.
+    """
+    if text is None:
+        return 1
+    fits_64_bits = len(text) < 19
+    if text.strip().isdecimal() and fits_64_bits:
+        return int(text)
+    return parse_seeds(text.strip().removesuffix(","))
+
+
+def _is_results(source: str) -> bool:
+    """Returns True if an argument of the command names the results of a sweep.
+
+    The names of shipped scenarios never do, even if there is a folder of the same name.
+
+    Args:
+        source: The argument: a scenario, the folder of a sweep, or its table of results.
+    """
+    from trilat_net.scenario import list_shipped
+
+    from .sweep.sweep_results import PLAN_FILE
+
+    if source in list_shipped():
+        return False
+    return source.endswith(".csv") or (Path(source) / PLAN_FILE).exists()

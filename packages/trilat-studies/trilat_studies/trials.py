@@ -1,0 +1,776 @@
+"""Runs a scenario once per seed and checks whether it behaves as expected.
+
+A scenario is the TOML file that describes an experiment. Its table [expect] states what a run
+must achieve, such as a largest error or a time until which the arms agree. A trial is a run of
+the scenario with one seed of the random numbers, whose metrics are compared with this table.
+
+From pytest, one test per seed:
+
+    import pytest
+    import trilat_net
+
+    TRIALS = trilat_net.trials("jitter", seeds=range(1, 6))
+
+    @pytest.mark.parametrize("trial", TRIALS, ids=str)
+    def test_jitter(trial):
+        trial.check()
+
+All seeds in one test, on all cores: `trilat_net.check("jitter", seeds=range(1, 21))`.
+
+The report for build servers is JUnit XML according to Jenkins' `junit-10.xsd`. It has a suite
+per scenario and a case per run. A case has one `failure` with all unmet expectations, or an
+`error` if the run has no result.
+
+Invariant:
+    - One command repeats a trial, and the result of the trial contains that command.
+    - An evaluation is a pure function of metrics and expectations. It states the measured
+      value, the limit and the margin, whether or not the expectation is met.
+    - A live trial, which runs over a network, is evaluated from its log by the same code. In
+      addition its session must end in order, and its records must be the same bit for bit when
+      they are computed again.
+    - Results are in the order of the trials, no matter which process ran them.
+    - A trial that repeatedly kills its worker process affects no other trial.
+"""
+
+import re
+import xml.etree.ElementTree as Xml
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from msgspec.structs import asdict
+
+from trilat_net.analysis.metrics.log_metrics import find_quantity
+from trilat_net.core.step.jit import is_core_cached
+from trilat_net.errors import LawFailed, LogError, ScenarioError, TrilatError, count_nouns
+from trilat_net.execution import virtual
+from trilat_net.execution.verify import verify
+from trilat_net.log.log_reader import open_log
+from trilat_net.net.clock import SystemClock
+from trilat_net.presentation.result_text import Block, MarkedText, TextTable
+from trilat_net.results import Result
+from trilat_net.scenario import Scenario, load_scenario
+from trilat_net.scenario.code_consent import list_imported_code
+from trilat_net.scenario.scenario_reader import read_experiment, reseed_scenario
+from trilat_net.work.executor import MAX_LOSSES, WorkerPool, Workers, open_worker_pool
+from trilat_net.work.intervals import MeanInterval, mean_interval
+from trilat_net.work.study_folder import format_command, list_assignments, set_options
+
+from .measure_run import (
+    ExpectationResult,
+    RunMetrics,
+    evaluate_expectations,
+    measure_log,
+    measure_virtual_run,
+)
+
+
+class TrialResult(NamedTuple):
+    """Result of running a scenario and comparing the run with its expectations.
+
+    An expectation is a limit for a metric, which the scenario states in its table [expect].
+
+    Attributes:
+        trial: The trial.
+        outcomes: Outcome of each expectation.
+        simulated_s: Duration of the run in its own time, in s.
+        wall_s: Duration in real time, in s.
+        error: Reason why the run has no result. Empty if it has one.
+        log: Log of a live trial, if it exists.
+    """
+
+    trial: "Trial"
+    outcomes: Sequence[ExpectationResult] = ()
+    simulated_s: float = 0.0
+    wall_s: float = 0.0
+    error: str = ""
+    log: Path | None = None
+
+    @property
+    def held(self) -> bool:
+        """True if the run was completed and met all expectations of its scenario."""
+        return not self.error and all(outcome.held for outcome in self.outcomes)
+
+    @property
+    def failures(self) -> list[str]:
+        """Sentences about what went wrong. Empty if the run met all expectations.
+
+        A sentence states an unmet expectation, or why the run has no result.
+        """
+        sentences = [f"no result: {self.error}"] if self.error else []
+        sentences += [
+            f"{outcome.key}: {outcome.measured}, expected {outcome.limit}"
+            for outcome in self.outcomes
+            if not outcome.held
+        ]
+        return sentences
+
+
+class Trial(NamedTuple):
+    """A scenario with one seed, which can be run and compared with its expectations.
+
+    `trials` creates these objects, for example as parameters of a test.
+
+    Attributes:
+        scenario: The scenario.
+        source: Name or path of the scenario, as in a command.
+        overrides: Overrides KEY=VALUE of the scenario, as in a command.
+        live: True if the trial runs over a network instead of in virtual time.
+    """
+
+    scenario: Scenario
+    source: str
+    overrides: tuple[str, ...] = ()
+    live: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.scenario.name}-seed{self.scenario.seed}"
+
+    @property
+    def again(self) -> str:
+        """Shell command that repeats this trial, for the user to copy."""
+        live = ["--live"] if self.live else []
+        seeds = ["--seeds", str(self.scenario.seed)]
+        return format_command("test", self.source, *live, *seeds, *set_options(self.overrides))
+
+    @property
+    def look(self) -> str:
+        """Shell command that simulates this trial and records its log, for inspection."""
+        arguments = ["--seed", str(self.scenario.seed), "-o", f"{self}.mcap"]
+        return format_command("sim", self.source, *arguments, *set_options(self.overrides))
+
+    def evaluate(self, metrics: RunMetrics, wall_s: float) -> TrialResult:
+        """Compares the metrics of a run with the expectations of the scenario.
+
+        Args:
+            metrics: Metrics of the run.
+            wall_s: Duration of the run in real time, in s.
+
+        Returns:
+            The result of the trial.
+        """
+        outcomes = evaluate_expectations(self.scenario.expect, metrics)
+        return TrialResult(self, outcomes, metrics.simulated_s, wall_s)
+
+    def run(self) -> TrialResult:
+        """Runs the trial in virtual time, in this process.
+
+        If a user's control law fails, the result contains the error instead of outcomes.
+        """
+        clock = SystemClock()
+        start_ns = clock.monotonic_ns()
+        try:
+            metrics = measure_virtual_run(self.scenario)
+        except LawFailed as failed:
+            wall_s = (clock.monotonic_ns() - start_ns) * 1e-9
+            return TrialResult(self, wall_s=wall_s, error=str(failed))
+        wall_s = (clock.monotonic_ns() - start_ns) * 1e-9
+        return self.evaluate(metrics, wall_s)
+
+    def check(self) -> TrialResult:
+        """Runs the trial in virtual time, and returns the result if all expectations are met.
+
+        Raises:
+            AssertionError: An expectation is not met. The text contains the reasons, and the
+                commands that repeat the run and record it.
+        """
+        __tracebackhide__ = True  # pytest shows the reason instead of this line
+        result = self.run()
+        if not result.held:
+            reasons = "; ".join(result.failures)
+            raise AssertionError("\n  ".join([f"{self}: {reasons}", self.again, self.look]))
+        return result
+
+
+def trials(
+    source: str | Path | Mapping[str, Any] | Scenario,
+    seeds: Iterable[int] = (),
+    set: Mapping[str, Any] | Sequence[str] = (),  # noqa: A002 - the command's --set, by its name
+    *,
+    live: bool = False,
+) -> list[Trial]:
+    """Returns the trials of a scenario, one per seed, for example as parameters of a test.
+
+    >>> [str(trial) for trial in tn.trials("jitter", seeds=[1, 2])]
+    ['jitter-seed1', 'jitter-seed2']
+
+    In virtual time, a scenario in which nothing is random has a single trial, with the first of
+    the seeds. All other seeds would give the same run.
+
+    Args:
+        source: Name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
+        seeds: Seeds of the random numbers. Empty stands for the scenario's own seed.
+        set: Overrides, as in `{"link.delay_ms": 400}` or `["link.delay_ms=400"]`.
+        live: True if the trials will run over a network.
+
+    Raises:
+        ScenarioError: The scenario, a seed or an override is not valid, or the scenario has no
+            expectations.
+    """
+    scenario = load_scenario(source, set)
+    label = read_experiment(source).label
+    _check_expectations_reachable(scenario, label)
+    if not live:
+        virtual.check_virtual(scenario)
+
+    distinct_seeds = list(dict.fromkeys(seeds)) or [scenario.seed]
+    for seed in distinct_seeds:
+        if not 0 <= seed < 2**63:
+            raise ScenarioError(
+                f"must be from 0 to 2^63 - 1, not {seed}", path="seed", source=label
+            )
+    if not scenario.random and not live:
+        del distinct_seeds[1:]
+
+    overrides = tuple(list_assignments(set) if isinstance(set, Mapping) else set)
+    return [
+        Trial(reseed_scenario(scenario, seed), label, overrides, live)
+        for seed in distinct_seeds
+    ]
+
+
+def _check_expectations_reachable(scenario: Scenario, source: str) -> None:
+    """Refuses expectations that no run of a scenario can meet.
+
+    Args:
+        scenario: The scenario.
+        source: Name or path of the scenario, for error messages.
+
+    Raises:
+        ScenarioError: The scenario has no expectations, a metric is unknown, or a time lies
+            after the end of the run.
+    """
+    expect = scenario.expect
+    end_s = scenario.duration_s
+    if not expect.has_expectations:
+        raise ScenarioError(
+            "the scenario has no expectations: add a table [expect] with keys such as "
+            "stable = true or synchronised_by_s = 12.0; the template of `trilat scenario new` "
+            "lists all keys",
+            source=source,
+        )
+
+    for key in expect.metrics:
+        try:
+            find_quantity(key)
+        except KeyError as error:
+            raise ScenarioError(
+                error.args[0], path=f"expect.metrics.{key}", source=source
+            ) from None
+
+    by_s = expect.synchronised_by_s
+    if by_s is not None and by_s >= end_s:
+        problem = f"must be before the end of the run at {end_s:g} s, not {by_s:g}"
+        raise ScenarioError(problem, path="expect.synchronised_by_s", source=source)
+    for n, window in enumerate(expect.windows):
+        if window.to_s > end_s:
+            problem = (
+                f"must not be after the end of the run at {end_s:g} s, not {window.to_s:g}"
+            )
+            raise ScenarioError(problem, path=f"expect.windows[{n}].to_s", source=source)
+
+
+def evaluate_live_log(
+    trial: Trial, log_file: Path, problems: Sequence[str], wall_s: float
+) -> TrialResult:
+    """Compares the run of a live session with the expectations of its scenario.
+
+    Two expectations are added to those of the scenario: that the session ended in order, and
+    that all records are the same bit for bit when they are computed again.
+
+    Args:
+        trial: The trial, with its scenario.
+        log_file: Log of the session, which may be missing.
+        problems: Problems of the session, as sentences. Empty if the session ended in order.
+        wall_s: Duration of the session in real time, in s.
+
+    Returns:
+        The result. If the log cannot be read, it contains the reason instead of outcomes.
+    """
+    existing_log = log_file if log_file.exists() else None
+    try:
+        log = open_log(log_file)
+        if not any(len(log[name]) for name in log.sites):
+            raise LogError(f"{log_file}: no records")
+        result = trial.evaluate(measure_log(log, trial.scenario.expect), wall_s)
+        verdict = verify(log)
+    except LogError as error:
+        text = "; ".join([*problems, str(error)])
+        return TrialResult(trial, wall_s=wall_s, error=text, log=existing_log)
+
+    session = ExpectationResult(
+        key="session",
+        held=not problems,
+        measured="; ".join(problems) or "ended in order",
+        limit="ends in order",
+    )
+    coverage = "" if verdict.coverage.share == 1.0 else f"; judged {verdict.coverage}"
+    execution = ExpectationResult(
+        key="executed again",
+        held=verdict.passed,
+        measured=f"{verdict.identical} identical{coverage}",
+        limit=count_nouns(verdict.records, "record"),
+    )
+    return result._replace(outcomes=[*result.outcomes, session, execution], log=existing_log)
+
+
+MAX_FAILURES_SHOWN = 5
+"""Failed runs of a scenario that are printed in full. Of further runs only the seeds are
+printed.
+"""
+
+TRIAL_COLUMNS = ("", "scenario", "expected", "limit", "worst", "margin", "held")
+"""Headers of the columns of the table of expectations."""
+
+
+class ExpectationRow(NamedTuple):
+    """One expectation of a scenario, with the results of all runs of this scenario.
+
+    The runs differ in their seeds. The object is a row in the table of a `TrialReport`.
+
+    Attributes:
+        scenario: Name or path of the scenario, as in a command.
+        key: Key of the expectation.
+        worst: Outcome of the run that came closest to its limit, or exceeded it most.
+        held: Number of runs that met the expectation.
+        runs: Number of all runs.
+        mean: Mean of the measured values, with its interval. None if it cannot be computed.
+    """
+
+    scenario: str
+    key: str
+    worst: ExpectationResult
+    held: int
+    runs: int
+    mean: MeanInterval | None = None
+
+    def cells(self) -> tuple[str, ...]:
+        """Returns the texts of this expectation's row in the printed table.
+
+        There is one text for each of `TRIAL_COLUMNS`, such as the limit, the worst measured
+        value, and the number of runs that met the expectation.
+        """
+        mark = "ok" if self.held == self.runs else "FAIL"
+        worst = self.worst
+        margin = format_margin(self.worst.margin)
+        held = f"{self.held}/{self.runs}"
+        return mark, self.scenario, self.key, worst.limit, worst.measured, margin, held
+
+
+@dataclass(frozen=True, repr=False)
+class TrialReport(Result):
+    """Results of several trials, with the texts that report them.
+
+    Attributes:
+        results: The results, in the order of scenarios and seeds.
+        wall_s: Duration of all trials together in real time, in s.
+    """
+
+    results: list[TrialResult]
+    wall_s: float
+
+    @property
+    def held(self) -> bool:
+        """True if all runs met all expectations."""
+        return all(result.held for result in self.results)
+
+    @property
+    def scenarios(self) -> dict[str, list[TrialResult]]:
+        """The results of each scenario, by the name or path of the scenario."""
+        groups: dict[str, list[TrialResult]] = {}
+        for result in self.results:
+            groups.setdefault(result.trial.source, []).append(result)
+        return groups
+
+    def rows(self) -> list[ExpectationRow]:
+        """Combines the results of each scenario to one row per expectation.
+
+        If some runs of a scenario have no result, another row states their number.
+        """
+        rows = []
+        for name, results in self.scenarios.items():
+            outcomes_by_key: dict[str, list[ExpectationResult]] = {}
+            for result in results:
+                for outcome in result.outcomes:
+                    outcomes_by_key.setdefault(outcome.key, []).append(outcome)
+            for key, outcomes in outcomes_by_key.items():
+                # An unmet expectation is worse than any other. After that the margin decides.
+                worst = min(outcomes, key=lambda outcome: (outcome.held, outcome.margin or 0.0))
+                row = ExpectationRow(
+                    scenario=name,
+                    key=key,
+                    worst=worst,
+                    held=sum(outcome.held for outcome in outcomes),
+                    runs=len(outcomes),
+                    mean=mean_interval([outcome.value for outcome in outcomes]),
+                )
+                rows.append(row)
+
+            errors = [result.error for result in results if result.error]
+            if errors:
+                row = ExpectationRow(
+                    scenario=name,
+                    key="a result",
+                    worst=ExpectationResult("a result", False, errors[0], ""),
+                    held=len(results) - len(errors),
+                    runs=len(results),
+                )
+                rows.append(row)
+        return rows
+
+    def failures(self) -> list[str]:
+        """Returns lines about the failed runs, with the commands that repeat them.
+
+        Empty if all runs met their expectations.
+        """
+        lines = []
+        for results in self.scenarios.values():
+            failed = [result for result in results if not result.held]
+            for result in failed[:MAX_FAILURES_SHOWN]:
+                trial = result.trial
+                reasons = "; ".join(result.failures)
+                lines.append(f"{trial.source}, seed {trial.scenario.seed}: {reasons}")
+                lines += [f"  {line}" for line in _list_repeat_commands(result)]
+            further = failed[MAX_FAILURES_SHOWN:]
+            if further:
+                seeds = ", ".join(str(result.trial.scenario.seed) for result in further)
+                lines.append(f"  and {len(further)} more, seeds {seeds}")
+        return lines
+
+    def remarks(self) -> list[str]:
+        """Returns lines that help to interpret the results of the trials.
+
+        The lines name the scenario keys that were changed for all trials, the scenarios that
+        ran only once because nothing in them is random, and the duration and speed of all runs.
+        """
+        remarks = []
+        overrides = self.results[0].trial.overrides if self.results else ()
+        if overrides:
+            remarks.append(f"changed in all: {', '.join(overrides)}")
+
+        first_trials = {name: results[0].trial for name, results in self.scenarios.items()}
+        run_once = [
+            name
+            for name, trial in first_trials.items()
+            if not (trial.scenario.random or trial.live)
+        ]
+        if run_once:
+            remarks.append(f"run once, nothing in it is random: {', '.join(run_once)}")
+
+        simulated_s = sum(result.simulated_s for result in self.results)
+        is_live = any(result.trial.live for result in self.results)
+        kind = "ran live" if is_live else "simulated"
+        speed = f": {simulated_s / self.wall_s:.3g}x" if self.wall_s > 0.0 else ""
+        runs = count_nouns(len(self.results), "run")
+        remarks.append(f"{runs}, {simulated_s:.6g} s {kind} in {self.wall_s:.1f} s{speed}")
+        return remarks
+
+    def table(self) -> list[str]:
+        """Returns the table of expectations as aligned lines, of which the first is the header.
+
+        The table has a row per expectation. A column with the means over the runs is added if
+        there are any.
+        """
+        rows = self.rows()
+        cells = [row.cells() for row in rows]
+        if not any(row.mean for row in rows):
+            return TextTable(TRIAL_COLUMNS, cells, align="lllllrr").lines()
+        means = [str(row.mean) if row.mean else "" for row in rows]
+        cells = [(*texts, mean) for texts, mean in zip(cells, means, strict=True)]
+        return TextTable((*TRIAL_COLUMNS, "mean, 95 %"), cells, align="lllllrrr").lines()
+
+    def blocks(self) -> Iterator[Block]:
+        """Yields the parts of the text that `trilat test` prints.
+
+        The parts are a table of the expectations and how well the runs met them, the failures,
+        and remarks such as the duration of all runs.
+        """
+        header, *lines = self.table()
+        yield header
+        for line in lines:
+            mark, _, rest = line.partition(" ")
+            yield MarkedText(f"[{'green' if mark == 'ok' else 'red'}]{mark}[/]", rest)
+        yield from [*self.failures(), *self.remarks()]
+
+    def headline(self) -> str:
+        """Returns a sentence with the number of runs that met all expectations."""
+        held = sum(result.held for result in self.results)
+        return f"{held} of {count_nouns(len(self.results), 'run')} as expected"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Converts the results to plain values, as `trilat test --json` prints them."""
+        runs = [
+            {
+                "scenario": result.trial.source,
+                "seed": result.trial.scenario.seed,
+                "held": result.held,
+                "error": result.error or None,
+                "log": str(result.log) if result.log else None,
+                "again": result.trial.again,
+                "expected": [asdict(outcome) for outcome in result.outcomes],
+            }
+            for result in self.results
+        ]
+        return {"held": self.held, "wall_s": self.wall_s, "runs": runs}
+
+    def to_rows(self) -> list[dict[str, Any]]:
+        """Returns a table of plain values, one row for each expectation of each run."""
+        return [
+            {
+                "scenario": result.trial.source,
+                "seed": result.trial.scenario.seed,
+                **asdict(outcome),
+            }
+            for result in self.results
+            for outcome in result.outcomes
+        ]
+
+
+def _run_trial(trial: Trial) -> TrialResult:
+    """Runs a trial in a worker process.
+
+    An error that concerns only this trial becomes its result, so that the other trials of the
+    worker still run.
+    """
+    try:
+        return trial.run()
+    except (TrilatError, ArithmeticError, ValueError, MemoryError) as error:
+        return TrialResult(trial, error=f"{type(error).__name__}: {error}")
+
+
+def run_trials(
+    batch: Sequence[Trial],
+    jobs: int | None = None,
+    done: Callable[[TrialResult], None] = lambda _: None,
+    on: Workers = None,
+) -> TrialReport:
+    """Runs trials in virtual time and collects their results.
+
+    A trial is a run of a scenario with one random seed, whose result is compared with the
+    expectations of the scenario. If there is a single trial, or `jobs` is 1, no worker process
+    is started.
+
+    Args:
+        batch: The trials.
+        jobs: Number of worker processes. None uses all cores.
+        done: Function that is called with each result as it arrives.
+        on: Address of a Dask scheduler, or an executor, whose workers run the trials. None uses
+            processes of this machine.
+
+    Returns:
+        The results, in the order of the trials.
+    """
+    clock = SystemClock()
+    start_ns = clock.monotonic_ns()
+    laws = list_imported_code(trial.scenario for trial in batch)
+    results: dict[int, TrialResult] = {}
+    with open_worker_pool(jobs, on, most=len(batch), laws=laws) as pool:
+        for n, result in _iterate_results(pool, batch):
+            # The result names the trial of the batch, and not the copy that a worker received.
+            results[n] = result._replace(trial=batch[n])
+            done(results[n])
+    ordered_results = [results[n] for n in range(len(batch))]
+    return TrialReport(ordered_results, (clock.monotonic_ns() - start_ns) * 1e-9)
+
+
+def _iterate_results(
+    pool: WorkerPool, batch: Sequence[Trial]
+) -> Iterator[tuple[int, TrialResult]]:
+    """Yields the index and the result of each trial, in the order in which the trials end.
+
+    Args:
+        pool: Workers that run the trials.
+        batch: The trials.
+    """
+    if pool.is_local:
+        for n, trial in enumerate(batch):
+            yield n, trial.run()
+        return
+
+    if not is_core_cached():
+        # The first step compiles the simulation kernel, once for all processes.
+        next(virtual.execute_virtual(batch[0].scenario))
+    # The longest trials run first, so that no worker is left with a long trial at the end.
+    longest_first = sorted(range(len(batch)), key=lambda n: -batch[n].scenario.duration_s)
+    queue = [batch[n] for n in longest_first]
+    lost = partial(TrialResult, error=f"its worker process ended, {MAX_LOSSES} times")
+    for index, result in pool.iterate_results(_run_trial, queue, lost, len(queue)):
+        yield longest_first[index], result
+
+
+def check(
+    source: str | Path | Scenario,
+    seeds: Iterable[int] = (),
+    set: Mapping[str, Any] | Sequence[str] = (),  # noqa: A002 - the command's --set, by its name
+    *,
+    jobs: int | None = None,
+    on: Workers = None,
+) -> TrialReport:
+    """Runs a scenario in virtual time, once per seed, and checks its expectations.
+
+    The command is `trilat test`.
+
+    >>> tn.check("free", jobs=1).held
+    True
+
+    Args:
+        source: Name of a shipped scenario, a path, or a scenario.
+        seeds: Seeds of the random numbers. Empty stands for the scenario's own seed.
+        set: Overrides, as in `{"link.delay_ms": 400}`.
+        jobs: Number of worker processes. None uses all cores.
+        on: Workers to use instead of processes of this machine: the address of a Dask
+            scheduler, as in "tcp://10.0.0.5:8786", or an executor.
+
+    Returns:
+        The results, if all expectations are met.
+
+    Raises:
+        ScenarioError: The scenario or an override is not valid, or the scenario has no
+            expectations.
+        UsageError: The cluster cannot be reached, or a worker does not meet the requirements.
+        AssertionError: An expectation is not met. The text contains the margin and the command
+            that repeats the run.
+    """
+    __tracebackhide__ = True  # pytest shows the reason instead of this line
+    report = run_trials(trials(source, seeds, set), jobs, on=on)
+    for result in report.results:
+        if not result.held:
+            reasons = "; ".join(result.failures)
+            raise AssertionError(
+                f"not as expected: {result.trial}: {reasons}\n{report.summary()}"
+            )
+    return report
+
+
+def format_margin(margin: float | None) -> str:
+    """Returns a margin as a text in percent, with a sign.
+
+    Margins below 10 % have one decimal place.
+
+    Args:
+        margin: Distance to a limit as a fraction of the limit. None becomes an empty text.
+    """
+    if margin is None:
+        return ""
+    digits = 0 if abs(margin) >= 0.1 else 1
+    return f"{100.0 * margin:+,.{digits}f} %"
+
+
+def _list_repeat_commands(result: TrialResult) -> list[str]:
+    """Returns lines with the command that repeats a run, and the command that shows it."""
+    look = f"trilat report {result.log}" if result.log else result.trial.look
+    return [f"again: {result.trial.again}", f"look:  {look}"]
+
+
+# Characters that XML 1.0 forbids, even as character references.
+_NOT_XML = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+
+
+def encode_junit_xml(report: TrialReport, began_unix_ns: int, host: str) -> bytes:
+    """Encodes the results of trials as a JUnit XML document, which build servers display.
+
+    Args:
+        report: The results.
+        began_unix_ns: Start of the trials in Unix time, in ns.
+        host: Name of this machine.
+
+    Returns:
+        The document.
+    """
+    root = Xml.Element(
+        "testsuites", _build_count_attributes(report.results), name="trilat test"
+    )
+    began = datetime.fromtimestamp(began_unix_ns // 10**9, UTC)
+    for name, results in report.scenarios.items():
+        suite = Xml.SubElement(
+            root,
+            "testsuite",
+            _build_count_attributes(results),
+            name=_replace_forbidden(name),
+            skipped="0",
+            timestamp=f"{began:%Y-%m-%dT%H:%M:%S}",
+            hostname=_replace_forbidden(host),
+        )
+        _add_properties(suite, results)
+        for result in results:
+            _add_case(suite, result)
+    Xml.indent(root)
+    document: bytes = Xml.tostring(root, encoding="utf-8", xml_declaration=True)
+    return document + b"\n"
+
+
+def _add_properties(suite: Xml.Element, results: Sequence[TrialResult]) -> None:
+    """Adds the properties that are common to all runs of a scenario to its suite.
+
+    Args:
+        suite: Suite of the scenario.
+        results: Results of the scenario.
+    """
+    properties = Xml.SubElement(suite, "properties")
+    trial = results[0].trial
+    property_values = {
+        "driver": "live" if trial.live else "virtual",
+        "source": trial.source,
+        "overrides": " ".join(trial.overrides),
+        "duration_s": f"{trial.scenario.duration_s:g}",
+        "simulated_s": f"{sum(result.simulated_s for result in results):.6g}",
+        "random": str(trial.scenario.random).lower(),
+    }
+    for key, value in property_values.items():
+        Xml.SubElement(properties, "property", name=key, value=_replace_forbidden(value))
+
+
+def _build_count_attributes(results: Sequence[TrialResult]) -> dict[str, str]:
+    """Returns the XML attributes with the numbers of tests, failures and errors, and the time.
+
+    A run without a result counts as an error, and a run with an unmet expectation as a failure.
+    """
+    errors = sum(bool(result.error) for result in results)
+    failures = sum(not result.held for result in results) - errors
+    return {
+        "tests": str(len(results)),
+        "failures": str(failures),
+        "errors": str(errors),
+        "time": f"{sum(result.wall_s for result in results):.3f}",
+    }
+
+
+def _add_case(suite: Xml.Element, result: TrialResult) -> None:
+    """Adds the test case of a run to a suite.
+
+    Args:
+        suite: Suite of the scenario.
+        result: Result of the run.
+    """
+    trial = result.trial
+    case = Xml.SubElement(
+        suite,
+        "testcase",
+        name=f"seed {trial.scenario.seed}",
+        classname=f"trilat.{trial.scenario.name}",
+        time=f"{result.wall_s:.3f}",
+    )
+    if not result.held:
+        tag = "error" if result.error else "failure"
+        problem_type = "error" if result.error else "expectation"
+        message = _replace_forbidden("; ".join(result.failures))
+        problem = Xml.SubElement(case, tag, type=problem_type, message=message)
+        lines = [*result.failures, *_list_repeat_commands(result)]
+        problem.text = _replace_forbidden("\n".join(lines))
+    output = [_describe_outcome(outcome) for outcome in result.outcomes]
+    Xml.SubElement(case, "system-out").text = _replace_forbidden("\n".join(output))
+
+
+def _describe_outcome(outcome: ExpectationResult) -> str:
+    """Returns a line with the measured value, the limit and the margin of an expectation."""
+    mark = "ok" if outcome.held else "FAIL"
+    margin = "" if outcome.margin is None else f" ({format_margin(outcome.margin)})"
+    return f"{mark} {outcome.key}: {outcome.measured}, expected {outcome.limit}{margin}"
+
+
+def _replace_forbidden(text: str) -> str:
+    """Returns a text in which the characters that XML forbids are replaced by U+FFFD."""
+    return _NOT_XML.sub("\N{REPLACEMENT CHARACTER}", text)

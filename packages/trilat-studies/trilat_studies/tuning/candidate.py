@@ -1,0 +1,846 @@
+"""Runs and scores a candidate of a tuning: a control law with chosen gains.
+
+The score contains the error, the effort of the motors, and a class that states how well the
+arms behaved. The error is the distance of the arms from the consensus pose q*, on which the
+arms would agree if gravity did not act on them:
+
+- Before any operator acts, q* = sum_i beta_i q_i(0), where q_i(0) are the joint angles of arm i
+  at the start, in rad.
+- While operators pull at arms like springs, q* = sum_i beta_i K_i x_i / sum_i beta_i K_i for
+  each joint. The operator at arm i has the target x_i, in rad, and the stiffness K_i, in N
+  m/rad.
+- After the operators have released the arms, q* keeps its value.
+
+Here beta_i is the influence of arm i. It follows from the dominance factors alpha_ij, the
+weights with which arm i follows arm j, by beta' alpha = beta' with sum_i beta_i = 1.
+
+A law may promise another motion than agreement at q*, see `LawSettings.target_motion`. For
+such a law, the distance between the arms is replaced by the distance of each arm from the
+promised motion, and a run is judged by where the promised motion ends instead of q*. The
+distance of the mean from q* stays part of the error, so that arms that do not move at all are
+no solution.
+
+Walls, and operators who push without a target, do not determine a pose. If a scenario has them,
+its twin is run too, which is the same scenario without them.
+
+Invariant:
+    - A score is a function of the scenario alone. The errors of a run that does not reach its
+      end are None.
+    - Neither gains nor control laws enter q*.
+    - Only settled runs, which are stable and end at q* or at the pose that their law promises,
+      may be part of a Pareto front.
+    - The end of a log is reported if an arm hangs down (both of its links point down) and did
+      not hang at the start, even if all arms are close to each other. It is also reported if
+      the mean pose of the arms is more than 0.2 rad from q*, although no operator or wall can
+      explain the distance.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+
+from trilat_net.analysis.arm_rows import build_arm_rows
+from trilat_net.analysis.dominance_history import (
+    evaluate_ramps,
+    find_closed_groups,
+    left_perron_vector,
+    list_scripted_ramps,
+)
+from trilat_net.analysis.run_end import EndBehaviour, RunEnd, Stability, find_hanging_sites
+from trilat_net.analysis.site_signals import SETTLED_ERROR_RAD
+from trilat_net.analysis.torque_sources import compute_target_motion
+from trilat_net.core.step.ticks import NS_PER_S
+from trilat_net.core.step.vectors import Array
+from trilat_net.errors import ScenarioError
+from trilat_net.laws.interface import LawSettings, TuningRun
+from trilat_net.log.log_reader import Log
+from trilat_net.scenario import Scenario, parse_scenario
+from trilat_net.scenario.expect import END_WINDOW_S
+from trilat_net.scenario.operators.kernel_operators import JointSpring, Wall
+from trilat_net.scenario.scenario_reader import ExperimentText, read_experiment
+from trilat_net.scenario.validate import refuse_live_only
+from trilat_net.work.intervals import mean_interval
+from trilat_net.work.study_folder import format_command, format_toml_value, set_options
+
+from ..measure_run import RecordBatch, run_whole
+from .search_space import GainValues, ModelInformation, SearchSpace, SiteControls
+
+CONFLICT_RAD = 0.02
+"""Distance from q*, in rad, beyond which the target of an operator keeps the arms separate."""
+_POSE_SAMPLES_HZ = 100.0
+"""Rate at which the targets of operators are compared with q*."""
+
+
+def check_comparable(scenario: Scenario) -> None:
+    """Checks that control laws can be compared fairly in a scenario.
+
+    The comparison needs a pose that all arms could reach.
+
+    Args:
+        scenario: The scenario in which laws are to be compared.
+
+    Raises:
+        ScenarioError: The scenario is refused. The message states the reason and a remedy.
+    """
+    refuse_live_only(scenario)
+    if any(spec.task.shared for spec in scenario.sites.values()):
+        raise ScenarioError(
+            "laws are compared by the distance between joint angles, but in this scenario the "
+            "end effectors are synchronised: choose a scenario in joint space",
+            path="task.space",
+            source=scenario.name,
+        )
+
+    # Sites that follow each other but nobody else never move towards the other sites.
+    groups = find_closed_groups(scenario.alpha)
+    if len(groups) > 1:
+        group_names = [", ".join(scenario.names[site] for site in group) for group in groups]
+        raise ScenarioError(
+            f"these groups of sites do not follow each other: {' and '.join(group_names)}; "
+            "the sites therefore have no common pose",
+            path="dominance",
+            source=scenario.name,
+        )
+
+    # An operator that pulls away from the common pose keeps the arms separate.
+    t_s = np.arange(0.0, scenario.duration_s, 1.0 / _POSE_SAMPLES_HZ)
+    pose_rad = compute_consensus_pose(scenario, t_s)
+    for spring in _list_springs(scenario, t_s):
+        has_stiffness = spring.stiffness_nm_rad > 0.0
+        pulls = spring.acts * has_stiffness
+        conflict_rad = np.abs(spring.target_rad - pose_rad) * pulls
+        if conflict_rad.max(initial=0.0) > CONFLICT_RAD:
+            largest_rad = conflict_rad.max(axis=1)
+            worst_s = t_s[largest_rad.argmax()]
+            raise ScenarioError(
+                f"at {worst_s:g} s this hand pulls towards a different pose from the other "
+                "hands: no law can bring the arms together, so their distance says nothing "
+                "about the law; keep only one of the operators",
+                path=f"sites.{spring.site}.hands",
+                source=scenario.name,
+            )
+
+
+def build_twin(scenario: Scenario) -> Scenario | None:
+    """Derives the scenario that shows at which pose the arms would come to rest undisturbed.
+
+    Walls, and operators who push without a target pose, keep the arms away from that pose. The
+    derived scenario, the twin of the candidate, lacks them. The pose at the end of its run
+    depends only on the dominance factors (the weights with which the arms follow one another)
+    and on the targets.
+
+    Args:
+        scenario: Scenario of the candidate.
+
+    Returns:
+        The twin. None if no twin is needed because the scenario has no such walls and
+        operators.
+    """
+    sites = {}
+    for name, spec in scenario.sites.items():
+        hands = tuple(hand for hand in spec.hands if isinstance(hand, JointSpring))
+        environment = tuple(part for part in spec.environment if not isinstance(part, Wall))
+        sites[name] = msgspec.structs.replace(spec, hands=hands, environment=environment)
+    if sites == scenario.sites:
+        return None
+    return msgspec.structs.replace(scenario, sites=sites)
+
+
+def compute_consensus_pose(scenario: Scenario, t_s: Array) -> Array:
+    """Computes q*, the pose on which the arms would agree if gravity did not act on them.
+
+    While operators pull the arms like springs towards target poses, q* is the average of the
+    targets for each joint. It is weighted with the stiffness of the operators and the influence
+    of their arms. Before that, q* is the weighted average of the start poses. Afterwards, q*
+    keeps its last value.
+
+    Args:
+        scenario: Scenario with the arms, their operators and the dominance factors, which are
+            the weights with which the arms follow one another.
+        t_s: Times, shape (K,), in s.
+
+    Returns:
+        The pose at the K times, shape (K, n), in rad, for n joints.
+    """
+    beta = left_perron_vector(scenario.alpha)
+    weights = dict(zip(scenario.names, beta, strict=True))
+    weighted_starts = []
+    for name, spec in scenario.sites.items():
+        q0_rad = np.array(spec.q0_rad)
+        weighted_starts.append(weights[name] * q0_rad)
+    start_rad = np.sum(weighted_starts, axis=0)
+
+    shape = (len(t_s), len(start_rad))
+    stiffness = np.zeros(shape)
+    torque = np.zeros(shape)
+    for spring in _list_springs(scenario, t_s):
+        weight = weights[spring.site]
+        weighted_stiffness = weight * spring.stiffness_nm_rad * spring.acts
+        stiffness += weighted_stiffness
+        torque += weighted_stiffness * spring.target_rad
+    is_held = stiffness > 0.0
+    no_pose_rad = np.zeros_like(torque)
+    held_pose_rad = np.divide(torque, stiffness, where=is_held, out=no_pose_rad)
+
+    # A joint keeps the pose of the last time at which a spring held it. Row 0 is the start
+    # pose, for joints that no spring has held yet.
+    poses_rad = np.vstack([start_rad, held_pose_rad])
+    row_numbers = np.arange(1, len(t_s) + 1)[:, np.newaxis]
+    held_rows = np.where(is_held, row_numbers, 0)
+    last_held = np.maximum.accumulate(held_rows, axis=0)
+    return np.take_along_axis(poses_rad, last_held, axis=0)
+
+
+class _SpringHistory(NamedTuple):
+    """Pull of an operator towards a target pose, as by a spring, sampled at K times.
+
+    The consensus pose q* is computed from the springs of all operators.
+
+    Attributes:
+        site: Site of the operator.
+        stiffness_nm_rad: Stiffness per joint, shape (n,), in N m/rad.
+        acts: 1 at times at which the spring acts and 0 at other times, shape (K, 1).
+        target_rad: Target pose, shape (K, n), in rad.
+    """
+
+    site: str
+    stiffness_nm_rad: Array
+    acts: Array
+    target_rad: Array
+
+
+def _list_springs(scenario: Scenario, t_s: Array) -> Iterator[_SpringHistory]:
+    """Yields the operators of all sites that pull like a spring.
+
+    Args:
+        scenario: Scenario in which the laws are compared.
+        t_s: Times, shape (K,), in s.
+    """
+    for name, spec in scenario.sites.items():
+        for hand in spec.hands:
+            if not isinstance(hand, JointSpring):
+                continue
+            acts = (t_s >= hand.start_s) & (t_s < hand.end_s)
+            target_rad, _ = compute_target_motion(hand.actor, t_s)
+            yield _SpringHistory(
+                site=name,
+                stiffness_nm_rad=np.array(hand.stiffness_nm_rad),
+                acts=acts[:, np.newaxis].astype(np.float64),
+                target_rad=target_rad,
+            )
+
+
+STRAYED_RAD = 0.2
+"""Distance of the arms' mean pose from q*, in rad, beyond which the arms have strayed. They
+fell, hang down or were thrown.
+"""
+TOGETHER_RAD = 0.02
+"""Largest distance of a joint from the mean of the arms, in rad, at which the arms agree."""
+
+
+class CandidateClass(StrEnum):
+    """How well the arms behaved with a control law and chosen gains, from worst to best.
+
+    If several classes apply to a run, the first one counts. `CLASS_MEANINGS` explains each
+    class. JSON files contain the values.
+    """
+
+    DIVERGED = "diverged"
+    OSCILLATED = "oscillated"
+    STRAYED = "strayed"
+    APART = "apart"
+    OPEN = "open"
+    SETTLED = "settled"
+
+    @property
+    def word(self) -> str:
+        """Word for this class in printed text, such as "stable" for a candidate that settled.
+
+        Where possible, it is the word that the judgement of a single run uses.
+        """
+        if self is CandidateClass.OSCILLATED:
+            return Stability.NOT_STABLE.value
+        if self is CandidateClass.SETTLED:
+            return Stability.STABLE.value
+        return self.value
+
+
+CLASS_MEANINGS = {
+    CandidateClass.DIVERGED: "not stable: a joint exceeded the speed limit",
+    CandidateClass.OSCILLATED: "it keeps oscillating, drifts or grows",
+    CandidateClass.STRAYED: (
+        f"the mean pose ends more than {STRAYED_RAD} rad from the pose of a weightless "
+        "consensus, or would after as long again: the arms fell, hang, sink, or were thrown"
+    ),
+    CandidateClass.APART: f"an arm ends more than {TOGETHER_RAD} rad from the mean of all arms",
+    CandidateClass.OPEN: "it hardly decays, or is undecided: a longer run may decide",
+    CandidateClass.SETTLED: "it converged or decays, and no other class applies",
+}
+"""Meanings of the classes. docs/reference/stability.md defines the judgement of a run."""
+
+
+def classify_candidate(
+    ends: Sequence[RunEnd], fall_rad: float, apart_rad: float
+) -> CandidateClass:
+    """Classifies how well the arms behaved with a control law and chosen gains.
+
+    The scenario may have walls, and operators who push without a target pose. Then a second run
+    without them shows at which pose the arms would come to rest undisturbed. The arms should
+    rest near the consensus pose q*, which follows from the targets of the other operators.
+
+    Args:
+        ends: Judgements of the end of the run and of the second run. Without a second run, the
+            judgement of the run is given twice.
+        fall_rad: Predicted distance, in rad, between the mean pose of the arms and q*, or the
+            mean of the promised motion, at the end of a run twice as long. The largest distance
+            over the joints counts.
+        apart_rad: Largest distance of a joint from the mean of all arms, or from the promised
+            motion, in the last second, in rad.
+
+    Returns:
+        The worst class that applies to one of the runs.
+    """
+    stabilities = {end.stability for end in ends}
+    if any(end.behaviour is EndBehaviour.DIVERGED for end in ends):
+        return CandidateClass.DIVERGED
+    if Stability.NOT_STABLE in stabilities:
+        return CandidateClass.OSCILLATED
+    if fall_rad > STRAYED_RAD:
+        return CandidateClass.STRAYED
+    if apart_rad > TOGETHER_RAD:
+        return CandidateClass.APART
+    return CandidateClass.OPEN if Stability.OPEN in stabilities else CandidateClass.SETTLED
+
+
+_SHORT_S = 0.5
+"""Time before the planned end of a run, in s, from which on its log is reported as short."""
+_POSE_SAMPLES = 2000
+"""Number of times at which q* of a log is computed."""
+
+
+def check_final_posture(log: Log) -> list[str]:
+    """Warns if the end of a run says little about its control law.
+
+    The warnings concern a run that is shorter than planned, and arms that hang down or fell.
+    The errors and torques of such arms are small, but not because of the control law.
+
+    Args:
+        log: Log of the run.
+
+    Returns:
+        The warnings, one sentence each. Empty if the log is complete and its arms did not fall.
+
+    Raises:
+        LogError: A record cannot be read.
+    """
+    parts = {site: log[site] for site in log.sites if len(log[site])}
+    diverged = [site for site, part in parts.items() if part.record(-1).mode == "diverged"]
+    if diverged:
+        return [f"{', '.join(diverged)} diverged: its figures end there"]
+
+    warnings = []
+    end_times_s = [float(part.t_s[-1]) for part in parts.values()]
+    end_s = min(end_times_s, default=0.0)
+    planned_s = log.scenario.duration_s
+    if end_s <= planned_s - _SHORT_S:
+        warnings.append(
+            f"ends at {end_s:.4g} s of {planned_s:g} s: its figures are of a shorter run"
+        )
+
+    end_poses_rad = {}
+    for site, part in parts.items():
+        in_last_second = part.t_s > part.t_s[-1] - END_WINDOW_S
+        end_poses_rad[site] = part.q[in_last_second].mean(axis=0)
+    hanging = find_hanging_sites(log.scenario, end_poses_rad)
+    if hanging:
+        verb = "hangs" if len(hanging) == 1 else "hang"
+        warnings.append(
+            f"{', '.join(hanging)} {verb} at the end: small errors and torques of arms that "
+            "hang say nothing about a law"
+        )
+        return warnings
+    return [*warnings, *_warn_fallen(log, end_poses_rad)]
+
+
+def _warn_fallen(log: Log, end_poses_rad: dict[str, Array]) -> list[str]:
+    """Returns a warning if the mean pose of a log ends far from q*.
+
+    There is no warning if the scenario has no pose q*, or if an operator or a wall could be the
+    reason.
+
+    Args:
+        log: The log.
+        end_poses_rad: Mean pose of each site in the last second, shape (n,), in rad.
+
+    Returns:
+        At most one sentence.
+    """
+    scenario = log.scenario
+    try:
+        check_comparable(scenario)
+    except ScenarioError:
+        return []
+    has_other_forces = build_twin(scenario) is not None
+    if has_other_forces or len(end_poses_rad) < len(scenario.names):
+        return []
+
+    end_s = min(float(log[site].t_s[-1]) for site in end_poses_rad)
+    t_s = np.linspace(0.0, end_s, _POSE_SAMPLES)
+    mean_rad = np.mean(list(end_poses_rad.values()), axis=0)
+    consensus_rad = compute_consensus_pose(scenario, t_s)
+    distance_rad = np.abs(mean_rad - consensus_rad[-1])
+    joint = int(distance_rad.argmax())
+    if distance_rad[joint] <= STRAYED_RAD:
+        return []
+    return [
+        f"the arms end {distance_rad[joint]:.2g} rad (joint {joint + 1}) from where a "
+        "weightless consensus would stand: they sank, or drifted"
+    ]
+
+
+class CandidateScore(msgspec.Struct, frozen=True):
+    """Measured score of a candidate. docs/reference/tuning-procedure.md has the formulas.
+
+    Attributes:
+        outcome: Class of the candidate.
+        error_rad: RMS distance of the arms from the pose q*, in rad. None if the run diverged.
+        spread_rad: Part of the error that is the distance between the arms at the same time,
+            without delays. For a law that promises another motion, it is the distance of the
+            arms from this motion.
+        pose_rad: Part of the error that is the distance of the arms' mean from q*.
+        effort_nm: RMS of the torque minus the gravity torque at the arm's own pose, in N m.
+        settled_s: Time from which the largest |e| stays below 0.01 rad, in s, where e is the
+            error of a site against its peers. None if |e| is larger at the end.
+        saturated: Fraction of all joint torques that were at the torque limit.
+        diverged_s: Time at which the first site left its limits, in s. None if no site did.
+        seeds: Number of runs over which the score is averaged. The class is the worst class
+            among these runs.
+        error_half_rad: Half the width of the 95 % interval of the mean error. None for a single
+            run.
+        effort_half_nm: Half the width of the 95 % interval of the mean effort. None for a
+            single run.
+    """
+
+    outcome: CandidateClass
+    error_rad: float | None
+    spread_rad: float | None
+    pose_rad: float | None
+    effort_nm: float | None
+    settled_s: float | None
+    saturated: float
+    diverged_s: float | None = None
+    seeds: int = 1
+    error_half_rad: float | None = None
+    effort_half_nm: float | None = None
+
+
+_AVERAGED = ("error_rad", "spread_rad", "pose_rad", "effort_nm", "settled_s", "saturated")
+"""Fields of a score that are averaged over the seeds."""
+
+
+def average_scores(scores: Sequence[CandidateScore]) -> CandidateScore:
+    """Combines the scores of a candidate over runs that differ only in their random numbers.
+
+    The class is the worst of all runs, and each number is the mean over the runs. A number that
+    is missing for one of the runs is None.
+
+    Args:
+        scores: Score of each run, at least one.
+    """
+    if len(scores) == 1:
+        return scores[0]
+    rank = list(CandidateClass)
+    worst = min(scores, key=lambda score: rank.index(score.outcome))
+
+    intervals = {}
+    means = {}
+    for field in _AVERAGED:
+        values = [getattr(score, field) for score in scores]
+        interval = mean_interval(values)
+        intervals[field] = interval
+        means[field] = None if interval is None else interval.mean
+    error = intervals["error_rad"]
+    effort = intervals["effort_nm"]
+    return msgspec.structs.replace(
+        worst,
+        **means,
+        seeds=len(scores),
+        error_half_rad=None if error is None else error.half,
+        effort_half_nm=None if effort is None else effort.half,
+    )
+
+
+def measure_candidate(text: str, twin_text: str | None) -> CandidateScore:
+    """Runs a candidate and its twin, and scores the candidate.
+
+    The twin is the same run without walls and without operators that have no target pose, see
+    `build_twin`. It shows at which pose the arms would come to rest.
+
+    Args:
+        text: Canonical text of the candidate's scenario.
+        twin_text: Canonical text of the twin's scenario. None if there is no twin. The final
+            pose is then taken from the candidate's own run.
+
+    Returns:
+        The score of the candidate.
+    """
+    run = _measure_run(parse_scenario(text))
+    twin = run if twin_text is None else _measure_run(parse_scenario(twin_text))
+    ends = (run.end, twin.end)
+    outcome = classify_candidate(ends, twin.fall_rad, twin.apart_rad)
+
+    # The numbers of a run that ended early cannot be compared with those of other runs.
+    diverged_s = [end.diverged_at_s for end in ends if end.diverged_at_s is not None]
+    if diverged_s:
+        return CandidateScore(
+            outcome=outcome,
+            error_rad=None,
+            spread_rad=None,
+            pose_rad=None,
+            effort_nm=None,
+            settled_s=None,
+            saturated=run.saturated,
+            diverged_s=diverged_s[0],
+        )
+
+    # The distance between the arms is measured in the run, and the pose in its twin.
+    return CandidateScore(
+        outcome=outcome,
+        error_rad=float(np.hypot(run.spread_rad, twin.pose_rad)),
+        spread_rad=run.spread_rad,
+        pose_rad=twin.pose_rad,
+        effort_nm=run.effort_nm,
+        settled_s=run.settled_s,
+        saturated=run.saturated,
+    )
+
+
+class _RunMeasures(NamedTuple):
+    """Quantities that are measured in one run of a candidate or of its twin.
+
+    `CandidateScore` is computed from them.
+
+    Attributes:
+        end: Judgement of the end of the run.
+        fall_rad: Predicted distance from q*, see `classify_candidate`.
+        apart_rad: Distance between the arms at the end, see `classify_candidate`.
+        spread_rad: RMS distance of the arms from their mean, or from the motion that their law
+            promises, in rad.
+        pose_rad: RMS distance of the arms' mean from q*, in rad.
+        effort_nm: See `CandidateScore`.
+        settled_s: See `CandidateScore`.
+        saturated: See `CandidateScore`.
+    """
+
+    end: RunEnd
+    fall_rad: float
+    apart_rad: float
+    spread_rad: float
+    pose_rad: float
+    effort_nm: float
+    settled_s: float | None
+    saturated: float
+
+
+def _measure_run(scenario: Scenario) -> _RunMeasures:
+    """Runs a scenario in virtual time, and measures the run."""
+    records_by_site, end, _ = run_whole(scenario)
+    records = list(records_by_site.values())
+    t_s, q, e, tau_x = _sample_at_common_times(records)
+    mean_rad = q.mean(axis=0)
+    from_pose_rad = mean_rad - compute_consensus_pose(scenario, t_s)
+    promised_rad = _compute_promised_motion(scenario, t_s, q, tau_x)
+    if promised_rad is None:
+        from_target_rad = q - mean_rad
+        from_end_rad = from_pose_rad
+    else:
+        from_target_rad = q - promised_rad
+        from_end_rad = mean_rad - promised_rad.mean(axis=0)
+    in_last_second = t_s > t_s[-1] - END_WINDOW_S
+    final_distance_rad = np.abs(from_target_rad[:, in_last_second])
+
+    effort_nm, saturated = _measure_torques(scenario, records)
+    return _RunMeasures(
+        end=end,
+        fall_rad=_predict_fall_rad(t_s, from_end_rad),
+        apart_rad=float(final_distance_rad.max()),
+        spread_rad=_rms(from_target_rad),
+        pose_rad=_rms(from_pose_rad),
+        effort_nm=effort_nm,
+        settled_s=_find_settling_time(t_s, e),
+        saturated=saturated,
+    )
+
+
+def _compute_promised_motion(
+    scenario: Scenario, t_s: Array, q: Array, tau_x: Array
+) -> Array | None:
+    """Computes the motion that the law of the first site promises for all arms.
+
+    Args:
+        scenario: Scenario of the run.
+        t_s: Times, shape (K,), in s.
+        q: Joint angles, shape (N, K, n), in rad.
+        tau_x: Recorded exogenous torques, shape (N, K, n), in N m. Their sign is opposite to
+            that of the torques from outside.
+
+    Returns:
+        The promised joint angles, shape (N, K, n), in rad. None if the law promises that the
+        arms move together.
+    """
+    laws = [scenario.sites[name].control for name in scenario.names]
+    if not isinstance(laws[0], LawSettings):
+        return None
+    alpha = np.zeros((len(t_s), len(laws), len(laws)))
+    for site, name in enumerate(scenario.names):
+        start, ramps = list_scripted_ramps(scenario, name)
+        period_s = 1.0 / scenario.sites[name].rate_hz
+        peers = [scenario.names.index(peer) for peer in scenario.peers(name)]
+        alpha[:, site, peers] = evaluate_ramps(start, ramps, t_s, period_s).alpha
+    run = TuningRun(laws=laws, t_s=t_s, q=q, outside_nm=-tau_x, alpha=alpha)
+    return laws[0].target_motion(run)
+
+
+def _predict_fall_rad(t_s: Array, from_pose_rad: Array) -> float:
+    """Predicts the distance from the promised pose at the end of a run twice as long.
+
+    The distance is averaged over the second before the middle of the run and over the last
+    second. If it grew in the second half, the growth is assumed to continue at the same pace.
+
+    Args:
+        t_s: Times, shape (K,), in s.
+        from_pose_rad: Distance of the mean pose from q* or from the mean of the promised
+            motion, shape (K, n), in rad.
+
+    Returns:
+        The distance, the largest over the joints, in rad.
+    """
+    end_s = t_s[-1]
+    half_s = 0.5 * end_s
+    at_end = t_s > end_s - END_WINDOW_S
+    at_half = (t_s > half_s - END_WINDOW_S) & (t_s <= half_s + 1e-9)
+    mean_at_end_rad = from_pose_rad[at_end].mean(axis=0)
+    mean_at_half_rad = from_pose_rad[at_half].mean(axis=0)
+    end_rad = np.abs(mean_at_end_rad)
+    half_rad = np.abs(mean_at_half_rad)
+    growth_rad = np.maximum(end_rad - half_rad, 0.0)
+    predicted_rad = end_rad + 2.0 * growth_rad
+    return float(predicted_rad.max())
+
+
+def _find_settling_time(t_s: Array, e: Array) -> float | None:
+    """Returns the last time at which |e| is not below 0.01 rad, in s.
+
+    Args:
+        t_s: Times, shape (K,), in s.
+        e: Errors, shape (N, K, n), in rad.
+
+    Returns:
+        The time. It is 0 if |e| is always below 0.01 rad, and None if |e| is not below 0.01 rad
+        at the end.
+    """
+    largest_rad = np.abs(e).max(axis=(0, 2))
+    is_settled = largest_rad[-1] < SETTLED_ERROR_RAD
+    if not is_settled:
+        return None
+    unsettled_s = t_s[largest_rad >= SETTLED_ERROR_RAD]
+    return float(unsettled_s.max(initial=0.0))
+
+
+def _measure_torques(scenario: Scenario, records: Sequence[RecordBatch]) -> tuple[float, float]:
+    """Returns the effort, and the fraction of the joint torques that were at their limit.
+
+    Args:
+        scenario: Scenario in which the laws are compared.
+        records: Records of each site.
+
+    Returns:
+        The RMS of the torque minus the gravity torque, in N m, and the fraction.
+    """
+    mean_squares = []
+    saturated_shares = []
+    for record, site in zip(records, scenario.names, strict=True):
+        arm = build_arm_rows(scenario, site)
+        effort_nm = record.tau - arm.gravity_torque(record.q)
+        mean_squares.append(np.mean(effort_nm**2))
+        limits = scenario.sites[site].limits
+        is_saturated = np.abs(record.tau) >= limits.tau_limit_nm
+        saturated_shares.append(np.mean(is_saturated))
+    rms_effort_nm = np.sqrt(np.mean(mean_squares))
+    saturated_share = np.mean(saturated_shares)
+    return float(rms_effort_nm), float(saturated_share)
+
+
+def _sample_at_common_times(
+    records: Sequence[RecordBatch],
+) -> tuple[Array, Array, Array, Array]:
+    """Returns the joint angles, errors and exogenous torques of all sites at common times.
+
+    Sites may have different tick rates. The times are those of the slowest site's ticks, and of
+    every other site the latest record is taken.
+
+    Args:
+        records: Records of each site.
+
+    Returns:
+        The times, shape (K,), in s; the joint angles, shape (N, K, n), in rad; the errors,
+        shape (N, K, n), in rad; and the exogenous torques, shape (N, K, n), in N m.
+    """
+    end_ns = min(record.t_ns[-1] for record in records)
+    slowest_ns = min((record.t_ns for record in records), key=len)
+    times_ns = slowest_ns[slowest_ns <= end_ns]
+    q = []
+    e = []
+    tau_x = []
+    for record in records:
+        next_indices = np.searchsorted(record.t_ns, times_ns, side="right")
+        latest = next_indices - 1
+        q.append(record.q[latest])
+        e.append(record.e[latest])
+        tau_x.append(record.tau_x[latest])
+    return times_ns / NS_PER_S, np.array(q), np.array(e), np.array(tau_x)
+
+
+def _rms(values: Array) -> float:
+    """Returns the root mean square of all values of an array."""
+    return float(np.sqrt(np.mean(values**2)))
+
+
+class TuningScenario(NamedTuple):
+    """The scenario in which control laws are compared, with the overrides that produced it.
+
+    The overrides are kept so that commands can name the scenario as the user did.
+
+    Attributes:
+        experiment: Scenario as its author wrote it.
+        overrides: Overrides KEY=VALUE of the scenario, as on the command line.
+        scenario: Scenario with the overrides.
+    """
+
+    experiment: ExperimentText
+    overrides: tuple[str, ...]
+    scenario: Scenario
+
+    @property
+    def source(self) -> str:
+        """Name or path of the scenario, as it is given to a command of `trilat`."""
+        return self.experiment.label
+
+    def with_controls(self, controls: SiteControls) -> "TuningScenario":
+        """Returns the scenario with another table [control] for each site.
+
+        If all sites have the same table and a single override produces it, this override is
+        used, so that commands stay short. Otherwise there is one override per site.
+
+        Args:
+            controls: Table of each site.
+        """
+        site_overrides = [
+            f"sites.{name}.control={format_toml_value(table)}"
+            for name, table in controls.items()
+        ]
+        overrides = (*self.overrides, *site_overrides)
+        scenario = self.experiment.load(overrides)
+
+        first = next(iter(controls.values()))
+        if all(table == first for table in controls.values()):
+            common_overrides = (*self.overrides, f"control={format_toml_value(first)}")
+            # Loading fails if a site of the scenario sets a gain that this law does not have.
+            with suppress(ScenarioError):
+                common_scenario = self.experiment.load(common_overrides)
+                if common_scenario.sites == scenario.sites:
+                    return self._replace(overrides=common_overrides, scenario=common_scenario)
+        return self._replace(overrides=overrides, scenario=scenario)
+
+    def with_gains(
+        self, space: SearchSpace, knowledge: ModelInformation, gains: GainValues
+    ) -> "TuningScenario":
+        """Returns this scenario with a given control law and given values of its gains.
+
+        Args:
+            space: The control law.
+            knowledge: What the law is told about the arm, such as its gravity parameters.
+            gains: Values of the gains, by their names.
+        """
+        controls = space.controls(self.scenario, knowledge, gains)
+        return self.with_controls(controls)
+
+    @property
+    def texts(self) -> tuple[str, str | None]:
+        """Texts of the scenario and of its twin, which a worker process reads.
+
+        The twin is the same scenario without walls and without operators who push the arms
+        without a target pose. Its text is None if the scenario has no such parts.
+        """
+        twin = build_twin(self.scenario)
+        twin_text = None if twin is None else twin.text
+        return self.scenario.text, twin_text
+
+    @property
+    def command(self) -> str:
+        """The command with which a user can simulate the scenario and record a log."""
+        options = set_options(self.overrides)
+        return format_command("sim", self.source, *options)
+
+
+class CandidateItem(NamedTuple):
+    """The runs of a control law with chosen gains, as they are sent to a worker process.
+
+    Attributes:
+        runs: For each random seed, the text of the scenario, and the text of the same scenario
+            without walls and without operators who push the arms without a target pose. The
+            second text is None if the scenario has no such parts.
+        name: Name of the law and its gains in error messages.
+    """
+
+    runs: tuple[tuple[str, str | None], ...]
+    name: str
+
+    def __str__(self) -> str:
+        return self.name
+
+
+def build_candidate_item(seeds: Sequence[TuningScenario]) -> CandidateItem:
+    """Packs the runs of a control law with chosen gains for a worker process.
+
+    Args:
+        seeds: The scenario with the law and its gains, once for each random seed. At least one.
+    """
+    first = seeds[0]
+    name = ", ".join(first.overrides) or first.source
+    runs = tuple(seed.texts for seed in seeds)
+    return CandidateItem(runs, name)
+
+
+def measure_candidate_task(task: CandidateItem) -> CandidateScore:
+    """Runs a candidate with all of its seeds, and returns its average score.
+
+    The function needs nothing but its argument. Therefore any worker process can call it.
+
+    Args:
+        task: The runs of the candidate.
+    """
+    scores = [measure_candidate(text, twin_text) for text, twin_text in task.runs]
+    return average_scores(scores)
+
+
+def load_tuning_scenario(
+    source: str | Path | Mapping[str, Any] | Scenario, overrides: Sequence[str] = ()
+) -> TuningScenario:
+    """Loads a scenario in which control laws are to be compared.
+
+    Args:
+        source: Name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
+        overrides: Overrides KEY=VALUE of the scenario, as on the command line.
+
+    Raises:
+        ScenarioError: The scenario does not exist, or is not valid with the overrides.
+    """
+    experiment = read_experiment(source)
+    scenario = experiment.load(overrides)
+    return TuningScenario(experiment, tuple(overrides), scenario)

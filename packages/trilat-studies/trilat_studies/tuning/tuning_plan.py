@@ -1,0 +1,790 @@
+"""Plans and runs the tuning of control laws, and determines their Pareto fronts.
+
+The gains of every law are tuned in the same way, so that the laws can be compared fairly. A
+candidate is a law with a choice of gains. Two objectives are minimised: the error, and the
+effort of the motors. The Pareto front of a law consists of the candidates for which no other
+candidate is better in both.
+
+Every law gets the same number of candidates. The first half is a Latin hypercube, an evenly
+spread random sample, in the logarithms of the gains (McKay, Beckman and Conover, Technometrics
+21, 1979). The second half refines the law's own front, in four rounds with shrinking steps.
+
+Invariant:
+    - The result is a function of the plan alone. It does not depend on the number of processes
+      or on their speed.
+    - The candidates are a function of the seed, the search space and the scores of earlier
+      rounds. Their number is the budget.
+    - Only stable runs that end at the common pose of the arms compete. Of two runs with equal
+      objectives the first one is kept.
+    - The gains that the paper prints are measured, but they are not searched and belong to no
+      front.
+"""
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+
+from trilat_net.core.step.jit import is_core_cached
+from trilat_net.core.step.vectors import Array
+from trilat_net.errors import ScenarioError, UsageError, count_nouns
+from trilat_net.execution.fused import FusedRun
+from trilat_net.net.clock import SystemClock
+from trilat_net.results import Result
+from trilat_net.scenario import Scenario
+from trilat_net.scenario.imported_code import name_law_classes
+from trilat_net.work.executor import Progress, Workers, ignore_progress, open_worker_pool
+from trilat_net.workers import count_cores
+
+from .candidate import (
+    CLASS_MEANINGS,
+    CandidateClass,
+    CandidateItem,
+    CandidateScore,
+    TuningScenario,
+    build_candidate_item,
+    build_twin,
+    check_comparable,
+    load_tuning_scenario,
+    measure_candidate,
+    measure_candidate_task,
+)
+from .search_space import (
+    PAPER_GAINS,
+    SEARCH_SPACES,
+    ModelInformation,
+    SearchSpace,
+    build_model_information,
+    select_search_spaces,
+    weigh_joints,
+)
+
+ObjectivePoint = tuple[float, float]
+"""Objective and effort of a run. The objective is the error or the settling time."""
+
+
+class Objective(StrEnum):
+    """Quantity that the search minimises together with the effort of the controllers.
+
+    Both conflict in general: a smaller error needs larger torques.
+    """
+
+    ERROR = "error"
+    SETTLING = "settling"
+
+    @property
+    def unit(self) -> str:
+        """Unit of the quantity, for tables and axes."""
+        return "rad" if self is Objective.ERROR else "s"
+
+    def point(self, score: CandidateScore) -> ObjectivePoint | None:
+        """Returns the point of a candidate in the plane of objective and effort.
+
+        Args:
+            score: Score of the candidate.
+
+        Returns:
+            The objective and the effort. None if the candidate may not be part of a Pareto
+            front, because it is not stable or does not end at the common pose.
+        """
+        value = score.error_rad if self is Objective.ERROR else score.settled_s
+        if score.outcome is not CandidateClass.SETTLED:
+            return None
+        if value is None or score.effort_nm is None:
+            return None
+        return value, score.effort_nm
+
+
+def find_pareto_front(points: Sequence[ObjectivePoint | None]) -> list[int]:
+    """Returns the indices of the points of the Pareto front, in the order of rising effort.
+
+    The front contains the best compromises between both objectives: a point is part of it if no
+    other point is at least as good in both objectives.
+
+    Args:
+        points: The points. None stands for a run that does not compete.
+    """
+    competitors = []
+    for index, point in enumerate(points):
+        if point is not None:
+            value, effort_nm = point
+            competitors.append((effort_nm, value, index))
+    # In the order of rising effort, only points with a smaller objective are not dominated.
+    front = list[int]()
+    least_value = float("inf")
+    for _, value, index in sorted(competitors):
+        if value < least_value:
+            front.append(index)
+            least_value = value
+    return front
+
+
+def compute_crowding(points: Sequence[ObjectivePoint]) -> list[float]:
+    """Computes how isolated each point of a front is, so that gaps can be refined.
+
+    The crowding distance of a point is half the perimeter of the box between its two
+    neighbours, where each side is relative to the span of the front. It is infinite for the
+    first and the last point. Source: Deb, Pratap, Agarwal and Meyarivan, "A fast and elitist
+    multiobjective genetic algorithm: NSGA-II", IEEE Trans. Evolutionary Computation 6 (2002).
+
+    Args:
+        points: Points of the front, in the order of rising effort.
+
+    Returns:
+        The distance of each point, large for isolated points.
+    """
+    if len(points) < 3:
+        return [float("inf")] * len(points)
+    value_span = abs(points[-1][0] - points[0][0]) or 1.0
+    effort_span = abs(points[-1][1] - points[0][1]) or 1.0
+    distances = [float("inf")]
+    for before, after in zip(points[:-2], points[2:], strict=True):
+        value_side = abs(after[0] - before[0]) / value_span
+        effort_side = abs(after[1] - before[1]) / effort_span
+        distances.append(value_side + effort_side)
+    distances.append(float("inf"))
+    return distances
+
+
+REFINEMENT_STEPS = (0.12, 0.08, 0.05, 0.03)
+"""Standard deviation of the steps of each refinement round, as a fraction of the range of a
+gain in logarithms.
+"""
+GAIN_DIGITS = 4
+"""Significant digits to which gains are rounded before they are run, so that commands stay
+short.
+"""
+
+CandidateGains = dict[str, float]
+"""Values of the gains of a candidate, by name."""
+
+
+class CandidateSearch:
+    """Search for the best gains of one control law, in several rounds.
+
+    A candidate is one choice of values of the gains. In each round, the caller runs the
+    candidates of `propose_candidates` and passes their scores to `record_scores`. The result is
+    the Pareto front of the law: the best compromises between the objective and the effort.
+
+    Args:
+        space: The law and the ranges of its gains.
+        budget: Number of candidates.
+        seed: Seed of the random numbers, which is the same for every law.
+        objective: Objective besides the effort.
+
+    Attributes:
+        tried: Gains of all candidates that have run, in order.
+        scores: Scores of these candidates, in the same order.
+        rounds: Number of candidates of each round. Their sum is the budget.
+    """
+
+    def __init__(
+        self, space: SearchSpace, budget: int, seed: int, objective: Objective
+    ) -> None:
+        self.space = space
+        self.tried: list[CandidateGains] = []
+        self.scores: list[CandidateScore] = []
+        self._objective = objective
+        self._rng = np.random.default_rng(seed)
+        log_bounds = np.log([[knob.low, knob.high] for knob in space.knobs])
+        self._log_low = log_bounds[:, 0]
+        self._log_range = log_bounds[:, 1] - log_bounds[:, 0]
+        sampled = (budget + 1) // 2
+        refinements = len(REFINEMENT_STEPS)
+        share, remainder = divmod(budget - sampled, refinements)
+        self.rounds = [sampled]
+        for n in range(refinements):
+            self.rounds.append(share + (n < remainder))  # the first rounds take the remainder
+
+    @property
+    def points(self) -> list[ObjectivePoint | None]:
+        """Objective and effort of each tried choice of gains, in the order of the runs.
+
+        The objective is the error, in rad, or the settling time, in s. The effort is the RMS
+        motor torque without gravity, in N m. None stands for gains that do not compete, because
+        the arms were not stable or did not end at the common pose.
+        """
+        return [self._objective.point(score) for score in self.scores]
+
+    @property
+    def front(self) -> list[int]:
+        """Indices of the gains that are the best compromises, in order of rising effort.
+
+        An index refers to `tried`. These gains are the Pareto front of the law: no other tried
+        gains are at least as good in both objective and effort. The objective is the error or
+        the settling time, and the effort is the RMS motor torque without gravity.
+        """
+        return find_pareto_front(self.points)
+
+    @property
+    def front_points(self) -> list[ObjectivePoint]:
+        """Objective and effort of the best compromises that the search has found for this law.
+
+        The objective is the error, in rad, or the settling time, in s. The effort is the RMS
+        motor torque without gravity, in N m. The pairs are in the order of rising effort.
+        """
+        points = self.points
+        front_points = []
+        for index in self.front:
+            point = points[index]
+            if point is not None:
+                front_points.append(point)
+        return front_points
+
+    @property
+    def outcomes(self) -> dict[CandidateClass, int]:
+        """Number of tried choices of gains in each class, such as settled or diverged.
+
+        The class states how well the arms behaved, see `CandidateClass`.
+        """
+        counts = Counter(score.outcome for score in self.scores)
+        return {outcome: counts[outcome] for outcome in CandidateClass}
+
+    def propose_candidates(self, round_number: int) -> list[CandidateGains]:
+        """Returns the gains that are to be tried in a round.
+
+        The first round spreads its candidates evenly over the ranges of the gains by a Latin
+        hypercube. The later rounds refine the best candidates so far. Therefore the scores of
+        all earlier rounds must have been recorded.
+
+        Args:
+            round_number: 0 for the Latin hypercube, and 1 to 4 for the refinement rounds.
+        """
+        shape = (self.rounds[round_number], len(self.space.knobs))
+        if round_number == 0:
+            # Imported here, because SciPy costs half a second and most commands do not need it.
+            from scipy.stats import qmc
+
+            count, dimensions = shape
+            positions = qmc.LatinHypercube(dimensions, rng=self._rng).random(count)
+        else:
+            parents = self._select_parents(shape[0])
+            deviation = REFINEMENT_STEPS[round_number - 1]
+            steps = deviation * self._rng.standard_normal(shape)
+            positions = np.clip(parents + steps, 0.0, 1.0)
+        return [self._compute_gains(position) for position in positions]
+
+    def record_scores(
+        self, gains: Sequence[CandidateGains], scores: Sequence[CandidateScore]
+    ) -> None:
+        """Stores the scores of a round, from which the next round is proposed.
+
+        Args:
+            gains: The candidates that were run.
+            scores: Their scores, in the same order.
+        """
+        self.tried += gains
+        self.scores += scores
+
+    def _select_parents(self, count: int) -> Array:
+        """Selects the candidates that a refinement round varies.
+
+        Every other parent is the best candidate. The others are taken in turn from the ranking
+        of `_rank_candidates`.
+
+        Args:
+            count: Number of parents.
+
+        Returns:
+            Their positions in the search space, shape (count, gains), each number in [0, 1].
+        """
+        best, ranked = self._rank_candidates(count)
+        parents = []
+        for n in range(count):
+            index = best
+            if n % 2 == 1:
+                index = ranked[n // 2 % len(ranked)]
+            gains = self.tried[index]
+            parents.append([gains[knob.name] for knob in self.space.knobs])
+
+        # Position 0 is the least value of a gain, and position 1 the largest.
+        logs = np.log(np.reshape(parents, (count, len(self.space.knobs))))
+        positions: Array = (logs - self._log_low) / self._log_range
+        return positions
+
+    def _rank_candidates(self, count: int) -> tuple[int, list[int]]:
+        """Ranks the candidates that are worth refining.
+
+        If there is a front, the best candidate is the one with the least objective, and the
+        most isolated points of the front come first. If there is no front yet, the candidates
+        with the least error come first and those that diverged last, and only some of them are
+        kept.
+
+        Args:
+            count: Number of candidates of the round. Without a front, a quarter of this number
+                is kept.
+
+        Returns:
+            The index of the best candidate, and the indices of the ranked candidates.
+        """
+        front = self.front
+        if front:
+            distances = compute_crowding(self.front_points)
+            crowding = dict(zip(front, distances, strict=True))
+            ranked = sorted(front, key=lambda index: -crowding[index])
+            return front[-1], ranked
+        keys = []
+        for score in self.scores:
+            diverged = score.outcome is CandidateClass.DIVERGED
+            keys.append((diverged, score.error_rad or 0.0))
+        ranked = sorted(range(len(keys)), key=keys.__getitem__)
+        return ranked[0], ranked[: max(1, count // 4)]
+
+    def _compute_gains(self, position: Array) -> CandidateGains:
+        """Returns the gains at a position in the search space, rounded and within their ranges.
+
+        Args:
+            position: Relative positions within the logarithms of the ranges, shape (gains,),
+                each in [0, 1].
+        """
+        logs = self._log_low + position * self._log_range
+        gains = {}
+        for knob, log in zip(self.space.knobs, logs, strict=True):
+            value = float(f"{np.exp(log):.{GAIN_DIGITS}g}")
+            gains[knob.name] = min(max(value, knob.low), knob.high)
+        return gains
+
+
+DEFAULT_BUDGET = 64
+"""Default number of candidates per law. Four laws on `free` take some minutes on two cores."""
+MAX_BUDGET = 100_000
+"""Largest number of candidates per law."""
+MAX_TUNING_SEEDS = 1000
+"""Largest number of seeds of each candidate."""
+MAX_TICKS = 10_000_000
+"""Largest number of ticks of a candidate, over all sites. A run of a minute with three sites at
+1 kHz has 180 000 ticks.
+"""
+_PROBE_S = 2.0
+"""Duration of the run from which the duration of a search is estimated, in s."""
+
+
+class PaperGainsResult(NamedTuple):
+    """Score of the published gains of the adaptive law, in the scenario of a comparison.
+
+    The gains are printed in the paper from which the law comes. The score shows what tuning
+    improves over them.
+
+    Attributes:
+        name: Name of the variant, such as "as printed".
+        candidate: Scenario with these gains.
+        score: Error, effort and class of the run.
+    """
+
+    name: str
+    candidate: TuningScenario
+    score: CandidateScore
+
+
+class TuningPlan(NamedTuple):
+    """A comparison of control laws by searching the best gains of each, ready to run.
+
+    `plan_tuning` creates this object and checks it. `run` executes the searches.
+
+    Attributes:
+        base: Scenario in which the laws are compared.
+        spaces: The laws with their search spaces.
+        budget: Number of candidates per law.
+        seed: Seed of the search.
+        objective: Objective besides the effort.
+        knowledge: Information about the model of the arms that all laws get.
+        others: The scenario with further seeds. The score of a candidate is the mean over all
+            seeds.
+    """
+
+    base: TuningScenario
+    spaces: list[SearchSpace]
+    budget: int
+    seed: int
+    objective: Objective
+    knowledge: ModelInformation
+    others: tuple[TuningScenario, ...] = ()
+
+    @property
+    def runs(self) -> int:
+        """Number of all simulated runs of the comparison.
+
+        It includes the runs with the published gains, and the second runs that are needed to
+        measure the final pose of the arms in some scenarios.
+        """
+        paper_candidates = len(self.build_paper_scenarios(self.base))
+        candidates = len(self.spaces) * self.budget + paper_candidates
+        seeds = 1 + len(self.others)
+        runs_per_seed = 2 if self.twin else 1
+        return candidates * seeds * runs_per_seed
+
+    @property
+    def twin(self) -> bool:
+        """True if every choice of gains needs a second run, which measures the final pose.
+
+        This is so if the scenario has walls, or operators who push the arms without a target
+        pose. They keep the arms away from the pose at which the arms would rest undisturbed, so
+        the second run leaves them out.
+        """
+        return build_twin(self.base.scenario) is not None
+
+    def build_paper_scenarios(self, base: TuningScenario) -> dict[str, TuningScenario]:
+        """Returns the scenario with the published gains of the adaptive law, in two variants.
+
+        The gains are printed in the paper from which the law comes. In the first variant, the
+        law is told the same gravity parameters as all compared laws. In the second variant, the
+        law is told nothing about the arm.
+
+        Args:
+            base: The scenario.
+
+        Returns:
+            The scenarios, by the name of the variant.
+        """
+        space = SEARCH_SPACES["adaptive"]
+        informed = space.controls(base.scenario, self.knowledge, PAPER_GAINS)
+        uninformed = {site: {**table, "theta_hat0": 0.0} for site, table in informed.items()}
+        return {
+            "as printed": base.with_controls(informed),
+            "as printed, told nothing": base.with_controls(uninformed),
+        }
+
+    def estimate_s(self, jobs: int | None = None) -> float:
+        """Estimates the duration of the search from a short run, in s of real time.
+
+        Args:
+            jobs: Number of worker processes. None stands for all cores.
+        """
+        scenario = self.base.scenario
+        probe_s = min(scenario.duration_s, _PROBE_S)
+        probe = msgspec.structs.replace(scenario, duration_s=probe_s).text
+        measure_candidate(probe, None)  # loads the compiled kernel, so that it is not timed
+        clock = SystemClock()
+        start_ns = clock.monotonic_ns()
+        measure_candidate(probe, None)
+        elapsed_s = (clock.monotonic_ns() - start_ns) * 1e-9
+        run_s = elapsed_s * scenario.duration_s / probe_s
+        processes = min(jobs or count_cores(), len(self.spaces) * self.budget)
+        return run_s * self.runs / processes
+
+    def run(
+        self, jobs: int | None = None, progress: Progress = ignore_progress, on: Workers = None
+    ) -> "TuningResult":
+        """Searches the gains of all laws.
+
+        In each round, the candidates of all laws are run together, so that no worker waits for
+        the slowest candidate of each law.
+
+        Args:
+            jobs: Number of worker processes. None uses all cores.
+            progress: Function that is called with the number of finished and of all candidates.
+            on: Workers to use instead of processes of this machine.
+
+        Raises:
+            RunFailed: A candidate killed its workers, or the cluster is no longer available.
+        """
+        searches = [
+            CandidateSearch(space, self.budget, self.seed, self.objective)
+            for space in self.spaces
+        ]
+        bases = (self.base, *self.others)
+        paper_scenarios = [self.build_paper_scenarios(base) for base in bases]
+        paper_names = list(paper_scenarios[0])
+        paper_items = [
+            build_candidate_item([scenarios[name] for scenarios in paper_scenarios])
+            for name in paper_names
+        ]
+        total = len(searches) * self.budget + len(paper_items)
+        paper_scores: list[CandidateScore] = []
+        finished = 0
+
+        def report_progress(in_round: int, _: int) -> None:
+            progress(finished + in_round, total)
+
+        if not is_core_cached():
+            # A short run compiles the simulation kernel once, before the processes start.
+            FusedRun(self.base.scenario).advance_to(_PROBE_S)
+        with open_worker_pool(jobs, on, most=total) as pool:
+            for round_number in range(len(searches[0].rounds)):
+                proposals = [search.propose_candidates(round_number) for search in searches]
+                items: list[CandidateItem] = []
+                for search, candidates in zip(searches, proposals, strict=True):
+                    items += self._build_items(bases, search.space, candidates)
+                if round_number == 0:
+                    items += paper_items
+                # The scores come in the order of the items: those of each law, and in the first
+                # round those of the printed gains, which remain in the end.
+                scores = iter(pool.map(measure_candidate_task, items, report_progress))
+                finished += len(items)
+                for search, candidates in zip(searches, proposals, strict=True):
+                    search.record_scores(candidates, [next(scores) for _ in candidates])
+                paper_scores += scores
+        printed = []
+        for name, score in zip(paper_names, paper_scores, strict=True):
+            printed.append(PaperGainsResult(name, paper_scenarios[0][name], score))
+        return TuningResult(self, searches, printed)
+
+    def _build_items(
+        self,
+        bases: Sequence[TuningScenario],
+        space: SearchSpace,
+        candidates: Sequence[CandidateGains],
+    ) -> list[CandidateItem]:
+        """Returns the work that measures candidates of one law.
+
+        Args:
+            bases: Scenario with each seed.
+            space: The law and its gains.
+            candidates: Values of the gains of each candidate.
+        """
+        items = []
+        for gains in candidates:
+            seeds = [base.with_gains(space, self.knowledge, gains) for base in bases]
+            items.append(build_candidate_item(seeds))
+        return items
+
+
+_EDGE = 1.02
+"""Factor within which a gain counts as being at an end of its range."""
+
+
+@dataclass(frozen=True, repr=False)
+class TuningResult(Result):
+    """Result of a comparison of control laws, each with the best gains that a search found.
+
+    Attributes:
+        plan: The comparison: its scenario, the laws and the ranges of their gains.
+        found: For each law in the order of the plan, all tried gains and their scores.
+        printed: Scores of the published gains of the adaptive law, for comparison. They are
+            printed in the paper from which the law comes.
+    """
+
+    plan: TuningPlan
+    found: list[CandidateSearch]
+    printed: list[PaperGainsResult]
+
+    def blocks(self) -> Iterator[Any]:
+        """Yields the parts of the text that `trilat compare --tune` prints.
+
+        See `compose_tuning`.
+        """
+        from .tuning_report import compose_tuning
+
+        return compose_tuning(self)
+
+    def headline(self) -> str:
+        """Returns a sentence that states how many points the Pareto front of each law has."""
+        fronts = ", ".join(f"{search.space.law} {len(search.front)}" for search in self.found)
+        return f"{self.plan.base.scenario.name}: points on the front: {fronts}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Converts the result to plain values, as `trilat compare --tune --json` prints it."""
+        printed = []
+        for result in self.printed:
+            facts = msgspec.to_builtins(result.score)
+            command = result.candidate.command
+            printed.append({"name": result.name, **facts, "command": command})
+        return {
+            "scenario": self._describe_scenario(),
+            "procedure": self._describe_procedure(),
+            "laws": {search.space.law: self._describe_law(search) for search in self.found},
+            "as_printed": printed,
+        }
+
+    def _describe_scenario(self) -> dict[str, Any]:
+        """Returns the plain values that describe the scenario, for `to_dict`."""
+        base = self.plan.base
+        scenario = base.scenario
+        limits_nm = {name: spec.limits.tau_limit_nm for name, spec in scenario.sites.items()}
+        return {
+            "source": base.source,
+            "overrides": list(base.overrides),
+            "name": scenario.name,
+            "seed": scenario.seed,
+            "sites": len(scenario.names),
+            "duration_s": scenario.duration_s,
+            "tau_limit_nm": limits_nm,
+        }
+
+    def _describe_procedure(self) -> dict[str, Any]:
+        """Returns the plain values that describe how the gains were tuned, for `to_dict`."""
+        plan = self.plan
+        procedure: dict[str, Any] = {
+            "candidates_per_law": plan.budget,
+            "seed": plan.seed,
+            "seeds": 1 + len(plan.others),
+            "latin_hypercube": (plan.budget + 1) // 2,
+            "refining_steps": list(REFINEMENT_STEPS),
+            "runs": plan.runs,
+            "twin": plan.twin,
+            "objective": plan.objective.value,
+            "objective_unit": plan.objective.unit,
+            "gravity_told": plan.knowledge.gravity,
+            "knowledge": plan.knowledge.text,
+            "box": plan.knowledge.box,
+        }
+        weights = weigh_joints(plan.base.scenario)
+        if weights:
+            procedure["joint_weights"] = weights
+        procedure["outcomes"] = {
+            outcome.value: text for outcome, text in CLASS_MEANINGS.items()
+        }
+        return procedure
+
+    def _describe_law(self, search: CandidateSearch) -> dict[str, Any]:
+        """Returns the search space, front and candidates of a law, for `to_dict`."""
+        candidates = []
+        for gains, score in zip(search.tried, search.scores, strict=True):
+            candidates.append({"gains": gains, **msgspec.to_builtins(score)})
+
+        overall_front = self.list_overall_front(search)
+        front = []
+        for index in search.front:
+            point = {
+                "candidate": index,
+                **candidates[index],
+                "on_the_front_of_all": index in overall_front,
+                "command": self.candidate(search, index).command,
+            }
+            front.append(point)
+
+        return {
+            "told": search.space.known_facts,
+            "searched": [knob._asdict() for knob in search.space.knobs],
+            "outcomes": {outcome.value: count for outcome, count in search.outcomes.items()},
+            "front": front,
+            "candidates": candidates,
+        }
+
+    def to_rows(self) -> list[dict[str, Any]]:
+        """Returns a table of all candidates that were tried, one row per candidate of each law.
+
+        A row contains plain values, ready for CSV.
+        """
+        rows = []
+        for law, facts in self.to_dict()["laws"].items():
+            for candidate in facts["candidates"]:
+                gains = candidate.pop("gains")
+                rows.append({"law": law, **candidate, **gains})
+        return rows
+
+    def candidate(self, search: CandidateSearch, index: int) -> TuningScenario:
+        """Returns the scenario of a candidate, with which its run can be repeated.
+
+        Args:
+            search: Search of the candidate's law.
+            index: Index of the candidate in this search.
+        """
+        plan = self.plan
+        return plan.base.with_gains(search.space, plan.knowledge, search.tried[index])
+
+    def list_edge_gains(self, search: CandidateSearch) -> list[str]:
+        """Lists the gains whose best value lies at an end of the searched range.
+
+        Such a range should be widened, because a better value may lie outside of it. The best
+        candidate of the law is the one with the least objective.
+
+        Args:
+            search: Search of the law.
+
+        Returns:
+            A string for each such gain. Empty if there are none.
+        """
+        if not search.front:
+            return []
+        best = search.tried[search.front[-1]]
+        names = []
+        for knob in search.space.knobs:
+            is_inside = knob.low * _EDGE < best[knob.name] < knob.high / _EDGE
+            if not is_inside:
+                names.append(knob.name)
+        return names
+
+    def list_overall_front(self, search: CandidateSearch) -> list[int]:
+        """Lists the gains of a law that are on the common Pareto front of all compared laws.
+
+        Gains are on the front if no other gains of any law have both a smaller objective (error
+        or settling time) and a smaller effort (motor torque).
+
+        Args:
+            search: Tried gains of the law, with their scores.
+
+        Returns:
+            Indices of the gains in `search.tried`. Empty if other laws are better everywhere.
+        """
+        points = []
+        owners = []
+        for other in self.found:
+            other_points = other.points
+            for index in other.front:
+                points.append(other_points[index])
+                owners.append((other.space.law, index))
+        overall_front = [owners[n] for n in find_pareto_front(points)]
+        return [index for law, index in overall_front if law == search.space.law]
+
+
+def plan_tuning(
+    source: str | Path | Mapping[str, Any] | Scenario,
+    overrides: Sequence[str] = (),
+    *,
+    laws: Sequence[str | type] = (),
+    budget: int = DEFAULT_BUDGET,
+    seed: int = 1,
+    objective: str = "error",
+    gravity_percent: float = 100.0,
+    seeds: int = 1,
+) -> TuningPlan:
+    """Plans a comparison of control laws with tuned gains, and checks that it can run.
+
+    The arguments are explained at `trilat_net.tune`. Overrides are texts KEY=VALUE. With
+    several seeds, the first is the seed of the scenario, and each further seed is larger by 1.
+
+    Returns:
+        The checked plan.
+
+    Raises:
+        ScenarioError: The scenario is not valid, or laws cannot be compared in it.
+        UsageError: Another argument is not valid.
+    """
+    if not 1 <= budget <= MAX_BUDGET:
+        raise UsageError(
+            f"--budget, the number of candidates per law, must be from 1 to {MAX_BUDGET}, "
+            f"not {budget}"
+        )
+    if not 0 <= seed < 2**63:
+        raise UsageError(f"--seed must be from 0 to 2^63 - 1, not {seed}")
+    if objective not in list(Objective):
+        raise UsageError(f"--objective must be {' or '.join(Objective)}, not {objective!r}")
+    if not 1 <= seeds <= MAX_TUNING_SEEDS:
+        raise UsageError(
+            f"--seeds, the number of runs per candidate, must be from 1 to {MAX_TUNING_SEEDS}, "
+            f"not {seeds}"
+        )
+    knowledge = build_model_information(gravity_percent)
+    base = load_tuning_scenario(source, overrides)
+    scenario = base.scenario
+    spaces = select_search_spaces([name_law_classes(law) for law in laws], scenario)
+    ticks = sum(map(scenario.ticks, scenario.names))
+    if ticks > MAX_TICKS:
+        problem = (
+            f"a candidate would take {count_nouns(ticks, 'tick')}, but at most {MAX_TICKS} are "
+            "allowed: shorten the run with --duration"
+        )
+        raise ScenarioError(problem, path="duration_s", source=base.source)
+    check_comparable(scenario)
+
+    # If nothing is random, all seeds give the same run.
+    others = []
+    if scenario.random:
+        for other_seed in range(scenario.seed + 1, scenario.seed + seeds):
+            texts = (*overrides, f"seed={other_seed}")
+            others.append(load_tuning_scenario(source, texts))
+    return TuningPlan(
+        base=base,
+        spaces=spaces,
+        budget=budget,
+        seed=seed,
+        objective=Objective(objective),
+        knowledge=knowledge,
+        others=tuple(others),
+    )

@@ -1,0 +1,501 @@
+"""Reports a comparison of control laws as tables, a Markdown page, JSON and a figure.
+
+The gains of each law were tuned by a search. The Pareto front of a law consists of the gains
+for which no other gains of the law are better in both error and effort, which is the RMS motor
+torque. The figure shows error against effort. `write_tuning` writes the files front.json,
+front.md, front.png and front.pdf.
+
+Invariant:
+    - The files are a function of the result alone. Repeating the same comparison gives equal
+      bytes.
+    - The JSON contains the complete result. The other files are views of it.
+    - The headers of the tables contain the units. Each run is counted in exactly one class.
+    - The figure shows every stable run in which the arms end at the pose that the operators ask
+      for, on a front or not. Stars mark the published gains of the adaptive law, which belong
+      to no front.
+"""
+
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from trilat_net.analysis.certificate.observed_energy import NEGATIVE_ENERGY_MEANING
+from trilat_net.errors import count_nouns
+from trilat_net.files import write_whole
+from trilat_net.presentation import style
+from trilat_net.presentation.appearance import REPORT_SIZE, SITE_COLOURS
+from trilat_net.presentation.result_text import Block, TextTable, format_number
+from trilat_net.scenario.laws import BUILT_IN
+from trilat_net.work.intervals import MeanInterval
+
+from .candidate import CLASS_MEANINGS, CandidateClass, CandidateScore
+from .search_space import SEARCH_SPACES, weigh_joints
+
+if TYPE_CHECKING:
+    from .tuning_plan import CandidateSearch, TuningPlan, TuningResult
+
+_MAX_FRONT_ROWS = 8
+"""Largest number of points of a front that the terminal shows. The files have all points."""
+
+
+def compose_tuning(tuned: "TuningResult") -> Iterator[Block]:
+    """Yields the text that reports a comparison of tuned control laws on the terminal.
+
+    The text contains a table of the laws, explanations of the classes of behaviour, and the
+    best compromises between error and effort (the Pareto front) of each law. The scores of the
+    published gains, notes, and commands that repeat the best runs follow.
+
+    Args:
+        tuned: Result of the comparison of control laws.
+    """
+    yield tabulate_laws(tuned)
+    yield from (f"  {line}" for line in _list_class_meanings())
+    yield from (f"note: {line}" for line in list_energy_notes(tuned))
+
+    for search in tuned.found:
+        if search.front:
+            yield ""
+            yield tabulate_front(tuned, search, _MAX_FRONT_ROWS)
+    yield (
+        "  * no candidate of any law is better in both objectives; of a long front "
+        f"{_MAX_FRONT_ROWS} points are shown"
+    )
+
+    yield ""
+    yield _tabulate_paper_gains(tuned)
+    for search in tuned.found:
+        for gain in tuned.list_edge_gains(search):
+            yield (
+                f"note: {search.space.law} is best at the edge of the range of {gain}; widen "
+                "the search"
+            )
+
+    yield ""
+    if not any(search.front for search in tuned.found):
+        yield (
+            "no candidate of any law is stable and at the pose: a longer --duration or a "
+            "larger --budget may show more"
+        )
+        return
+    yield "commands for the last point of each front; front.md has the others:"
+    for search in tuned.found:
+        if search.front:
+            last_point = search.front[-1]
+            yield f"  {tuned.candidate(search, last_point).command}"
+
+
+def tabulate_laws(tuned: "TuningResult") -> TextTable:
+    """Returns a table that summarises the search of each law in a row.
+
+    A row has the number of candidates (choices of gains), the number of candidates of each
+    class, such as stable or diverged, the number of points on the law's Pareto front and on the
+    common front of all laws, and the two ends of the front.
+
+    Args:
+        tuned: Result of the comparison of control laws.
+    """
+    classes = list(reversed(CandidateClass))
+    objective = f"{tuned.plan.objective} {tuned.plan.objective.unit}"
+    heads = ("law", "tried", *(outcome.word for outcome in classes), "front", "of all")
+    heads += (f"least {objective}", "at effort N m", "least effort N m", f"at {objective}")
+    rows = []
+    for search in tuned.found:
+        outcomes = search.outcomes
+        row = [search.space.law, str(len(search.tried))]
+        row += [str(outcomes[outcome]) for outcome in classes]
+        row.append(str(len(search.front)))
+        row.append(str(len(tuned.list_overall_front(search))))
+        row += _format_front_ends(search)
+        rows.append(tuple(row))
+    return TextTable(heads, rows, align="lr")
+
+
+def _format_front_ends(search: "CandidateSearch") -> list[str]:
+    """Returns the table cells of the two ends of a law's front.
+
+    Returns:
+        The least objective with its effort, and the least effort with its objective. All cells
+        are "-" if the law has no front.
+    """
+    front = search.front_points
+    if not front:
+        return [format_number(None)] * 4
+    least_value, effort_nm = front[-1]
+    value, least_effort_nm = front[0]
+    numbers = (least_value, effort_nm, least_effort_nm, value)
+    return [format_number(number) for number in numbers]
+
+
+def _tabulate_search(plan: "TuningPlan") -> TextTable:
+    """Returns a table of the gains that are tuned, with the ranges in which they are searched.
+
+    There is a row per gain. The information that a law gets about the model of the arm is named
+    in its first row.
+
+    Args:
+        plan: The comparison.
+    """
+    rows = []
+    for space in plan.spaces:
+        information = space.known_facts
+        for knob in space.knobs:
+            name = f"{knob.name} ({knob.where})" if knob.where else knob.name
+            unit = knob.unit or "-"
+            row = (space.law, name, unit, f"{knob.low:g}", f"{knob.high:g}", information)
+            rows.append(row)
+            information = ""
+    heads = ("law", "gain", "unit", "from", "to", "information")
+    return TextTable(heads, rows, align="lllrrl")
+
+
+def tabulate_front(
+    tuned: "TuningResult", search: "CandidateSearch", most: int | None = None
+) -> TextTable:
+    """Returns a table of the candidates on a law's Pareto front, by rising effort.
+
+    A candidate is on the front if no other candidate has both a smaller error and a smaller
+    effort. A * marks the candidates that are also on the common front of all laws.
+
+    Args:
+        tuned: Result of the comparison of control laws.
+        search: Search of the law.
+        most: Largest number of rows. Of a longer front, evenly spread points are shown, with
+            the first and the last one. None for all points.
+    """
+    count = len(search.front)
+    shown = count if most is None else min(most, count)
+    row_indices = {round(n) for n in np.linspace(0, count - 1, shown)}
+    overall_front = tuned.list_overall_front(search)
+    knobs = search.space.knobs
+    rows = []
+    for n, index in enumerate(search.front):
+        if n not in row_indices:
+            continue
+        mark = "*" if index in overall_front else ""
+        gains = [f"{search.tried[index][knob.name]:g}" for knob in knobs]
+        score = _format_score(search.scores[index])
+        rows.append((f"{search.space.law} {n + 1}{mark}", *gains, *score))
+    heads = [f"{knob.name} {knob.unit}".strip() for knob in knobs]
+    return TextTable(("law", *heads, *_SCORE_HEADS), rows, align="lr")
+
+
+def _tabulate_paper_gains(tuned: "TuningResult") -> TextTable:
+    """Returns a table of the scores of the adaptive law with its published gains.
+
+    The gains are printed in the paper from which the law comes. The scores are the error, the
+    effort and the class of behaviour. The table has a row for each variant: with and without
+    information about the arm.
+
+    Args:
+        tuned: Result of the comparison of control laws.
+    """
+    rows = []
+    for result in tuned.printed:
+        score = result.score
+        rows.append((result.name, score.outcome.word, *_format_score(score)))
+    return TextTable(("law", "class", *_SCORE_HEADS), rows, align="llr")
+
+
+_SCORE_HEADS = ("error rad", "spread rad", "pose rad", "effort N m", "settling s", "clamped %")
+"""Headers of the columns of a score."""
+
+
+def _format_score(score: CandidateScore) -> tuple[str, ...]:
+    """Returns the table cells of a score, in the order of `_SCORE_HEADS`."""
+    return (
+        _format_mean(score.error_rad, score.error_half_rad),
+        format_number(score.spread_rad),
+        format_number(score.pose_rad),
+        _format_mean(score.effort_nm, score.effort_half_nm),
+        format_number(score.settled_s),
+        f"{100.0 * score.saturated:.3g}",
+    )
+
+
+def _format_mean(mean: float | None, half: float | None) -> str:
+    """Returns a mean as a string, with its interval if it has one.
+
+    Args:
+        mean: The mean, or None.
+        half: Half the width of the interval, or None.
+    """
+    if mean is None or half is None:
+        return format_number(mean)
+    return str(MeanInterval(mean, half))
+
+
+def describe_procedure(plan: "TuningPlan") -> list[str]:
+    """Describes what is the same for all compared laws, as one sentence each.
+
+    They are the candidates, the scenario, the model information that laws get, the objectives,
+    and further conditions that apply only to some comparisons.
+
+    Args:
+        plan: The comparison.
+    """
+    scenario = plan.base.scenario
+    sampled = (plan.budget + 1) // 2
+    limits_nm = np.hstack([spec.limits.tau_limit_nm for spec in scenario.sites.values()])
+    limit_range = dict.fromkeys((limits_nm.min(), limits_nm.max()))  # one entry if both agree
+    limits = " to ".join(f"{limit:g}" for limit in limit_range)
+    knowledge = plan.knowledge.text
+    if any(space.law == "known" for space in plan.spaces):
+        knowledge += "; known gets the exact inertia as well"
+    lines = [
+        f"{count_nouns(plan.budget, 'candidate')} per law, {sampled} of a Latin hypercube, the "
+        f"others refined; seed {plan.seed}",
+        f"{scenario.duration_s:g} s of {scenario.name} with its seed {scenario.seed}, torques "
+        f"clamped at {limits} N m",
+        knowledge,
+        "class: judged from the motion in the second half of each run alone, without the twins "
+        "and roots that trilat certify uses for a log",
+        "error: RMS distance of the arms from the pose of a weightless consensus; effort: RMS "
+        "of tau - G(q)",
+    ]
+
+    weights = weigh_joints(scenario)
+    if weights:
+        shares = ", ".join(f"{weight:g}" for weight in weights)
+        lines.append(
+            f"Kp, Kd, K and d of the joints are {shares} times the number, by their inertia"
+        )
+    if plan.others:
+        seeds = count_nouns(1 + len(plan.others), "seed")
+        lines.append(f"every candidate is the mean of {seeds}, with its 95 % interval")
+    if plan.objective == "settling":
+        lines.append(
+            "minimised: the time from which the largest |e| stays below 0.01 rad, and effort"
+        )
+    if plan.twin:
+        lines.append(
+            "the pose is judged on the twin: the scenario without walls and without torques "
+            "that have no target"
+        )
+    return lines
+
+
+def list_energy_notes(tuned: "TuningResult") -> list[str]:
+    """Returns what a tuning leaves out about laws that keep accounts of energy.
+
+    The classes follow from the motion of the arms. A run whose law had overdrawn its accounts
+    can therefore count as stable here, while its certificate is open.
+
+    Args:
+        tuned: Result of the comparison of control laws.
+    """
+    laws = []
+    for search in tuned.found:
+        law = BUILT_IN.get(search.space.law)
+        if callable(getattr(law, "energies", None)):
+            laws.append(search.space.law)
+    if not laws:
+        return []
+    return [
+        f"{', '.join(laws)} declare energies, which `trilat certify` checks and the classes "
+        f"above do not: {NEGATIVE_ENERGY_MEANING}"
+    ]
+
+
+def _list_class_meanings() -> list[str]:
+    """Returns a line for each class of behaviour, such as stable, with its meaning.
+
+    The report prints these lines below the table of control laws. A run belongs to the first
+    class that applies.
+    """
+    return [f"{outcome.word}: {text}" for outcome, text in CLASS_MEANINGS.items()]
+
+
+def _build_tuning_page(tuned: "TuningResult") -> str:
+    """Composes the Markdown page that reports a comparison of control laws.
+
+    The page contains, for each point of a front, the command that repeats its run.
+
+    Args:
+        tuned: Result of the comparison of control laws.
+
+    Returns:
+        The text of the page.
+    """
+    scenario = tuned.plan.base.scenario
+    parts = [
+        f"# {scenario.name}: laws compared fairly",
+        _format_list(describe_procedure(tuned.plan)),
+        tabulate_laws(tuned).markdown(),
+        "Classes, the first that applies:",
+        _format_list([*_list_class_meanings(), *list_energy_notes(tuned)]),
+        "## Search ranges",
+        _tabulate_search(tuned.plan).markdown(),
+        "## Fronts",
+        "A * marks the points that no candidate of any law dominates.",
+    ]
+
+    for search in tuned.found:
+        parts.append(f"### {search.space.law}")
+        if search.front:
+            commands = [tuned.candidate(search, index).command for index in search.front]
+            parts.append(tabulate_front(tuned, search).markdown())
+            parts.append(_format_code(commands))
+        else:
+            parts.append("No candidate of this law is stable and at the pose.")
+
+    parts.append("## As printed")
+    parts.append(_tabulate_paper_gains(tuned).markdown())
+    parts.append(_format_code([result.candidate.command for result in tuned.printed]))
+    return "\n\n".join(parts) + "\n"
+
+
+def _format_list(lines: Sequence[str]) -> str:
+    """Returns lines as a bulleted list in Markdown."""
+    return "\n".join(f"- {line}" for line in lines)
+
+
+def _format_code(lines: Sequence[str]) -> str:
+    """Returns lines as a block of code in Markdown."""
+    return "\n".join(["```", *lines, "```"])
+
+
+FRONT_WIDTH_IN = 3.5
+"""Width of the figure, in inches: a column of a page with two columns."""
+_HEIGHT_IN = 3.1
+"""Height of the figure, in inches."""
+_SIZE_PT = 8.0
+"""Font size of the figure."""
+_MARKS = ("o", "s", "^", "D", "v", "P")
+"""Markers of the laws."""
+# Labels of the vertical axis.
+_LABELS = {"error": "error (rad)", "settling": "settling time (s)"}
+
+
+def _draw_front(tuned: "TuningResult") -> Figure:
+    """Draws the Pareto fronts of all laws in one panel, with error against effort.
+
+    The Pareto front of a law contains the best compromises between both. The axes are
+    logarithmic if all numbers are positive.
+
+    Args:
+        tuned: Result of the comparison of control laws.
+    """
+    with style.styled_figure(REPORT_SIZE, _HEIGHT_IN) as figure:
+        figure.set_figwidth(FRONT_WIDTH_IN)
+        axes = figure.add_subplot()
+        handles = [_draw_law(axes, search) for search in tuned.found]
+        handles += _draw_paper_gains(axes, tuned)
+        axes.set_xlabel("effort (N m)", fontsize=_SIZE_PT)
+        axes.set_ylabel(_LABELS[tuned.plan.objective], fontsize=_SIZE_PT)
+        axes.tick_params(labelsize=_SIZE_PT)
+        drawn = [number for line in axes.lines for number in np.ravel(line.get_xydata())]
+        if not drawn:
+            style.annotate_empty_panel(axes, "no stable candidate at the pose")
+        elif min(drawn) > 0.0:
+            axes.set(xscale="log", yscale="log")
+            for axis in (axes.xaxis, axes.yaxis):
+                style.set_plain_log_axis(axis)
+        figure.legend(
+            handles=handles,
+            loc="outside upper center",
+            ncols=2,
+            fontsize=_SIZE_PT,
+            labelspacing=0.3,
+            columnspacing=0.8,
+            handlelength=1.2,
+        )
+    return figure
+
+
+def _draw_law(axes: Axes, search: "CandidateSearch") -> Line2D:
+    """Draws all stable runs of a law faintly, and its front as a line of steps on top.
+
+    Returns:
+        The legend entry of the law, with the numbers of stable and of all candidates.
+    """
+    law = search.space.law
+    # A built-in law has the same marker and colour in every figure.
+    laws = list(dict.fromkeys([*SEARCH_SPACES, law]))
+    rank = laws.index(law)
+    marker = _MARKS[rank % len(_MARKS)]
+    colour = SITE_COLOURS[rank % len(SITE_COLOURS)]
+
+    settled = [point for point in search.points if point is not None]
+    axes.plot(
+        [effort_nm for _, effort_nm in settled],
+        [value for value, _ in settled],
+        marker=marker,
+        color=colour,
+        linestyle="",
+        markersize=2.0,
+        alpha=0.3,
+        markeredgewidth=0.0,
+    )
+
+    look: dict[str, Any] = {
+        "marker": marker,
+        "markersize": 3.5,
+        "linewidth": 1.1,
+        "color": colour,
+    }
+    front = search.front_points
+    efforts_nm = [effort_nm for _, effort_nm in front]
+    values = [value for value, _ in front]
+    axes.step(efforts_nm, values, where="post", **look)
+    stable = search.outcomes[CandidateClass.SETTLED]
+    return Line2D([], [], label=f"{law} ({stable}/{len(search.scores)})", **look)
+
+
+def _draw_paper_gains(axes: Axes, tuned: "TuningResult") -> list[Line2D]:
+    """Draws the gains that the paper prints as stars.
+
+    Returns:
+        Their legend entries. If a variant has no point in the figure, its entry states why.
+    """
+    entries = []
+    for result, fill in zip(tuned.printed, ("full", "none"), strict=True):
+        look: dict[str, Any] = {
+            "linestyle": "",
+            "marker": "*",
+            "markersize": 7.0,
+            "fillstyle": fill,
+            "color": style.REFERENCE,
+        }
+        label = result.name
+        outcome = result.score.outcome
+        point = tuned.plan.objective.point(result.score)
+        if point is not None:
+            value, effort_nm = point
+            axes.plot([effort_nm], [value], **look)
+        elif outcome is CandidateClass.SETTLED:
+            label += " (never)"  # a stable run whose |e| is still above the limit at its end
+        else:
+            label += f" ({outcome.word})"
+        entries.append(Line2D([], [], label=label, **look))
+    return entries
+
+
+def write_tuning(tuned: "TuningResult", folder: Path) -> list[Path]:
+    """Writes the results of a comparison into an existing folder.
+
+    The files are the results as JSON, a page in Markdown, and the figure of the fronts as PNG
+    and PDF.
+
+    Args:
+        tuned: Result of the comparison of control laws.
+        folder: The folder.
+
+    Returns:
+        The paths of the files.
+    """
+    json_path = folder / "front.json"
+    page_path = folder / "front.md"
+    picture_paths = [folder / "front.png", folder / "front.pdf"]
+    text = json.dumps(tuned.to_dict(), indent=2, ensure_ascii=False, allow_nan=False)
+    write_whole(json_path, text + "\n")
+    write_whole(page_path, _build_tuning_page(tuned))
+    figure = _draw_front(tuned)
+    for path in picture_paths:
+        style.write_figure(figure, path, style.REPORT_DPI)
+    return [json_path, page_path, *picture_paths]

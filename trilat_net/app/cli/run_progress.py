@@ -1,0 +1,96 @@
+"""What commands of many runs share: progress on the terminal, and runs that take place live."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+import typer
+
+from ...errors import format_wall_time
+from ...net.clock import SystemClock
+from ...presentation import terminal_output as terminal
+
+if TYPE_CHECKING:
+    from trilat_net.app.demo_session import SessionResult
+
+    from ...scenario import Scenario
+
+
+_PROGRESS_LINES = 10
+"""Number of lines that show progress if the output is not a terminal."""
+
+
+@contextmanager
+def show_progress(
+    label: str, print_line: Callable[[str], None], items: str = "runs"
+) -> Iterator[Callable[[int, int], None]]:
+    """Shows progress as a bar in a terminal, and elsewhere as a few printed lines.
+
+    Args:
+        label: Label of the bar.
+        print_line: Function that prints a line.
+        items: Noun of the counted items, in the plural.
+
+    Yields:
+        A function to call with the number of finished items and of all items.
+    """
+    if terminal.err.is_interactive:
+        with terminal.progress_bar(label) as show:
+            yield show
+        return
+    clock = SystemClock()
+    first_call_ns = -1  # time of the first call of `show_line`, -1 before it
+    done_at_first_call = 0
+    printed_tenths = 0  # tenths of the items that were finished at the last printed line
+
+    def show_line(done: int, total: int) -> None:
+        """Prints a line with the remaining time, about once per tenth of the items.
+
+        The remaining time follows from the mean duration of the items since the first call. No
+        line is printed at the first call, where this duration is unknown, nor after the last
+        item.
+
+        Args:
+            done: Number of finished items.
+            total: Number of all items.
+        """
+        nonlocal first_call_ns, done_at_first_call, printed_tenths
+        if first_call_ns < 0:
+            # The time before the first item is the start of the processes, which does not
+            # count towards the duration of an item.
+            first_call_ns = clock.monotonic_ns()
+            done_at_first_call = done
+        finished_tenths = done * _PROGRESS_LINES // total
+        has_no_remaining_time = done in (total, done_at_first_call)
+        if has_no_remaining_time or finished_tenths <= printed_tenths:
+            return
+        printed_tenths = finished_tenths
+        elapsed_s = (clock.monotonic_ns() - first_call_ns) * 1e-9
+        remaining_s = elapsed_s / (done - done_at_first_call) * (total - done)
+        print_line(f"  {done} of {total} {items}, about {format_wall_time(remaining_s)} left")
+
+    yield show_line
+
+
+def run_in_own_folder(scenario: "Scenario", label: str, folder_name: str) -> "SessionResult":
+    """Runs a scenario live, with its results in a new folder.
+
+    Args:
+        scenario: The scenario.
+        label: Name of the run in the printed line.
+        folder_name: Name of the folder, to which a number is added.
+
+    Raises:
+        typer.Exit: The session was interrupted.
+    """
+    from trilat_net.app.demo_session import run_demo
+
+    from ...files import make_results_folder
+
+    folder = make_results_folder(None, folder_name, force=False)
+    terminal.print_text(f"{label}: {scenario.duration_s:g} s live, into {folder}")
+    outcome = run_demo(scenario, folder, terminal.out)
+    if outcome.interrupted:
+        terminal.err.print("interrupted")
+        raise typer.Exit(128 + outcome.interrupted)
+    return outcome

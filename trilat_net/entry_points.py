@@ -1,0 +1,90 @@
+"""Finds the commands and functions that other installed packages add to this program.
+
+A package adds them by entry points, a section of its pyproject.toml that names objects
+(docs/develop/packages.md). This program reads the names without importing the package. It
+imports an object when somebody uses it.
+
+Packages of this program, such as trilat-studies, do the same. `package_names` lists what
+belongs to them, so that the program can say which package to install if it is missing.
+
+Invariant:
+    - What this program has under a name itself is never replaced.
+    - A name of a package of this program is never taken from another package.
+"""
+
+from functools import cache
+from importlib import metadata
+from typing import Any
+
+from .errors import UsageError
+from .package_names import PACKAGE_COMMANDS, PACKAGE_FUNCTIONS
+
+COMMANDS = "trilat_net.commands"
+"""Group of the commands. A name is that of the command, with a hyphen for each space."""
+FUNCTIONS = "trilat_net.api"
+"""Group of the functions and classes of the Python interface."""
+
+_PACKAGE_OF = {
+    COMMANDS: {name: package for package, names in PACKAGE_COMMANDS.items() for name in names},
+    FUNCTIONS: {
+        name: package for package, names in PACKAGE_FUNCTIONS.items() for name in names.split()
+    },
+}
+
+
+@cache
+def find_entries(group: str) -> dict[str, metadata.EntryPoint]:
+    """Returns the entry points of a group by their names, without importing their packages.
+
+    Args:
+        group: `COMMANDS` or `FUNCTIONS`.
+    """
+    entries: dict[str, metadata.EntryPoint] = {}
+    for entry in metadata.entry_points(group=group):
+        package = find_package(group, entry.name)
+        top = entry.module.partition(".")[0]
+        if not package or top == package.replace("-", "_"):
+            entries.setdefault(entry.name, entry)
+    return entries
+
+
+def find_package(group: str, name: str) -> str:
+    """Returns the package of this program that has a name, or "" if none has.
+
+    Args:
+        group: `COMMANDS` or `FUNCTIONS`.
+        name: Name of the entry point.
+    """
+    return _PACKAGE_OF[group].get(name, "")
+
+
+def load_entry(group: str, name: str, use: str) -> Any:
+    """Imports the object of an entry point.
+
+    Args:
+        group: `COMMANDS` or `FUNCTIONS`.
+        name: Name of the entry point.
+        use: What the object is to a user, as in "trilat sweep", for the error.
+
+    Returns:
+        The object, or None if there is no such name.
+
+    Raises:
+        UsageError: The package of this program that has the name is not installed, or the
+            package of another author cannot be imported.
+    """
+    entry = find_entries(group).get(name)
+    package = find_package(group, name)
+    if entry is None:
+        if package:
+            raise UsageError(f"{use} is in a package of its own: pip install {package}")
+        return None
+    if package:
+        return entry.load()
+    try:
+        return entry.load()
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error}"
+        raise UsageError(
+            f"{use} cannot be used, because {entry.value} cannot be imported: {reason}"
+        ) from error
