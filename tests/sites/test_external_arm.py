@@ -656,12 +656,13 @@ def test_the_example_of_a_message_is_one() -> None:
 def test_the_page_names_every_field_of_a_message() -> None:
     docs = Path(__file__).parents[2] / "docs"
     how_to = (docs / "sessions" / "external-arm.md").read_text(encoding="utf-8")
-    page = (docs / "reference" / "external-arm-messages.md").read_text(encoding="utf-8")
-    table = page[page.index("| key |") : page.index("The torque stands")]
+    page = (docs / "develop" / "session-protocol.md").read_text(encoding="utf-8")
+    table = page[page.index("| `v` |") : page.index("The torque stands")]
     assert set(re.findall(r"`(\w+)`", table)) == set(ArmMeasurement.__struct_fields__)
     assert f"| {VERSION}, the version of the messages |" in table
-    switch = page[page.index("| of `enable` |") : page.index("Several programs")]
-    assert set(re.findall(r"^\| `(\w+)`", switch, re.MULTILINE)) == {"held"}
+    assert "`v`, `site`, `boot`, `n` and `sent_ns` as above and `held`" in " ".join(
+        page.split()
+    )
     assert set(ArmEnable.__struct_fields__) - set(ArmMeasurement.__struct_fields__) == {"held"}
     for seconds in (HELD_SILENCE_NS, SILENCE_LIMIT_NS, FRESH_NS, SWITCH_SILENCE_NS):
         assert f"{seconds * 1e-9:g} s" in how_to
