@@ -147,8 +147,11 @@ def class_heights() -> dict[str, int]:
 
 
 def strings(path: Path) -> Iterator[str]:
-    """Yields the strings of a file, also those in f-strings, but not its docstrings."""
+    """Yields the strings of a file, also those in f-strings, but neither its docstrings nor `__all__`."""
     statements = {id(node.value) for node in ast.walk(tree(path)) if isinstance(node, ast.Expr)}
+    for node in tree(path).body:
+        if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "__all__":
+            statements |= {id(inner) for inner in ast.walk(node.value)}
     for node in ast.walk(tree(path)):
         match node:
             case ast.Constant(value=str(text)) if id(node) not in statements:
