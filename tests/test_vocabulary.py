@@ -8,11 +8,7 @@ import pytest
 from . import house
 
 PAGE = (house.ROOT / "docs" / "vocabulary.md").read_text(encoding="utf-8")
-USED = [
-    row
-    for row in re.findall(r"^\| ([^|]+) \| ([^|]+) \|$", PAGE, re.MULTILINE)
-    if row[0] != "word"
-]
+USED = re.findall(r"^- \*\*([^*]+)\*\*: (.+)$", PAGE, re.MULTILINE)
 UNUSED = {
     "node, broker": "member, router",
     "neighbour": "peer",
