@@ -101,7 +101,6 @@ ELSEWHERE = {
     "docs/logs/replay.md: trilat replay": "tests/live/test_replay.py",
     "docs/maps/README.md: trilat sweep runs/mine --confirm": "packages/trilat-studies/tests/sweep_tests/test_confirmation.py",
     "docs/maps/README.md: trilat sweep SCENARIO": "packages/trilat-studies/tests/command_tests/test_sweeps.py",
-    "docs/maps/p_d.md: trilat sweep runs/map-p_d --confirm": "packages/trilat-studies/tests/sweep_tests/test_confirmation.py",
     "docs/sessions/network.md: trilat keys new keys m1 m2 s recorder operator --host": "tests/live/test_namespaces.py",
     "docs/sessions/network.md: trilat keys new keys m1 m2 s recorder operator router": "tests/live/test_routers.py",
     "docs/sessions/network-check.md: trilat ping --answer": "tests/sites/test_network_benchmark.py",
