@@ -37,10 +37,10 @@ def test_the_readme_shows_the_judgement_of_its_first_run(tmp_path: Path) -> None
     trilat("sim", "two_people", "-o", "run.mcap", cwd=tmp_path).succeeds()
     printed = trilat("certify", "run.mcap", cwd=tmp_path).succeeds().splitlines()
     assert printed[0] == shown.strip()
-    assert len([line for line in printed if line.startswith(("ok ", "note "))]) == 8
+    assert len([line for line in printed if line.startswith(("ok ", "note "))]) == 9
     page = (ROOT / "docs/tutorials/first-result.md").read_text(encoding="utf-8")
     explained = re.findall(r"^\| `(.+?)` \|", page, re.MULTILINE)
-    assert len(explained) == 8
+    assert len(explained) == 9
     for line, words in zip(printed, explained, strict=False):
         assert line.partition(" ")[2].strip().startswith(words)
 
