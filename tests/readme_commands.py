@@ -1,9 +1,9 @@
-"""The commands of the tables of README.md and docs/commands.md, with real arguments.
+"""The commands of README.md's table and of docs/commands.md, with real arguments.
 
 `.ci/readme` runs them after `make setup` alone.
 
 Invariant:
-- Every command that the table of docs/commands.md names stands here or in a fenced block of one of the
+- Every command that docs/commands.md lists stands here or in a fenced block of one of the
   pages (`list_missing_commands`).
 - Every command of the README's table stands here as it stands there, apart from names of logs, the address
   HOST, and options that follow (`list_unlike_commands`).
@@ -161,13 +161,12 @@ def list_all() -> list[str]:
     ]
 
 
-def read_table_commands() -> set[str]:
-    """The commands that the table of docs/commands.md names, as in "log info", and whole groups, as in "keys"."""
+def read_listed_commands() -> set[str]:
+    """The commands that the lists of docs/commands.md name, as in "log info", and whole groups, as in "keys"."""
     text = (ROOT / "docs/commands.md").read_text(encoding="utf-8")
-    table = text.partition("| command | what it does |")[2].partition("\n\n")[0]
     named: set[str] = set()
-    for row in table.splitlines()[2:]:
-        for code in re.findall(r"`trilat ([^`]*)`", row.split(" | ")[0]):
+    for row in re.findall(r"^- (`trilat .*?`): ", text, re.MULTILINE):
+        for code in re.findall(r"`trilat ([^`]*)`", row):
             parts = [
                 re.sub(r"\[.*?\]|--\S.*|\b[A-Z]{1,}\b.*", "", part).split()
                 for part in code.split(" / ")
@@ -182,7 +181,7 @@ def read_table_commands() -> set[str]:
 
 
 def list_missing_commands(commands: set[str]) -> set[str]:
-    """The commands of the program that the table names and that nothing runs.
+    """The commands of the program that the page lists and that nothing runs.
 
     Args:
         commands: all commands of the program, as in "log info".
@@ -194,7 +193,7 @@ def list_missing_commands(commands: set[str]) -> set[str]:
     done = {f"{words[0]} {word}" for words in run for word in words[1:]} | {
         words[0] for words in run
     }
-    named = read_table_commands()
+    named = read_listed_commands()
     assert all(
         name in commands or any(one.startswith(f"{name} ") for one in commands)
         for name in named

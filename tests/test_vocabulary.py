@@ -8,11 +8,7 @@ import pytest
 from . import house
 
 PAGE = (house.ROOT / "docs" / "vocabulary.md").read_text(encoding="utf-8")
-SYMBOLS = re.search(r"## Symbols\n.*?(?=^## )", PAGE, re.MULTILINE | re.DOTALL)
-ROWS = re.findall(
-    r"^\| ([^|]+) \| ([^|]+) \|$", PAGE.replace(SYMBOLS[0] if SYMBOLS else "", ""), re.MULTILINE
-)
-USED = [row for row in ROWS if row[0] != "word"]
+USED = re.findall(r"^- \*\*([^*]+)\*\*: (.+)$", PAGE, re.MULTILINE)
 UNUSED = {
     "node, broker": "member, router",
     "neighbour": "peer",

@@ -245,7 +245,7 @@ class Connection:
             raise UsageError(
                 f"--keys: the keys of {self.keys_of} expire on {self.keys_end:{_DATE}}, but "
                 f"the session is planned until {planned_end:{_DATE}}: renew the keys with "
-                "trilat keys renew (docs/sessions/network.md)"
+                "trilat keys renew (docs/sessions/keys.md)"
             )
 
     def describe_end(self) -> str:
@@ -259,7 +259,7 @@ class Connection:
         """
         if self.keys_end is None or self.keys_end - datetime.now(UTC) > ENDS_SOON:
             return ""
-        remedy = "renew the keys with trilat keys renew (docs/sessions/network.md)"
+        remedy = "renew the keys with trilat keys renew (docs/sessions/keys.md)"
         return f"the keys of {self.keys_of} expire on {self.keys_end:{_DATE}}: {remedy}"
 
     def require(self, member: str) -> "Connection":

@@ -268,7 +268,7 @@ def keys_new_command(
     )
 
 
-@options.command("keys s2 bridge --host 192.0.2.9", page="docs/sessions/network.md")
+@options.command("keys s2 bridge --host 192.0.2.9", page="docs/sessions/keys.md")
 def keys_add_command(
     folder: Annotated[
         Path, typer.Argument(help="Folder that `trilat keys new` created.", metavar="DIR")
@@ -309,7 +309,7 @@ def keys_add_command(
     terminal.print_line(f"the new keys are valid for {count_nouns(days, 'day')}")
 
 
-@options.command("keys", "keys m1 recorder --days 90", page="docs/sessions/network.md")
+@options.command("keys", "keys m1 recorder --days 90", page="docs/sessions/keys.md")
 def keys_renew_command(
     folder: Annotated[
         Path, typer.Argument(help="Folder that `trilat keys new` created.", metavar="DIR")
