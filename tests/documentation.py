@@ -100,7 +100,6 @@ ELSEWHERE = {
     "docs/logs/replay.md: trilat replay": "tests/live/test_replay.py",
     "docs/maps/README.md: trilat sweep runs/mine --confirm": "packages/trilat-studies/tests/sweep_tests/test_confirmation.py",
     "docs/maps/README.md: trilat sweep SCENARIO": "packages/trilat-studies/tests/command_tests/test_sweeps.py",
-    "docs/maps/p_d.md: trilat sweep runs/map-p_d --confirm": "packages/trilat-studies/tests/sweep_tests/test_confirmation.py",
     "docs/sessions/network.md: trilat keys new keys m1 m2 s recorder operator --host": "tests/live/test_namespaces.py",
     "docs/sessions/network.md: trilat keys new keys m1 m2 s recorder operator router": "tests/live/test_routers.py",
     "docs/sessions/network-check.md: trilat ping --answer": "tests/sites/test_network_benchmark.py",
@@ -116,7 +115,7 @@ ELSEWHERE = {
     "docs/tutorials/two-people.md: trilat experiment analyse": "tests/studies/experiment/test_experiment_analysis.py",
     "docs/theory/growth-exponents.md: $ trilat sweep p_d_margin": "packages/trilat-studies/tests/sweep_tests/test_exponents.py",
     "docs/studies/sweep.md: $ trilat sweep p_d_margin": "packages/trilat-studies/tests/command_tests/test_sweeps.py",
-    "docs/studies/sweep-cluster.md: $ dask scheduler": "packages/trilat-studies/tests/test_dask_cluster.py",
+    "docs/studies/sweep.md: $ dask scheduler": "packages/trilat-studies/tests/test_dask_cluster.py",
 }
 """Beginnings of blocks that take machines, a robot, a session or minutes, and the tests of the same."""
 
