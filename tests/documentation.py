@@ -116,7 +116,7 @@ ELSEWHERE = {
     "docs/tutorials/two-people.md: trilat experiment analyse": "tests/studies/experiment/test_experiment_analysis.py",
     "docs/theory/growth-exponents.md: $ trilat sweep p_d_margin": "packages/trilat-studies/tests/sweep_tests/test_exponents.py",
     "docs/studies/sweep.md: $ trilat sweep p_d_margin": "packages/trilat-studies/tests/command_tests/test_sweeps.py",
-    "docs/studies/sweep-cluster.md: $ dask scheduler": "packages/trilat-studies/tests/test_dask_cluster.py",
+    "docs/studies/sweep.md: $ dask scheduler": "packages/trilat-studies/tests/test_dask_cluster.py",
 }
 """Beginnings of blocks that take machines, a robot, a session or minutes, and the tests of the same."""
 

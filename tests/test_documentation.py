@@ -201,7 +201,6 @@ COMMAND_PAGES = {
     "docs/logs/log-checks.md",
     "docs/logs/log-tools.md",
     "docs/logs/rerun.md",
-    "docs/logs/signatures.md",
     "docs/logs/verify.md",
     "docs/studies/seeds.md",
 }
@@ -217,7 +216,6 @@ OF_RUNS = {
     "docs/logs/log-checks.md": "paper",
     "docs/logs/log-tools.md": "paper",
     "docs/logs/rerun.md": "paper",
-    "docs/logs/signatures.md": "free",
     "docs/logs/verify.md": "paper",
 }
 """Pages whose blocks are about run.mcap, and its scenario."""

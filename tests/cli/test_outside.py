@@ -16,7 +16,7 @@ from trilat_net.log.log_reader import open_log
 LAWS = Path(__file__).parents[1] / "laws.py"
 DOC = Path(__file__).parents[2] / "docs" / "extend" / "own-controller.md"
 INTERFACE = DOC.with_name("law-interface.md")
-INPUTS = DOC.parent / "data" / "law-inputs.csv"
+INPUTS = DOC.parents[1] / "data" / "law-inputs.csv"
 FAILING = ("--set", "sites.s.control.law=tests.laws:Failing", "--set", "sites.s.control.at=40")
 SHORT = ("--duration", "0.1")
 
@@ -135,7 +135,7 @@ def test_what_page_says_of_law_is_what_law_gets() -> None:
 
     with INPUTS.open(newline="", encoding="utf-8") as stream:
         rows = [(row["object"], row["field"]) for row in csv.DictReader(stream)]
-    assert f"(data/{INPUTS.name})" in INTERFACE.read_text(encoding="utf-8")
+    assert f"data/{INPUTS.name})" in INTERFACE.read_text(encoding="utf-8")
     for kind in (LawContext, LawInput):
         assert [field for name, field in rows if name == kind.__name__] == list(kind._fields)
 

@@ -335,7 +335,7 @@ def keys_renew_command(
         terminal.print_line(f"{member_folder}: valid for {count_nouns(days, 'day')} from now")
 
 
-@options.command("lab", page="docs/logs/signatures.md")
+@options.command("lab", page="docs/logs/log-checks.md")
 def keys_pair_command(
     name: Annotated[
         Path,

@@ -70,7 +70,7 @@ def log_check_command(
     raise typer.Exit(check.exit_code)
 
 
-@options.command("run.mcap --key lab.key", page="docs/logs/signatures.md")
+@options.command("run.mcap --key lab.key", page="docs/logs/log-checks.md")
 def log_sign_command(
     file: options.LogArgument,
     key: Annotated[
@@ -94,7 +94,7 @@ def log_sign_command(
         terminal.print_text(f"{signature}: signs {file}")
 
 
-@options.command("run.mcap.active", page="docs/logs/log-damage.md")
+@options.command("run.mcap.active", page="docs/logs/log-checks.md")
 def log_recover_command(
     file: options.LogArgument,
     output: Annotated[
