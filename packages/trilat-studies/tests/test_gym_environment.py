@@ -121,7 +121,7 @@ def test_a_saved_episode_says_that_a_program_moved_its_arm(tmp_path: Path) -> No
     ("vary", "words"),
     [
         ({"link.dely_ms": (0.0, 300.0)}, "did you mean 'delay_ms'"),
-        ({"link.delay_ms": (0.0, -300.0)}, "link.delay_ms"),
+        ({"link.delay_ms": (0.0, -300.0)}, "delay_ms: expected a number >= 0.0"),
         ({"seeds": [1, 2]}, "did you mean 'seed'"),
         ({"link.delay_ms": []}, "link.delay_ms needs a pair of bounds or a list"),
     ],
