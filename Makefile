@@ -22,7 +22,7 @@ help:
 	@echo "make push-set     measure anew which tests make test leaves to make test-long"
 	@echo "make faults       docs/data/fault-matrix.csv: two thousand sessions in which things go wrong, and the matrix of faults"
 	@echo "make docs         the documentation as a site, with search, offline: build/site/html/index.html"
-	@echo "make media        the moving picture of README.md, from the log of a simulated run"
+	@echo "make media        the pictures of README.md, the gallery and a report, from logs of simulated runs"
 	@echo "make bench   the figures of docs/theory/benchmarks.md, measured on this machine"
 	@echo "make suite-gains  docs/studies/bench.md: tunes the gains that are out of date; entered again, it continues"
 	@echo "make suite        docs/studies/bench.md: the whole suite of control laws; entered again, it continues"

@@ -321,7 +321,7 @@ def test_recorded_episodes_are_marked_with_their_outcome(tmp_path: Path) -> None
             reached(bus, clock) as running,
             open_hand(bus, clock, SESSION, "m1", scenario) as hand,
         ):
-            for seconds in (4.0, 0.3):
+            for seconds in (4.0, 0.04):
                 found.extend(
                     example["record"](
                         running,

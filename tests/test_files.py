@@ -19,6 +19,7 @@ from tests.other_systems import replace_os
 from trilat_net import files
 from trilat_net.errors import LogRefused, UsageError
 from trilat_net.files import (
+    choose_report_folder,
     create_file,
     extend_file,
     format_extra_install,
@@ -409,3 +410,11 @@ def test_a_library_whose_own_library_is_missing_is_told_apart(
         files.import_extra("optional_thing", "view", "viewers")
     with pytest.raises(UsageError, match="viewers need not_there_at_all: "):
         files.import_extra("not_there_at_all", "view", "viewers")
+
+
+@pytest.mark.parametrize("name", ["run.mcap", "run", "a.b.mcap", "run.mcap.active", ".run"])
+def test_the_folder_of_a_report_is_never_the_log(name: str, tmp_path: Path) -> None:
+    folder = choose_report_folder(tmp_path / name)
+    assert folder != tmp_path / name
+    assert folder.parent == tmp_path
+    assert folder.name.startswith(name.removesuffix(".active").removesuffix(".mcap"))

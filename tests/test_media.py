@@ -7,6 +7,7 @@ from types import SimpleNamespace
 from typing import Any
 from xml.etree import ElementTree
 
+import matplotlib.image
 import numpy as np
 import pytest
 
@@ -15,6 +16,7 @@ import trilat_net as tn
 ROOT = Path(__file__).parents[1]
 MEDIA = SimpleNamespace(**runpy.run_path(str(ROOT / "docs" / "media" / "moving_picture.py")))
 GALLERY = SimpleNamespace(**runpy.run_path(str(ROOT / "docs" / "media" / "make_media.py")))
+REPORT = SimpleNamespace(**runpy.run_path(str(ROOT / "docs" / "media" / "report_picture.py")))
 GALLERY_TEXT = GALLERY.PAGE.read_text(encoding="utf-8")
 ENTRIES = list(GALLERY.read_gallery(GALLERY_TEXT))
 PICTURE = (MEDIA.PICTURES / MEDIA.PICTURE).read_text(encoding="utf-8")
@@ -90,3 +92,17 @@ def test_commands_of_gallery_make_its_pictures(entry: Any, tmp_path: Path) -> No
     """To the byte: the same version of the program draws the same picture."""
     made = GALLERY.make_picture(entry, tmp_path)
     assert made.read_bytes() == (GALLERY.PICTURES / entry.path).read_bytes()
+
+
+def test_the_picture_of_a_report_has_the_size_of_its_window() -> None:
+    pixels = matplotlib.image.imread(REPORT.PICTURE)
+    height, width = pixels.shape[:2]
+    assert (width, height) == (REPORT.SCALE * REPORT.WIDTH, REPORT.SCALE * REPORT.HEIGHT)
+
+
+def test_the_picture_of_a_report_names_the_browser_that_it_lacks(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(SystemExit, match="apt-get install chromium"):
+        REPORT.find_browser()

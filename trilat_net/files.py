@@ -412,6 +412,15 @@ def extend_file(path: Path) -> BinaryIO:
     return open(path, "ab", buffering=0, opener=open_without_following)
 
 
+def choose_report_folder(log: Path) -> Path:
+    """Returns the default folder of a log's report, which is named after the log.
+
+    Args:
+        log: File of the log. If its name has no suffix, the folder ends in "-report".
+    """
+    return log.with_suffix("") if log.suffix else log.with_name(f"{log.name}-report")
+
+
 def make_results_folder(folder: Path | None, name: str, *, force: bool | None) -> Path:
     """Makes a folder for the results of a command, or uses an existing one.
 

@@ -1,5 +1,7 @@
+import inspect
 import re
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,7 @@ from typer.testing import CliRunner
 from tests.golden.surface import all_options
 from trilat_net.app.cli import app
 from trilat_net.app.cli.options import list_laws
+from trilat_net.presentation.exports import list_export_formats
 
 from .running import simulated, trilat
 
@@ -140,3 +143,13 @@ def test_only_commands_that_accept_folders_of_logs_offer_them(tmp_path: Path) ->
         if not accepts and command != ["log", "sign"]:
             assert "is a folder, not a file" in done.err, (command, done)
             assert str(Path("logs") / "one.mcap") in done.err, (command, done)
+
+
+def test_export_help_names_every_format_and_setting() -> None:
+    text = " ".join(printed("log", "export", "--help").replace("│", " ").split())
+    for form in list_export_formats():
+        module = import_module(f"trilat_net.presentation.exports.{form}")
+        assert form in text
+        for parameter in inspect.signature(module.FORMAT.write).parameters.values():
+            if parameter.kind is parameter.KEYWORD_ONLY:
+                assert re.search(rf"\b{parameter.name}(=|, as --{parameter.name})", text)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import trilat_net as tn
-from tests.cli.running import trilat
+from tests.cli.running import started, trilat
 
 
 def test_the_skeleton_is_a_law_and_replaces_nothing(
@@ -34,6 +34,17 @@ def test_the_skeleton_is_a_law_and_replaces_nothing(
     trilat("new", "law", "soft_law.py", cwd=tmp_path).refuses("test_soft_law.py", "exists")
     trilat("new", "law", "numpy.py", cwd=tmp_path).refuses("Python already has a module numpy")
     trilat("new", "law", "my-law.py", cwd=tmp_path).refuses("such as mylaw.py or my_law.py")
+
+
+def test_a_law_that_is_compiled_anew_needs_no_notice(tmp_path: Path) -> None:
+    """The core is in the cache after the first run; the law is compiled by every process."""
+    trilat("new", "law", "swift.py", cwd=tmp_path)
+    words = ["sim", "two_sites", "--duration", "0.1", "--set", "control.law=swift:Swift"]
+    trilat(*words, "-o", "first.mcap", cwd=tmp_path).succeeds()
+    run = started(*words, "-o", "second.mcap", cwd=tmp_path)
+    out, err = run.communicate()
+    assert "second.mcap" in out
+    assert "compiling" not in err
 
 
 @pytest.mark.long

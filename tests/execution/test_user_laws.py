@@ -9,8 +9,9 @@ import pytest
 from tests.execution.deliveries import SITES, TICKS
 from tests.execution.logs import OTHER_PLATFORM, external_log, numbers, without_records
 from tests.log_editing import Record, edited, opened, recorded
-from trilat_net.errors import LawFailed, ScenarioError, UsageError
+from trilat_net.errors import LawFailed, ScenarioError, UsageError, join_arguments
 from trilat_net.execution import virtual
+from trilat_net.execution.log_checks import run_log_checks
 from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log, open_log
@@ -91,6 +92,22 @@ def test_hidden_memory_of_a_law_shows_at_a_fresh_start() -> None:
     found = verify(log, resume_every=40)
     assert found.first is not None
     assert found.first.tick == 40
+
+
+def test_the_report_says_how_hidden_memory_would_show() -> None:
+    log = opened(own("tests.laws:Forgetful"))
+    (law,) = find_user_laws(log.scenario)[:1]
+
+    def find_text(**settings: int) -> str:
+        findings = run_log_checks(log, virtual=False, **settings).findings
+        return next(one.text for one in findings if one.check == "executed again")
+
+    words = ["trilat", "verify", *log.sources, "--law", str(law.file), "--resume-every", "100"]
+    command = join_arguments(words)
+    assert find_text().endswith(f"but by: {command}")
+    assert "--resume-every" not in find_text(resume_every=1000)
+    built_in = run_log_checks(opened(recorded("paper")), virtual=False)
+    assert not [one for one in built_in.findings if "--resume-every" in one.text]
 
 
 def test_a_changed_memory_shows_at_its_own_tick() -> None:

@@ -78,7 +78,8 @@ def test_python_changes_stops_measures_and_ends_session_as_commands_do(stage: St
     running.begun()
     running.recording()
     session = tn.session("t", connect=running.endpoints)
-    assert "takes effect at tick" in session.set_link("m1->s", delay_ms=250.0, loss=0.05)
+    with session:
+        assert "takes effect at tick" in session.set_link("m1->s", delay_ms=250.0, loss=0.05)
     assert "takes effect at tick" in session.set_dominance(
         "s", {"m1": 0.9, "m2": 0.1}, ramp_s=0.5
     )

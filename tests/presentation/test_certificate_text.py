@@ -10,6 +10,7 @@ import pytest
 from tests.analysis import logs
 from tests.analysis.certificate import runs
 from trilat_net.analysis.certificate.stability_certificate import certify
+from trilat_net.analysis.judge import certify_run
 from trilat_net.analysis.run_end import EndBehaviour, Stability
 from trilat_net.analysis.stability_decision import LoopRoots
 from trilat_net.presentation.certificate_text import (
@@ -127,6 +128,22 @@ def test_divergence_is_said_once_with_its_joint() -> None:
     site = cause.split()[0]
     speed_rad_s = float(cause.split("reached ")[1].split()[0])
     assert np.abs(log[site].qd[-1]).max() == pytest.approx(speed_rad_s, rel=1e-2)
+
+
+def test_sentences_about_a_record_fit_its_length() -> None:
+    """This run diverged after milliseconds: there is neither a last second nor a push to follow."""
+    short = {"duration_s": 2.0, "rate_hz": 1000, "limits.qd_limit_rad_s": 0.02}
+    log = runs.run("free", short).log
+    found = certify_run(log)
+    assert found.twins is not None
+    assert found.twins.text == "twins: too short a record to follow a push"
+    texts = [line.text for line in describe_certificate(found)]
+    assert not [text for text in texts if "last second" in text]
+    brief = runs.run("free", {"duration_s": 0.5, "rate_hz": 200}).certificate
+    assert brief.end.text.endswith("in the whole record")
+    assert runs.run("free", {"duration_s": 1.5, "rate_hz": 200}).certificate.end.text.endswith(
+        "in the last second"
+    )
 
 
 def test_a_short_run_says_so_once_and_for_how_long() -> None:

@@ -31,6 +31,16 @@ from trilat_net.net.zenoh_bus import ZenohBus
 MEMBERS = ("m1", "s", "recorder")
 
 
+def test_a_measurement_that_fails_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    failing = "raise MemoryError('no more pages')"
+    monkeypatch.setattr(doctor, "_RATES_CODE", failing)
+    monkeypatch.setattr(doctor, "_RIGHTS_CODE", failing)
+    monkeypatch.setattr(doctor, "is_core_cached", lambda: True)
+    for found in (doctor.examine_rate(), *doctor.examine_rights()):
+        assert found.state == "warn"
+        assert found.text.endswith("failed (exit code 1: MemoryError: no more pages)")
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("deployment") / "keys"

@@ -17,7 +17,7 @@ from ..analysis.metrics.log_metrics import LogMetrics, compute_log_metrics
 from ..errors import UsageError
 from ..execution.log_checks import LogCheckReport, run_log_checks
 from ..execution.virtual import SimulatedLog, simulate_scenario
-from ..files import make_results_folder
+from ..files import choose_report_folder, make_results_folder
 from ..log.accounting import MIN_COVERAGE
 from ..log.log_reader import Log, open_log, open_logs
 from ..scenario import Scenario, load_scenario
@@ -229,7 +229,7 @@ def report(
         raise UsageError(
             "a report needs a log in a file: save the log first, as in log.save('run.mcap')"
         )
-    folder = first.with_suffix("") if out is None else Path(out)
+    folder = choose_report_folder(first) if out is None else Path(out)
     return conclude(opened, make_results_folder(folder, "", force=force), png=png)
 
 

@@ -369,8 +369,10 @@ def _add_memory_advice(finding: Finding, log: Log, result: VerifyResult) -> Find
     is_about_runs = finding.check == "executed again" and finding.passed
     if not (files and is_about_runs and result.whole_run) or result.withheld:
         return finding
-    laws = " ".join(f"--law {file}" for file in files)
-    command = f"trilat verify {join_arguments(log.sources)} {laws} --resume-every 100"
+    words = ["trilat", "verify", *log.sources]
+    for file in files:
+        words += ["--law", file]
+    command = join_arguments([*words, "--resume-every", "100"])
     advice = f"memory of your law that the records lack would not show here, but by: {command}"
     return replace(finding, text=f"{finding.text}; {advice}")
 

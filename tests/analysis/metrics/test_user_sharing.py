@@ -11,6 +11,7 @@ import trilat_net
 from tests.analysis.logs import rewritten
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics, measure_run
 from trilat_net.log.log_reader import Log
+from trilat_net.net.messages import Event
 from trilat_net.scenario import parse_scenario
 
 TRIO = """
@@ -102,6 +103,14 @@ def test_a_takeover_lasts_until_the_larger_share() -> None:
         "takeovers": 1.0,
         "takeover_s": pytest.approx(0.25, abs=1e-9),
     }
+
+
+def test_the_program_is_the_user_that_the_log_names() -> None:
+    """m1 leads for ticks 0 to 249, and for tick 250, at equal shares, if it is the program."""
+    event = Event(member="m1", boot=1, kind="hand", text="m1: policy takes hold at t = 0.000 s")
+    log = rewritten(prescribed(), others=[event])
+    found = measure_run(log, ["intervention_share"])["intervention_share"]
+    assert found.value == pytest.approx(149.0 / 400.0)
 
 
 def test_a_step_of_shares_takes_over_at_once() -> None:

@@ -272,21 +272,16 @@ class Certificate(Result):
         """Returns one line for people: the judgement, and how the run ended."""
         if self.end.behaviour is EndBehaviour.DIVERGED:
             return f"{self.stability}: {self.end.text}"
-        text = f"{self.stability}: {self._describe_end()}"
+        phrase = self.end.phrase
+        # A proof may show a run to be stable whose end alone would be judged otherwise.
+        is_good = self.stability in (Stability.STABLE, Stability.SETTLED)
+        if is_good and self.end.stability is not Stability.SETTLED:
+            phrase = f"{phrase} at the end of the record"
+            if self.end.behaviour is EndBehaviour.UNDECIDED:
+                phrase = "the end of the record shows no trend yet"
+        text = f"{self.stability}: {phrase}"
         rests_on = self.decision.rests_on
         return f"{text}; rests on: {rests_on}" if rests_on else text
-
-    def _describe_end(self) -> str:
-        """Returns how the run ended, as a phrase that agrees with the judgement.
-
-        A proof may show a run to be stable whose end, taken alone, would be judged otherwise.
-        """
-        is_good = self.stability in (Stability.STABLE, Stability.SETTLED)
-        if not is_good or self.end.stability is Stability.SETTLED:
-            return self.end.phrase
-        if self.end.behaviour is EndBehaviour.UNDECIDED:
-            return "the end of the record shows no trend yet"
-        return f"{self.end.phrase} at the end of the record"
 
     def to_dict(self) -> JsonObject:
         """Returns the certificate as plain values, with the keys of `trilat certify --json`."""

@@ -283,13 +283,18 @@ def _open_page(files: list[Path]) -> None:
     import webbrowser
     from contextlib import suppress
 
-    from ...files import format_extra_install, make_results_folder, refuse_link
+    from ...files import (
+        choose_report_folder,
+        format_extra_install,
+        make_results_folder,
+        refuse_link,
+    )
     from ...presentation.conclude import conclude
 
     terminal.print_note(
         f"Rerun is not installed ({format_extra_install('view')}); this is the log's page"
     )
-    folder = files[0].with_suffix("")
+    folder = choose_report_folder(files[0])
     refuse_link(folder)
     page = folder / "report.html"
     if not page.is_file():

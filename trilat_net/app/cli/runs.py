@@ -434,13 +434,13 @@ def report_command(
 
     A summary is written beside the page, and with --png also the figures.
     """
-    from ...files import make_results_folder, refuse_link
+    from ...files import choose_report_folder, make_results_folder, refuse_link
     from ...presentation.conclude import conclude
 
     log = laws.open(*files)  # so that no folder is created for a log that cannot be read
     if folder is None:
         # The sender of the log may have placed a symbolic link at the default path.
-        folder = files[0].with_suffix("")
+        folder = choose_report_folder(files[0])
         refuse_link(folder)
     results = make_results_folder(folder, "", force=force)
     with terminal.progress_bar(f"checking {files[0]} and drawing") as progress:
