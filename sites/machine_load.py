@@ -25,7 +25,7 @@ _IDLE_COLUMNS = slice(3, 5)  # idle, and waiting for a disk
 _TIME_COLUMNS = slice(0, 8)  # without guests, whose time the column "user" includes
 
 
-class ProcessorTimes(NamedTuple):
+class _ProcessorTimes(NamedTuple):
     """Times that all processors of the machine have spent since its start, in system ticks.
 
     Attributes:
@@ -37,7 +37,7 @@ class ProcessorTimes(NamedTuple):
     total: int
 
     @classmethod
-    def parse(cls, text: str) -> "ProcessorTimes":
+    def parse(cls, text: str) -> "_ProcessorTimes":
         """Parses the times from the content of /proc/stat, as proc_stat(5) describes it.
 
         The first line of the file is used, which is the sum of all processors.
@@ -61,9 +61,9 @@ def measure_busy_share(clock: Clock) -> float | None:
         The fraction between 0 and 1. None if the operating system does not report it.
     """
     with suppress(OSError, ValueError, IndexError):
-        before = ProcessorTimes.parse(_STATISTICS.read_text(encoding="ascii"))
+        before = _ProcessorTimes.parse(_STATISTICS.read_text(encoding="ascii"))
         clock.sleep_until(clock.monotonic_ns() + MEASURED_NS)
-        after = ProcessorTimes.parse(_STATISTICS.read_text(encoding="ascii"))
+        after = _ProcessorTimes.parse(_STATISTICS.read_text(encoding="ascii"))
         passed = after.total - before.total
         if passed > 0:
             idle_share = (after.idle - before.idle) / passed

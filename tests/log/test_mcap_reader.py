@@ -17,9 +17,12 @@ from trilat_net.execution import virtual
 from trilat_net.log import mcap_reader, mcap_records
 from trilat_net.log.mcap_reader import McapMessage, McapReader
 from trilat_net.log.mcap_records import (
+    MAGIC,
     RECORD_HEAD_BYTES,
+    Damage,
     RecordFrame,
     RecordScanner,
+    ScannedRecord,
     UnreadableRecord,
     unpack_chunk,
 )
@@ -74,6 +77,62 @@ def test_a_torn_file_gives_every_chunk_that_is_whole(size: int) -> None:
     assert walk.torn is not None or size == FRAMES[-1].end
     assert sum(walk.chunks.values()) == len(whole)
     assert items == ITEMS[: len(items)]
+
+
+def overwritten(offset: int, foreign: bytes) -> bytes:
+    return DATA[:offset] + foreign + DATA[offset + len(foreign) :]
+
+
+OFFSETS = st.integers(len(MAGIC), len(DATA) - 1)
+FOREIGN = st.binary(min_size=1, max_size=300)
+
+
+@settings(max_examples=40)
+@given(OFFSETS, FOREIGN)
+def test_a_scan_leaves_out_no_byte(offset: int, foreign: bytes) -> None:
+    """Records and damaged parts follow each other without a gap up to the end mark."""
+    data = overwritten(offset, foreign)
+    scanner = RecordScanner(io.BytesIO(data))
+    damaged = []
+    covered = len(MAGIC)
+    for item in scanner.scan():
+        if isinstance(item, Damage):
+            damaged.append(item)
+            begin, end = item.offset, item.offset + item.length
+        else:
+            begin, end = item.frame.offset, item.frame.end
+            assert item.content == data[begin + RECORD_HEAD_BYTES : end]
+        assert begin <= covered
+        covered = max(covered, end)
+    assert damaged == scanner.damaged
+    if scanner.torn is not None:
+        assert scanner.torn.offset <= covered
+        covered = scanner.torn.offset + scanner.torn.length
+        assert covered == len(data)
+    else:
+        footer_bytes = FRAMES[-1].size
+        rest = len(data) - covered - scanner.trailing - len(MAGIC)
+        assert rest in (0, footer_bytes)
+
+
+@settings(max_examples=20)
+@given(OFFSETS, FOREIGN)
+def test_both_ways_of_reading_give_the_same(offset: int, foreign: bytes) -> None:
+    """Who reads the messages alone, and who scans the records, finds the same in a damaged file."""
+    data = overwritten(offset, foreign)
+    walk, items = walked(data)
+    scan = McapReader(io.BytesIO(data), "file")
+    scanned = [
+        message
+        for record in scan.scan()
+        if isinstance(record, ScannedRecord)
+        for message in scan.read_record(record)
+    ]
+    assert scanned == items
+    assert set(scan.damaged) == set(walk.damaged)
+    assert (scan.torn, scan.complete) == (walk.torn, walk.complete)
+    assert (scan.metadata, scan.attachments) == (walk.metadata, walk.attachments)
+    assert scan.judge_digest() == walk.judge_digest()
 
 
 @settings(max_examples=20)

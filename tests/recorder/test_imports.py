@@ -5,7 +5,7 @@ import sys
 
 from tests import house
 
-MOST_FILES = 40
+MOST_FILES = 45
 PROGRAM = """
 import sys
 from recorder import backfill, record_process, session_recording, site_reception

@@ -339,7 +339,7 @@ PROGRESS_EVERY = 256
 """Number of records between two reports of progress."""
 
 
-class SiteVerifier:
+class _SiteVerifier:
     """Executes one site again from its records, and compares each record with the result.
 
     The state of the executed site is certain as long as it follows from the records before. It
@@ -791,7 +791,7 @@ def _execute_sites(
     for name in sites:
         if name in withheld:
             continue
-        verifier = SiteVerifier(
+        verifier = _SiteVerifier(
             log=log, site=name, by_tick=by_tick, result=result, resume_every=resume_every
         )
         verifier.run(report)

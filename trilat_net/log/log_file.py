@@ -117,7 +117,7 @@ SYNC_PERIOD_NS = 1_000_000_000
 """Period with which a thread syncs the file, in ns."""
 
 
-class FileSync:
+class _FileSync:
     """Forces the data of one file onto the disk (sync), so that they survive a loss of power.
 
     Args:
@@ -251,7 +251,7 @@ class LogFile:
             raise UsageError(str(describe_write_error(path, error))) from None
         sync_folder(path.parent)
         self._room = room or DiskReserve(path.parent)
-        self._syncing = FileSync(
+        self._syncing = _FileSync(
             self._raw.fileno(), durable, now_ns or SystemClock().monotonic_ns
         )
         self._pending = bytearray()

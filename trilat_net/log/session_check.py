@@ -128,7 +128,7 @@ def check_file(*files: str | Path, progress: Progress | None = None) -> LogCheck
     Raises:
         LogError: A file cannot be read, or belongs to another session than the previous files.
     """
-    check = SessionCheck()
+    check = _SessionCheck()
     paths = [Path(file) for file in files]
     try:
         total = sum(path.stat().st_size for path in paths)
@@ -146,7 +146,7 @@ def check_file(*files: str | Path, progress: Progress | None = None) -> LogCheck
     )
 
 
-class ChannelCheck:
+class _ChannelCheck:
     """Checks the messages of one channel of a session: their numbers, schema and time stamps.
 
     Args:
@@ -380,7 +380,7 @@ def _parse_number(about: Mapping[str, str], key: str) -> int:
     return int(text) if re.fullmatch(r"\d{1,19}", text) else 0
 
 
-class SessionCheck:
+class _SessionCheck:
     """Checks one session, whose log is one file or several parts.
 
     The caller passes the files to `read`, one after another, and then gets the results from
@@ -393,7 +393,7 @@ class SessionCheck:
 
     def __init__(self) -> None:
         self.ours = False
-        self.channels: dict[str, ChannelCheck] = {}
+        self.channels: dict[str, _ChannelCheck] = {}
         self._findings = Findings()
         self._counts: Counter[str] = Counter()
         self._scenario: Scenario | None = None
@@ -448,7 +448,7 @@ class SessionCheck:
         Raises:
             LogError: The file belongs to another session than the previous files.
         """
-        checks: dict[str, ChannelCheck | None] = {}
+        checks: dict[str, _ChannelCheck | None] = {}
         self._file = file
         has_begun = False
         for message in _read_checked(reader, structure):
@@ -577,7 +577,7 @@ class SessionCheck:
                     f"has the {key} {value}, but the session states {stated_value!r}",
                 )
 
-    def _begin_channel(self, channel: ChannelInfo) -> ChannelCheck | None:
+    def _begin_channel(self, channel: ChannelInfo) -> _ChannelCheck | None:
         """Begins the check of a channel in the present file, when its first message is read.
 
         The description of the channel (its schema, encoding and metadata) is checked at once,
@@ -619,7 +619,7 @@ class SessionCheck:
                     self._file, None, f"{shown_topic}: the scenario has no member of this name"
                 )
             self._counted.open_channel(topic)
-            self.channels[topic] = ChannelCheck(
+            self.channels[topic] = _ChannelCheck(
                 key=key,
                 about=self._about,
                 scenario=self._scenario,
