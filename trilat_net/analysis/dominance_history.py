@@ -259,16 +259,32 @@ def find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:
     return lost
 
 
-def list_losses(log: Log) -> list[str]:
-    """Describes when sites continued without a peer that they no longer heard.
+class PeerLoss(NamedTuple):
+    """A span of time in which a site continued without a peer that it no longer heard.
+
+    Attributes:
+        site: Name of the site.
+        peer: Name of the peer.
+        from_s: Start, in s.
+        to_s: End, in s.
+    """
+
+    site: str
+    peer: str
+    from_s: float
+    to_s: float
+
+
+def list_losses(log: Log) -> list[PeerLoss]:
+    """Lists when sites continued without a peer that they no longer heard.
 
     Args:
         log: The log of the run.
 
     Returns:
-        A sentence for each span of time. Empty if no peer was lost.
+        Each span of time, by site and peer. Empty if no peer was lost.
     """
-    sentences = []
+    losses = []
     for site in log.sites:
         part = log[site]
         is_lost = find_lost_peers(log, site, part.t_s)
@@ -283,12 +299,11 @@ def list_losses(log: Log) -> list[str]:
             edges = np.diff(lost[:, j], prepend=0, append=0)
             start_rows = np.flatnonzero(edges > 0)
             end_rows = np.flatnonzero(edges < 0)
-            starts_s = times_s[start_rows]
-            ends_s = times_s[end_rows]
+            starts_s = times_s[start_rows].tolist()
+            ends_s = times_s[end_rows].tolist()
             for from_s, to_s in zip(starts_s, ends_s, strict=True):
-                sentence = f"{site} without {peer} {from_s:.4g} to {to_s:.4g} s"
-                sentences.append(sentence)
-    return sentences
+                losses.append(PeerLoss(site, peer, from_s, to_s))
+    return losses
 
 
 def list_scripted_ramps(scenario: Scenario, site: str) -> tuple[Array, list[DominanceRamp]]:

@@ -3,14 +3,16 @@
 Walls that are held over a tick: what they give, the damping that takes it, and the premise by its name.
 """
 
+from collections.abc import Iterator, Mapping
 from types import SimpleNamespace
+from typing import get_args
 
 import numpy as np
 import pytest
 
 import trilat_net
+from trilat_net.analysis.certificate.premise_quantities import AbsentSpan, PremiseQuantities
 from trilat_net.analysis.certificate.premises import (
-    AbsentSpan,
     Premise,
     check_premises,
     find_absent_spans,
@@ -19,6 +21,7 @@ from trilat_net.analysis.certificate.premises import (
 from trilat_net.analysis.torque_sources import find_wall_energies
 from trilat_net.core.step.vectors import Array
 from trilat_net.log.log_reader import Log
+from trilat_net.presentation import premise_text
 from trilat_net.scenario import load_scenario
 
 from . import runs
@@ -88,6 +91,22 @@ def test_one_that_fails_says_why(name: str, overrides: dict[str, object], says: 
     found = premises(**overrides)[name]
     assert found.holds is False
     assert says in found.text
+    assert [text for text in strings_in(found.quantities) if " " in text] == []
+
+
+def strings_in(value: object) -> Iterator[str]:
+    """Yields every string in the quantities of a premise."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, Mapping):
+        yield from strings_in((*value.keys(), *value.values()))
+    elif isinstance(value, tuple):
+        for item in value:
+            yield from strings_in(item)
+
+
+def test_each_kind_of_quantities_has_its_sentence() -> None:
+    assert set(premise_text._DESCRIBE) == set(get_args(PremiseQuantities))
 
 
 def test_unequal_scalars_of_kd_hold() -> None:

@@ -31,6 +31,7 @@ from ...results import JsonObject
 from ...scenario.describe import find_energy_laws
 from ..aligned import hold_torque
 from ..arm_rows import build_arm_rows
+from .premise_quantities import BookedTorqueQuantities, BooksQuantities, SamplingQuantities
 from .premises import Premise
 
 LEAST_ENERGY_J = -1e-9
@@ -149,7 +150,7 @@ class ObservedEnergy(NamedTuple):
         content = self._asdict()
         del content["curves"]
         content["finding"] = self.finding.name.lower()
-        content["premises"] = [premise._asdict() for premise in self.premises]
+        content["premises"] = [premise.to_json() for premise in self.premises]
         content["least"] = [least._asdict() for least in self.least]
         return content
 
@@ -487,8 +488,8 @@ def _check_books(log: Log, books: Mapping[str, _SiteBooks], scale_j: float) -> l
     residual_j = {site: _largest_residual_j(site_books) for site, site_books in books.items()}
     worst = max(residual_j, key=residual_j.__getitem__)
     holds = residual_j[worst] <= -LEAST_ENERGY_J + 1e-9 * scale_j
-    text = f"the books of {worst}'s law close to {residual_j[worst]:.1e} J of {scale_j:.4g} J"
-    premises = [Premise("books", holds, f"{text}, and the others closer")]
+    books_quantities = BooksQuantities(worst, residual_j[worst], scale_j)
+    premises = [Premise("books", holds, books_quantities)]
 
     limited = []
     for site in books:
@@ -497,20 +498,11 @@ def _check_books(log: Log, books: Mapping[str, _SiteBooks], scale_j: float) -> l
             limited.append(site)
     leak_j = {site: float(site_books.leak.max()) for site, site_books in books.items()}
     largest_leak_j = SAMPLING_SHARE * scale_j + 1e-9
-    unbooked = [site for site in limited if leak_j[site] > largest_leak_j]
-    if unbooked:
-        text = (
-            f"cut off at {', '.join(unbooked)}: the law books another torque than the arm got"
-        )
-    elif limited:
-        text = f"cut off at {', '.join(limited)}, and booked so"
-    else:
-        text = "never cut off"
-    premises.append(Premise("torque", not unbooked, text))
+    unbooked = tuple(site for site in limited if leak_j[site] > largest_leak_j)
+    torques = BookedTorqueQuantities(tuple(limited), unbooked)
+    premises.append(Premise("torque", not unbooked, torques))
 
     worst = max(leak_j, key=leak_j.__getitem__)
-    text = f"the arm of {worst} got up to {leak_j[worst]:.3g} J more than its law books"
-    premises.append(
-        Premise("sampling", leak_j[worst] <= largest_leak_j, f"{text}, between ticks")
-    )
+    sampling = SamplingQuantities(worst, leak_j[worst])
+    premises.append(Premise("sampling", leak_j[worst] <= largest_leak_j, sampling))
     return premises

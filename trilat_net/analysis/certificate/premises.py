@@ -15,23 +15,25 @@ proof is in docs/theory/theorem.md. The theorem has conditions, called premises:
 The module also collects how many records were available.
 
 Invariant:
-    - A premise holds, fails, or cannot be decided, and always states its evidence.
+    - A premise holds, fails, or cannot be decided, and always contains the quantities that show
+      it. The package `presentation` writes the sentences about them.
     - Missing information never makes a run stable. The judgement stays open if too many records
       are missing, or if the run was repeated with the recorded motion of some sites.
     - A log that was changed after it was written does not pass.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...errors import count_nouns
+from ...hooks import find_hook
 from ...log.accounting import Coverage
 from ...log.log_reader import Log
 from ...log.running_digest import Integrity
 from ...log.session_check import judge_integrity
 from ...net.messages import HALTED_MODES
+from ...results import JsonObject
 from ...scenario import Scenario
 from ..aligned import Bools, find_unlimited_rows
 from ..dominance_history import (
@@ -53,6 +55,33 @@ from .energy_balance import (
     rise_above_minimum,
 )
 from .energy_terms import SiteConstants, derive_site_constants
+from .premise_quantities import (
+    AbsentSpan,
+    AgeRange,
+    AxisQuantities,
+    CutTorque,
+    DelayQuantities,
+    DominanceQuantities,
+    FollowingQuantities,
+    FunctionalObstacle,
+    GainQuantities,
+    Interruption,
+    LawQuantities,
+    MissingFunctional,
+    OperatorQuantities,
+    ParameterFault,
+    ParameterQuantities,
+    PremiseQuantities,
+    PresenceQuantities,
+    PresentStretch,
+    RecordQuantities,
+    SingularPoseQuantities,
+    StopQuantities,
+    Supply,
+    TorqueQuantities,
+    TouchedStop,
+    WallQuantities,
+)
 
 CONSTANT_DELAY_TOLERANCE_S = 1e-7
 """Ages of samples that differ by less than this count as equal, in s.
@@ -78,16 +107,9 @@ LEAST_SPEED_M_S = 1e-9
 
 Slower speeds are the rounding error of an axis along which the end effector cannot move.
 """
-MAX_LISTED_NAMES = 4
-"""Largest number of links or sites that a sentence names."""
-
 
 NO_COMMON_TIME = "there is no time at which every site has records"
 NO_PERIOD = "there is no period whose records are complete"
-_ORIENTATIONS_TEXT = (
-    "the arm follows orientations, for which ed is not the derivative of e, "
-    "so dV/dt has terms of either sign"
-)
 
 
 class Premise(NamedTuple):
@@ -97,16 +119,25 @@ class Premise(NamedTuple):
         name: Key of the premise, as in "delays".
         holds: True if the run meets the condition, False if not, None if the log does not show
             it.
-        text: The evidence, as a sentence.
+        quantities: What the log shows about the condition.
     """
 
     name: str
     holds: bool | None
-    text: str
+    quantities: PremiseQuantities
+
+    @property
+    def text(self) -> str:
+        """The evidence, as a sentence."""
+        return str(find_hook("describe a premise")(self.quantities))
+
+    def to_json(self) -> JsonObject:
+        """Returns the premise as plain values, with the keys of `trilat certify --json`."""
+        return {"name": self.name, "holds": self.holds, "text": self.text}
 
 
-def explain_no_functional(scenario: Scenario) -> str:
-    """Explains for which arms the energy function of the stability proof does not exist.
+def find_missing_functionals(scenario: Scenario) -> list[MissingFunctional]:
+    """Finds the arms for which the energy function of the stability proof does not exist.
 
     The energy exists only for certain control laws. It requires the true dynamic parameters of
     the arm. It is not defined if the end effector also follows the orientation of other arms.
@@ -115,37 +146,39 @@ def explain_no_functional(scenario: Scenario) -> str:
         scenario: The description of the experiment.
 
     Returns:
+        The sites of these arms, grouped by the reason. Empty if the energy exists for every
+        arm.
+    """
+    sites_by_reason: dict[tuple[FunctionalObstacle, str], list[str]] = {}
+    for site, spec in scenario.sites.items():
+        law = ""
+        if not spec.arm.known:
+            obstacle = FunctionalObstacle.UNKNOWN_PARAMETERS
+        elif not spec.control.has_functional:
+            obstacle = FunctionalObstacle.LAW
+            law = spec.control.tag
+        elif spec.task.space == "pose":
+            obstacle = FunctionalObstacle.ORIENTATIONS
+        else:
+            continue
+        sites_by_reason.setdefault((obstacle, law), []).append(site)
+    return [
+        MissingFunctional(obstacle, law, tuple(sites))
+        for (obstacle, law), sites in sites_by_reason.items()
+    ]
+
+
+def explain_no_functional(scenario: Scenario) -> str:
+    """Explains for which arms the energy function of the stability proof does not exist.
+
+    Args:
+        scenario: The description of the experiment.
+
+    Returns:
         The names of these arms' sites and the reasons, separated by semicolons. Empty if the
         energy exists for every arm.
     """
-    sites_by_reason: dict[str, list[str]] = {}
-    for site, spec in scenario.sites.items():
-        if not spec.arm.known:
-            reason = "theta of the arm is unknown, and V depends on it"
-        elif not spec.control.has_functional:
-            reason = f"law {spec.control.tag} has no functional V"
-        elif spec.task.space == "pose":
-            reason = _ORIENTATIONS_TEXT
-        else:
-            continue
-        sites_by_reason.setdefault(reason, []).append(site)
-    return "; ".join(
-        f"{', '.join(sites)}: {reason}" for reason, sites in sites_by_reason.items()
-    )
-
-
-class AbsentSpan(NamedTuple):
-    """A span of time during which a site was absent from the session.
-
-    Attributes:
-        site: Name of the site.
-        from_s: Start, in s after the start of the session.
-        to_s: End, in s.
-    """
-
-    site: str
-    from_s: float
-    to_s: float
+    return str(find_hook("describe missing functionals")(find_missing_functionals(scenario)))
 
 
 class FunctionalFacts(NamedTuple):
@@ -255,10 +288,9 @@ def check_premises(run: RunFacts) -> list[Premise]:
     Returns:
         The premises that concern this run, in the order in which a certificate lists them.
     """
-    law_text = run.unknown
-    if run.constants:
-        law_text = "adaptive at every site, of arms whose theta is known"
-    premises: list[Premise | None] = [Premise("law", bool(run.constants), law_text)]
+    missing = find_missing_functionals(run.log.scenario)
+    law = Premise("law", bool(run.constants), LawQuantities(tuple(missing)))
+    premises: list[Premise | None] = [law]
 
     if run.constants:
         premises += [_check_parameters(run), _check_gains(run)]
@@ -282,22 +314,16 @@ def _check_parameters(run: RunFacts) -> Premise:
         low = constants.low
         high = constants.high
         if ((theta < low) | (theta > high)).any():
-            faults.append(
-                f"{site}: theta is outside the box in which the law keeps its estimates"
-            )
+            faults.append((site, ParameterFault.OUTSIDE_BOX))
 
         gains = run.log.scenario.sites[site].control.gains(theta)
         first_estimate = np.clip(gains.theta_hat0, low, high)
         is_wrong_forever = ~constants.adapts & (first_estimate != theta)
         if is_wrong_forever.any():
-            faults.append(f"{site}: a parameter is neither learnt nor known")
+            faults.append((site, ParameterFault.NEVER_LEARNT))
         if constants.unknown_friction.any():
-            faults.append(f"{site}: the law does not compensate all friction of the joints")
-
-    if faults:
-        return Premise("parameters", False, _join_limited(faults))
-    text = "every parameter is learnt or known, and no box excludes it"
-    return Premise("parameters", True, text)
+            faults.append((site, ParameterFault.FRICTION))
+    return Premise("parameters", not faults, ParameterQuantities(tuple(faults)))
 
 
 def _check_gains(run: RunFacts) -> Premise:
@@ -308,20 +334,16 @@ def _check_gains(run: RunFacts) -> Premise:
     constants = run.constants
     Kd = np.array([site_constants.weighing_Kd for site_constants in constants.values()])
     scales = find_kd_scales(Kd)
-    if scales is None:
-        rows = []
-        for site, site_constants in constants.items():
-            values = ", ".join(f"{value:g}" for value in site_constants.Kd)
-            rows.append(f"{site} ({values})")
-        text = f"Kd differs in shape between sites, so that no beta exists: {', '.join(rows)}"
-        return Premise("Kd", False, text)
-
-    if not Kd.all():  # NaN (an axis that is not followed) counts as positive
-        return Premise("Kd", False, "some Kd is zero, but the theorem requires positive Kd")
-    if np.ptp(scales) == 0.0:
-        return Premise("Kd", True, "one Kd for all sites")
-    scales_by_site = dict(zip(constants, scales, strict=True))
-    return Premise("Kd", True, f"one Kd up to a scalar: {_format_by_site(scales_by_site)}")
+    scales_by_site = None
+    if scales is not None:
+        scales_by_site = dict(zip(constants, map(float, scales), strict=True))
+    quantities = GainQuantities(
+        Kd={site: tuple(one_site.Kd.tolist()) for site, one_site in constants.items()},
+        scales=scales_by_site,
+        is_positive=bool(Kd.all()),  # NaN (an axis that is not followed) counts as positive
+    )
+    holds = scales_by_site is not None and quantities.is_positive
+    return Premise("Kd", holds, quantities)
 
 
 def _check_walls(log: Log) -> Premise | None:
@@ -336,23 +358,8 @@ def _check_walls(log: Log) -> Premise | None:
     """
     if not any(map(list_sampled_walls, log.scenario.sites.values())):
         return None
-    walls = find_wall_energies(log)
-    if not walls:
-        return Premise("walls", True, "no sampled wall was touched")
-
-    active = [wall for wall in walls if wall.arm_damping_n_s_m <= wall.required_damping_n_s_m]
-    summary = "every sampled wall is passive"
-    listed_walls = walls
-    if active:
-        summary = "a sampled wall generates energy in contact"
-        listed_walls = active
-    texts = [
-        f"{wall.site}: K h / 2 + B is {wall.required_damping_n_s_m:.3g} N s/m, the arm's own "
-        f"damping {wall.arm_damping_n_s_m:.3g}; generated {wall.generated_j:.3g} J "
-        "with respect to qd"
-        for wall in listed_walls
-    ]
-    return Premise("walls", not active, f"{summary}: {'; '.join(texts)}")
+    quantities = WallQuantities(tuple(find_wall_energies(log)))
+    return Premise("walls", not quantities.active, quantities)
 
 
 def _check_dominance(run: FunctionalFacts) -> Premise:
@@ -368,48 +375,22 @@ def _check_dominance(run: FunctionalFacts) -> Premise:
         site for site, energy in energies.items() if not energy.motion.dominance.constant
     ]
     if changing:
-        losses = list_losses(run.log)
-        text = f"the shares of {_join_limited(changing)} change"
-        if losses:
-            text += f": {_join_limited(losses)}; the remaining sites follow each other"
-        return Premise("shares", False, text)
+        losses = tuple(list_losses(run.log))
+        quantities = DominanceQuantities(changing=tuple(changing), losses=losses)
+        return Premise("shares", False, quantities)
 
     Kd = np.array([energy.motion.constants.weighing_Kd for energy in energies.values()])
     weights = compute_lyapunov_weights(run.log.scenario.alpha, Kd)
-    groups = [tuple(names[n] for n in group) for group in weights.groups]
+    groups = tuple(tuple(names[n] for n in group) for group in weights.groups)
     if len(groups) > 1:
-        return Premise("shares", False, describe_closed_groups(groups))
+        return Premise("shares", False, DominanceQuantities(groups=groups))
 
-    weightless = [site for site in names if site not in groups[0]]
-    if weightless:
-        followers = ", ".join(weightless)
-        text = (
-            f"alpha is reducible: none of {', '.join(groups[0])} follows {followers}, whose "
-            f"beta is 0, so V says nothing about {followers}, which follow as in a cascade"
-        )
-        return Premise("shares", False, text)
-
-    text = "constant, alpha irreducible"
+    weightless = tuple(site for site in names if site not in groups[0])
+    beta = None
     if weights.scales is not None:
-        beta_by_site = dict(zip(names, weights.beta, strict=True))
-        text += f"; beta: {_format_by_site(beta_by_site)}"
-    return Premise("shares", True, text)
-
-
-def describe_closed_groups(groups: Sequence[Sequence[str]]) -> str:
-    """Returns a sentence that the total energy of all arms is not defined, and why.
-
-    The total energy weights each site, the process that runs one arm. If no group of sites
-    follows another group, the weights of the groups relative to each other are arbitrary.
-
-    Args:
-        groups: Names of the sites in each group. They follow each other and no site outside the
-            group.
-    """
-    group_texts = " and ".join("{" + ", ".join(group) + "}" for group in groups)
-    return (
-        f"{group_texts} follow nobody outside: beta is not unique, certify each group by itself"
-    )
+        beta = dict(zip(names, weights.beta.tolist(), strict=True))
+    quantities = DominanceQuantities(groups=groups, weightless=weightless, beta=beta)
+    return Premise("shares", not weightless, quantities)
 
 
 def _check_delays(run: FunctionalFacts) -> Premise:
@@ -419,7 +400,7 @@ def _check_delays(run: FunctionalFacts) -> Premise:
     no sample of any peer came into use.
     """
     varying = []
-    constant = set()
+    constant_s = []
     for site, energy in run.energies.items():
         records = energy.motion.records
         for peer, view in energy.followed.items():
@@ -432,19 +413,20 @@ def _check_delays(run: FunctionalFacts) -> Premise:
             latest_first_s = records.h_s + CONSTANT_DELAY_TOLERANCE_S
             starts_late = records.first == 0 and first_stamp_s > latest_first_s
             if np.ptp(age_s) > CONSTANT_DELAY_TOLERANCE_S or starts_late:
-                shortest_ms = 1e3 * age_s.min()
-                longest_ms = 1e3 * age_s.max()
-                varying.append(f"{peer}->{site} ({shortest_ms:.4g} to {longest_ms:.4g} ms)")
+                ages = AgeRange(
+                    peer=peer,
+                    site=site,
+                    shortest_s=float(age_s.min()),
+                    longest_s=float(age_s.max()),
+                )
+                varying.append(ages)
             else:
-                constant.add(f"{1e3 * age_s[0]:.4g} ms")
+                constant_s.append(float(age_s[0]))
 
-    if varying:
-        text = f"the age of the sample in use varies: {_join_limited(varying)}"
-        return Premise("delays", False, text)
-    if not constant:
-        return Premise("delays", None, "no sample came into use")
-    text = f"constant on every link: {', '.join(sorted(constant))}"
-    return Premise("delays", True, text)
+    holds = None
+    if varying or constant_s:
+        holds = not varying
+    return Premise("delays", holds, DelayQuantities(tuple(varying), tuple(constant_s)))
 
 
 def _check_following(run: FunctionalFacts) -> Premise:
@@ -461,37 +443,34 @@ def _check_following(run: FunctionalFacts) -> Premise:
         if intervals:
             from_s = intervals[0].from_s
             to_s = intervals[-1].to_s
-            interruptions.append(f"{site} {from_s:.4g} to {to_s:.4g} s")
+            interruptions.append(Interruption(site, from_s, to_s))
         is_halted = is_halted or any(interval.mode in HALTED_MODES for interval in intervals)
 
+    limited_ticks = {}
     for site in log.sites:
         limits = log.scenario.sites[site].limits
         limited_rows = ~find_unlimited_rows(limits, log[site].qd_des)
         if limited_rows.any():
-            ticks = count_nouns(np.count_nonzero(limited_rows), "tick")
-            interruptions.append(f"{site} with a reference as fast as it may be at {ticks}")
+            limited_ticks[site] = int(np.count_nonzero(limited_rows))
 
-    if not interruptions:
-        return Premise("following", True, "every site follows its peers all the time")
-    modes = "hold, brake, return or stop" if is_halted else "hold, brake or return"
-    return Premise("following", False, f"{modes}: {_join_limited(interruptions)}")
+    holds = not interruptions and not limited_ticks
+    quantities = FollowingQuantities(tuple(interruptions), limited_ticks, is_halted)
+    return Premise("following", holds, quantities)
 
 
 def _check_torque_limits(run: FunctionalFacts) -> Premise:
     """Checks that no torque of a law was cut off at the limit of its actuator."""
-    limited_sites = []
+    cut_off = []
     for site, energy in run.energies.items():
         limited = energy.motion.limited
         if limited.any():
-            ticks = count_nouns(np.count_nonzero(limited.any(axis=1)), "tick")
-            limited_sites.append(f"{site}{_name_joints(run, site, limited)} at {ticks}")
-    if limited_sites:
-        return Premise("torque", False, f"cut off: {_join_limited(limited_sites)}")
-    return Premise("torque", True, "never cut off")
+            ticks = int(np.count_nonzero(limited.any(axis=1)))
+            cut_off.append(CutTorque(site, _find_joints(run, site, limited), ticks))
+    return Premise("torque", not cut_off, TorqueQuantities(tuple(cut_off)))
 
 
-def _name_joints(run: FunctionalFacts, site: str, affected: Bools) -> str:
-    """Returns the names of affected joints in parentheses, with a space before them.
+def _find_joints(run: FunctionalFacts, site: str, affected: Bools) -> tuple[str, ...]:
+    """Returns the names of affected joints.
 
     Args:
         run: Facts of the run.
@@ -499,13 +478,12 @@ def _name_joints(run: FunctionalFacts, site: str, affected: Bools) -> str:
         affected: True for each record and joint that is affected, shape (K, n).
 
     Returns:
-        The text. Empty for the built-in planar arm, whose joints have no names.
+        The names. Empty for the built-in planar arm, whose joints have no names.
     """
     model = run.log.scenario.arms[site]
     if model.chain is None:
-        return ""
-    names = [model.joint_names[n] for n in np.flatnonzero(affected.any(axis=0))]
-    return f" ({_join_limited(names)})"
+        return ()
+    return tuple(model.joint_names[n] for n in np.flatnonzero(affected.any(axis=0)))
 
 
 def _check_stops(run: FunctionalFacts) -> Premise | None:
@@ -526,12 +504,9 @@ def _check_stops(run: FunctionalFacts) -> Premise | None:
         records = energy.motion.records
         pushed = energy.motion.constants.arm.stop_torque(records.q, records.qd) != 0.0
         if pushed.any():
-            first_s = records.t_s[int(np.argmax(pushed.any(axis=1)))]
-            touched.append(f"{site}{_name_joints(run, site, pushed)} from {first_s:.4g} s on")
-    if touched:
-        text = f"the arm runs into the stops of its joints: {_join_limited(touched)}"
-        return Premise("stops", False, text)
-    return Premise("stops", True, "no stop is touched")
+            first_s = float(records.t_s[int(np.argmax(pushed.any(axis=1)))])
+            touched.append(TouchedStop(site, _find_joints(run, site, pushed), first_s))
+    return Premise("stops", not touched, StopQuantities(tuple(touched)))
 
 
 def _check_axes(run: FunctionalFacts) -> Premise | None:
@@ -560,14 +535,8 @@ def _check_axes(run: FunctionalFacts) -> Premise | None:
             is_followed = site in run.energies[follower].followed
             followed_axes = np.array(follower_motion.constants.axes) > 0.0
             if is_followed and (free_axes & followed_axes).any():
-                faults.append(
-                    f"{follower} follows {site} along an axis that {site} does not follow"
-                )
-
-    if faults:
-        return Premise("axes", False, _join_limited(faults))
-    text = "every site follows along each axis along which it moves and is followed"
-    return Premise("axes", True, text)
+                faults.append((follower, site))
+    return Premise("axes", not faults, AxisQuantities(tuple(faults)))
 
 
 def _check_singular_poses(run: FunctionalFacts) -> Premise | None:
@@ -579,26 +548,21 @@ def _check_singular_poses(run: FunctionalFacts) -> Premise | None:
     Returns:
         The premise. None if all sites work in joint space.
     """
-    near = []
-    least_by_site = {}
+    near_s = {}
+    least_values = {}
     for site, energy in run.energies.items():
         following = energy.motion.following
         if not isinstance(following, TaskFollowing):
             continue
-        least_by_site[site] = following.least.min()
+        least_values[site] = float(following.least.min())
         if following.damping.any():
             first_row = int(np.argmax(following.damping > 0.0))
-            first_s = energy.motion.records.t_s[first_row]
-            near.append(f"{site} from {first_s:.4g} s on")
+            near_s[site] = float(energy.motion.records.t_s[first_row])
 
-    if not least_by_site:
+    if not least_values:
         return None
-    if near:
-        text = f"a pose is so nearly singular that it is damped: {_join_limited(near)}"
-        return Premise("singular poses", False, text)
-    bounds = _format_by_site(least_by_site)
-    text = f"no pose is near one; least singular value at least: {bounds}"
-    return Premise("singular poses", True, text)
+    quantities = SingularPoseQuantities(near_s, least_values)
+    return Premise("singular poses", not near_s, quantities)
 
 
 def _check_operators(run: FunctionalFacts) -> Premise:
@@ -621,41 +585,32 @@ def _check_operators(run: FunctionalFacts) -> Premise:
     external = run.log.scenario.external
     if external and not push_times_s:
         # Arms outside the program record their external torque only if they measure it.
-        text = f"no record says who pushes the arm of {_join_limited(external)}"
-        return Premise("hands", None, text)
+        return Premise("hands", None, OperatorQuantities(unmeasured=tuple(external)))
     if not push_times_s:
-        return Premise("hands", True, "nobody pushes")
+        return Premise("hands", True, OperatorQuantities())
 
-    weightless = [
+    weightless = tuple(
         site
         for n, site in enumerate(energies)
         if site in push_times_s and not balance.beta[:, n].any()
-    ]
+    )
     if weightless:
-        sites = _join_limited(weightless)
-        return Premise("hands", False, f"{sites}, of beta 0, is pushed: V does not show that")
+        return Premise("hands", False, OperatorQuantities(weightless=weightless))
 
     supplied_j = float(rise_above_minimum(balance.external_work).max())
-    sources = " and ".join(balance.external)
-    if supplied_j <= 1e-9 * balance.scale + ZERO_ENERGY_J:
-        text = f"the {sources} only absorbed energy: passive with respect to r"
-        return Premise("hands", True, text)
-
-    in_task_space = any(energy.motion.constants.axes for energy in energies.values())
-    r = "qd - v" if in_task_space else "qd + Lambda e"
-    text = f"the {sources} supplied up to {supplied_j:.3g} J with respect to r = {r}"
-    released_s = max(t_s[-1] for t_s in push_times_s.values())
+    released_s = float(max(t_s[-1] for t_s in push_times_s.values()))
     ages_s = [energy.largest_age_s for energy in energies.values()]
-    free_s = float(balance.t_s[-1] - released_s)
-    least_s = max(MIN_FREE_S, MIN_FREE_AGES * max(ages_s))
-    if free_s >= least_s:
-        return Premise("hands", True, f"{text}; nobody pushes after {released_s:.3f} s")
-    if free_s > 1e-9:
-        short = f"{free_s:.3g} s of free motion at the end are less than {least_s:.3g} s"
-        text += f", and push until {released_s:.3f} s: {short}"
-        return Premise("hands", False, text)
-    text += ", and push to the end: not passive with respect to r"
-    return Premise("hands", False, text)
+    supply = Supply(
+        sources=tuple(balance.external),
+        energy_j=supplied_j,
+        is_passive=bool(supplied_j <= 1e-9 * balance.scale + ZERO_ENERGY_J),
+        in_task_space=any(energy.motion.constants.axes for energy in energies.values()),
+        released_s=released_s,
+        free_s=float(balance.t_s[-1]) - released_s,
+        least_free_s=float(max(MIN_FREE_S, MIN_FREE_AGES * max(ages_s))),
+    )
+    holds = supply.is_passive or supply.free_s >= supply.least_free_s
+    return Premise("hands", holds, OperatorQuantities(supply=supply))
 
 
 def _check_records(run: FunctionalFacts) -> Premise:
@@ -663,14 +618,11 @@ def _check_records(run: FunctionalFacts) -> Premise:
 
     Missing records leave the premise undecided, because V is unknown there.
     """
-    if not run.unjudged:
-        text = "every period of every site rests on records"
-        if not run.balance.judged.all():
-            text += " while all sites were present"
-        return Premise("records", True, text)
-    spans = [f"{from_s:.4g} to {to_s:.4g} s" for from_s, to_s in run.unjudged]
-    text = f"not judged: {_join_limited(spans)}: records are missing there"
-    return Premise("records", None, text)
+    quantities = RecordQuantities(
+        unjudged_s=tuple(run.unjudged),
+        is_whole=bool(run.balance.judged.all()),
+    )
+    return Premise("records", None if run.unjudged else True, quantities)
 
 
 def find_absent_spans(log: Log) -> list[AbsentSpan]:
@@ -722,17 +674,11 @@ def _check_presence(run: FunctionalFacts) -> Premise | None:
     stretches = []
     for from_s, to_s in absences:
         if from_s - stretch_start_s > LEAST_ABSENCE_S:
-            stretches.append(_describe_stretch(run.energies, stretch_start_s, from_s))
+            stretches.append(_examine_stretch(run.energies, stretch_start_s, from_s))
         stretch_start_s = max(stretch_start_s, to_s)
 
-    absent = _join_limited(
-        [f"{site} {from_s:.4g} to {to_s:.4g} s" for site, from_s, to_s in run.absent]
-    )
-    text = (
-        f"away: {absent}, about which the theorem says nothing; by themselves: "
-        f"{'; '.join(stretches)}"
-    )
-    return Premise("presence", False, text)
+    quantities = PresenceQuantities(tuple(run.absent), tuple(stretches))
+    return Premise("presence", False, quantities)
 
 
 FUNCTIONAL_CHECKS = (
@@ -750,8 +696,10 @@ FUNCTIONAL_CHECKS = (
 """Checks of the premises that can be decided only if V is known, in the order of the report."""
 
 
-def _describe_stretch(energies: Mapping[str, SiteEnergy], from_s: float, to_s: float) -> str:
-    """Describes a stretch of time during which all sites were present.
+def _examine_stretch(
+    energies: Mapping[str, SiteEnergy], from_s: float, to_s: float
+) -> PresentStretch:
+    """Examines a stretch of time during which all sites were present.
 
     Args:
         energies: Energies of every site.
@@ -759,8 +707,8 @@ def _describe_stretch(energies: Mapping[str, SiteEnergy], from_s: float, to_s: f
         to_s: End of the stretch, in s.
 
     Returns:
-        A phrase that states the time from which all sites follow their peers, and whether the
-        delays are constant from then on.
+        The stretch with the time from which all sites follow their peers, and the links whose
+        delay varies from then on.
     """
     all_follow_s = from_s
     for energy in energies.values():
@@ -771,9 +719,8 @@ def _describe_stretch(energies: Mapping[str, SiteEnergy], from_s: float, to_s: f
             last_row = np.flatnonzero(not_following)[-1]
             all_follow_s = max(all_follow_s, float(records.t_s[last_row]) + records.h_s)
 
-    stretch = f"{from_s:.4g} to {to_s:.4g} s"
     if to_s - all_follow_s < LEAST_ABSENCE_S:
-        return f"{stretch} not all follow"
+        return PresentStretch(from_s, to_s, follow_from_s=None)
 
     varying = []
     for site, energy in energies.items():
@@ -782,9 +729,8 @@ def _describe_stretch(energies: Mapping[str, SiteEnergy], from_s: float, to_s: f
         for peer, view in energy.followed.items():
             age_s = (records.t_s - view.stamp_s)[inside & np.isfinite(view.stamp_s)]
             if len(age_s) and np.ptp(age_s) > CONSTANT_DELAY_TOLERANCE_S:
-                varying.append(f"{peer}->{site}")
-    delays = f"ages vary ({_join_limited(varying)})" if varying else "delays are constant"
-    return f"{stretch} all follow from {all_follow_s:.4g} s on, {delays}"
+                varying.append((peer, site))
+    return PresentStretch(from_s, to_s, all_follow_s, tuple(varying))
 
 
 def find_unjudged_spans(balance: EnergyBalance) -> list[tuple[float, float]]:
@@ -805,18 +751,6 @@ def find_unjudged_spans(balance: EnergyBalance) -> list[tuple[float, float]]:
     starts_s = times[::2].tolist()
     ends_s = times[1::2].tolist()
     return list(zip(starts_s, ends_s, strict=True))
-
-
-def _join_limited(items: Sequence[str]) -> str:
-    """Joins texts with commas. Counts the texts beyond `MAX_LISTED_NAMES` instead."""
-    text = ", ".join(items[:MAX_LISTED_NAMES])
-    hidden = len(items) - MAX_LISTED_NAMES
-    return f"{text} and {hidden} more" if hidden > 0 else text
-
-
-def _format_by_site(values: Mapping[str, float]) -> str:
-    """Returns a string such as "m1 0.5, s 2" of a value per site."""
-    return ", ".join(f"{site} {value:.4g}" for site, value in values.items())
 
 
 class Evidence(NamedTuple):
@@ -848,23 +782,12 @@ class Evidence(NamedTuple):
 
         Empty if they suffice.
         """
-        reasons = []
-        if not self.integrity.passed:
-            reasons.append(f"the log is not as it was made: {self.integrity.text}")
-        if self.coverage.share < self.min_coverage:
-            reasons.append(f"records are missing: {self.coverage.describe(self.min_coverage)}")
-        if self.functional_share is not None and self.functional_share < self.min_coverage:
-            percent = 100.0 * self.functional_share
-            reasons.append(f"V is judged over {percent:.4g} % of its periods")
-        if self.unmet:
-            sites = " and ".join(self.unmet)
-            reasons.append(f"{sites}, as recorded, did not react to this run")
-        return reasons
+        return list(find_hook("list the faults of evidence")(self))
 
     @property
     def text(self) -> str:
         """A sentence for the user: how many records exist, and whether the log is unchanged."""
-        return f"{self.coverage.describe(self.min_coverage)}; {self.integrity.text}"
+        return str(find_hook("describe evidence")(self))
 
     def to_json(self) -> dict[str, Any]:
         """Returns how complete and how authentic the records are, as plain values.

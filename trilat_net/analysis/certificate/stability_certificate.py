@@ -30,6 +30,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...core.step.vectors import Array
+from ...hooks import find_hook
 from ...log.accounting import MIN_COVERAGE
 from ...log.log_reader import Log
 from ...results import JsonObject, Result, finite_or_none
@@ -52,7 +53,6 @@ from .premises import (
     Premise,
     check_premises,
     collect_evidence,
-    describe_closed_groups,
     find_unjudged_spans,
     gather_facts,
 )
@@ -299,7 +299,7 @@ class Certificate(Result):
             "rise": _rise_to_json(verdict.rise),
             "tolerance_j": verdict.tolerance,
             "closed_groups": [list(group) for group in self.groups],
-            "premises": [premise._asdict() for premise in self.premises],
+            "premises": [premise.to_json() for premise in self.premises],
             "growth": {
                 "motion": end.behaviour.name.lower(),
                 "text": end.text,
@@ -323,7 +323,7 @@ class Certificate(Result):
 
         The values are plain, ready for JSON.
         """
-        return [premise._asdict() for premise in self.premises]
+        return [premise.to_json() for premise in self.premises]
 
     def accepts(self, accepted: Collection[str]) -> bool:
         """Returns True if the run is stable, or has another judgement that the user accepts.
@@ -472,7 +472,8 @@ def _judge_decidability(run: FunctionalFacts, _: Sequence[Premise]) -> Stability
     are not known precisely enough to decide whether V rose.
     """
     if run.groups:
-        return StabilityVerdict(StabilityFinding.NOT_JUDGED, describe_closed_groups(run.groups))
+        text = find_hook("describe closed groups")(run.groups)
+        return StabilityVerdict(StabilityFinding.NOT_JUDGED, text)
     scale = run.balance.scale
     if run.tolerance <= COARSE_TOLERANCE_SHARE * scale + 2.0 * ZERO_ENERGY_J:
         return None

@@ -1,0 +1,403 @@
+"""The quantities by which the conditions of the stability theorem are judged, one class each.
+
+A site is the process that runs one arm, and the sites follow each other. A condition of the
+theorem is called a premise. `premises` and `observed_energy` compute the quantities from the
+log of a run. `presentation.premise_text` writes the sentences about them.
+
+Invariant:
+    - An empty collection means that nothing of this kind was found in the run.
+    - The quantities contain only names and numbers, no sentence.
+"""
+
+from collections.abc import Mapping
+from enum import Enum, auto
+from typing import NamedTuple
+
+from ..dominance_history import PeerLoss
+from ..torque_sources import WallEnergy
+
+
+class FunctionalObstacle(Enum):
+    """Reason why the energy function V of the stability proof does not exist for an arm."""
+
+    UNKNOWN_PARAMETERS = auto()
+    """The parameters theta of the arm are unknown."""
+    LAW = auto()
+    """The control law has no such function."""
+    ORIENTATIONS = auto()
+    """The arm follows orientations. Then ed is not the derivative of e."""
+
+
+class MissingFunctional(NamedTuple):
+    """Sites whose arms have no energy function V, for the same reason.
+
+    Attributes:
+        obstacle: The reason.
+        law: Tag of the control law, if the law is the reason. Otherwise empty.
+        sites: Names of the sites.
+    """
+
+    obstacle: FunctionalObstacle
+    law: str
+    sites: tuple[str, ...]
+
+
+class LawQuantities(NamedTuple):
+    """Quantities of the premise that every site has an adaptive law, and V exists.
+
+    Attributes:
+        missing: Sites without V, grouped by the reason.
+    """
+
+    missing: tuple[MissingFunctional, ...]
+
+
+class ParameterFault(Enum):
+    """Reason why an adaptive law cannot learn the parameters theta of its arm."""
+
+    OUTSIDE_BOX = auto()
+    """Theta is outside the box in which the law keeps its estimates."""
+    NEVER_LEARNT = auto()
+    """A parameter is neither adapted nor known."""
+    FRICTION = auto()
+    """The law does not compensate all friction of the joints."""
+
+
+class ParameterQuantities(NamedTuple):
+    """Quantities of the premise that the adaptive laws can learn the parameters of their arms.
+
+    Attributes:
+        faults: Name of the site and reason, for each fault.
+    """
+
+    faults: tuple[tuple[str, ParameterFault], ...]
+
+
+class GainQuantities(NamedTuple):
+    """Quantities of the premise that the gain Kd is the same everywhere, up to a factor.
+
+    Attributes:
+        Kd: Gain of each site per joint, in N m s/rad. In task space per coordinate, in N s/m.
+        scales: Factor of each site. None if the gains differ by more than a factor.
+        is_positive: True if no gain is zero.
+    """
+
+    Kd: Mapping[str, tuple[float, ...]]
+    scales: Mapping[str, float] | None
+    is_positive: bool
+
+
+class WallQuantities(NamedTuple):
+    """Quantities of the premise that simulated walls generate no energy.
+
+    Attributes:
+        walls: The walls that were touched, with their energies and dampings.
+    """
+
+    walls: tuple[WallEnergy, ...]
+
+    @property
+    def active(self) -> tuple[WallEnergy, ...]:
+        """Walls whose arm dissipates less energy than they generate."""
+        return tuple(
+            wall for wall in self.walls if wall.arm_damping_n_s_m <= wall.required_damping_n_s_m
+        )
+
+
+class DominanceQuantities(NamedTuple):
+    """Quantities of the premise on the dominance factors.
+
+    Attributes:
+        changing: Sites whose dominance factors change.
+        losses: Spans of time in which sites continued without a peer.
+        groups: Closed groups of sites, which follow nobody outside their group. Empty if the
+            factors change.
+        weightless: Sites with the weight zero in V.
+        beta: Weight of each site in V. None if there are no unique weights.
+    """
+
+    changing: tuple[str, ...] = ()
+    losses: tuple[PeerLoss, ...] = ()
+    groups: tuple[tuple[str, ...], ...] = ()
+    weightless: tuple[str, ...] = ()
+    beta: Mapping[str, float] | None = None
+
+
+class AgeRange(NamedTuple):
+    """Smallest and largest age of the samples that a site uses of a peer.
+
+    Attributes:
+        peer: Site that sends the samples.
+        site: Site that receives them.
+        shortest_s: Smallest age, in s.
+        longest_s: Largest age, in s.
+    """
+
+    peer: str
+    site: str
+    shortest_s: float
+    longest_s: float
+
+
+class DelayQuantities(NamedTuple):
+    """Quantities of the premise that the delay of every link is constant.
+
+    Attributes:
+        varying: Ages on the links whose delay varies.
+        constant_s: Delay of each of the other links that delivered a sample, in s.
+    """
+
+    varying: tuple[AgeRange, ...]
+    constant_s: tuple[float, ...]
+
+
+class Interruption(NamedTuple):
+    """The time during which a site did not follow its peers.
+
+    Attributes:
+        site: Name of the site.
+        from_s: Start, in s.
+        to_s: End, in s.
+    """
+
+    site: str
+    from_s: float
+    to_s: float
+
+
+class FollowingQuantities(NamedTuple):
+    """Quantities of the premise that every site follows its peers.
+
+    Attributes:
+        interruptions: Times at which sites held, braked, returned or had stopped.
+        limited_ticks: Number of ticks at which the velocity of the reference was limited, by
+            the name of the site.
+        is_halted: True if a site had stopped.
+    """
+
+    interruptions: tuple[Interruption, ...]
+    limited_ticks: Mapping[str, int]
+    is_halted: bool
+
+
+class CutTorque(NamedTuple):
+    """A site whose torque was cut off at the limit of its actuators.
+
+    Attributes:
+        site: Name of the site.
+        joints: Names of the joints. Empty if the joints have no names.
+        ticks: Number of ticks.
+    """
+
+    site: str
+    joints: tuple[str, ...]
+    ticks: int
+
+
+class TorqueQuantities(NamedTuple):
+    """Quantities of the premise that no torque was cut off.
+
+    Attributes:
+        cut: Sites whose torque was cut off.
+    """
+
+    cut: tuple[CutTorque, ...]
+
+
+class TouchedStop(NamedTuple):
+    """A site whose arm ran into the mechanical stops of its joints.
+
+    Attributes:
+        site: Name of the site.
+        joints: Names of the joints. Empty if the joints have no names.
+        from_s: Time of the first contact, in s.
+    """
+
+    site: str
+    joints: tuple[str, ...]
+    from_s: float
+
+
+class StopQuantities(NamedTuple):
+    """Quantities of the premise that no joint touches its stops.
+
+    Attributes:
+        touched: Sites whose arms touched their stops.
+    """
+
+    touched: tuple[TouchedStop, ...]
+
+
+class AxisQuantities(NamedTuple):
+    """Quantities of the premise that followed sites follow along the same axes.
+
+    Attributes:
+        faults: Pairs (follower, followed site) with an axis that only the follower follows.
+    """
+
+    faults: tuple[tuple[str, str], ...]
+
+
+class SingularPoseQuantities(NamedTuple):
+    """Quantities of the premise that no arm came near a singular pose.
+
+    Attributes:
+        near_s: Time from which the arm of a site was near a singular pose, in s, by site.
+        least_values: Least singular value of the Jacobian of each site, in m/rad.
+    """
+
+    near_s: Mapping[str, float]
+    least_values: Mapping[str, float]
+
+
+class Supply(NamedTuple):
+    """Energy that operators and environments supplied, and the motion without them at the end.
+
+    Attributes:
+        sources: Names of the sources.
+        energy_j: Largest energy that they supplied beyond what they had absorbed, in J.
+        is_passive: True if this energy is a rounding error.
+        in_task_space: True if a site follows in task space. Then r is qd - v.
+        released_s: Time after which nobody pushes, in s.
+        free_s: Duration of the motion from then on, in s.
+        least_free_s: Duration to which the theorem applies at least, in s.
+    """
+
+    sources: tuple[str, ...]
+    energy_j: float
+    is_passive: bool
+    in_task_space: bool
+    released_s: float
+    free_s: float
+    least_free_s: float
+
+
+class OperatorQuantities(NamedTuple):
+    """Quantities of the premise that operators and environments are passive.
+
+    Attributes:
+        unmeasured: Sites with external arms, if no record tells who pushes them.
+        weightless: Sites that are pushed although their weight in V is zero.
+        supply: Energy that operators and environments supplied. None if nobody pushes, or if V
+            does not show the energy.
+    """
+
+    unmeasured: tuple[str, ...] = ()
+    weightless: tuple[str, ...] = ()
+    supply: Supply | None = None
+
+
+class RecordQuantities(NamedTuple):
+    """Quantities of the premise that no records are missing.
+
+    Attributes:
+        unjudged_s: Spans (start, end) in which records are missing although all sites were
+            present, in s.
+        is_whole: True if no records are missing in the absence of sites either.
+    """
+
+    unjudged_s: tuple[tuple[float, float], ...]
+    is_whole: bool
+
+
+class AbsentSpan(NamedTuple):
+    """A span of time during which a site was absent from the session.
+
+    Attributes:
+        site: Name of the site.
+        from_s: Start, in s after the start of the session.
+        to_s: End, in s.
+    """
+
+    site: str
+    from_s: float
+    to_s: float
+
+
+class PresentStretch(NamedTuple):
+    """A stretch of time during which all sites were present.
+
+    Attributes:
+        from_s: Start, in s.
+        to_s: End, in s.
+        follow_from_s: Time from which all sites follow their peers, in s. None if they never
+            do.
+        varying: Links (peer, site) whose delay varies from then on.
+    """
+
+    from_s: float
+    to_s: float
+    follow_from_s: float | None
+    varying: tuple[tuple[str, str], ...] = ()
+
+
+class PresenceQuantities(NamedTuple):
+    """Quantities of the premise that all sites are present during the whole run.
+
+    Attributes:
+        absent: Spans of time during which sites were absent.
+        stretches: The times between, during which all sites were present.
+    """
+
+    absent: tuple[AbsentSpan, ...]
+    stretches: tuple[PresentStretch, ...]
+
+
+class BooksQuantities(NamedTuple):
+    """Quantities of the premise that the energies that control laws declare add up.
+
+    Attributes:
+        site: Site whose law has the largest error.
+        residual_j: This error, in J.
+        scale_j: Largest energy that occurs, in J.
+    """
+
+    site: str
+    residual_j: float
+    scale_j: float
+
+
+class BookedTorqueQuantities(NamedTuple):
+    """Quantities of the premise that control laws count the torque that the arms received.
+
+    Attributes:
+        cut: Sites whose torque was cut off at the limit of their actuators.
+        unbooked: Those of them whose law counts another torque than the arm received.
+    """
+
+    cut: tuple[str, ...]
+    unbooked: tuple[str, ...]
+
+
+class SamplingQuantities(NamedTuple):
+    """Quantities of the premise that arms receive little energy that their laws do not count.
+
+    Attributes:
+        site: Site that received most of such energy.
+        leak_j: This energy, in J. It arises between ticks.
+    """
+
+    site: str
+    leak_j: float
+
+
+PremiseQuantities = (
+    LawQuantities
+    | ParameterQuantities
+    | GainQuantities
+    | WallQuantities
+    | DominanceQuantities
+    | DelayQuantities
+    | FollowingQuantities
+    | TorqueQuantities
+    | StopQuantities
+    | AxisQuantities
+    | SingularPoseQuantities
+    | OperatorQuantities
+    | RecordQuantities
+    | PresenceQuantities
+    | BooksQuantities
+    | BookedTorqueQuantities
+    | SamplingQuantities
+)
+"""The quantities of any premise."""
