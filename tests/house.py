@@ -86,7 +86,7 @@ def room_imports() -> set[tuple[str, str]]:
     return {
         (a, b)
         for a, b in pairs
-        if a != b and not {a, b} & (BELOW_ALL | {"__init__", "__main__"})
+        if a != b and not {a, b} & (BELOW_ALL | {"__init__", "__main__", "extension"})
     }
 
 
@@ -147,8 +147,11 @@ def class_heights() -> dict[str, int]:
 
 
 def strings(path: Path) -> Iterator[str]:
-    """Yields the strings of a file, also those in f-strings, but not its docstrings."""
+    """Yields the strings of a file, also those in f-strings, but not its docstrings and `__all__`."""
     statements = {id(node.value) for node in ast.walk(tree(path)) if isinstance(node, ast.Expr)}
+    for node in tree(path).body:
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
+            statements |= {id(name) for name in ast.walk(node)}
     for node in ast.walk(tree(path)):
         match node:
             case ast.Constant(value=str(text)) if id(node) not in statements:
