@@ -197,7 +197,6 @@ def unused_methods() -> set[str]:
         "live",
         "packages",
         "containers",
-        "plugins",
         "tests",
         "benchmarks",
         "examples",
