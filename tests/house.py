@@ -86,7 +86,7 @@ def room_imports() -> set[tuple[str, str]]:
     return {
         (a, b)
         for a, b in pairs
-        if a != b and not {a, b} & (BELOW_ALL | {"__init__", "__main__"})
+        if a != b and not {a, b} & (BELOW_ALL | {"__init__", "__main__", "extension"})
     }
 
 
@@ -197,7 +197,6 @@ def unused_methods() -> set[str]:
         "live",
         "packages",
         "containers",
-        "plugins",
         "tests",
         "benchmarks",
         "examples",

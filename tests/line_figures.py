@@ -23,7 +23,7 @@ from pathlib import Path
 
 from . import house
 
-SOURCES = ("trilat_net", "sites", "recorder", "live", "packages", "plugins")
+SOURCES = ("trilat_net", "sites", "recorder", "live", "packages")
 PARTS = {
     "ros2": r"ros2|robot_model",
     "lerobot": r"lerobot",

@@ -384,11 +384,12 @@ def names_of(path: Path) -> tuple[str, ...]:
 @pytest.mark.push
 def test_a_test_that_a_page_names_exists(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
-    files = {path.stem: path for path in (ROOT / "tests").rglob("*.py")}
+    folders = (ROOT / "tests", *ROOT.glob("packages/*/tests"))
+    files = {path.stem: path for folder in folders for path in folder.rglob("*.py")}
     functions = {name for path in files.values() for name in names_of(path)}
-    for named in re.findall(r"`(tests/[\w/.]+)`", text):
+    for named in re.findall(r"`((?:packages/[\w-]+/)?tests/[\w/.]+)`", text):
         assert (ROOT / named).exists(), named
-    names = re.findall(r"`(?:tests/[\w/]*/)?(test_\w+?)(_?\.\.\.|\.py)?`", text)
+    names = re.findall(r"`(?:[\w/-]*tests/[\w/]*/)?(test_\w+?)(_?\.\.\.|\.py)?`", text)
     assert len(names) > 15 or page.name != "errata-proof.md"
     for name, rest in names:
         known = name in files or any(

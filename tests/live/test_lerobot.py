@@ -3,10 +3,10 @@
 import threading
 
 import pytest
+from lerobot_tests.driving import assert_taken_over, drive
+from lerobot_tests.lerobot_stub import plugins
 
 import trilat_net
-from tests.plugins.driving import assert_taken_over, drive
-from tests.plugins.lerobot_stub import plugins
 
 from .processes import PAPER, Session, Stage
 

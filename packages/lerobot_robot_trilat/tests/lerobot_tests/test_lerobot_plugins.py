@@ -37,8 +37,8 @@ def test_a_plugin_is_found_by_the_name_of_its_distribution(
 ) -> None:
     """LeRobot imports the module of that name, which registers its configuration."""
     assert sorted(found) == [ROBOT, TELEOPERATOR]
-    for name, module in found.items():
-        project = tomllib.loads((PLUGINS / name / "pyproject.toml").read_text(encoding="utf-8"))
+    for folder, (name, module) in zip(PLUGINS, found.items(), strict=True):
+        project = tomllib.loads((folder / "pyproject.toml").read_text(encoding="utf-8"))
         assert project["project"]["name"] == module.__name__ == name
         assert project["tool"]["setuptools"]["py-modules"] == [name]
     assert found[ROBOT].TrilatRobotConfig().type == "trilat"
@@ -46,7 +46,7 @@ def test_a_plugin_is_found_by_the_name_of_its_distribution(
 
 
 def test_plugins_import_the_interface_alone() -> None:
-    for path in PLUGINS.rglob("*.py"):
+    for path in (folder / f"{folder.name}.py" for folder in PLUGINS):
         lines = [
             line
             for line in path.read_text(encoding="utf-8").splitlines()

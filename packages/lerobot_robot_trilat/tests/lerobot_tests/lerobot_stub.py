@@ -15,7 +15,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-PLUGINS = Path(__file__).parents[2] / "plugins"
+PLUGINS = sorted(Path(__file__).parents[3].glob("lerobot_*"))
+"""Folders of the plugins."""
 _BOTH = ["is_connected", "connect", "is_calibrated", "calibrate", "configure", "disconnect"]
 ABSTRACT = {
     "Robot": [
@@ -94,8 +95,8 @@ def plugins() -> Iterator[dict[str, ModuleType]]:
         importlib.import_module("lerobot")
     except ImportError:
         sys.modules.update(_modules())
-    names = sorted(path.name for path in PLUGINS.iterdir() if path.is_dir())
-    sys.path[:0] = [str(PLUGINS / name) for name in names]
+    names = [path.name for path in PLUGINS]
+    sys.path[:0] = map(str, PLUGINS)
     try:
         yield {name: importlib.import_module(name) for name in names}
     finally:
