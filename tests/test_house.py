@@ -45,6 +45,8 @@ CALLED_BY_LIBRARIES = {
     "_LeafLocator.get_disambiguator",
     "_LeafLocator.get_source_stamp",
     "_PackageCommand.short_help",
+    "_RowAttributes.generic_resolve",
+    "_RowsAttributes.resolve_shape",
 }
 
 

@@ -2,7 +2,7 @@
 
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -122,3 +122,20 @@ def test_jobs_belong_to_this_machine() -> None:
     assert count_workers(3) == 3
     with pytest.raises(UsageError, match="jobs"):
         count_workers(3, "tcp://127.0.0.1:1")
+
+
+def compute_together(items: Sequence[int]) -> Any:
+    """Roots, several at once; an item below zero is an error."""
+    for item in items:
+        if item < 0:
+            raise ValueError(item)
+        yield float(item) ** 0.5
+
+
+def test_items_together_are_yielded_up_to_the_first_error() -> None:
+    results = WorkerPool(None, 1).iterate_results(
+        abs, [4, 9, 16, -1, 25], together=compute_together, together_count=3
+    )
+    assert [next(results) for _ in range(3)] == [(0, 2.0), (1, 3.0), (2, 4.0)]
+    with pytest.raises(ValueError, match="-1"):
+        next(results)

@@ -19,7 +19,7 @@ Invariant:
 
 import math
 from collections import deque
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import cached_property
 from typing import NamedTuple, Protocol
 
@@ -240,6 +240,30 @@ def _make_prompt_inputs(sites: int) -> RunInputs:
     return RunInputs(feed)
 
 
+class RunMemory(NamedTuple):
+    """All arrays of a run, for drivers that compute several runs together.
+
+    N is the number of sites.
+
+    Attributes:
+        tables: Arrays of all sites.
+        progress: How far each site is, shape (N,), see `ProgressRow`.
+        next_samples: For each site and peer the next sample to accept, shape (N, P).
+        sent: Latest records of the sites.
+        peaks: Peaks in intervals of 50 ms, see `run_until`.
+        sums: Sums over the records, shape (N,), see `SumsRow`.
+        settled_rad: Position error below which an arm counts as settled, rad.
+    """
+
+    tables: SiteArrays
+    progress: RowArray
+    next_samples: IntArray
+    sent: RecentRecords
+    peaks: Array
+    sums: RowArray
+    settled_rad: float
+
+
 class FusedRun:
     """Run of all sites of a scenario in one compiled loop.
 
@@ -259,7 +283,10 @@ class FusedRun:
         plants: Users' programs that move external arms, by site.
 
     Attributes:
+        scenario: The scenario.
         ran_s: Time up to which `advance_to` has executed the run, in s.
+        pending_deliveries: Function that brings the links up to date, if the run was advanced
+            together with other runs. It is called before the run continues alone.
 
     Raises:
         ScenarioError: The loop cannot execute the scenario, see `check_fusable`, or a law
@@ -280,7 +307,8 @@ class FusedRun:
         count = len(names)
         setups = [scenario.setup(name) for name in names]
         self.ran_s = 0.0
-        self._scenario = scenario
+        self.pending_deliveries: Callable[[], None] | None = None
+        self.scenario = scenario
         self._settled_rad = settled_rad
         self._inputs = inputs or _make_prompt_inputs(count)
         self._hands: dict[int, HandActor] = {}
@@ -332,7 +360,7 @@ class FusedRun:
         fastest_hz = int(self._progress["rate_hz"].max())
         # Ticks of the fastest site until the latest sample arrives, with a margin for rounding.
         late_ticks = self._inputs.late_ns * fastest_hz // NS_PER_S + 2
-        ticks_per_slow_tick = _find_largest_ratio(self._scenario)
+        ticks_per_slow_tick = _find_largest_ratio(self.scenario)
         needed = max(ticks_per_slow_tick + 1, keep, late_ticks)
         pages = 1 << needed.bit_length()  # the least power of two above `needed`
         floats = max(layout.floats for layout in self._layouts)
@@ -411,6 +439,26 @@ class FusedRun:
             addresses[i] = compiled_law.address
         self._law_arrays = LawArrays(addresses, rows, sent)
 
+    @property
+    def memory(self) -> RunMemory:
+        """All arrays of the run. They change while it is executed."""
+        return RunMemory(
+            tables=self._tables,
+            progress=self._progress,
+            next_samples=self._next_samples,
+            sent=self._sent,
+            peaks=self._peaks,
+            sums=self._sums,
+            settled_rad=self._settled_rad,
+        )
+
+    def _update_links(self) -> None:
+        """Brings the links up to date, if the run was advanced together with other runs."""
+        deliver = self.pending_deliveries
+        self.pending_deliveries = None
+        if deliver is not None:
+            deliver()
+
     def step_to(self, last_ns: int) -> None:
         """Executes all planned ticks up to a time, and applies the changes up to that time.
 
@@ -423,6 +471,7 @@ class FusedRun:
         Raises:
             LawFailed: A user's control law failed.
         """
+        self._update_links()
         rates_hz = [int(progress["rate_hz"]) for progress in self._progress]
         while self._changes and self.diverged_s is None:
             tick, i, change = self._changes[0]
@@ -692,6 +741,8 @@ class FusedRun:
             factor: Number by which the difference is multiplied.
         """
         assert not self.has_programs
+        self._update_links()
+        other._update_links()
         self._state.scale_difference(other._state, factor)
         self._changes = deque(other._changes)
         self._popped_ticks = list(other._popped_ticks)
@@ -714,6 +765,7 @@ class FusedRun:
         Returns:
             Views of the arrays, without copies.
         """
+        self._update_links()
         if i not in self._selected:
             self._selected[i] = select_site(self._tables, i, self._layouts[i])
         return self._selected[i]
@@ -843,7 +895,7 @@ class FusedRun:
     @property
     def _has_wall(self) -> bool:
         """True if the environment of any site contains a wall."""
-        specs = self._scenario.sites.values()
+        specs = self.scenario.sites.values()
         return any(isinstance(part, Wall) for spec in specs for part in spec.environment)
 
     @property

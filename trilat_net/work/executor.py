@@ -13,6 +13,7 @@ Invariant:
       message is the one that kills its workers.
 """
 
+import itertools
 import textwrap
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -42,6 +43,11 @@ Progress = Callable[[int, int], None]
 """Function that is called with the number of finished items and the number of all items."""
 Workers = str | Executor | None
 """Address of a Dask scheduler, an executor, or None for processes of this machine."""
+
+Together = Callable[[Sequence[T]], Iterable[R]]
+"""Function of several items that computes them together. It yields their results in order, and
+raises the error of an item in place of its result.
+"""
 
 BATCH_S = 0.4
 """Intended duration of a batch, in s, so that the overhead of a batch is below 1 % of it."""
@@ -84,6 +90,7 @@ def run_batch(
     items: Sequence[T],
     required: WorkerRequirements | None,
     allowed: CodeConsents,
+    together: Together[T, Any] | None = None,
 ) -> _BatchResult:
     """Runs a function on each item of a batch, stopping at the first error.
 
@@ -96,6 +103,7 @@ def run_batch(
         required: Requirements on the worker, such as the version of the program. None if there
             are no requirements.
         allowed: Imported control laws that the user allowed to run.
+        together: Function that replaces `function` if the batch has several items.
 
     Returns:
         The results up to the first error, the time that they took, and the error.
@@ -110,12 +118,14 @@ def run_batch(
     results: list[Any] = []
     error = None
     with allowing_any_settings(allowed):
-        for item in items:
-            try:
-                results.append(function(item))
-            except Exception as raised:
-                error = raised  # `WorkerPool` raises it when it collects the results
-                break
+        new_results: Iterable[Any] = map(function, items)
+        if together is not None and len(items) > 1:
+            new_results = together(items)
+        try:
+            for result in new_results:
+                results.append(result)  # noqa: PERF402 - keeps the results before an error
+        except Exception as raised:
+            error = raised  # `WorkerPool` raises it when it collects the results
     return _BatchResult(results, (clock.monotonic_ns() - start_ns) * 1e-9, error)
 
 
@@ -146,15 +156,22 @@ class _Feed(Generic[T]):
         count: Number of items. None if it is not known.
         workers: Number of workers that take items from the queue.
         batch_s: Intended duration of a batch, in s.
+        least: Number of items for which a batch may take longer than that.
     """
 
     def __init__(
-        self, items: Iterable[T], count: int | None, workers: int, batch_s: float = BATCH_S
+        self,
+        items: Iterable[T],
+        count: int | None,
+        workers: int,
+        batch_s: float = BATCH_S,
+        least: int = 1,
     ) -> None:
         self._new = enumerate(items)
         self._remaining = count
         self._workers = workers
         self._batch_s = batch_s
+        self._least = least
         self._retries: deque[tuple[int, T]] = deque()
         self._suspects: deque[tuple[int, T]] = deque()  # items in their last attempt
         self._losses: Counter[int] = Counter()
@@ -196,7 +213,7 @@ class _Feed(Generic[T]):
         if self._wall_s > 0.0:
             # The finished items, `_runs` in number, took `_wall_s` together.
             items_in_batch_s = int(self._batch_s * self._runs / self._wall_s)
-            size = min(MAX_BATCH, items_in_batch_s)
+            size = max(self._least, min(MAX_BATCH, items_in_batch_s))
         if self._remaining is not None:
             # Towards the end the batches become smaller, so that no worker is idle for long:
             # all batches in flight together contain at most half of the remaining items.
@@ -275,6 +292,8 @@ class WorkerPool:
         items: Iterable[T],
         lost: Callable[[T], R] | None = None,
         count: int | None = None,
+        together: Together[T, R] | None = None,
+        together_count: int = 1,
     ) -> Iterator[tuple[int, R]]:
         """Runs a function on each item with all workers, and yields each result as it arrives.
 
@@ -286,6 +305,8 @@ class WorkerPool:
             lost: Function that returns the result of an item that killed its workers. None if
                 such an item is an error.
             count: Number of items, if it is known.
+            together: Function that replaces `function` for several items at once.
+            together_count: Number of items that `together` should get.
 
         Yields:
             The number of an item, counted from 0, and its result.
@@ -295,18 +316,22 @@ class WorkerPool:
             UsageError: A worker does not meet the requirements.
         """
         if self._executor is None:
-            for number, item in enumerate(items):
-                with allowing_any_settings(allowed_code):
-                    result = function(item)
-                yield number, result
+            numbers = itertools.count()
+            remaining = iter(items)
+            while batch := list(islice(remaining, together_count)):
+                result = run_batch(function, batch, None, allowed_code, together)
+                for value in result.results:
+                    yield next(numbers), value
+                if result.error is not None:
+                    raise result.error
             return
 
         batch_s = BATCH_S if self._cluster is None else CLUSTER_BATCH_S
-        feed = _Feed(items, count, self.workers, batch_s)
+        feed = _Feed(items, count, self.workers, batch_s, together_count)
         pending: dict[Future[_BatchResult], _Batch] = {}
         try:
             while True:
-                self._submit(function, feed, pending)
+                self._submit(function, feed, pending, together)
                 if not pending:
                     return
                 ended = wait(pending, _POLL_S, FIRST_COMPLETED).done
@@ -352,6 +377,7 @@ class WorkerPool:
         function: Callable[[T], R],
         feed: _Feed[T],
         pending: dict[Future[_BatchResult], _Batch],
+        together: Together[T, R] | None,
     ) -> None:
         """Submits batches until every worker has one batch that runs and one that waits.
 
@@ -359,6 +385,7 @@ class WorkerPool:
             function: The function to run on each item.
             feed: Queue of the items.
             pending: Batches in flight, by their futures. New batches are added.
+            together: Function for several items at once, if there is one.
         """
         assert self._executor is not None
         while len(pending) < self.workers * _BATCHES_PER_WORKER:
@@ -367,7 +394,7 @@ class WorkerPool:
                 return
             numbers = [number for number, _ in batch]
             items = [item for _, item in batch]
-            arguments: Any = (function, items, self._required, dict(allowed_code))
+            arguments: Any = (function, items, self._required, dict(allowed_code), together)
             try:
                 future = self._executor.submit(run_batch, *arguments)
             except BrokenExecutor:

@@ -30,7 +30,7 @@ from ..fields import is_distribution
 from ..files import describe_write_error, extend_file
 from ..log.provenance import collect_provenance
 from ..scenario.imported_code import name_law_classes
-from .executor import Progress, WorkerPool
+from .executor import Progress, Together, WorkerPool
 
 
 def format_command(*arguments: str) -> str:
@@ -235,6 +235,8 @@ class RunJournal(Generic[E]):
         done: int,
         total: int,
         show: Progress,
+        together: Together[T, E] | None = None,
+        together_count: int = 1,
     ) -> None:
         """Executes the runs of a study that are not finished yet, and writes each as it ends.
 
@@ -245,11 +247,19 @@ class RunJournal(Generic[E]):
             done: Number of finished runs.
             total: Number of all runs.
             show: Function that is called with the number of finished runs and `total`.
+            together: Function that executes the runs of several tasks at once.
+            together_count: Number of tasks that `together` should get.
 
         Raises:
             LogRefused: The disk is full.
         """
-        results = pool.iterate_results(run, tasks, count=total - done)
+        results = pool.iterate_results(
+            run,
+            tasks,
+            count=total - done,
+            together=together,
+            together_count=together_count,
+        )
         for number, (_, entry) in enumerate(results, done + 1):
             self.add(entry)
             show(number, total)

@@ -239,6 +239,7 @@ def _run_sweep(
     if was_complete:
         terminal.out.print("nothing was left to run")
     remarks = [sweep_run.describe_sweep_speed(finished)] if finished.runs else []
+    remarks += filter(None, [sweep_run.describe_runs_alone(finished)])
     remarks.append(f"results: {folder.path / sweep_results.RESULTS_FILE}")
     _print_results(finished.results, remarks, folder.path)
     return finished

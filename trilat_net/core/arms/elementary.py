@@ -15,6 +15,8 @@ Invariant:
 
 import math
 
+import numpy as np
+
 from ..step.jit import leaf
 
 _QUARTERS_PER_RAD = 2.0 / math.pi
@@ -34,9 +36,9 @@ def sincos(x: float) -> tuple[float, float]:
     itself causes an error of similar size. Both results are NaN if the angle is not finite or
     is beyond `LARGEST_RAD`.
     """
-    if not abs(x) <= LARGEST_RAD:
-        return math.nan, math.nan
-    quarter = math.floor(x * _QUARTERS_PER_RAD + 0.5)
+    # NumPy's `floor` returns a float: the angle y need not wait for conversions to an integer
+    # and back.
+    quarter = float(np.floor(x * _QUARTERS_PER_RAD + 0.5))
     y = ((x - quarter * _PART_1) - quarter * _PART_2) - quarter * _PART_3
     z = y * y
     # Horner's scheme for sin(y) and cos(y), with y from -pi/4 to pi/4.
@@ -54,14 +56,16 @@ def sincos(x: float) -> tuple[float, float]:
     c = c * z - 1.38888888888730564116e-3
     c = c * z + 4.16666666666665929218e-2
     c = 1.0 - 0.5 * z + z * z * c
-    turn = int(quarter) & 3
-    if turn == 0:
-        return s, c
-    if turn == 1:
-        return c, -s
-    if turn == 2:
-        return -s, -c
-    return -c, s
+    # After n quarter turns: (s, c), (c, -s), (-s, -c) or (-c, s) for n modulo 4. Selections in
+    # place of branches let a loop over several angles use vector instructions.
+    is_in_range = abs(x) <= LARGEST_RAD
+    turn = int(quarter if is_in_range else 0.0)
+    is_odd = turn & 1 != 0
+    sine = c if is_odd else s
+    cosine = s if is_odd else c
+    sine = -sine if turn & 2 != 0 else sine
+    cosine = -cosine if (turn + 1) & 2 != 0 else cosine
+    return (sine if is_in_range else math.nan), (cosine if is_in_range else math.nan)
 
 
 _LOG_2_HIGH = 6.93145751953125e-1

@@ -151,6 +151,8 @@ TorqueSourceRows = NDArray[np.void]
 TorqueTable = Array
 SourceTorque = tuple[float, float, float]
 """Torque ON each joint, N m, and the largest force of a wall in it, N."""
+NO_TORQUE: SourceTorque = (0.0, 0.0, 0.0)
+"""The torque on an arm without operators and environments."""
 
 _PULSE = int(TorqueKind.PULSE)
 _HAND = int(TorqueKind.HAND)
@@ -606,6 +608,38 @@ def source_torque(
 
 
 @leaf
+def add_source_torque(
+    total: SourceTorque,
+    t_s: float,
+    q: Vector,
+    qd: Vector,
+    lengths: Vector,
+    actor: Row,
+    table: TorqueTable,
+    sampled: int,
+) -> SourceTorque:
+    """Adds the torque of one operator or environment to the torque of the previous ones.
+
+    Args:
+        total: Torque on the joints so far, N m, and the largest force of a wall so far, N.
+        t_s: Time since the start of the session, s.
+        q: Joint angles, rad.
+        qd: Joint velocities, rad/s.
+        lengths: Lengths of the two links, m.
+        actor: Parameters of the operator or environment.
+        table: Recorded torques and other numbers of all operators and environments.
+        sampled: 1 to add only a sampled actor, 0 to add only others.
+
+    Returns:
+        The new total. It is `total` if the actor is not of the requested sort.
+    """
+    if actor.sampled != sampled:
+        return total
+    torque = source_torque(t_s=t_s, q=q, qd=qd, lengths=lengths, actor=actor, table=table)
+    return total[0] + torque[0], total[1] + torque[1], max(total[2], torque[2])
+
+
+@leaf
 def torque_on_arm(
     t_s: float,
     q: Vector,
@@ -633,19 +667,19 @@ def torque_on_arm(
     Returns:
         The torques on the two joints, N m, and the largest force of a wall, N.
     """
-    total_0 = 0.0
-    total_1 = 0.0
-    largest_n = 0.0
+    total = NO_TORQUE
     for n in range(actors.shape[0]):
-        actor: Row = actors[n]
-        if actor.sampled == sampled:
-            torque = source_torque(
-                t_s=t_s, q=q, qd=qd, lengths=lengths, actor=actor, table=table
-            )
-            total_0 += torque[0]
-            total_1 += torque[1]
-            largest_n = max(largest_n, torque[2])
-    return total_0, total_1, largest_n
+        total = add_source_torque(
+            total=total,
+            t_s=t_s,
+            q=q,
+            qd=qd,
+            lengths=lengths,
+            actor=actors[n],
+            table=table,
+            sampled=sampled,
+        )
+    return total
 
 
 @leaf

@@ -14,7 +14,7 @@ from math import inf, isfinite
 from ..step import control
 from ..step.jit import leaf
 from ..step.site_setup import Law
-from ..step.vectors import Array, Pair, Row, Vector, five, pair, put
+from ..step.vectors import Array, Pair, Row, Vector, five, pair, put_five, put_pair
 from .exogenous import TorqueSourceRows, TorqueTable, torque_on_arm
 from .two_link_arm import forward_dynamics, inertia, regressor
 
@@ -40,13 +40,13 @@ def update_errors(s: Row) -> None:
     v = (-Lambda[0] * e[0], -Lambda[1] * e[1])
     a = (-Lambda[0] * ed[0], -Lambda[1] * ed[1])
     Y = regressor(g=s.g, q=q, qd=qd, v=v, a=a)
-    put(s.e, e)
-    put(s.ed, ed)
-    put(s.r, r)
-    put(s.Y[0], Y[0])
-    put(s.Y[1], Y[1])
+    put_pair(s.e, e)
+    put_pair(s.ed, ed)
+    put_pair(s.r, r)
+    put_five(s.Y[0], Y[0])
+    put_five(s.Y[1], Y[1])
     Yr = control.regressor_transpose_times(Y, r)
-    put(s.Yr, Yr)
+    put_five(s.Yr, Yr)
 
 
 @leaf
@@ -63,7 +63,7 @@ def advance_estimate(s: Row, gain_s: float, Yr: Vector) -> None:
     """
     estimate = control.update_estimate(s.theta_hat, gain_s, s.Gamma, Yr)
     projected = control.project_estimate(estimate, s.low, s.high)
-    put(s.theta_hat, projected)
+    put_five(s.theta_hat, projected)
 
 
 @leaf
@@ -114,7 +114,7 @@ def update_torque(s: Row) -> None:
         )
     tau_0 = control.limit_torque(tau[0], s.tau_limit[0])
     tau_1 = control.limit_torque(tau[1], s.tau_limit[1])
-    put(s.tau, (tau_0, tau_1))
+    put_pair(s.tau, (tau_0, tau_1))
 
 
 @leaf
@@ -142,7 +142,7 @@ def put_gravity(s: Row, theta: Array, torque: Array) -> None:
     """
     inner = s.Y[0, 3] * theta[3]
     outer = s.Y[1, 4] * theta[4]
-    put(torque, (inner + outer, outer))
+    put_pair(torque, (inner + outer, outer))
 
 
 @leaf
@@ -157,8 +157,8 @@ def update_model(s: Row) -> None:
         q = pair(s.q)
         qd = pair(s.qd)
         M = inertia(s.known, q)
-        put(s.M[0], M[0])
-        put(s.M[1], M[1])
+        put_pair(s.M[0], M[0])
+        put_pair(s.M[1], M[1])
         Y = regressor(g=s.g, q=q, qd=qd, v=qd, a=(0.0, 0.0))
         for i in range(2):
             s.bias[i] = 0.0
@@ -201,7 +201,7 @@ def put_source_torque(
         table=table,
         sampled=sampled,
     )
-    put(torque, (on_arm[0], on_arm[1]))
+    put_pair(torque, (on_arm[0], on_arm[1]))
 
 
 @leaf
@@ -235,11 +235,11 @@ def update_external_torque(
     continuous_0, continuous_1, continuous_wall_n = torque_on_arm(
         t_s=t_s, q=q, qd=qd, lengths=lengths, actors=actors, table=table, sampled=0
     )
-    put(s.held, (held_0, held_1))
+    put_pair(s.held, (held_0, held_1))
     s.wall_n = max(held_wall_n, continuous_wall_n)
     total_0 = continuous_0 + held_0
     total_1 = continuous_1 + held_1
-    put(s.on_arm, (total_0, total_1))
+    put_pair(s.on_arm, (total_0, total_1))
     is_measured = s.external != 0
     if is_measured:
         for i in range(2):
@@ -411,6 +411,6 @@ def advance_arm(
     is_finite = isfinite(q[0]) and isfinite(q[1]) and isfinite(qd[0]) and isfinite(qd[1])
     if not is_finite:
         return False
-    put(s.q, q)
-    put(s.qd, qd)
+    put_pair(s.q, q)
+    put_pair(s.qd, qd)
     return True

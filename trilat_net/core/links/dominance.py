@@ -28,7 +28,7 @@ from ..step.jit import leaf
 from ..step.row_fields import LinkRow, SiteRow
 from ..step.site_setup import StaleAction
 from ..step.ticks import Mode, tick_ns
-from ..step.vectors import Array, RowArray, put
+from ..step.vectors import Array, RowArray
 from .lost_peers import regroup
 
 ROW_SUM_TOLERANCE = 1e-9
@@ -386,9 +386,9 @@ def update_reference(t_ns: int, site: SiteRow, links: RowArray, ramps: Array) ->
         apply_ramps(t_ns, site.ramps, ramps, links)
     if site.degrades:
         regroup(t_ns, site, links)
-    put(site.q_followed, site.q_des)
-    put(site.qd_followed, site.qd_des)
     for i in range(site.q_des.shape[0]):
+        site.q_followed[i] = site.q_des[i]
+        site.qd_followed[i] = site.qd_des[i]
         q_des = 0.0
         qd_des = 0.0
         felt = 0.0

@@ -249,7 +249,7 @@ def _apply_recorded_hand(
 
 
 @leaf
-def _update_peaks(
+def update_peaks(
     row: Array,
     t_ns: int,
     settled_rad: float,
@@ -258,7 +258,7 @@ def _update_peaks(
     peaks: Array,
     sums: SumsRow,
 ) -> None:
-    """Updates the peaks of the present bucket by a record, and advances to the next bucket.
+    """Updates the peaks of the present bucket, and the sums of errors, by a record.
 
     Args:
         row: The floats of the record.
@@ -266,12 +266,11 @@ def _update_peaks(
         settled_rad: Errors below this are settled, rad.
         s: The row of the site.
         progress: The progress of the site.
-        peaks: The peaks of the site, see `run_until`, shape (buckets, 3 n).
+        peaks: The peaks of the site in the present bucket, see `run_until`, shape (3 n,).
         sums: The sums of the site.
     """
     largest_error = 0.0
-    bucket = progress.bucket
-    joints = peaks.shape[1] // 3
+    joints = peaks.shape[0] // 3
     pose = _first_sent(s) - 3 * s.shared if s.task else 0
     reference = 2 * s.joints
     # A task may have fewer coordinates than the arm has joints, or more: the rest are zeros.
@@ -289,11 +288,20 @@ def _update_peaks(
         sums.errors[i] += e * e
         error = abs(e)
         largest_error = max(largest_error, error)
-        peaks[bucket, i] = max(peaks[bucket, i], error)
-        peaks[bucket, joints + i] = max(peaks[bucket, joints + i], speed)
-        peaks[bucket, 2 * joints + i] = angle
+        peaks[i] = max(peaks[i], error)
+        peaks[joints + i] = max(peaks[joints + i], speed)
+        peaks[2 * joints + i] = angle
     if largest_error >= settled_rad:
         progress.unsettled_ns = t_ns
+
+
+@leaf
+def _advance_bucket(progress: ProgressRow) -> None:
+    """Advances to the next bucket if a site has made all ticks of the present one.
+
+    Args:
+        progress: Progress of the site; changed.
+    """
     progress.part += BUCKETS_PER_S
     while progress.part >= progress.rate_hz:
         progress.part -= progress.rate_hz
@@ -357,12 +365,12 @@ def _put_source_torque(
 
 
 @leaf
-def _update_sums(
+def update_sums(
     k: int,
     t_ns: int,
     s: SiteRow,
     chain: RowArray | None,
-    actors: TorqueSourceRows,
+    environments: TorqueSourceRows,
     table: TorqueTable,
     row: Array,
     sums: SumsRow,
@@ -378,8 +386,8 @@ def _update_sums(
         t_ns: Nominal time of the tick, ns since the epoch.
         s: Row of the site.
         chain: Rows of the chain, or None for the planar arm.
-        actors: Operators and environments, the operators first.
-        table: Their tables.
+        environments: Environments of the site, without its operators.
+        table: Tables of all torque sources.
         row: Floats of the record.
         sums: Sums of the site.
     """
@@ -399,15 +407,14 @@ def _update_sums(
     for i in range(n):
         sums.held[i] = s.held[i]
         sums.now[i] = s.on_arm[i] - s.held[i]
-    # Rows of operators come first. With operators, s.held and s.on_arm contain their torque
-    # too.
+    # With operators, s.held and s.on_arm contain their torque too.
     if first > 0:
         _put_source_torque(
             t_s=t_s,
             s=s,
             chain=chain,
             row=row,
-            actors=actors[first:],
+            actors=environments,
             table=table,
             sampled=0,
             torque=sums.now,
@@ -417,7 +424,7 @@ def _update_sums(
             s=s,
             chain=chain,
             row=row,
-            actors=actors[first:],
+            actors=environments,
             table=table,
             sampled=1,
             torque=sums.held,
@@ -642,21 +649,24 @@ def finish_site(
     )
     _record_sent(site[0], i, record, laws)
     site_sums: SumsRow = sums[i]  # one view for both: a view of a row costs time
-    _update_peaks(
+    update_peaks(
         row=record,
         t_ns=t_ns,
         settled_rad=settled_rad,
         s=site[0],
         progress=site_progress,
-        peaks=peaks[i],
+        peaks=peaks[i, site_progress.bucket],
         sums=site_sums,
     )
-    _update_sums(
+    _advance_bucket(site_progress)
+    # Rows of operators come before those of environments.
+    first_environment = max(site_sums.first_environment, 0)
+    update_sums(
         k=k,
         t_ns=t_ns,
         s=site[0],
         chain=chain,
-        actors=arrays.actors[i],
+        environments=arrays.actors[i, first_environment:],
         table=arrays.table,
         row=record,
         sums=site_sums,

@@ -37,7 +37,12 @@ from typing import Any, ParamSpec, TypeVar, cast
 import numba
 from llvmlite.binding import parse_bitcode
 from numba.core import event, types
-from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
+from numba.core.caching import (
+    CompileResultCacheImpl,
+    FunctionCache,
+    IndexDataCacheFile,
+    NullCache,
+)
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, compile_result
 from numba.core.compiler_lock import global_compiler_lock
@@ -189,6 +194,14 @@ _OPTIONS: Any = {"_nrt": False}
 """Options of leaves: no leaf allocates an array, so Numba need not count references, which
 would cost more than the arithmetic.
 """
+_LEAF_OPTIONS: Any = {
+    "nopython": True,
+    "boundscheck": None,
+    # A division by zero gives inf or NaN, which stage 7 of a tick finds. An error would need a
+    # branch, which keeps loops over several runs from using vector instructions.
+    "error_model": "numpy",
+    **_OPTIONS,
+}
 _INNER = "within"
 """Marks kept code as that of an inner leaf."""
 
@@ -196,7 +209,8 @@ _INNER = "within"
 class _LeafLocator:
     """Locates the machine code of a function, with the interface of Numba's cache locators.
 
-    Numba compares the source stamp, here a hash of the file, instead of the time of the file.
+    Numba compares the source stamp, here a hash of the files beside the function, instead of
+    the time of its file.
     """
 
     def __init__(self, function: Callable[..., Any], file: str) -> None:
@@ -210,8 +224,11 @@ class _LeafLocator:
         return str(root / self._py_file.parent.name)
 
     def get_source_stamp(self) -> str:
-        source = self._py_file.read_bytes()
-        return hashlib.sha256(source).hexdigest()
+        digest = hashlib.sha256()
+        # Functions of lanes are outside of the core, whose hash names the directory.
+        for source in sorted(self._py_file.parent.glob("*.py")):
+            digest.update(source.read_bytes())
+        return digest.hexdigest()
 
     def get_disambiguator(self) -> str:
         return str(self._line)
@@ -440,9 +457,14 @@ class _LeafCompiler(Compiler):
 
     Attributes:
         depth: Number of leaves whose compilation is in progress.
+        library_class: Class of the code of a leaf that is not an inner leaf.
+        has_distinct_arguments: True if the arguments of a leaf that is not an inner leaf never
+            overlap in memory.
     """
 
     depth = 0
+    library_class = _LeafLibrary
+    has_distinct_arguments = False
 
     def compile_extra(self, function: Any) -> Any:
         """Compiles a leaf to machine code that Python can call, or to LLVM code.
@@ -460,9 +482,11 @@ class _LeafCompiler(Compiler):
         """
         state = self.state
         is_inner = _LeafCompiler.depth > 0
-        state.library = _LeafLibrary(state.targetctx.codegen(), function.__qualname__)
+        library_class = _LeafLibrary if is_inner else self.library_class
+        state.library = library_class(state.targetctx.codegen(), function.__qualname__)
         state.library.enable_object_caching()
         state.library.is_inner = is_inner
+        state.flags.noalias = self.has_distinct_arguments and not is_inner
         if is_inner:
             # No machine code, and no wrappers by which Python or C could call it.
             state.flags.no_compile = True
@@ -486,15 +510,61 @@ class _LeafCompiler(Compiler):
         return result
 
 
+class _LaneLibrary(_LeafLibrary):
+    """The code of a function of lanes, in which all functions that it calls are inlined."""
+
+    def _optimize_final_module(self) -> None:
+        for function in self._final_module.functions:
+            # The names of the function itself and of its wrapper contain the library's name.
+            if not function.is_declaration and self.name not in function.name:
+                function.add_function_attribute("alwaysinline")
+        super()._optimize_final_module()
+
+
+class _LaneCompiler(_LeafCompiler):
+    """Compiles a function of lanes. Its arguments do not overlap in memory."""
+
+    library_class = _LaneLibrary
+    has_distinct_arguments = True
+
+
+def is_in_lanes(numba_type: Any) -> bool:
+    """Returns True if a value is a row of several runs side by side.
+
+    Args:
+        numba_type: Numba's type of the value. A type of rows in lanes has the attribute
+            `in_lanes`.
+    """
+    return bool(getattr(numba_type, "in_lanes", False))
+
+
 class _Leaf(CPUDispatcher):
     """Numba's dispatcher of a leaf, which compiles the leaf for the types of its arguments.
 
     An inner leaf, which was compiled as a part of another leaf, is compiled again for calls
     from Python.
+
+    Attributes:
+        choose_lane_form: Returns the implementation of the leaf for rows in lanes, see
+            `set_lane_form`. None if the implementation is the leaf itself.
     """
 
     _cache: Any
     _compiler: Any
+
+    def __init__(self, function: Any, targetoptions: Any, pipeline_class: Any) -> None:
+        super().__init__(function, targetoptions=targetoptions, pipeline_class=pipeline_class)
+        self.choose_lane_form: Callable[[tuple[Any, ...]], Callable[..., Any]] | None = None
+        self._compiler._get_implementation = self._choose_implementation
+
+    def _choose_implementation(self, arguments: tuple[Any, ...], _keywords: Any) -> Any:
+        """Returns the Python function to compile for given types of arguments.
+
+        Numba calls this method.
+        """
+        if self.choose_lane_form is not None and any(map(is_in_lanes, arguments)):
+            return self.choose_lane_form(arguments)
+        return self.py_func
 
     def get_call_template(self, arguments: Any, keywords: Any) -> Any:
         """Returns Numba's typing information for a call with given types of arguments.
@@ -558,13 +628,17 @@ class _Leaf(CPUDispatcher):
 
             # A compiled caller can use machine code and LLVM code alike.
             if known is None:
-                known = self._cache.load_inner(argument_types, self.targetctx)
+                # Rows in lanes are defined outside of the core, whose hash names the cache.
+                is_stored = not any(map(is_in_lanes, argument_types))
+                if is_stored:
+                    known = self._cache.load_inner(argument_types, self.targetctx)
                 if known is None:
                     # Report the compilation, as Numba's own method does.
                     data = {"dispatcher": self, "args": argument_types}
                     with event.trigger_event("numba:compile", data=data):
                         known = self._compiler.compile(argument_types, return_type)
-                    self._cache.save_inner(argument_types, known)
+                    if is_stored:
+                        self._cache.save_inner(argument_types, known)
                 self.add_overload(known)
             return known.entry_point
 
@@ -596,10 +670,75 @@ def leaf(function: Callable[P, R]) -> Callable[P, R]:
     """
     if _config.DISABLE_JIT:
         return function
-    options = {"nopython": True, "boundscheck": None, **_OPTIONS}
-    dispatcher = cast(Any, _Leaf)(function, targetoptions=options, pipeline_class=_LeafCompiler)
+    return _make_leaf(function, _LeafCompiler)
+
+
+def _make_leaf(function: Callable[P, R], compiler: type[_LeafCompiler]) -> Callable[P, R]:
+    """Returns Numba's dispatcher of a leaf, which stands for the function in all calls.
+
+    Args:
+        function: The Python function.
+        compiler: Class that compiles it.
+    """
+    dispatcher = cast(Any, _Leaf)(
+        function, targetoptions=dict(_LEAF_OPTIONS), pipeline_class=compiler
+    )
     dispatcher._cache = cast(Any, _LeafCache)(function)
     return cast(Callable[P, R], dispatcher)
+
+
+def lane_leaf(function: Callable[P, R]) -> Callable[P, R]:
+    """Marks a function that computes one stage of several runs, a lane for each (decorator).
+
+    The loops over the lanes use vector instructions. This needs two guarantees to the compiler,
+    which apply to the marked function only: all leaves that it calls become part of its code,
+    and no two of its arguments overlap in memory. The caller has to make sure of the latter.
+
+    Such a function is called from compiled code by its address, see `find_lane_address`.
+    """
+    return _make_leaf(function, _LaneCompiler)
+
+
+def find_lane_address(function: Callable[..., Any], argument_types: tuple[Any, ...]) -> int:
+    """Compiles a function of lanes, or loads its code, and returns the address of its code.
+
+    Args:
+        function: A function with the decorator `lane_leaf`.
+        argument_types: Numba's types of its arguments.
+    """
+    dispatcher: Any = function
+    dispatcher.compile(argument_types)
+    result = dispatcher.overloads[argument_types]
+    return int(result.library.get_pointer_to_function(result.fndesc.llvm_func_name))
+
+
+def read_lane_assembly(function: Callable[..., Any], argument_types: tuple[Any, ...]) -> str:
+    """Returns the machine code of a function of lanes as text, for tests.
+
+    Args:
+        function: A function with the decorator `lane_leaf`.
+        argument_types: Numba's types of its arguments.
+    """
+    dispatcher: Any = function
+    # Numba has no text of code from the cache.
+    compiled: Any = _make_leaf(dispatcher.py_func, _LaneCompiler)
+    compiled._cache = NullCache()
+    compiled.compile(argument_types)
+    return str(compiled.overloads[argument_types].library.get_asm_str())
+
+
+def set_lane_form(
+    function: Callable[..., Any], choose: Callable[[tuple[Any, ...]], Callable[..., Any]]
+) -> None:
+    """Gives a leaf another implementation for arguments that are rows in lanes.
+
+    Args:
+        function: A function with the decorator `leaf`.
+        choose: Function that returns the implementation for given types of the arguments.
+    """
+    if not _config.DISABLE_JIT:
+        dispatcher: Any = function
+        dispatcher.choose_lane_form = choose
 
 
 class _NamedCache(_LeafCache):

@@ -40,7 +40,7 @@ from .row_fields import ArrivalRow, SiteRow
 from .site_arrays import SiteArrays, TickBuffers
 from .site_setup import Law, Scheme, StaleAction
 from .ticks import LifeReason, Mode, tick_ns
-from .vectors import Array, IntArray, Points, RowArray, Vector, put
+from .vectors import Array, IntArray, Points, RowArray, Vector
 
 _DIVERGED = int(Mode.DIVERGED)
 _FAULT = int(Mode.FAULT)
@@ -330,7 +330,8 @@ def _advance(
     h_s = 1.0 / s.rate_hz
     # Evaluate this before the arm moves: whether an arm at rest is fast depends on its speed.
     adapts = _adapts(s)
-    put(s.q_before, s.q)
+    for i in range(s.q.shape[0]):
+        s.q_before[i] = s.q[i]
     if s.external == 0:
         for i in range(s.u.shape[0]):
             torque = s.tau[i]

@@ -7,8 +7,8 @@ processor.
 Invariant:
     - A compiled function reads a vector only by index. Therefore its argument may be a tuple or
       an array.
-    - A compiled function returns a vector as a tuple. The function `put` copies a tuple into an
-      array.
+    - A compiled function returns a vector as a tuple. The functions `put_pair` and `put_five`
+      copy a tuple into an array, and `put` copies an array.
 """
 
 from collections.abc import Sequence
@@ -47,9 +47,27 @@ def five(a: Vector) -> Five:
 
 @leaf
 def put(a: Any, values: Any) -> None:
-    """Copies `values` into the array `a` of the same length."""
+    """Copies the array `values` into the array `a` of the same length."""
     for i in range(a.shape[0]):
         a[i] = values[i]
+
+
+# A tuple is not indexed by the variable of a loop: the compiled code would branch on it.
+@leaf
+def put_pair(a: Any, values: Pair) -> None:
+    """Copies two numbers into an array, whose length is 2."""
+    a[0] = values[0]
+    a[1] = values[1]
+
+
+@leaf
+def put_five(a: Any, values: Five) -> None:
+    """Copies five numbers into an array, whose length is 5."""
+    a[0] = values[0]
+    a[1] = values[1]
+    a[2] = values[2]
+    a[3] = values[3]
+    a[4] = values[4]
 
 
 @leaf

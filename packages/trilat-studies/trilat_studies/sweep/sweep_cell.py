@@ -14,9 +14,10 @@ Invariant:
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from enum import StrEnum
 from itertools import chain
+from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 
@@ -29,6 +30,9 @@ from trilat_net.execution.fused import FusedRun, RunTotals, check_fusable
 from trilat_net.results import finite_or_none
 from trilat_net.scenario import Scenario, parse_scenario
 from trilat_net.scenario.validate import refuse_live_only
+
+if TYPE_CHECKING:
+    from trilat_net.execution.lanes import RunGroup
 
 
 class CellClass(StrEnum):
@@ -150,6 +154,66 @@ def check_sweepable(scenario: Scenario) -> None:
     check_fusable(scenario)
 
 
+class _CellInProgress:
+    """A cell whose run is in progress.
+
+    Args:
+        scenario: Scenario of the cell. Its `duration_s` is the first duration.
+        longest_s: Longest duration of the run, in s.
+
+    Attributes:
+        duration_s: First duration of the run, in s.
+        run: The run.
+    """
+
+    def __init__(self, scenario: Scenario, longest_s: float) -> None:
+        self.duration_s = scenario.duration_s
+        self._scenario = scenario
+        self._longest_s = longest_s
+        self._end_s = scenario.duration_s
+        self._extended = 0
+        self.run = FusedRun(scenario, SETTLED_ERROR_RAD)
+
+    def note_first_end(self) -> None:
+        """Evaluates the run at the end of the scenario's duration."""
+        self._totals = self.run.totals
+        self._outcome = self._build_result()
+        if self._end_s < self._longest_s and _chatters(self._scenario, self.run):
+            self._longest_s = self._end_s
+
+    def find_next_end(self) -> float | None:
+        """Returns the time up to which the run has to continue, in s. None if it has not."""
+        if is_conclusive(self._outcome) or self._end_s >= self._longest_s:
+            return None
+        return min(2.0 * self._end_s, self._longest_s)
+
+    def note_extension(self, end_s: float) -> None:
+        """Evaluates the run, which was extended.
+
+        Args:
+            end_s: New end of the run, in s.
+        """
+        self._end_s = end_s
+        self._extended += 1
+        self._outcome = self._build_result()
+
+    def judge(self) -> CellResult:
+        """Returns the result of the cell, after the last extension."""
+        judged = judge_virtual_run(self._scenario, self.run)
+        decision = judged.decision
+        return msgspec.structs.replace(
+            self._outcome,
+            verdict=classify_decision(decision.stability, judged.end.behaviour),
+            reasons="; ".join(decision.reasons),
+            stability=decision.stability.value,
+            rests_on=decision.rests_on,
+        )
+
+    def _build_result(self) -> CellResult:
+        """Returns the result of the run up to the time that it has reached."""
+        return _build_result(self.run, self._scenario, self._totals, self._extended)
+
+
 def classify_cell(text: str, longest_s: float) -> CellResult:
     """Runs a cell in virtual time and classifies the end of the run.
 
@@ -166,31 +230,74 @@ def classify_cell(text: str, longest_s: float) -> CellResult:
         longest_s: Longest duration of the run, in s. The run is not extended if this is not
             longer than its first duration.
     """
-    scenario = parse_scenario(text)
-    run = FusedRun(scenario, SETTLED_ERROR_RAD)
-    run.advance_to(scenario.duration_s)
-    totals = run.totals
-    extended = 0
-    outcome = _build_result(run, scenario, totals, extended)
+    cell = _CellInProgress(parse_scenario(text), longest_s)
+    cell.run.advance_to(cell.duration_s)
+    cell.note_first_end()
+    while (end_s := cell.find_next_end()) is not None:
+        cell.run.advance_to(end_s)
+        cell.note_extension(end_s)
+    return cell.judge()
 
-    end_s = scenario.duration_s
-    if end_s < longest_s and _chatters(scenario, run):
-        longest_s = end_s
-    while not is_conclusive(outcome) and end_s < longest_s:
-        end_s = min(2.0 * end_s, longest_s)
-        extended += 1
-        run.advance_to(end_s)
-        outcome = _build_result(run, scenario, totals, extended)
 
-    judged = judge_virtual_run(scenario, run)
-    decision = judged.decision
-    return msgspec.structs.replace(
-        outcome,
-        verdict=classify_decision(decision.stability, judged.end.behaviour),
-        reasons="; ".join(decision.reasons),
-        stability=decision.stability.value,
-        rests_on=decision.rests_on,
-    )
+class JudgedCell(NamedTuple):
+    """Result of a cell that was run side by side with others, if possible.
+
+    Attributes:
+        result: Result of the cell.
+        obstacle: Property because of which the cell ran alone. Empty if there is none.
+    """
+
+    result: CellResult
+    obstacle: str
+
+
+def classify_cells(texts: Iterable[str], longest_s: float) -> Iterator[JudgedCell]:
+    """Runs cells side by side, if possible, and classifies the end of each run.
+
+    The result of a cell is that of `classify_cell`, which explains the method.
+
+    Args:
+        texts: Canonical texts of the cells' scenarios.
+        longest_s: Longest duration of each run, in s.
+
+    Yields:
+        The results in the order of the cells.
+    """
+    # A single run must not load the code of lanes.
+    from trilat_net.execution.lanes import find_obstacle, group_runs
+
+    cells = [_CellInProgress(parse_scenario(text), longest_s) for text in texts]
+    runs = [cell.run for cell in cells]
+    for group in group_runs(runs):
+        _run_group(group, cells)
+    for cell in cells:
+        yield JudgedCell(cell.judge(), find_obstacle(cell.run))
+
+
+def _run_group(group: "RunGroup", cells: Sequence[_CellInProgress]) -> None:
+    """Runs the cells of a group, and extends those that are not conclusive.
+
+    Args:
+        group: Group of the runs of some cells. They have the same duration.
+        cells: All cells.
+    """
+    members = [cells[index] for index in group.members]
+    group.advance_to(members[0].duration_s)
+    for cell in members:
+        cell.note_first_end()
+    while True:
+        ends_s = [cell.find_next_end() for cell in members]
+        chosen = [position for position, end_s in enumerate(ends_s) if end_s is not None]
+        if not chosen:
+            return
+        group.keep(chosen)
+        members = [members[position] for position in chosen]
+        # Cells with the same duration are extended to the same times.
+        end_s = members[0].find_next_end()
+        assert end_s is not None
+        group.advance_to(end_s)
+        for cell in members:
+            cell.note_extension(end_s)
 
 
 def measure_exponent(scenario: Scenario) -> float | None:
@@ -379,6 +486,8 @@ class CellRun(msgspec.Struct, frozen=True):
         outcome: Result of the run.
         metrics: Further metrics of the sweep over the scenario's duration, by key. None for a
             metric that the run does not have.
+        alone: Property because of which the run was computed alone, in a sweep whose runs are
+            computed side by side. Empty if there is none.
     """
 
     cell: int
@@ -389,3 +498,4 @@ class CellRun(msgspec.Struct, frozen=True):
     scenario: LineDiff
     outcome: CellResult
     metrics: dict[str, float | None] = {}
+    alone: str = ""

@@ -16,7 +16,8 @@ Invariant:
 import hashlib
 import json
 import math
-from collections.abc import Iterable, Mapping
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,9 +25,11 @@ import msgspec
 
 from trilat_net.analysis.metrics.log_metrics import measure_run
 from trilat_net.errors import ScenarioError, UsageError, count_nouns, format_wall_time
+from trilat_net.execution.fused import FusedRun
 from trilat_net.execution.virtual import simulate_scenario
 from trilat_net.files import make_results_folder, write_whole
 from trilat_net.net.clock import SystemClock
+from trilat_net.scenario import Scenario
 from trilat_net.scenario.code_consent import list_imported_code
 from trilat_net.scenario.laws import identify_law
 from trilat_net.work import executor
@@ -254,6 +257,8 @@ class FinishedSweep(NamedTuple):
         simulated_s: Simulated time of these runs together, in s.
         wall_s: Real time that these runs took, in s.
         jobs: Number of worker processes.
+        alone: Reasons why runs were not computed side by side with others, with the number of
+            these runs. Runs of a sweep that computes all runs one by one are not counted.
     """
 
     results: SweepResults
@@ -262,6 +267,7 @@ class FinishedSweep(NamedTuple):
     simulated_s: float
     wall_s: float
     jobs: int
+    alone: Mapping[str, int] = {}
 
 
 class CellItem(NamedTuple):
@@ -295,17 +301,66 @@ def run_cell(task: CellItem) -> CellRun:
     Raises:
         ScenarioError: The scenario is not valid or cannot run. The message names the cell.
     """
-    plan = task.plan
+    scenario = _build_scenario(task)
+    outcome = sweep_cell.classify_cell(scenario.text, task.plan.longest_s)
+    return _complete_run(task, scenario, outcome)
+
+
+def run_cells(tasks: Sequence[CellItem]) -> Iterator[CellRun]:
+    """Executes several runs of a sweep, side by side where that is possible.
+
+    Args:
+        tasks: The runs, of one sweep.
+
+    Yields:
+        The finished runs in the order of the tasks, equal to those of `run_cell`.
+
+    Raises:
+        ScenarioError: The scenario of a run is not valid or cannot run. The runs before it are
+            yielded first.
+    """
+    scenarios = []
+    problem = None
+    for task in tasks:
+        try:
+            scenarios.append(_build_scenario(task))
+        except ScenarioError as error:
+            problem = error
+            break
+    texts = [scenario.text for scenario in scenarios]
+    judged_cells = sweep_cell.classify_cells(texts, tasks[0].plan.longest_s)
+    for task, scenario, judged in zip(tasks, scenarios, judged_cells, strict=False):
+        run = _complete_run(task, scenario, judged.result)
+        yield msgspec.structs.replace(run, alone=judged.obstacle)
+    if problem is not None:
+        raise problem
+
+
+def _build_scenario(task: CellItem) -> Scenario:
+    """Returns the scenario of a run of a sweep.
+
+    Raises:
+        ScenarioError: The scenario is not valid or cannot run. The message names the cell.
+    """
     cell = task.cell
     try:
-        scenario = plan.scenario(*cell.overrides, f"seed={task.seed}")
+        scenario = task.plan.scenario(*cell.overrides, f"seed={task.seed}")
         sweep_cell.check_sweepable(scenario)
     except ScenarioError as error:
         overrides = ", ".join(cell.overrides)
         raise ScenarioError(f"cell {cell.number} ({overrides}): {error}") from None
+    return scenario
 
-    longest_s = max(plan.longest_s, scenario.duration_s)
-    outcome = sweep_cell.classify_cell(scenario.text, longest_s)
+
+def _complete_run(task: CellItem, scenario: Scenario, outcome: CellResult) -> CellRun:
+    """Measures what the sweep needs besides the class of a cell, and returns the whole result.
+
+    Args:
+        task: The run.
+        scenario: Its scenario.
+        outcome: Its class.
+    """
+    plan = task.plan
     if plan.judge == "twins":
         exponent_per_s = sweep_cell.measure_exponent(scenario)
         outcome = msgspec.structs.replace(outcome, exponent_per_s=exponent_per_s)
@@ -319,7 +374,7 @@ def run_cell(task: CellItem) -> CellRun:
 
     laws = dict.fromkeys(identify_law(site.control) for site in scenario.sites.values())
     return CellRun(
-        cell=cell.number,
+        cell=task.cell.number,
         seed=task.seed,
         random=scenario.random,
         law=", ".join(laws),
@@ -328,6 +383,59 @@ def run_cell(task: CellItem) -> CellRun:
         outcome=outcome,
         metrics=metrics,
     )
+
+
+LANE_RUNS = 32
+"""Number of runs that a worker gets at once, to compute them side by side."""
+LANE_SITE_TICKS = 100_000_000
+"""Number of site ticks from which a sweep compiles the code for several runs side by side.
+
+The compilation takes some ten seconds per kind of site. The code then saves about 0.4 us per
+site tick.
+"""
+
+
+def uses_lanes(plan: SweepPlan, runs: int) -> bool:
+    """Returns True if the runs of a sweep are to be computed side by side.
+
+    Args:
+        plan: The sweep.
+        runs: Number of runs that remain.
+    """
+    rates_hz = [spec.rate_hz for spec in plan.base.sites.values()]
+    site_ticks = runs * plan.base.duration_s * sum(rates_hz)
+    return site_ticks >= LANE_SITE_TICKS
+
+
+def _compile_lanes(plan: SweepPlan) -> None:
+    """Compiles the code for several runs side by side, once for all worker processes.
+
+    Args:
+        plan: The sweep. The code is that of its first cell.
+    """
+    from trilat_net.execution.lanes import LEAST_RUNS, group_runs
+
+    scenario = _build_scenario(CellItem(plan, plan.cell(0), plan.seeds[0]))
+    runs = [FusedRun(scenario) for _ in range(LEAST_RUNS)]
+    for group in group_runs(runs):
+        group.advance_to(1.0 / max(spec.rate_hz for spec in plan.base.sites.values()))
+
+
+def describe_runs_alone(finished: FinishedSweep) -> str:
+    """Returns a sentence on runs that were not computed side by side, and why.
+
+    Args:
+        finished: The finished sweep.
+
+    Returns:
+        The numbers of these runs and of all runs, and the reasons. Empty if there are none.
+    """
+    if not finished.alone:
+        return ""
+    all_runs = count_nouns(len(finished.results.rows), "run")
+    reasons = ", ".join(f"{reason} ({count})" for reason, count in finished.alone.items())
+    count = sum(finished.alone.values())
+    return f"{count} of {all_runs} were computed one by one: {reasons}"
 
 
 def estimate_sweep(
@@ -440,6 +548,7 @@ def run_sweep(
         wall_s = (clock.monotonic_ns() - started_ns) * 1e-9
         new_runs = [run for key, run in journal.done.items() if key not in finished_before]
         rows = build_result_rows(plan, list(journal.done.values()))
+        reasons = [run.alone for run in journal.done.values() if run.alone]
 
     results = SweepResults(plan, rows)
     if len(plan.seeds) > 1:
@@ -454,6 +563,7 @@ def run_sweep(
         simulated_s=sum(run.outcome.ran_s for run in new_runs),
         wall_s=wall_s,
         jobs=count,
+        alone=Counter(reasons),
     )
 
 
@@ -491,6 +601,9 @@ def _run_cells(
             for number, seed in runs
             if (number, seed) not in journal.done
         )
+        runs_side_by_side = uses_lanes(plan, run_count - len(journal.done))
+        if runs_side_by_side:
+            _compile_lanes(plan)
         journal.run_pending(
             pool=pool,
             run=run_cell,
@@ -498,6 +611,8 @@ def _run_cells(
             done=len(journal.done),
             total=run_count,
             show=progress,
+            together=run_cells if runs_side_by_side else None,
+            together_count=LANE_RUNS if runs_side_by_side else 1,
         )
 
     first_runs = ((number, first_seed) for number in range(plan.cells))

@@ -1,0 +1,35 @@
+"""A sweep whose cells run side by side has the table of one whose cells run one by one."""
+
+from pathlib import Path
+
+import pytest
+
+from trilat_studies.sweep import plan_sweep, sweep_run
+from trilat_studies.sweep.sweep_results import RESULTS_FILE
+
+
+def run_in(folder: Path) -> sweep_run.FinishedSweep:
+    """Runs a sweep of 16 cells, half of them with two tick rates, in this process."""
+    plan = plan_sweep(
+        "free",
+        ["duration_s=0.5"],
+        over=["sites.s.rate_hz=1000,500", "control.Kd=1:4.5:0.5"],
+        longest_s=1.0,
+    )
+    return sweep_run.run_sweep(sweep_run.prepare_sweep_folder(plan, folder), jobs=1)
+
+
+def test_table_does_not_depend_on_lanes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    alone = run_in(tmp_path / "alone")
+    assert not alone.alone
+    assert sweep_run.describe_runs_alone(alone) == ""
+    monkeypatch.setattr(sweep_run, "LANE_SITE_TICKS", 0)
+    together = run_in(tmp_path / "together")
+    assert together.runs == alone.runs == len(together.results.rows)
+    table = (tmp_path / "together" / RESULTS_FILE).read_bytes()
+    assert table == (tmp_path / "alone" / RESULTS_FILE).read_bytes()
+    assert sweep_run.describe_runs_alone(together) == (
+        "8 of 16 runs were computed one by one: tick rates that differ between sites (8)"
+    )

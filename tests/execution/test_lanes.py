@@ -1,0 +1,231 @@
+"""Runs side by side are the runs alone, bit for bit."""
+
+import platform
+import random
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+
+from trilat_net.execution import virtual
+from trilat_net.execution.fused import FusedRun
+from trilat_net.execution.lanes import LANES, LEAST_RUNS, find_obstacle, group_runs
+from trilat_net.execution.lanes.lane_run import LaneRun, read_assembly
+from trilat_net.scenario import Scenario, load_scenario
+
+LINKS: tuple[dict[str, Any], ...] = (
+    {"link.delay_ms": 0.0},
+    {"link.delay_ms": 33.3},
+    {"link.delay_ms": 150.0, "link.loss": 0.2},
+    {"link.model": "uniform", "link.delay_ms": 40.0, "link.half_width_ms": 40.0},
+    {
+        "link.model": "uniform",
+        "link.delay_ms": 40.0,
+        "link.half_width_ms": 40.0,
+        "link.order": "in_order",
+    },
+    {
+        "link.model": "normal",
+        "link.delay_ms": 30.0,
+        "link.deviation_ms": 20.0,
+        "link.playout_ms": 60.0,
+    },
+    {
+        "link.model": "sine",
+        "link.delay_ms": 50.0,
+        "link.amplitude_ms": 50.0,
+        "link.period_s": 0.3,
+    },
+    {"link.preset": "4g", "link.duplicate": 0.2},
+)
+STRUCTURES: tuple[tuple[str, dict[str, Any]], ...] = (
+    ("free", {}),
+    ("p_d_margin", {}),
+    ("windup", {}),
+    ("free", {"scheme": "digital", "rate_hz": 333}),
+    ("asymmetric", {}),
+    ("contact", {}),
+    ("jitter", {}),
+    ("free", {"sites.s.on_stale": {"action": "hold", "age_ms": 60.0}}),
+)
+"""Scenarios whose runs differ in their equations; the quick tests use the first three."""
+
+
+def draw_cells(
+    draws: random.Random, structure: tuple[str, Mapping[str, Any]], count: int
+) -> list[Scenario]:
+    """Cells of one structure, each with gains, links and a seed of its own."""
+    name, settings = structure
+    base = load_scenario(name, {"duration_s": 0.6, **settings})
+    gain = "control.Kd" if name in ("free", "windup", "asymmetric") else "control.d"
+    cells = []
+    for _ in range(count):
+        numbers = {gain: draws.uniform(0.5, 3.0), "seed": draws.randrange(1000)}
+        cells.append(load_scenario(base, {**draws.choice(LINKS), **numbers}))
+    return cells
+
+
+def read_numbers(run: FusedRun) -> dict[str, bytes]:
+    """Everything that a run computes, by field, without entries of rings that are not in use."""
+    memory = run.memory
+    numbers = {
+        f"site.{name}": memory.tables.site[name] for name in memory.tables.site.dtype.names
+    }
+    numbers |= {f"sums.{name}": memory.sums[name] for name in memory.sums.dtype.names}
+    numbers |= {
+        f"progress.{name}": memory.progress[name] for name in memory.progress.dtype.names
+    }
+    numbers |= {"peaks": memory.peaks, "records": run.records}
+    return {name: np.ascontiguousarray(array).tobytes() for name, array in numbers.items()}
+
+
+def check_equal(run: FusedRun, alone: FusedRun) -> None:
+    """Checks that two runs have the same bits."""
+    expected = read_numbers(alone)
+    assert [name for name, bits in read_numbers(run).items() if bits != expected[name]] == []
+    assert (run.ran_s, run.diverged_s, run.totals) == (
+        alone.ran_s,
+        alone.diverged_s,
+        alone.totals,
+    )
+
+
+def run_alone(scenario: Scenario, *ends_s: float) -> FusedRun:
+    """The run of a scenario by itself."""
+    run = FusedRun(scenario)
+    for end_s in ends_s or (scenario.duration_s,):
+        run.advance_to(end_s)
+    return run
+
+
+def check_cells(cells: Sequence[Scenario]) -> None:
+    """Checks cells in lanes against each cell alone."""
+    runs = [FusedRun(cell) for cell in cells]
+    LaneRun(runs).advance_to(cells[0].duration_s)
+    for run, cell in zip(runs, cells, strict=True):
+        check_equal(run, run_alone(cell))
+
+
+@pytest.mark.parametrize("structure", STRUCTURES[:3], ids=lambda structure: structure[0])
+@pytest.mark.parametrize("count", [LANES, 5])
+def test_every_lane_has_the_bits_of_its_run_alone(
+    structure: tuple[str, dict[str, Any]], count: int
+) -> None:
+    check_cells(draw_cells(random.Random(count), structure, count))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("cells", [400, 2000])
+def test_random_cells_have_the_bits_of_their_runs_alone(cells: int) -> None:
+    draws = random.Random(cells)
+    while cells > 0:
+        count = draws.randint(1, LANES)
+        check_cells(draw_cells(draws, draws.choice(STRUCTURES), count))
+        cells -= count
+
+
+def test_lane_has_the_bits_of_site_step() -> None:
+    cells = draw_cells(random.Random(3), STRUCTURES[0], 4)
+    runs = [FusedRun(cell) for cell in cells]
+    LaneRun(runs).advance_to(cells[0].duration_s)
+    outputs = {step.site.name: step.output for step in virtual.execute_virtual(cells[2])}
+    for name, record in zip(cells[2].names, runs[2].records, strict=True):
+        columns = cells[2].layout(name).columns()
+        for key in ("q", "qd", "q_des", "tau", "theta_hat"):
+            assert record[columns[key]].tolist() == list(getattr(outputs[name], key))
+
+
+def test_lanes_end_where_their_arms_leave_the_limits() -> None:
+    """Each at a time of its own; the others go on."""
+    limits = np.linspace(0.5, 6.0, LANES)
+    cells = [
+        load_scenario("free", {"duration_s": 1.5, "limits.qd_limit_rad_s": float(limit)})
+        for limit in limits
+    ]
+    check_cells(cells)
+    ends_s = [run_alone(cell).diverged_s for cell in cells]
+    assert None in ends_s
+    assert len(set(ends_s)) > 3
+
+
+def test_runs_continue_in_lanes_or_alone() -> None:
+    """Some cells are extended in lanes; then one goes on alone, with its links as they would be."""
+    cells = draw_cells(random.Random(7), STRUCTURES[0], LANES)
+    runs = [FusedRun(cell) for cell in cells]
+    lanes = LaneRun(runs)
+    lanes.advance_to(0.3)
+    chosen = [2, 3, 9, 14]
+    lanes.keep(chosen)
+    lanes.advance_to(0.7)
+    for index in chosen:
+        check_equal(runs[index], run_alone(cells[index], 0.3, 0.7))
+    for index in (0, 9, 14):
+        start_s = 0.7 if index in chosen else 0.3
+        runs[index].advance_to(1.0)
+        alone = run_alone(cells[index], start_s, 1.0)
+        check_equal(runs[index], alone)
+        links, expected = runs[index].memory.tables.links, alone.memory.tables.links
+        assert [n for n in links.dtype.names if (links[n] != expected[n]).any()] == []
+        assert (runs[index].memory.next_samples == alone.memory.next_samples).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "obstacle"),
+    [
+        ("six_joints", {}, "arms that are chains of joints"),
+        ("free", {"control.law": "tdpa", "scheme": "digital"}, "laws that the kernel"),
+        ("free", {"sites.s.rate_hz": 500}, "tick rates that differ"),
+        ("play", {}, "hands that move an arm live"),
+        ("free", {"sites.s.on_stale": {"action": "glide"}}, "glide"),
+    ],
+)
+def test_obstacles_are_named(name: str, settings: dict[str, Any], obstacle: str) -> None:
+    run = FusedRun(load_scenario(name, {"duration_s": 0.1, **settings}))
+    assert obstacle in find_obstacle(run)
+
+
+def test_groups_have_one_structure_and_few_runs_stay_alone() -> None:
+    free = [FusedRun(load_scenario("free", {"duration_s": 0.1})) for _ in range(LANES + 1)]
+    longer = [
+        FusedRun(load_scenario("free", {"duration_s": 0.2})) for _ in range(LEAST_RUNS - 1)
+    ]
+    rates = [FusedRun(load_scenario("free", {"duration_s": 0.1, "sites.s.rate_hz": 500}))]
+    sizes = []
+    members = []
+    for group in group_runs([*free, *longer, *rates]):
+        sizes.append(len(group.members))
+        members += group.members
+    assert sorted(members) == list(range(LANES + LEAST_RUNS + 1))
+    assert sorted(sizes) == [1] * (LEAST_RUNS + 1) + [LANES]
+
+
+def _has_avx2() -> bool:
+    """True if the processor has vector registers of four numbers."""
+    import llvmlite.binding
+
+    return platform.machine() in ("x86_64", "AMD64") and bool(
+        llvmlite.binding.get_host_cpu_features().get("avx2")
+    )
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not _has_avx2(), reason="the processor has no AVX2")
+def test_stages_use_vector_instructions() -> None:
+    """A single branch in a leaf would cost a factor of four: stage 8 alone divides eight times."""
+    code = read_assembly(FusedRun(load_scenario("free", {"duration_s": 0.1})), 0)
+    packed = {
+        name: len(re.findall(rf"\bv{name}pd\b[^\n]*[yz]mm", code))
+        for name in ("add", "sub", "mul", "div", "max", "sqrt")
+    }
+    arithmetic = r"\bv(?:add|sub|mul)pd\b[^\n]*[yz]mm"
+    loops = [
+        block
+        for block in re.split(r"\n(?=\.LBB)", code)
+        if len(re.findall(arithmetic, block)) > 9
+    ]
+    assert packed["div"] >= 8
+    assert packed["add"] + packed["sub"] + packed["mul"] >= 650
+    # errors and estimate; torque, record and integration; statistics
+    assert len(loops) >= 3

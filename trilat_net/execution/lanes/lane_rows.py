@@ -1,0 +1,347 @@
+# mypy: disallow-untyped-calls=False, disallow-untyped-decorators=False
+# mypy: disable-error-code="no-any-return, override"
+"""Defines rows of several runs side by side, which compiled code reads like rows of one run.
+
+A lane is the position of one run among runs that are computed together. Each number of a row of
+one run becomes `LANES` numbers, which are adjacent in memory. Therefore a loop over the lanes
+can use vector instructions. The functions of the kernel are called with a row in one lane. It
+has the same fields as a row of one run, so that no function of the kernel needs a second form.
+
+Fields that have the same value in all lanes can be constants, for example the control law. The
+compiler then removes the branches for other values.
+
+Invariant:
+    - A row in a lane has the fields, shapes and types of a row of one run.
+    - All properties on which compiled code depends are in the name of a type, which is a part
+      of the key under which the code is stored.
+"""
+
+import hashlib
+import operator
+from typing import Any, NamedTuple
+
+import numpy as np
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.core.extending import intrinsic, models, register_model
+from numba.core.imputils import lower_builtin, lower_getattr_generic, lower_setattr_generic
+from numba.core.typing.templates import (
+    AbstractTemplate,
+    AttributeTemplate,
+    infer_getattr,
+    infer_global,
+    signature,
+)
+from numba.np import arrayobj
+from numpy.typing import NDArray
+
+LANES = 16
+"""Number of lanes: room for as many runs. A vector register holds at most eight numbers; with
+two registers per quantity, the processor computes one while it waits for the other.
+"""
+_WORD = 8
+"""Size of each number of a row, bytes."""
+_ALIGNMENT = 64
+"""Size of a vector register and of a cache line, bytes."""
+_NUMBA_KINDS = {"i8": types.int64, "f8": types.float64, "u8": types.uint64}
+
+Words = NDArray[np.int64]
+"""Rows in lanes as 64-bit words, shape (rows, words of a row, LANES)."""
+Constants = tuple[tuple[str, int], ...]
+"""Names and values of the fields that are equal in all lanes."""
+
+
+class LaneField(NamedTuple):
+    """A field of a row in lanes.
+
+    Attributes:
+        name: Name of the field.
+        kind: Kind of its numbers: "i8", "f8" or "u8".
+        first_word: Index of its first number in a row of one run.
+        shape: Shape of the field in a row of one run, () for a single number.
+    """
+
+    name: str
+    kind: str
+    first_word: int
+    shape: tuple[int, ...]
+
+
+class LaneTable(types.Type):
+    """Numba's type of a table of rows in all lanes, a pointer to its first number.
+
+    Args:
+        dtype: Data type of a row of one run. All its numbers have 64 bits.
+        constants: For each row the fields that are equal in all lanes.
+    """
+
+    in_lanes = True
+
+    def __init__(self, dtype: np.dtype[Any], constants: tuple[Constants, ...] = ((),)) -> None:
+        fields = []
+        assert dtype.fields is not None
+        for name, (field_dtype, offset, *_) in dtype.fields.items():
+            kind = field_dtype.base.str[1:]
+            fields.append(LaneField(name, kind, offset // _WORD, field_dtype.shape))
+        self.fields = tuple(fields)
+        self.row_length = dtype.itemsize // _WORD
+        self.constants = constants
+        super().__init__(f"{type(self).__name__}({self.fields}, {constants}, {LANES})")
+
+    @property
+    def mangling_args(self) -> tuple[str, tuple[str]]:
+        """Name of the type in symbols of machine code, without characters of its full name."""
+        digest = hashlib.sha256(self.name.encode()).hexdigest()
+        return type(self).__name__, (f"l{digest[:16]}",)
+
+    @property
+    def count(self) -> int:
+        """Number of rows with constants of their own."""
+        return len(self.constants)
+
+
+class _PartOfTable(LaneTable):
+    """Type of a part of a table in one lane, with the fields of the table."""
+
+    def __init__(self, table: LaneTable, constants: tuple[Constants, ...]) -> None:
+        self.fields = table.fields
+        self.row_length = table.row_length
+        self.constants = constants
+        types.Type.__init__(self, f"{type(self).__name__}({self.fields}, {constants}, {LANES})")
+
+
+class RowsInLane(_PartOfTable):
+    """Type of all rows of a table in one lane."""
+
+
+class LaneRow(_PartOfTable):
+    """Type of one row of a table in one lane."""
+
+    def find_field(self, name: str) -> LaneField | None:
+        """Returns the field of a name, or None."""
+        return next((field for field in self.fields if field.name == name), None)
+
+    def find_constant(self, name: str) -> int | None:
+        """Returns the value of a field that is equal in all lanes, or None."""
+        return dict(self.constants[0]).get(name)
+
+
+@register_model(LaneTable)
+class _TableModel(models.PrimitiveModel):
+    """A table is represented by a pointer."""
+
+    def __init__(self, manager: Any, numba_type: Any) -> None:
+        super().__init__(manager, numba_type, ir.IntType(8).as_pointer())
+
+
+@register_model(RowsInLane)
+@register_model(LaneRow)
+class _RowModel(models.StructModel):
+    """Rows in a lane are represented by a pointer to the first row and a lane's index."""
+
+    def __init__(self, manager: Any, numba_type: Any) -> None:
+        members = [("pointer", types.voidptr), ("lane", types.intp)]
+        super().__init__(manager, numba_type, members)
+
+
+def _offset_pointer(builder: Any, pointer: Any, offset: Any) -> Any:
+    """Generates the address that lies so many bytes behind a pointer."""
+    return builder.gep(pointer, [offset], source_etype=ir.IntType(8))
+
+
+@infer_getattr
+class _RowAttributes(AttributeTemplate):
+    """Types of the fields of a row in a lane."""
+
+    key = LaneRow
+
+    def generic_resolve(self, row: LaneRow, name: str) -> Any:
+        if row.find_constant(name) is not None:
+            return types.int64
+        field = row.find_field(name)
+        if field is None:
+            return None
+        kind = _NUMBA_KINDS[field.kind]
+        return types.Array(kind, len(field.shape), "A") if field.shape else kind
+
+
+@infer_getattr
+class _RowsAttributes(AttributeTemplate):
+    """Rows in a lane have the shape (count,)."""
+
+    key = RowsInLane
+
+    def resolve_shape(self, _rows: RowsInLane) -> Any:
+        return types.UniTuple(types.intp, 1)
+
+
+def _find_number(
+    context: Any, builder: Any, row_type: LaneRow, row_value: Any, field: LaneField
+) -> Any:
+    """Generates the address of the first number of a field in the lane of a row."""
+    row = cgutils.create_struct_proxy(row_type)(context, builder, value=row_value)
+    word = row.lane.type
+    in_lane = builder.mul(row.lane, ir.Constant(word, _WORD))
+    offset = builder.add(ir.Constant(word, field.first_word * LANES * _WORD), in_lane)
+    pointer = _offset_pointer(builder, row.pointer, offset)
+    number_type = context.get_data_type(_NUMBA_KINDS[field.kind])
+    return builder.bitcast(pointer, number_type.as_pointer())
+
+
+@lower_getattr_generic(LaneRow)
+def _read_field(context: Any, builder: Any, row_type: LaneRow, row: Any, name: str) -> Any:
+    """Generates the reading of a field: a constant, a number, or a view of an array."""
+    constant = row_type.find_constant(name)
+    if constant is not None:
+        return context.get_constant(types.int64, constant)
+    field = row_type.find_field(name)
+    assert field is not None
+    data = _find_number(context, builder, row_type, row, field)
+    if not field.shape:
+        return builder.load(data)
+
+    array_type = types.Array(_NUMBA_KINDS[field.kind], len(field.shape), "A")
+    view = context.make_array(array_type)(context, builder)
+    strides: list[int] = []
+    step = LANES * _WORD  # from one number of the lane to the next
+    for length in reversed(field.shape):
+        strides.insert(0, step)
+        step *= length
+
+    def pack(numbers: Any) -> Any:
+        constants = [context.get_constant(types.intp, number) for number in numbers]
+        return cgutils.pack_array(builder, constants)
+
+    arrayobj.populate_array(
+        view,
+        data=data,
+        shape=pack(field.shape),
+        strides=pack(strides),
+        itemsize=context.get_constant(types.intp, _WORD),
+        meminfo=None,
+    )
+    return view._getvalue()
+
+
+@lower_setattr_generic(LaneRow)
+def _write_field(context: Any, builder: Any, sig: Any, args: Any, name: str) -> None:
+    """Generates the writing of a number."""
+    row_type, value_type = sig.args
+    row, value = args
+    field = row_type.find_field(name)
+    data = _find_number(context, builder, row_type, row, field)
+    kind = _NUMBA_KINDS[field.kind]
+    builder.store(context.cast(builder, value, value_type, kind), data)
+
+
+@lower_getattr_generic(RowsInLane)
+def _read_shape(context: Any, builder: Any, rows: RowsInLane, _value: Any, _name: str) -> Any:
+    """Generates the shape of rows in a lane, which is a constant."""
+    count = context.get_constant(types.intp, rows.count)
+    return context.make_tuple(builder, types.UniTuple(types.intp, 1), [count])
+
+
+def _find_row(
+    context: Any,
+    builder: Any,
+    rows_type: RowsInLane,
+    rows_value: Any,
+    index: Any,
+    row_type: Any,
+) -> Any:
+    """Generates the row of an index, of the type `row_type`."""
+    rows = cgutils.create_struct_proxy(rows_type)(context, builder, value=rows_value)
+    row = cgutils.create_struct_proxy(row_type)(context, builder)
+    row_bytes = ir.Constant(index.type, rows_type.row_length * LANES * _WORD)
+    row.pointer = _offset_pointer(builder, rows.pointer, builder.mul(index, row_bytes))
+    row.lane = rows.lane
+    return row._getvalue()
+
+
+@infer_global(operator.getitem)
+class _RowsItem(AbstractTemplate):
+    """The type of `rows[index]`, if all rows have the same constants."""
+
+    def generic(self, args: Any, _keywords: Any) -> Any:
+        rows, index = args
+        if not isinstance(rows, RowsInLane) or not isinstance(index, types.Integer):
+            return None
+        if len(set(rows.constants)) > 1:
+            return None
+        return signature(LaneRow(rows, rows.constants[:1]), rows, types.intp)
+
+
+@lower_builtin(operator.getitem, RowsInLane, types.Integer)
+def _get_item(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    """Generates `rows[index]`."""
+    return _find_row(context, builder, sig.args[0], args[0], args[1], sig.return_type)
+
+
+@intrinsic
+def _in_lane(_context: Any, table: Any, _lane: Any) -> Any:
+    """Generates the rows of a table in one lane."""
+    rows_type = RowsInLane(table, table.constants)
+
+    def generate(context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        rows = cgutils.create_struct_proxy(rows_type)(context, builder)
+        rows.pointer, rows.lane = args
+        return rows._getvalue()
+
+    return rows_type(table, types.intp), generate
+
+
+@intrinsic(prefer_literal=True)
+def _select_row(_context: Any, rows: Any, index: Any) -> Any:
+    """Generates the row of an index that is known to the compiler."""
+    if not isinstance(index, types.IntegerLiteral):
+        return None
+    number = index.literal_value
+    row_type = LaneRow(rows, rows.constants[number : number + 1])
+
+    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        position = context.get_constant(types.intp, number)
+        return _find_row(context, builder, sig.args[0], args[0], position, sig.return_type)
+
+    return row_type(rows, index), generate
+
+
+@intrinsic
+def _pointer_to(_context: Any, address: Any) -> Any:
+    """Generates the conversion of an address to a pointer."""
+
+    def generate(_target: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        return builder.inttoptr(args[0], ir.IntType(8).as_pointer())
+
+    return types.voidptr(address), generate
+
+
+# Compiled code calls these functions with one argument less than their definitions have.
+in_lane: Any = _in_lane
+"""Returns the rows of a table in one lane: `in_lane(table, lane)`."""
+select_row: Any = _select_row
+"""Returns a row with its own constants: `select_row(rows, index)`. The index is a constant."""
+pointer_to: Any = _pointer_to
+"""Converts the address of a table to a pointer, which stands for the table in calls."""
+
+
+def allocate_words(rows: int, row_length: int) -> Words:
+    """Returns zeros that begin at a cache line, shape (rows, words, LANES).
+
+    Args:
+        rows: Number of rows.
+        row_length: Numbers in a row of one run.
+    """
+    count = rows * row_length * LANES
+    room = np.zeros(count + _ALIGNMENT // _WORD, np.int64)
+    first = -room.ctypes.data // _WORD % (_ALIGNMENT // _WORD)
+    return room[first : first + count].reshape(rows, row_length, LANES)
+
+
+def read_words(rows: NDArray[Any]) -> Words:
+    """Returns rows of one run as words, shape (rows, words of a row).
+
+    Args:
+        rows: Structured array of the rows, shape (rows,).
+    """
+    row_length = rows.dtype.itemsize // _WORD
+    return np.ascontiguousarray(rows).view(np.int64).reshape(len(rows), row_length)

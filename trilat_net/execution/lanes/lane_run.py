@@ -1,0 +1,476 @@
+"""Advances several runs of one structure together, a lane for each.
+
+Invariant:
+    - After `advance_to`, each run has the numbers that `FusedRun.advance_to` would give it, bit
+      for bit. Only the entries of ring buffers that are not used any more may differ.
+    - The tables of the lanes do not overlap in memory, as `advance_site` requires.
+"""
+
+from collections.abc import Sequence
+from functools import partial
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba.core import types
+from numpy.typing import NDArray
+
+from ...core.step.fused_run import NEVER_NS
+from ...core.step.jit import find_lane_address, read_lane_assembly
+from ...core.step.ticks import BUCKETS_PER_S, Mode, tick_ns
+from ...core.step.vectors import IntArray
+from ..fused import FusedRun
+from .lane_deliveries import (
+    BLOCK_TICKS,
+    copy_link_states,
+    repeat_deliveries,
+    use_samples,
+)
+from .lane_rows import LANES, LaneTable, Words, allocate_words, read_words
+from .lane_stages import JOINTS, EndedRuns, advance_site, run_block
+from .lane_structure import RunStructure, SiteStructure, find_structure
+
+_STATE_DTYPE = np.dtype([(name, "f8", (JOINTS,)) for name in ("q", "qd", "tau_x")])
+"""Layout of the state that a site sends to its peers."""
+_REFERENCE_FIELDS = ("alpha", "alpha_rate", "gone")
+"""Fields of a link's row that stage 3 of a tick writes."""
+_STATE_FIELDS = ("q", "qd", "tau_x")
+"""Fields of a link's row that contain the sample in use."""
+
+
+class SiteTables(NamedTuple):
+    """The tables of one site in all lanes, in the order of the arguments of `advance_site`.
+
+    Attributes:
+        site: Row of the site.
+        links: Rows of its links.
+        actors: Rows of its operators and environments.
+        environments: The rows of its environments.
+        ramps: Row with the changes of its dominance factors.
+        record: Row with the floats of its record.
+        states: The latest states of all sites.
+        used: Samples in use in the ticks of a block.
+        peaks: Peaks, one row per bucket.
+        sums: Row of its sums.
+        progress: Row of its progress.
+    """
+
+    site: Any
+    links: Any
+    actors: Any
+    environments: Any
+    ramps: Any
+    record: Any
+    states: Any
+    used: Any
+    peaks: Any
+    sums: Any
+    progress: Any
+
+
+class LaneLayout(NamedTuple):
+    """Layouts of the tables of a run.
+
+    Attributes:
+        site: Of the row of a site.
+        link: Of the row of a link.
+        actor: Of the row of an operator or environment.
+        sums: Of the sums of a site.
+        progress: Of the progress of a site.
+        floats: Number of floats in a record.
+        columns: Number of columns of the peaks.
+        ramps: Shape of the table of dominance factors.
+    """
+
+    site: np.dtype[Any]
+    link: np.dtype[Any]
+    actor: np.dtype[Any]
+    sums: np.dtype[Any]
+    progress: np.dtype[Any]
+    floats: int
+    columns: int
+    ramps: tuple[int, ...]
+
+
+def find_layout(run: FusedRun) -> LaneLayout:
+    """Returns the layouts of the tables of a run."""
+    memory = run.memory
+    tables = memory.tables
+    return LaneLayout(
+        site=tables.site.dtype,
+        link=tables.links.dtype,
+        actor=tables.actors.dtype,
+        sums=memory.sums.dtype,
+        progress=memory.progress.dtype,
+        floats=memory.sent.rows.shape[2],
+        columns=memory.peaks.shape[2],
+        ramps=tables.ramps.shape[1:],
+    )
+
+
+def list_argument_types(
+    layout: LaneLayout, structure: RunStructure, site: SiteStructure
+) -> tuple[Any, ...]:
+    """Returns Numba's types of the arguments of `advance_site` for a site.
+
+    Args:
+        layout: Layouts of the tables.
+        structure: Structure of the run.
+        site: Structure of the site.
+    """
+    first = site.first_environment
+    environments = site.actors[first:] if first >= 0 else ()
+    tables = SiteTables(
+        site=LaneTable(layout.site, (site.constants,)),
+        links=LaneTable(layout.link, ((),) * structure.peers),
+        actors=LaneTable(layout.actor, site.actors),
+        environments=LaneTable(layout.actor, environments),
+        ramps=LaneTable(np.dtype([("rows", "f8", layout.ramps)])),
+        record=LaneTable(np.dtype([("floats", "f8", (layout.floats,))])),
+        states=LaneTable(_STATE_DTYPE),
+        used=LaneTable(np.dtype([("sample", "i8", (structure.peers,))])),
+        peaks=LaneTable(np.dtype([("joints", "f8", (layout.columns,))])),
+        sums=LaneTable(layout.sums, ((("first_environment", first),),)),
+        progress=LaneTable(layout.progress),
+    )
+    integer = types.int64
+    numbers = (integer, integer, integer, types.float64, integer, integer, integer, integer)
+    table = types.Array(types.float64, 2, "C")
+    return (*numbers, *tables, table)
+
+
+def read_assembly(run: FusedRun, i: int) -> str:
+    """Returns the machine code of the ticks of a site in lanes as text, for tests.
+
+    Args:
+        run: The run.
+        i: Index of the site.
+    """
+    structure = find_structure(run)
+    arguments = list_argument_types(find_layout(run), structure, structure.sites[i])
+    return read_lane_assembly(advance_site, arguments)
+
+
+class _LinksOfRun:
+    """The links of a run in a lane, which are brought up to date only if the run needs them.
+
+    Args:
+        run: The run before its first tick.
+    """
+
+    def __init__(self, run: FusedRun) -> None:
+        self._run = run
+        self._ticks = 0
+
+    def set_pending(self, ticks: int, links: NDArray[Any], states: NDArray[np.float64]) -> None:
+        """Notes that the run has advanced, and with which results.
+
+        Args:
+            ticks: Number of ticks that the run has made.
+            links: Rows of its links after these ticks. Only fields of the sample in use, and
+                fields that stage 3 of a tick writes, are up to date.
+            states: The latest states of its sites, see `repeat_deliveries`.
+        """
+        self._run.pending_deliveries = partial(self._update, ticks, links, states)
+
+    def _update(self, ticks: int, links: NDArray[Any], states: NDArray[np.float64]) -> None:
+        """Brings the links of the run up to date, see `set_pending`."""
+        memory = self._run.memory
+        tables = memory.tables
+        repeat_deliveries(
+            first=self._ticks,
+            end=ticks,
+            rate_hz=int(tables.site["rate_hz"][0, 0]),
+            links=tables.links,
+            models=tables.models,
+            dues=tables.dues,
+            calendars=tables.calendars,
+            points=tables.points,
+            states=states,
+        )
+        self._ticks = ticks
+        memory.next_samples[:] = max(ticks - 1, 0)
+        for name in (*_REFERENCE_FIELDS, *_STATE_FIELDS):
+            tables.links[name] = links.reshape(tables.links.shape)[name]
+
+
+class LaneRun:
+    """Several runs of one structure that advance together, each in a lane of its own.
+
+    Args:
+        runs: The runs before their first tick, at most `LANES`. They must have the same
+            structure, see `find_structure`, and no obstacle, see `find_obstacle`.
+
+    Attributes:
+        runs: The runs that are in the lanes. `advance_to` writes the results into them.
+    """
+
+    def __init__(self, runs: Sequence[FusedRun]) -> None:
+        assert 0 < len(runs) <= LANES
+        structure = find_structure(runs[0])
+        assert all(find_structure(run) == structure for run in runs)
+        assert all(run.ran_s == 0.0 for run in runs)
+        self.runs = list(runs)
+        self._structure = structure
+        self._layout = layout = find_layout(runs[0])
+        memories = [run.memory for run in runs]
+        tables = [memory.tables for memory in memories]
+        first = tables[0]
+        self._sites = len(structure.sites)
+        self._rate_hz = int(first.site["rate_hz"][0, 0])
+        self._table = first.table
+        self._ticks = 0
+        self._deliveries = [copy_link_states(arrays) for arrays in tables]
+        self._links_of_runs = [_LinksOfRun(run) for run in runs]
+
+        # A state waits at most as long as a sample waits in a calendar.
+        self._pages = max(arrays.calendars.shape[2] for arrays in tables)
+        self._states = allocate_words(self._sites * (self._pages + 1), 3 * JOINTS)
+        self._used = allocate_words(self._sites * BLOCK_TICKS, structure.peers)
+        self._peaks = np.zeros((self._sites, 0, layout.columns, LANES), np.int64)
+
+        def pack(tables_of_runs: Sequence[NDArray[Any]]) -> Words:
+            """Returns the tables of all runs side by side, shape (rows, words, LANES)."""
+            tables_of_lanes = [read_words(table.reshape(-1)) for table in tables_of_runs]
+            rows, row_length = tables_of_lanes[0].shape
+            packed = allocate_words(rows, row_length)
+            # Lanes without a run repeat the first run.
+            packed[:] = tables_of_lanes[0][:, :, None]
+            for lane, numbers in enumerate(tables_of_lanes):
+                packed[:, :, lane] = numbers
+            return packed
+
+        self._site = pack([arrays.site for arrays in tables])
+        self._links = pack([arrays.links for arrays in tables])
+        self._actors = pack([arrays.actors for arrays in tables])
+        # The environments have a table of their own, because arguments must not overlap.
+        self._environments = self._actors.copy()
+        self._sums = pack([memory.sums for memory in memories])
+        self._progress = pack([memory.progress for memory in memories])
+        self._ramps = pack([_view_rows(arrays.ramps) for arrays in tables])
+        self._records = allocate_words(self._sites, layout.floats)
+        self._ended = EndedRuns(
+            ticks=np.full(LANES, -1),
+            site_rows=np.zeros_like(self._site),
+            records=np.zeros_like(self._records),
+            sums=np.zeros_like(self._sums),
+            progress=np.zeros_like(self._progress),
+            peaks=np.zeros((self._sites, layout.columns, LANES), np.int64),
+        )
+        self._put_first_states(tables)
+        self._addresses = np.array(
+            [
+                find_lane_address(advance_site, list_argument_types(layout, structure, site))
+                for site in structure.sites
+            ]
+        )
+
+    def _put_first_states(self, tables: Sequence[Any]) -> None:
+        """Writes the states of all sites before the first tick, which their peers start with.
+
+        Args:
+            tables: Arrays of the sites of each run.
+        """
+        states = self._states.reshape(self._sites, self._pages + 1, 3 * JOINTS, LANES)
+        floats = states.view(np.float64)
+        for lane, arrays in enumerate(tables):
+            for j in range(self._sites):
+                # The peers of a site are all other sites: site 0 is a peer of site 1.
+                receiver = 1 if j == 0 else 0
+                link = arrays.links[receiver, j if j < receiver else j - 1]
+                for n, name in enumerate(_STATE_FIELDS):
+                    floats[j, self._pages, n * JOINTS : (n + 1) * JOINTS, lane] = link[name]
+
+    def _find_tables(self) -> IntArray:
+        """Returns the address of each table of each site, shape (N, 11)."""
+        structure = self._structure
+        addresses = []
+        for i in range(self._sites):
+            rows = SiteTables(
+                site=_share(self._site, i, self._sites),
+                links=_share(self._links, i, self._sites),
+                actors=_share(self._actors, i, self._sites),
+                environments=_share(self._environments, i, self._sites)[
+                    max(structure.sites[i].first_environment, 0) :
+                ],
+                ramps=_share(self._ramps, i, self._sites),
+                record=_share(self._records, i, self._sites),
+                states=self._states,
+                used=_share(self._used, i, self._sites),
+                peaks=self._peaks[i],
+                sums=_share(self._sums, i, self._sites),
+                progress=_share(self._progress, i, self._sites),
+            )
+            _check_distinct(rows)
+            addresses.append([table.ctypes.data for table in rows])
+        return np.array(addresses, dtype=np.int64)
+
+    def advance_to(self, until_s: float) -> None:
+        """Continues all runs until they are as long as a run with a duration of `until_s` s.
+
+        A run ends earlier if an arm leaves its limits. The results are written into the runs.
+
+        Args:
+            until_s: The time, s, later than that of the previous call.
+        """
+        lanes = [lane for lane in range(len(self.runs)) if self._ended.ticks[lane] < 0]
+        if not lanes:
+            return
+        ticks = max(1, round(until_s * self._rate_hz))
+        for lane in lanes:
+            self.runs[lane].plan([ticks] * self._sites)
+        self._widen_peaks(self.runs[lanes[0]].memory.peaks.shape[1])
+        tables = self._find_tables()
+        used = self._used.reshape(self._sites, BLOCK_TICKS, self._structure.peers, LANES)
+        present = EndedRuns(
+            ticks=self._ended.ticks,
+            site_rows=self._site,
+            records=self._records,
+            sums=self._sums,
+            progress=self._progress,
+            peaks=self._ended.peaks,
+        )
+        site_fields: Any = self._layout.site.fields
+        _, mode_offset = site_fields["mode"]
+        running = 1
+        while self._ticks < ticks and running:
+            count = min(BLOCK_TICKS, ticks - self._ticks)
+            for lane in lanes:
+                states = self._deliveries[lane]
+                use_samples(self._ticks, count, self._rate_hz, lane, states, used)
+            running = run_block(
+                first=self._ticks,
+                count=count,
+                rate_hz=self._rate_hz,
+                runs=len(self.runs),
+                settled_rad=self._structure.settled_rad,
+                pages=self._pages,
+                mode_word=mode_offset // 8,
+                addresses=self._addresses,
+                tables=tables,
+                table=self._table,
+                peaks=self._peaks,
+                present=present,
+                ended=self._ended,
+            )
+            self._ticks += count
+        for lane in lanes:
+            self._write_back(lane, self.runs[lane], until_s)
+
+    def keep(self, chosen: Sequence[int]) -> None:
+        """Removes all runs but some from the lanes, so that only these advance further.
+
+        Args:
+            chosen: Indices of the runs to keep in `runs`, in rising order. None of them may
+                have ended.
+        """
+        assert all(self._ended.ticks[lane] < 0 for lane in chosen)
+        lanes = list(chosen)
+        for lane_table in (
+            *(self._site, self._links, self._actors, self._environments, self._sums),
+            *(self._progress, self._ramps, self._records, self._states, self._peaks),
+        ):
+            lane_table[..., : len(lanes)] = lane_table[..., lanes]
+        self._ended.ticks[:] = -1
+        self._deliveries = [self._deliveries[lane] for lane in lanes]
+        self._links_of_runs = [self._links_of_runs[lane] for lane in lanes]
+        self.runs = [self.runs[lane] for lane in lanes]
+
+    def _widen_peaks(self, buckets: int) -> None:
+        """Makes room for the peaks of more intervals of time. -1 marks an empty interval."""
+        wider = allocate_words(self._sites * buckets, self._layout.columns)
+        peaks = wider.reshape(self._sites, buckets, self._layout.columns, LANES)
+        peaks.view(np.float64)[:] = -1.0
+        peaks[:, : self._peaks.shape[1]] = self._peaks
+        self._peaks = peaks
+
+    def _write_back(self, lane: int, run: FusedRun, until_s: float) -> None:
+        """Writes the numbers of a lane into its run.
+
+        Args:
+            lane: The lane.
+            run: The run.
+            until_s: Planned end of the run, s.
+        """
+        memory = run.memory
+        tables = memory.tables
+        ended_ticks = int(self._ended.ticks[lane])
+        has_ended = ended_ticks >= 0
+        ticks = ended_ticks if has_ended else self._ticks
+        site_rows = self._ended.site_rows if has_ended else self._site
+        records = self._ended.records if has_ended else self._records
+        sums = self._ended.sums if has_ended else self._sums
+        progress = self._ended.progress if has_ended else self._progress
+
+        last_bucket = (ticks - 1) * BUCKETS_PER_S // self._rate_hz
+        peaks = memory.peaks
+        new_peaks = self._peaks[:, : last_bucket + 1, :, lane].view(np.float64)
+        peaks[:, : last_bucket + 1] = new_peaks
+        if has_ended:
+            peaks[:, last_bucket] = self._ended.peaks[:, :, lane].view(np.float64)
+
+        _put_rows(tables.site, site_rows[:, :, lane])
+        _put_rows(memory.sums, sums[:, :, lane])
+        unsettled_ns = progress[:, :, lane].copy()
+        rows = unsettled_ns.view(memory.progress.dtype).reshape(-1)
+        memory.progress["unsettled_ns"] = rows["unsettled_ns"]
+        _write_progress(memory.progress, ticks, self._rate_hz)
+        if has_ended:
+            last_ns = tick_ns(ticks - 1, self._rate_hz)
+            diverged = tables.site["mode"][:, 0] == Mode.DIVERGED
+            memory.progress["diverged_ns"][diverged] = last_ns
+
+        page = (ticks - 1) & (memory.sent.t_ns.shape[1] - 1)
+        memory.sent.t_ns[:, page] = tick_ns(ticks - 1, self._rate_hz)
+        memory.sent.rows[:, page] = records[:, :, lane].view(np.float64)
+        run.ran_s = until_s
+        if run.diverged_s is not None:
+            run.ran_s = run.diverged_s
+        elif not has_ended:
+            states = np.ascontiguousarray(self._states[:, :, lane]).view(np.float64)
+            self._links_of_runs[lane].set_pending(
+                ticks=ticks,
+                links=np.ascontiguousarray(self._links[:, :, lane]).view(self._layout.link),
+                states=states.reshape(self._sites, self._pages + 1, 3 * JOINTS),
+            )
+
+
+def _view_rows(table: NDArray[np.float64]) -> NDArray[Any]:
+    """Returns a table of shape (N, rows, columns) as N words rows."""
+    return table.reshape(len(table), -1).view([("row", "f8", (table[0].size,))])
+
+
+def _share(table: Words, i: int, sites: int) -> Words:
+    """Returns the rows of site i of a table with the same number of rows for each site."""
+    rows = len(table) // sites
+    return table[i * rows : (i + 1) * rows]
+
+
+def _check_distinct(tables: SiteTables) -> None:
+    """Asserts that no two tables overlap: the compiled code of `advance_site` relies on it."""
+    filled = [table for table in tables if table.size]
+    ranges = sorted((table.ctypes.data, table.ctypes.data + table.nbytes) for table in filled)
+    for (_, end), (start, _) in pairwise(ranges):
+        assert end <= start
+
+
+def _put_rows(rows: NDArray[Any], numbers: Words) -> None:
+    """Overwrites structured rows by their words, shape (rows, words of a row)."""
+    new_rows = np.ascontiguousarray(numbers).view(rows.dtype)
+    rows[...] = new_rows.reshape(rows.shape)
+
+
+def _write_progress(progress: Any, ticks: int, rate_hz: int) -> None:
+    """Writes how far the sites of a run are, after a number of ticks.
+
+    Args:
+        progress: Rows of all sites, see `ProgressRow`; written.
+        ticks: Number of ticks of each site.
+        rate_hz: Tick rate, Hz.
+    """
+    parts = ticks * BUCKETS_PER_S
+    progress["tick"] = ticks
+    progress["bucket"] = parts // rate_hz
+    progress["part"] = parts % rate_hz
+    has_finished = ticks >= progress["ticks"][0]
+    progress["t_ns"] = NEVER_NS if has_finished else tick_ns(ticks, rate_hz)

@@ -1,0 +1,376 @@
+"""Computes one tick of a site for several runs at once, with the functions of the kernel.
+
+A lane is the position of one run among runs that are computed together. A tick is one period of
+the control loop. Each stage is a loop over the lanes that calls the functions of the kernel.
+The stages are loops of their own, so that each one uses vector instructions.
+
+Invariant:
+    - No equation of a tick is repeated here.
+    - The numbers of a lane do not depend on the other lanes.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from ...core.arms.exogenous import (
+    NO_TORQUE,
+    SourceTorque,
+    TorqueTable,
+    add_source_torque,
+    torque_on_arm,
+)
+from ...core.plug.plugged import call_address
+from ...core.step.fused_run import update_peaks, update_sums
+from ...core.step.jit import lane_leaf, leaf, set_lane_form
+from ...core.step.kernel import act_stages, reference_stages, torque_stage
+from ...core.step.ticks import BUCKETS_PER_S, Mode, tick_ns
+from ...core.step.vectors import Array, IntArray, Vector
+from .lane_rows import Words, in_lane, pointer_to, select_row
+
+_DIVERGED = int(Mode.DIVERGED)
+JOINTS = 2
+"""Number of joints of the arms that lanes support."""
+TAU_X_COLUMN = 5 * JOINTS
+"""Column of tau_x in a record, after q, qd, q_des, qd_des and tau."""
+
+
+def _no_torque(
+    _t_s: float,
+    _q: Vector,
+    _qd: Vector,
+    _lengths: Vector,
+    _actors: Any,
+    _table: TorqueTable,
+    _sampled: int,
+) -> SourceTorque:
+    """Form of `torque_on_arm` for an arm without operators and environments."""
+    return NO_TORQUE
+
+
+def _unroll_sources(count: int) -> Callable[..., SourceTorque]:
+    """Returns a form of `torque_on_arm` for a number of operators and environments.
+
+    Each of them has a kind that is known to the compiler. Therefore it is not selected by the
+    variable of a loop.
+
+    Args:
+        count: Number of operators and environments.
+    """
+    if count == 0:
+        return _no_torque
+    last = count - 1
+    torque_of_others = leaf(_unroll_sources(last))
+
+    def torque_of_all(
+        t_s: float,
+        q: Vector,
+        qd: Vector,
+        lengths: Vector,
+        actors: Any,
+        table: TorqueTable,
+        sampled: int,
+    ) -> SourceTorque:
+        total = torque_of_others(t_s, q, qd, lengths, actors, table, sampled)
+        actor = select_row(actors, last)
+        return add_source_torque(total, t_s, q, qd, lengths, actor, table, sampled)
+
+    return torque_of_all
+
+
+def _choose_form(argument_types: tuple[Any, ...]) -> Callable[..., SourceTorque]:
+    """Returns the form of `torque_on_arm` for given types of its arguments."""
+    actors = argument_types[4]
+    return _unroll_sources(actors.count)
+
+
+set_lane_form(torque_on_arm, _choose_form)
+
+
+@lane_leaf
+def advance_site(
+    k: int,
+    t_ns: int,
+    lanes: int,
+    settled_rad: float,
+    i: int,
+    block_row: int,
+    pages: int,
+    bucket: int,
+    site: Any,
+    links: Any,
+    actors: Any,
+    environments: Any,
+    ramps: Any,
+    record: Any,
+    states: Any,
+    used: Any,
+    peaks: Any,
+    sums: Any,
+    progress: Any,
+    table: TorqueTable,
+) -> None:
+    """Computes one tick of a site for several runs.
+
+    All tables have a lane for each run. No two of them overlap in memory.
+
+    Args:
+        k: The tick.
+        t_ns: Its nominal time, ns since the epoch.
+        lanes: Number of lanes to compute, at most `LANES`.
+        settled_rad: Position error below which an arm counts as settled, rad.
+        i: Index of the site.
+        block_row: Row of the tick in `used`.
+        pages: Number of latest states of each site in `states`, a power of two.
+        bucket: Row of the tick in `peaks`.
+        site: Row of the site.
+        links: Rows of its links.
+        actors: Rows of its operators and environments.
+        environments: The rows of its environments among them.
+        ramps: Row with the changes of its dominance factors.
+        record: Row with the floats of its record; written.
+        states: The latest states of all sites. Each site has `pages` rows, and one row for the
+            state before its first tick.
+        used: For each tick of a block, the sample of each peer that is in use; -1: none yet.
+        peaks: Peaks of the site, one row per bucket, see `update_peaks`.
+        sums: Sums of the site.
+        progress: Progress of the site.
+        table: Tables of the operators and environments of all sites, equal in all runs.
+    """
+    # 2 release: the state of each peer that is in use
+    for lane in range(lanes):
+        rows = in_lane(links, lane)
+        samples = in_lane(used, lane)[block_row].sample
+        for p in range(rows.shape[0]):
+            link = rows[p]
+            sample = samples[p]
+            # The peers of a site are all other sites, in scenario order.
+            peer = p if p < i else p + 1
+            page = pages if sample < 0 else sample & (pages - 1)
+            state = in_lane(states, lane)[peer * (pages + 1) + page]
+            link.used = sample
+            for c in range(JOINTS):
+                link.q[c] = state.q[c]
+                link.qd[c] = state.qd[c]
+                link.tau_x[c] = state.tau_x[c]
+
+    # 3 reference, 4 errors, 5 estimate
+    for lane in range(lanes):
+        reference_stages(
+            k=k,
+            t_ns=t_ns,
+            site=in_lane(site, lane),
+            links=in_lane(links, lane),
+            ramps=in_lane(ramps, lane)[0].rows,
+            actors=in_lane(actors, lane),
+            table=table,
+            chain=None,
+        )
+
+    # 6 torque, 7 emit, 8 advance
+    for lane in range(lanes):
+        floats = in_lane(record, lane)[0].floats
+        torque_stage(in_lane(site, lane), None)
+        act_stages(
+            k=k,
+            t_ns=t_ns,
+            site=in_lane(site, lane),
+            actors=in_lane(actors, lane),
+            table=table,
+            chain=None,
+            record=floats,
+        )
+        state = in_lane(states, lane)[i * (pages + 1) + (k & (pages - 1))]
+        for c in range(JOINTS):
+            state.q[c] = floats[c]
+            state.qd[c] = floats[JOINTS + c]
+            state.tau_x[c] = floats[TAU_X_COLUMN + c]
+
+    # Statistics of the run.
+    for lane in range(lanes):
+        s = in_lane(site, lane)[0]
+        floats = in_lane(record, lane)[0].floats
+        site_sums = in_lane(sums, lane)[0]
+        update_peaks(
+            row=floats,
+            t_ns=t_ns,
+            settled_rad=settled_rad,
+            s=s,
+            progress=in_lane(progress, lane)[0],
+            peaks=in_lane(peaks, lane)[bucket].joints,
+            sums=site_sums,
+        )
+        update_sums(
+            k=k,
+            t_ns=t_ns,
+            s=s,
+            chain=None,
+            environments=in_lane(environments, lane),
+            table=table,
+            row=floats,
+            sums=site_sums,
+        )
+
+
+class EndedRuns(NamedTuple):
+    """The numbers of runs at the instant at which an arm of theirs left its limits.
+
+    A run that has ended stays in its lane, and its later numbers have no meaning. N is the
+    number of sites, and the last axis of each array is the lane.
+
+    Attributes:
+        ticks: Number of ticks that each run has made, shape (LANES,). -1: the run has not
+            ended.
+        site_rows: Rows of the sites, shape (N, words of a row, LANES).
+        records: Records, shape (N, floats, LANES).
+        sums: Rows of the sums, shape (N, words of a row, LANES).
+        progress: Rows of the progress, shape (N, words of a row, LANES).
+        peaks: Peaks in the bucket of the instant, shape (N, 3 n, LANES).
+    """
+
+    ticks: IntArray
+    site_rows: Words
+    records: Words
+    sums: Words
+    progress: Words
+    peaks: Words
+
+
+@leaf
+def _copy_lane(lane: int, source: Words, target: Words) -> None:
+    """Copies the numbers of one lane.
+
+    Args:
+        lane: The lane.
+        source: Numbers of all sites, shape (N, words, LANES).
+        target: Written.
+    """
+    for i in range(source.shape[0]):
+        for word in range(source.shape[1]):
+            target[i, word, lane] = source[i, word, lane]
+
+
+@leaf
+def _keep_ended_runs(
+    ticks: int,
+    runs: int,
+    mode_word: int,
+    bucket: int,
+    peaks: Words,
+    present: EndedRuns,
+    ended: EndedRuns,
+) -> int:
+    """Keeps the numbers of runs of which an arm left its limits in the present tick.
+
+    Args:
+        ticks: Number of ticks that the runs have made.
+        runs: Number of runs.
+        mode_word: Index of the mode among the words of a site's row.
+        bucket: The present bucket.
+        peaks: Peaks of all sites, shape (N, buckets, 3 n, LANES).
+        present: Numbers of all runs now. Its peaks are not used.
+        ended: Written.
+
+    Returns:
+        The number of runs that have not ended.
+    """
+    running = 0
+    for lane in range(runs):
+        if ended.ticks[lane] >= 0:
+            continue
+        has_diverged = False
+        for i in range(present.site_rows.shape[0]):
+            has_diverged = has_diverged or present.site_rows[i, mode_word, lane] == _DIVERGED
+        if not has_diverged:
+            running += 1
+            continue
+        ended.ticks[lane] = ticks
+        _copy_lane(lane, present.site_rows, ended.site_rows)
+        _copy_lane(lane, present.records, ended.records)
+        _copy_lane(lane, present.sums, ended.sums)
+        _copy_lane(lane, present.progress, ended.progress)
+        _copy_lane(lane, peaks[:, bucket], ended.peaks)
+    return running
+
+
+@leaf
+def run_block(
+    first: int,
+    count: int,
+    rate_hz: int,
+    runs: int,
+    settled_rad: float,
+    pages: int,
+    mode_word: int,
+    addresses: IntArray,
+    tables: IntArray,
+    table: Array,
+    peaks: Words,
+    present: EndedRuns,
+    ended: EndedRuns,
+) -> int:
+    """Steps all sites of several runs, up to the end of a block or until all runs have ended.
+
+    Args:
+        first: First tick of the block.
+        count: Number of ticks.
+        rate_hz: Tick rate of all sites, Hz.
+        runs: Number of runs.
+        settled_rad: Position error below which an arm counts as settled, rad.
+        pages: Number of latest states of each site, a power of two.
+        mode_word: Index of the mode among the words of a site's row.
+        addresses: Address of the code of `advance_site` for each site, shape (N,).
+        tables: For each site the addresses of its tables, in the order of the arguments of
+            `advance_site`, shape (N, 11).
+        table: Tables of the operators and environments.
+        peaks: Peaks of all sites, shape (N, buckets, 3 n, LANES).
+        present: The numbers of all runs.
+        ended: Numbers of the runs that have ended; changed.
+
+    Returns:
+        The number of runs that have not ended.
+    """
+    running = runs
+    # Whole vector registers: the numbers of lanes without a run have no meaning.
+    lanes = (runs + 7) // 8 * 8
+    for block_row in range(count):
+        k = first + block_row
+        t_ns = tick_ns(k, rate_hz)
+        bucket = k * BUCKETS_PER_S // rate_hz
+        for i in range(addresses.shape[0]):
+            call_address(
+                addresses[i],
+                (
+                    k,
+                    t_ns,
+                    lanes,
+                    settled_rad,
+                    i,
+                    block_row,
+                    pages,
+                    bucket,
+                    pointer_to(tables[i, 0]),
+                    pointer_to(tables[i, 1]),
+                    pointer_to(tables[i, 2]),
+                    pointer_to(tables[i, 3]),
+                    pointer_to(tables[i, 4]),
+                    pointer_to(tables[i, 5]),
+                    pointer_to(tables[i, 6]),
+                    pointer_to(tables[i, 7]),
+                    pointer_to(tables[i, 8]),
+                    pointer_to(tables[i, 9]),
+                    pointer_to(tables[i, 10]),
+                    table,
+                ),
+            )
+        running = _keep_ended_runs(
+            ticks=k + 1,
+            runs=runs,
+            mode_word=mode_word,
+            bucket=bucket,
+            peaks=peaks,
+            present=present,
+            ended=ended,
+        )
+        if running == 0:
+            return running
+    return running

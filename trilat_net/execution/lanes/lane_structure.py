@@ -1,0 +1,129 @@
+"""Decides which runs can be computed together in lanes, and which need to run alone.
+
+Runs can be computed together if they differ in numbers only. Properties that decide which
+equations are evaluated, for example the control law, form the structure of a run.
+
+Invariant:
+    - Two runs with the same structure use the same compiled code and the same number tables.
+"""
+
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+
+from ...core.arms.exogenous import LIVE_KINDS, OWN_KINDS
+from ...core.step.site_setup import StaleAction
+from ..fused import FusedRun
+from .lane_rows import Constants
+
+SITE_CONSTANTS = (
+    *("rate_hz", "first", "scheme", "law", "external", "ramps", "on_stale", "theta_known"),
+    *("needs_model", "remembered", "asked", "order", "skipped", "degrades", "regrouped"),
+    *("holds", "joints", "shared", "parameters", "task", "sent", "reason"),
+)
+"""Fields of a site's row that are equal in runs of one structure and constant in each run."""
+_ACTOR_CONSTANTS = ("kind", "sampled", "table_first", "table_count")
+"""Fields of the row of an operator or environment that are equal in runs of one structure."""
+
+
+class SiteStructure(NamedTuple):
+    """Structure of one site of a run.
+
+    Attributes:
+        constants: Constants of the site.
+        actors: Constants of each operator and environment, the operators first.
+        first_environment: Index of the first environment; -1: none.
+    """
+
+    constants: Constants
+    actors: tuple[Constants, ...]
+    first_environment: int
+
+
+class RunStructure(NamedTuple):
+    """Structure of a run. Runs with the same structure can be computed together.
+
+    Attributes:
+        sites: Structure of each site.
+        peers: Number of peers of each site.
+        ramps: Number of rows of the tables of dominance factors.
+        table: Content of the table of the operators and environments.
+        duration_s: Duration of the scenario, s.
+        settled_rad: Position error below which an arm counts as settled, rad.
+    """
+
+    sites: tuple[SiteStructure, ...]
+    peers: int
+    ramps: int
+    table: tuple[tuple[int, ...], bytes]
+    duration_s: float
+    settled_rad: float
+
+
+def _read_constants(row: np.void, names: tuple[str, ...]) -> Constants:
+    """Returns the values of integer fields of a row, with their names."""
+    return tuple((name, int(row[name])) for name in names)
+
+
+def _list_actors(actors: Any) -> list[Any]:
+    """Returns the rows of a site's torque sources, without rows that only fill the array."""
+    return [row for row in actors if row["sampled"] in (0, 1)]
+
+
+def find_obstacle(run: FusedRun) -> str:
+    """Explains why a run cannot be computed together with other runs.
+
+    Args:
+        run: The run before its first tick.
+
+    Returns:
+        The property of the run that lanes do not support. Empty if there is none.
+    """
+    config: Any = numba.config
+    tables = run.memory.tables
+    if config.DISABLE_JIT:
+        return "Numba is disabled"
+    if tables.chain is not None:
+        return "arms that are chains of joints"
+    if tables.channel is not None:
+        return "control laws that the kernel does not contain"
+    if run.has_programs:
+        return "programs that move an arm"
+    kinds = {int(row["kind"]) for actors in tables.actors for row in _list_actors(actors)}
+    if kinds.intersection(LIVE_KINDS):
+        return "hands that move an arm live"
+    if kinds.intersection(OWN_KINDS):
+        return "operators or environments that users wrote"
+    if (tables.site["on_stale"] == StaleAction.GLIDE).any():
+        return "on_stale.action 'glide'"
+    if len(set(tables.site["rate_hz"].ravel().tolist())) > 1:
+        return "tick rates that differ between sites"
+    return ""
+
+
+def find_structure(run: FusedRun) -> RunStructure:
+    """Returns the structure of a run.
+
+    Args:
+        run: The run. There must be no obstacle, see `find_obstacle`.
+    """
+    memory = run.memory
+    tables = memory.tables
+    sites = []
+    for site, actors, sums in zip(tables.site, tables.actors, memory.sums, strict=True):
+        rows = _list_actors(actors)
+        structure = SiteStructure(
+            constants=_read_constants(site[0], SITE_CONSTANTS),
+            actors=tuple(_read_constants(row, _ACTOR_CONSTANTS) for row in rows),
+            first_environment=int(sums["first_environment"]),
+        )
+        sites.append(structure)
+    return RunStructure(
+        sites=tuple(sites),
+        peers=tables.links.shape[1],
+        ramps=tables.ramps.shape[1],
+        table=(tables.table.shape, tables.table.tobytes()),
+        duration_s=run.scenario.duration_s,
+        settled_rad=memory.settled_rad,
+    )

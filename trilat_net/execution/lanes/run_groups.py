@@ -1,0 +1,85 @@
+"""Advances many runs, side by side in lanes where that is possible, and else one by one.
+
+Invariant:
+    - The numbers of a run do not depend on the other runs.
+"""
+
+from collections.abc import Iterator, Sequence
+
+from ..fused import FusedRun
+from .lane_rows import LANES
+from .lane_run import LaneRun
+from .lane_structure import RunStructure, find_obstacle, find_structure
+
+LEAST_RUNS = 4
+"""Number of runs from which lanes are faster than one run after the other."""
+
+
+class RunGroup:
+    """Some runs that are advanced together.
+
+    Args:
+        members: Indices of the runs in the sequence that was divided into groups.
+        runs: The runs before their first tick.
+        in_lanes: True to compute them in lanes. They must have the same structure.
+
+    Attributes:
+        members: Indices of the runs that are left in the group.
+    """
+
+    def __init__(
+        self, members: Sequence[int], runs: Sequence[FusedRun], *, in_lanes: bool
+    ) -> None:
+        self.members = list(members)
+        self._runs = list(runs)
+        self._lanes = LaneRun(runs) if in_lanes else None
+
+    def advance_to(self, until_s: float) -> None:
+        """Continues the runs until they are as long as a run of `until_s` seconds.
+
+        Args:
+            until_s: The time, s, later than that of the previous call.
+        """
+        if self._lanes is not None:
+            self._lanes.advance_to(until_s)
+            return
+        for run in self._runs:
+            run.advance_to(until_s)
+
+    def keep(self, chosen: Sequence[int]) -> None:
+        """Removes all runs but some from the group.
+
+        Args:
+            chosen: Places in `members` of the runs to keep, in rising order. No arm of these
+                runs may have left its limits.
+        """
+        if self._lanes is not None:
+            self._lanes.keep(chosen)
+        self.members = [self.members[position] for position in chosen]
+        self._runs = [self._runs[position] for position in chosen]
+
+
+def group_runs(runs: Sequence[FusedRun]) -> Iterator[RunGroup]:
+    """Divides runs into groups that can be advanced together.
+
+    Args:
+        runs: The runs before their first tick.
+
+    Yields:
+        The groups, each when the work on the previous one has ended.
+    """
+    groups: dict[RunStructure, list[int]] = {}
+    for index, run in enumerate(runs):
+        if find_obstacle(run):
+            yield RunGroup([index], [run], in_lanes=False)
+        else:
+            groups.setdefault(find_structure(run), []).append(index)
+    for indices in groups.values():
+        for first in range(0, len(indices), LANES):
+            members = indices[first : first + LANES]
+            chosen = [runs[index] for index in members]
+            if len(members) >= LEAST_RUNS:
+                yield RunGroup(members, chosen, in_lanes=True)
+                continue
+            for index, run in zip(members, chosen, strict=True):
+                yield RunGroup([index], [run], in_lanes=False)
