@@ -57,9 +57,10 @@ def read_beside_docs(name: str) -> str:
 
 def lift_links_beside_docs(page: Path) -> None:
     """Rewrites a page's links to what stands beside docs in the repository: here it stands in docs."""
-    ups = "../" * len(page.relative_to(PAGES).parts)
-    text = page.read_text(encoding="utf-8")
-    page.write_text(text.replace(f"]({ups}", f"]({ups.removesuffix('../')}"), encoding="utf-8")
+    outside = "](" + "../" * len(page.relative_to(PAGES).parts)
+    inside = outside.removesuffix("../")
+    text = page.read_text(encoding="utf-8").replace(f"{outside}README.md", f"{inside}index.md")
+    page.write_text(text.replace(outside, inside), encoding="utf-8")
 
 
 def list_commands() -> str:
