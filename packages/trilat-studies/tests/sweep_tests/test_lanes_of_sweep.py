@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import pytest
-
 from trilat_studies.sweep import plan_sweep, sweep_run
 from trilat_studies.sweep.sweep_results import RESULTS_FILE
 
