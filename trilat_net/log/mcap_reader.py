@@ -220,8 +220,13 @@ class McapReader:
             reason = "is empty" if not self.size else "does not begin with the mark of MCAP"
             raise LogError(f"{self._source}: is not an MCAP file: the file {reason}")
         for item in self._walk():
-            if isinstance(item, mcap_records.ScannedRecord):
-                yield from self.read_record(item)
+            if isinstance(item, mcap_records.Damage) or item.frame.opcode not in _READ:
+                continue
+            # Not by `read_record`: a further generator would delay every message.
+            try:
+                yield from self._read_messages(item)
+            except mcap_records.UnreadableRecord as error:
+                self._note_damage(item.frame, error)
 
     def scan(self) -> Iterator[mcap_records.ScannedRecord | mcap_records.Damage]:
         """Yields the records and the damaged parts of the file, see `RecordScanner.scan`.
@@ -260,13 +265,21 @@ class McapReader:
         if record.frame.opcode not in _READ or self._gave_up:
             return
         try:
-            yield from self._read_messages(self._unpack(record), record.frame)
+            yield from self._read_messages(record)
         except mcap_records.UnreadableRecord as error:
-            # The scanner stops if its own list is too long. A scan must go on to the end of the
-            # file, so that the damage is added to another list.
-            damaged = self._more_damage if self._is_scanned else self.scanner.damaged
-            frame = record.frame
-            damaged.append(mcap_records.Damage(frame.offset, frame.size, str(error)))
+            self._note_damage(record.frame, error)
+
+    def _note_damage(self, frame: mcap_records.RecordFrame, error: Exception) -> None:
+        """Adds a record that cannot be read to the damaged parts.
+
+        Args:
+            frame: Place of the record.
+            error: The reason.
+        """
+        # The scanner stops if its own list is too long. A scan must go on to the end of the
+        # file, so that the damage is added to another list.
+        damaged = self._more_damage if self._is_scanned else self.scanner.damaged
+        damaged.append(mcap_records.Damage(frame.offset, frame.size, str(error)))
 
     @property
     def _gave_up(self) -> bool:
@@ -323,22 +336,21 @@ class McapReader:
         self._chain.add_entry(frame.opcode, content)
         return b""
 
-    def _read_messages(
-        self, data: bytes, frame: mcap_records.RecordFrame
-    ) -> Iterator[McapMessage]:
-        """Yields the messages of an unpacked chunk, and stores its schemas and channels.
+    def _read_messages(self, record: mcap_records.ScannedRecord) -> Iterator[McapMessage]:
+        """Yields the messages of a record, and stores its schemas and channels.
 
         Messages and definitions are added to the digests. The local variables make this loop
         fast, which runs for every message of a file.
 
         Args:
-            data: The unpacked records.
-            frame: Place of the chunk in the file.
+            record: The record, of a kind in `_READ`.
 
         Raises:
-            UnreadableRecord: A record of the chunk makes no sense.
+            UnreadableRecord: The record makes no sense.
             LogError: The messages need too much memory.
         """
+        frame = record.frame
+        data = self._unpack(record)
         find_topic = self._topics.get
         session_channels = self._session_channels
         memory_left = self._channel_memory_left
