@@ -9,13 +9,14 @@ Invariant:
       file is removed once the page is open.
 """
 
-import html
 import os
 import shutil
 import tempfile
 import webbrowser
 from contextlib import suppress
 from pathlib import Path
+
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 
 class BrowserOpening:
@@ -54,12 +55,7 @@ class BrowserOpening:
         """
         # `mkdtemp` creates the folder with mode 0700.
         self._folder = Path(tempfile.mkdtemp(prefix="trilat-live-", dir=Path.home()))
-        link = html.escape(self._target_link)
-        text = (
-            '<!DOCTYPE html><meta charset="utf-8"><title>trilat live</title>'
-            f'<meta http-equiv="refresh" content="0; url={link}">'
-            f'<p><a href="{link}">trilat live</a>'
-        )
+        text = _make_template().render(link=self._target_link)
         file = self._folder / "open.html"
         descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
         with os.fdopen(descriptor, "wb") as stream:
@@ -71,3 +67,13 @@ class BrowserOpening:
         if self._folder is not None:
             shutil.rmtree(self._folder, ignore_errors=True)
             self._folder = None
+
+
+def _make_template() -> Template:
+    """Returns the template of the file, which escapes the link."""
+    environment = Environment(
+        loader=PackageLoader("live", "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+    )
+    return environment.get_template("open.html")

@@ -4,7 +4,8 @@ A run is a session of two or more sites, each of which is a process that control
 log of the run is an MCAP file. `write_report` computes the numbers of the run from the log,
 draws the figures that explain whether the run was stable, and writes two files:
 
-- `report.html`, a page for people. `render_report` fills the template `assets/report.html`.
+- `report.html`, a page for people. `render_report` fills the template
+  `templates/report.html`.
   Each section of the page comes from one module `page_...`, in the order of the page:
   `page_summary`, `page_charts` and `page_leaders` (the first screen), `page_charts` (motion),
   `page_timeline`, `page_links`, `page_sites`, `page_certificate`, `page_sites` (the loops) and
@@ -17,19 +18,18 @@ data, which the page contains as JSON.
 Invariant:
     - The page is a single file that contains its images, styles and scripts. It loads nothing
       from a network, so that it can be sent by mail and read offline.
-    - Every text that comes from a scenario or from a log is escaped where its element is made.
-      Such a text therefore cannot add HTML to the page.
+    - Every text that comes from a scenario or from a log is escaped by the template in which it
+      stands. Such a text therefore cannot add HTML to the page.
     - The page has the colours and the type of the live page, which both read `theme.css`.
     - Empty tables are left out.
 """
 
 import json
 from collections.abc import Iterable, Sequence
-from html import escape
 from importlib import resources
 from pathlib import Path
-from string import Template
-from typing import Any
+
+from markupsafe import Markup
 
 from ..analysis.certificate.stability_certificate import Certificate
 from ..analysis.file_overview import summarise_run
@@ -40,6 +40,7 @@ from ..results import JsonObject
 from ..scenario import Scenario
 from .appearance import SITE_COLOURS
 from .charts import ChartBuilder
+from .html_templates import render_template
 from .page_certificate import render_certificate
 from .page_charts import render_chart_groups, render_overview
 from .page_html import render_section
@@ -92,9 +93,10 @@ def write_report(
     )
 
     page_path = folder / "report.html"
+    summary = json.dumps(facts, allow_nan=False, ensure_ascii=False, indent=2)
     summary_path = folder / "summary.json"
     write_whole(page_path, page)
-    write_whole(summary_path, _to_json(facts, indent=2) + "\n")
+    write_whole(summary_path, summary + "\n")
     return [page_path, summary_path]
 
 
@@ -103,9 +105,9 @@ def render_report(
     twin: Log | None,
     verdicts: Sequence[Finding],
     facts: JsonObject,
-    verdict: str = "",
-    reasons: str = "",
-) -> str:
+    verdict: Markup = Markup(),  # noqa: B008
+    reasons: Markup = Markup(),  # noqa: B008
+) -> Markup:
     """Composes the HTML page that reports a run.
 
     Args:
@@ -127,13 +129,11 @@ def render_report(
         place: render_chart_groups(log, place, data.charts, missing)
         for place in ("motion", "links", "loops")
     }
-    # A "<" in a text could end the script element that contains the data. In JSON, "\u003c"
-    # means the same character.
-    data_json = _to_json(data.to_builtins()).replace("<", "\\u003c")
-    return Template(_read_asset("report.html")).substitute(
-        name=escape(scenario.name),
-        title=escape(scenario.title or scenario.name),
-        origin_line=escape(summarise_origin(log)),
+    return render_template(
+        "report.html",
+        name=scenario.name,
+        title=scenario.title or scenario.name,
+        origin_line=summarise_origin(log),
         verdict=verdict,
         alarms=render_alarms(log),
         checks=render_checks(verdicts, facts),
@@ -146,7 +146,7 @@ def render_report(
         reasons=reasons,
         loops=render_loops(log, facts, groups["loops"]),
         origin=render_origin(log, facts, _read_asset("uPlot-LICENSE")),
-        data=data_json,
+        data=data.to_builtins(),
         css=_read_asset("theme.css") + _read_asset("report.css"),
         site_css=_render_site_css(scenario),
         js=_read_asset("report.js") + _read_asset("arms.js"),
@@ -155,20 +155,15 @@ def render_report(
     )
 
 
-def _read_asset(name: str) -> str:
-    """Returns the text of a file of the page, such as its template, its style or a script."""
-    return (_ASSETS / name).read_text(encoding="utf-8")
+def _read_asset(name: str) -> Markup:
+    """Returns the text of a file of the page, such as a style or a script."""
+    return Markup((_ASSETS / name).read_text(encoding="utf-8"))
 
 
-def _to_json(value: Any, indent: int | None = None) -> str:
-    """Returns a value as JSON text. Raises ValueError for NaN and infinity."""
-    return json.dumps(value, allow_nan=False, ensure_ascii=False, indent=indent)
-
-
-def _render_motion(charts: str) -> str:
+def _render_motion(charts: Markup) -> Markup:
     """Returns the section with positions, torques and estimates. Empty without charts."""
     if not charts:
-        return ""
+        return Markup()
     intro = (
         "Drag over a chart to zoom all, double-click to see the whole run, click a name to "
         "hide its line. Fig. 3 to 6 are those of the paper."
@@ -177,7 +172,7 @@ def _render_motion(charts: str) -> str:
     return render_section(heading, intro, charts, "figures")
 
 
-def _render_site_css(scenario: Scenario) -> str:
+def _render_site_css(scenario: Scenario) -> Markup:
     """Returns the CSS rules for the colours of the sites, in the colours of `theme.css`.
 
     The site with index i has the classes `site-i`, for lines in its colour, and `fill-i`, for
@@ -189,4 +184,4 @@ def _render_site_css(scenario: Scenario) -> str:
         value = f"var(--site-{colours[index % len(colours)]})"
         rules += f".site-{index} {{ stroke: {value}; }} "
         rules += f".fill-{index} {{ background: {value}; fill: {value}; }}\n"
-    return rules
+    return Markup(rules)

@@ -10,8 +10,8 @@ Invariant:
 
 import base64
 import io
-from html import escape
 
+from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from ..analysis.certificate.stability_certificate import Certificate
@@ -20,6 +20,7 @@ from ..log.log_reader import Log
 from .certificate_text import describe_certificate, list_energies
 from .figures.certificate_energy import draw_functional, draw_observed_energy
 from .figures.twin_differences import draw_twins
+from .html_templates import render_macro
 from .page_html import (
     render_details,
     render_facts,
@@ -32,7 +33,6 @@ from .page_html import (
 from .style import typeset
 
 _PAGE_DPI = 110
-_PREMISE_MARKS = {True: "holds", False: '<b class="bad">fails</b>', None: "undecided"}
 _SENTENCE_MARKS = {"ok": "✓", "FAIL": "✗", "open": "?", "note": "·"}
 _SENTENCE_CLASSES = {"ok": "passed", "FAIL": "failed", "open": "open", "note": "note"}
 _LONG_NAMES = {
@@ -61,7 +61,7 @@ _BALANCE_NOTE = (
 )
 
 
-def render_certificate(log: Log, certificate: Certificate) -> str:
+def render_certificate(log: Log, certificate: Certificate) -> Markup:
     """Renders the section about stability: the reasons, and folded tables and figures.
 
     Args:
@@ -69,13 +69,15 @@ def render_certificate(log: Log, certificate: Certificate) -> str:
         certificate: Judgement whether the run was stable, with its reasons.
     """
     _, *grounds = describe_certificate(certificate)
-    items = ""
-    for line in grounds:
-        mark = _SENTENCE_MARKS[line.mark]
-        css_class = _SENTENCE_CLASSES[line.mark]
-        text = escape(typeset(_lengthen_name(line.text)))
-        items += f'<li class="{css_class}"><b>{mark}</b>{text}</li>'
-    body = f'<ul class="verdicts">{items}</ul>'
+    lines = [
+        {
+            "mark": _SENTENCE_MARKS[line.mark],
+            "css_class": _SENTENCE_CLASSES[line.mark],
+            "text": typeset(_lengthen_name(line.text)),
+        }
+        for line in grounds
+    ]
+    body = render_macro("certificate.html", "grounds", lines=lines)
     folds = []
     if certificate.premises:
         premises = _render_premises(certificate)
@@ -84,13 +86,13 @@ def render_certificate(log: Log, certificate: Certificate) -> str:
         )
     if certificate.balance is not None:
         energies = list_energies(certificate.balance)
-        rows = [(escape(name), f"{energy_j:.4g}") for name, energy_j in energies]
+        rows = [(name, f"{energy_j:.4g}") for name, energy_j in energies]
         table = render_table({"energy": "", "J": "energy over the whole run"}, rows)
         note = render_note(_BALANCE_NOTE)
         folds.append(render_details("Energy balance", table + note))
     figures = _draw_certificate(log, certificate)
     if figures:
-        pictures = "".join(_render_picture(title, figure) for title, figure in figures)
+        pictures = Markup().join(_render_picture(title, figure) for title, figure in figures)
         names = ", ".join(title for title, _ in figures)
         folds.append(render_details(f"Figures: {names}", pictures))
     folds.append(render_details("Symbols on this page", render_facts(_SYMBOLS)))
@@ -110,15 +112,10 @@ def _lengthen_name(sentence: str) -> str:
     return f"{_LONG_NAMES.get(name, name)}{colon}{rest}"
 
 
-def _render_premises(certificate: Certificate) -> str:
+def _render_premises(certificate: Certificate) -> Markup:
     """Returns the table of the premises, which are the conditions of the stability theorem."""
-    premises = ""
-    for premise in certificate.premises:
-        name = escape(premise.name)
-        mark = _PREMISE_MARKS[premise.holds]
-        text = escape(premise.text)
-        premises += f'<tr><th scope="row">{name}</th><td>{mark}</td><td>{text}</td></tr>'
-    return render_scrolling(f'<table class="facts">{premises}</table>', "premises")
+    table = render_macro("certificate.html", "premises", premises=certificate.premises)
+    return render_scrolling(table, "premises")
 
 
 def _draw_certificate(log: Log, certificate: Certificate) -> list[tuple[str, Figure]]:
@@ -147,10 +144,10 @@ def _draw_certificate(log: Log, certificate: Certificate) -> list[tuple[str, Fig
     return figures
 
 
-def _render_picture(title: str, figure: Figure) -> str:
+def _render_picture(title: str, figure: Figure) -> Markup:
     """Returns a figure as an image with embedded PNG data."""
     drawing = io.BytesIO()
     figure.savefig(drawing, format="png", dpi=_PAGE_DPI)
     data = base64.b64encode(drawing.getvalue()).decode()
     source = f"data:image/png;base64,{data}"
-    return f'<img src="{source}" alt="{title}" class="picture">'
+    return render_macro("certificate.html", "picture", source=source, title=title)

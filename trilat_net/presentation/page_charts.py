@@ -10,15 +10,17 @@ Invariant:
 
 import tomllib
 from collections.abc import Mapping, Sequence
-from html import escape
 from importlib import resources
 from typing import Any
+
+from markupsafe import Markup
 
 from ..log.log_reader import Log
 from .charts import ChartBuilder
 from .figures.age_and_lateness import explain_missing_loop_times
 from .figures.arm_poses import render_arms_svg
 from .figures.joint_motion import explain_absent_operator
+from .html_templates import render_macro
 from .page_data import Chart
 from .page_html import render_details, render_note
 from .page_leaders import describe_leads, render_lead_bars
@@ -36,20 +38,13 @@ _MOST_HALF_CHARTS = 2
 _NO_VALUE = "the log has no value to draw"
 """Reason why a chart is left out."""
 
-_ARM_PLAYER = """<div id="arms" class="screen">
-<div class="row"></div>
-<div class="controls"><button type="button">play</button>
-<input type="range" min="0" max="1000" value="0" step="1"
-aria-label="time"><output>0.000 s</output></div>
-</div>
-"""
 _ARM_NOTE = (
     "Solid: the arm; dashed: where the other arms lead it, delayed and weighted. The arms "
     "follow the slider, and the pointer in any chart."
 )
 
 
-def render_overview(log: Log, builder: ChartBuilder, charts: Sequence[Chart]) -> str:
+def render_overview(log: Log, builder: ChartBuilder, charts: Sequence[Chart]) -> Markup:
     """Renders the moving arms, who leads, the error over time and the delay over time.
 
     Args:
@@ -57,16 +52,17 @@ def render_overview(log: Log, builder: ChartBuilder, charts: Sequence[Chart]) ->
         builder: Builder of the charts, which knows the box around the motion and the scale.
         charts: Charts of the page.
     """
-    html = ""
+    html = Markup()
     has_records = any(len(log[site]) for site in log.sites)
     if has_records:
-        html = _ARM_PLAYER + render_lead_bars(log, builder.leads)
+        html += render_macro("charts.html", "arm_player")
+        html += render_lead_bars(log, builder.leads)
         html += render_note(" ".join([*describe_leads(log, builder.leads), _ARM_NOTE]))
     absent = [site for site in log.sites if not len(log[site])]
     if absent:
         html += render_note(f"Not drawn, because there is no record: {', '.join(absent)}.")
     if any(chart.section == "overview" for chart in charts):
-        html += '<div class="charts" data-section="overview"></div>'
+        html += render_macro("charts.html", "charts", section="overview", is_small=False)
     if has_records:
         pictures = render_arms_svg(log, builder.bounds_m, builder.units_per_m)
         summary = "The arms at a few instants, with the path of the end effector until then"
@@ -76,7 +72,7 @@ def render_overview(log: Log, builder: ChartBuilder, charts: Sequence[Chart]) ->
 
 def render_chart_groups(
     log: Log, place: str, charts: Sequence[Chart], missing: Mapping[str, Sequence[str]]
-) -> str:
+) -> Markup:
     """Renders the groups of charts of a place, and a note about the charts that the page lacks.
 
     Args:
@@ -90,7 +86,7 @@ def render_chart_groups(
         "torques": explain_absent_operator(log),
         "timing": explain_missing_loop_times(log),
     }
-    html = ""
+    rendered = []
     lacking: dict[str, list[str]] = {}  # titles by the reason
     unfolded = 0
     for section, (heading, note) in _TEXTS[place].items():
@@ -102,14 +98,16 @@ def render_chart_groups(
             fits = unfolded + count <= _MOST_OPEN_CHARTS
             is_open = section in _OPEN_SECTIONS and fits
             unfolded += count if is_open else 0
-            html += _render_group(section, heading, text, count, is_open, is_small)
+            rendered.append(_render_group(section, heading, text, count, is_open, is_small))
             lacking.setdefault(_NO_VALUE, []).extend(missing.get(section, ()))
         elif absence_reasons.get(section):
             lacking.setdefault(absence_reasons[section], []).append(name)
         elif section in missing:
             lacking.setdefault(_NO_VALUE, []).append(name)
 
-    groups = f'<div class="groups">{html}</div>' if html else ""
+    groups = Markup()
+    if rendered:
+        groups = render_macro("charts.html", "groups", groups=rendered)
     if place == "loops":  # the section of the loops says itself what is missing
         return groups
     for reason, titles in lacking.items():
@@ -120,7 +118,7 @@ def render_chart_groups(
 
 def _render_group(
     section: str, heading: str, note: str, count: int, is_open: bool, is_small: bool
-) -> str:
+) -> Markup:
     """Returns a group of charts, as an empty container that unfolds.
 
     Args:
@@ -131,9 +129,13 @@ def _render_group(
         is_open: True if the group is unfolded at first.
         is_small: True for small charts without legends, of which there are many.
     """
-    width = "half" if count <= _MOST_HALF_CHARTS else "whole"
-    css_class = "charts small" if is_small else "charts"
-    attribute = " open" if is_open else ""
-    summary = f'<summary>{escape(heading)} <span class="note">{escape(note)}</span></summary>'
-    container = f'<div class="{css_class}" data-section="{section}"></div>'
-    return f'<details class="group {width}"{attribute}>{summary}{container}</details>'
+    return render_macro(
+        "charts.html",
+        "group",
+        heading=heading,
+        note=note,
+        width="half" if count <= _MOST_HALF_CHARTS else "whole",
+        is_open=is_open,
+        section=section,
+        is_small=is_small,
+    )

@@ -4,26 +4,23 @@ A report is a web page about a recorded run. A site is a process that controls o
 and a link is the directed connection from one site to another.
 
 Invariant:
-    - Texts and headers are escaped here. The cells of `render_table` and the bodies of
-      `render_details` and `render_section` are HTML already, and their callers escape the texts
-      in them.
+    - Every function returns `Markup`. A plain string that becomes a part of it is escaped.
     - A reader who uses the keyboard can scroll every region that scrolls sideways.
 """
 
-import re
 from collections.abc import Iterable, Mapping, Sequence
-from html import escape
+from typing import Any
+
+from markupsafe import Markup
 
 from ..log.log_reader import Log
-from .result_text import escape_text
+from .html_templates import render_macro
 
-_CODE = re.compile(r"`([^`]+)`")
-"""Text in backticks, which the page shows as code."""
 NO_NUMBER = "–"
 """Cell of a missing number."""
 
 
-def render_section(heading: str, intro: str, body: str, name: str = "") -> str:
+def render_section(heading: str, intro: str, body: Markup, name: str = "") -> Markup:
     """Renders a section of the page: its heading, a sentence about its content, and the body.
 
     Args:
@@ -33,17 +30,10 @@ def render_section(heading: str, intro: str, body: str, name: str = "") -> str:
         body: HTML of the content.
         name: Identifier of the section, for links and style. Empty for none.
     """
-    attribute = f' id="{name}"' if name else ""
-    title = f"<h2>{escape(heading)}</h2>"
-    return f"<section{attribute}>{title}<p>{render_text(intro)}</p>{body}</section>"
+    return _render("section", heading=heading, intro=intro, body=body, name=name)
 
 
-def render_text(text: str) -> str:
-    """Renders plain text as HTML, with text in backticks as code."""
-    return _CODE.sub(r"<code>\1</code>", escape(text))
-
-
-def render_details(summary: str, body: str, *, is_open: bool = False) -> str:
+def render_details(summary: str, body: Markup, *, is_open: bool = False) -> Markup:
     """Renders content that the reader can unfold.
 
     Args:
@@ -51,106 +41,82 @@ def render_details(summary: str, body: str, *, is_open: bool = False) -> str:
         body: HTML of the content.
         is_open: True if the content is unfolded at first.
     """
-    attribute = " open" if is_open else ""
-    return f"<details{attribute}><summary>{escape(summary)}</summary>{body}</details>"
+    return _render("details", summary=summary, body=body, is_open=is_open)
 
 
-def render_folds(folds: Iterable[str]) -> str:
+def render_folds(folds: Iterable[Markup]) -> Markup:
     """Renders parts that unfold, side by side while they are folded.
 
     Args:
         folds: HTML of each part, from `render_details`. Empty for a part that does not exist.
     """
-    return f'<div class="folds">{"".join(folds)}</div>'
+    return _render("folds", folds=folds)
 
 
-def render_note(text: str) -> str:
+def render_note(text: str) -> Markup:
     """Renders a string as a paragraph in small type."""
-    return f'<p class="note">{escape(text)}</p>'
+    return _render("note", text=text)
 
 
-def render_facts(facts: Iterable[tuple[str, str]]) -> str:
+def render_facts(facts: Iterable[tuple[str, str]]) -> Markup:
     """Renders a table with two columns: the name and the text of each fact."""
-    rows = ""
-    for name, text in facts:
-        rows += f'<tr><th scope="row">{escape(name)}</th><td>{escape_text(text)}</td></tr>'
-    return render_scrolling(f'<table class="facts">{rows}</table>', "facts")
+    return render_scrolling(_render("facts", facts=facts), "facts")
 
 
 def render_table(
     columns: Mapping[str, str], rows: Iterable[Sequence[str]], text_columns: Sequence[int] = ()
-) -> str:
+) -> Markup:
     """Renders an HTML table, which scrolls sideways where it is wider than the screen.
 
     Args:
         columns: Meaning of each column, by its header. Both are plain text. The meaning is
             shown while the pointer rests on the header. It is empty for a header that needs no
             explanation.
-        rows: Rows of cells, one cell per column. The cells are HTML already, so that they can
-            contain coloured squares and line breaks.
+        rows: Rows of cells, one cell per column. A cell is plain text, or `Markup` if it
+            contains a coloured square or line breaks.
         text_columns: Indices of the columns that hold texts, which may wrap. The first column
             is always a text.
     """
-    attributes = [
-        ' class="words"' if column in text_columns else "" for column in range(len(columns))
-    ]
-
-    head = ""
-    for attribute, (header, meaning) in zip(attributes, columns.items(), strict=True):
-        label = escape(header)
-        if meaning:
-            label = f'<abbr title="{escape(meaning)}">{label}</abbr>'
-        head += f'<th scope="col"{attribute}>{label}</th>'
-
-    body = ""
-    for row in rows:
-        cells = ""
-        for attribute, cell in zip(attributes, row, strict=True):
-            cells += f"<td{attribute}>{cell}</td>"
-        body += f"<tr>{cells}</tr>"
-    table = f"<thead><tr>{head}</tr></thead><tbody>{body}</tbody>"
-    first_header = next(iter(columns))
-    return render_scrolling(f'<table class="sites">{table}</table>', first_header)
+    table = _render("table", columns=columns, rows=rows, text_columns=text_columns)
+    return render_scrolling(table, next(iter(columns)))
 
 
-def render_legend(columns: Mapping[str, str]) -> str:
+def render_legend(columns: Mapping[str, str]) -> Markup:
     """Renders the meanings of a table's columns as a line, for screens without a pointer."""
     items = [f"{header}: {meaning}" for header, meaning in columns.items() if meaning]
-    text = escape("; ".join(items))
-    return f'<p class="note legend">{text}.</p>' if items else ""
+    return _render("legend", text="; ".join(items)) if items else Markup()
 
 
-def render_scrolling(html: str, label: str) -> str:
+def render_scrolling(content: Markup, label: str) -> Markup:
     """Renders HTML in a region that scrolls sideways, also by the keyboard.
 
     Args:
-        html: Content of the region.
+        content: HTML of the content of the region.
         label: Name of the region for screen readers, as plain text.
     """
-    name = escape(label)
-    return f'<div class="scroll" role="group" aria-label="{name}" tabindex="0">{html}</div>'
+    return _render("scrolling", content=content, label=label)
 
 
-def render_code(text: str) -> str:
+def render_code(text: str) -> Markup:
     """Renders lines of commands or of a file as they are."""
-    return f'<pre tabindex="0">{escape(text)}</pre>'
+    return _render("code", text=text)
 
 
-def render_swatch(log: Log, site: str) -> str:
-    """Renders a small square in the colour of a site."""
-    return f'<span class="swatch fill-{log.sites.index(site)}"></span>'
-
-
-def label_site(log: Log, name: str) -> str:
+def label_site(log: Log, name: str) -> Markup:
     """Renders the name and the role of a site, behind a square in the colour of the site."""
     role = log.scenario.sites[name].role
-    return f"{render_swatch(log, name)}{escape(name)} ({escape(role)})"
+    return _render("labelled", index=log.sites.index(name), text=f"{name} ({role})")
 
 
-def label_link(log: Log, link: str) -> str:
+def label_link(log: Log, link: str) -> Markup:
     """Renders the name of a link, as in "m1 → s", behind a square in its sender's colour."""
     peer, site = link.split("->")
-    return f"{render_swatch(log, peer)}{escape(peer)} → {escape(site)}"
+    return _render("labelled", index=log.sites.index(peer), text=f"{peer} → {site}")
+
+
+def _render(macro: str, **values: Any) -> Markup:
+    """Renders a macro of the template with the pieces of a page."""
+    return render_macro("parts.html", macro, **values)
 
 
 def format_cell(value: float | None) -> str:

@@ -11,10 +11,10 @@ Invariant:
 """
 
 from collections.abc import Sequence
-from html import escape
 from typing import NamedTuple
 
 import numpy as np
+from markupsafe import Markup
 
 from ..analysis.dominance_history import list_ramps, trace_dominance
 from ..analysis.timeline import recorded_end_s
@@ -22,8 +22,8 @@ from ..core.step.vectors import Array
 from ..errors import join_words
 from ..log.log_reader import Log
 from ..scenario import Scenario
+from .html_templates import render_macro
 from .page_data import LeadBar
-from .page_html import render_swatch
 
 _MAX_BARS = 4
 """Largest number of slaves with a bar or a sentence."""
@@ -137,14 +137,14 @@ def list_lead_bars(leads: Sequence[Lead]) -> list[LeadBar]:
     return bars
 
 
-def render_lead_bars(log: Log, leads: Sequence[Lead]) -> str:
+def render_lead_bars(log: Log, leads: Sequence[Lead]) -> Markup:
     """Renders a bar for each slave whose dominance factors change.
 
     Args:
         log: Log of the run.
         leads: Who leads each slave, from `trace_leads`.
     """
-    return "".join(_render_bar(log, lead) for lead in leads if not lead.is_constant)
+    return Markup().join(_render_bar(log, lead) for lead in leads if not lead.is_constant)
 
 
 def describe_leads(log: Log, leads: Sequence[Lead]) -> list[str]:
@@ -204,26 +204,24 @@ def describe_phases(lead: Lead) -> str:
     return "; ".join(phases)
 
 
-def _render_bar(log: Log, lead: Lead) -> str:
+def _render_bar(log: Log, lead: Lead) -> Markup:
     """Returns the bar of a slave: an area for each peer, with its share as the height."""
     end_s = recorded_end_s(log)
     tops = 1.0 - np.cumsum(lead.shares, axis=1)
     bottoms = tops + lead.shares
-    areas = ""
-    items = ""
+    peers = []
     for column, peer in enumerate(lead.peers):
         upper = _list_points(lead.t_s, tops[:, column])
         lower = _list_points(lead.t_s[::-1], bottoms[::-1, column])
-        colour = log.sites.index(peer)
-        areas += f'<polygon class="fill-{colour}" points="{" ".join([*upper, *lower])}"/>'
-        items += f"<span>{render_swatch(log, peer)}{escape(peer)}</span> "
-    slave = escape(_name_slave(log.scenario, lead.slave))
-    phases = escape(describe_phases(lead))
-    return (
-        f'<div class="lead"><p>Who leads {slave}: {items}<span class="soft">{phases}</span></p>'
-        f'<div class="bar"><svg viewBox="0 0 {end_s:.6g} 1" preserveAspectRatio="none" '
-        f'role="img" aria-label="Who leads {slave} over time: {phases}">{areas}'
-        '<line class="now" x1="0" x2="0" y1="0" y2="1"/></svg><output></output></div></div>'
+        points = " ".join([*upper, *lower])
+        peers.append({"name": peer, "index": log.sites.index(peer), "points": points})
+    return render_macro(
+        "charts.html",
+        "lead_bar",
+        slave=_name_slave(log.scenario, lead.slave),
+        peers=peers,
+        phases=describe_phases(lead),
+        end_s=f"{end_s:.6g}",
     )
 
 

@@ -10,11 +10,12 @@ Invariant:
     - Empty tables are left out.
 """
 
-from html import escape
+from markupsafe import Markup
 
 from ..errors import count_nouns
 from ..log.log_reader import Log
 from ..results import JsonObject
+from .html_templates import render_macro
 from .page_html import (
     format_cell,
     label_link,
@@ -75,7 +76,7 @@ _CLOCK_COLUMNS = {
 """Header and meaning of each number of a sender's clock, by its key in the summary."""
 
 
-def render_links(log: Log, facts: JsonObject, charts: str = "") -> str:
+def render_links(log: Log, facts: JsonObject, charts: Markup = Markup()) -> Markup:  # noqa: B008
     """Renders the section about the links: a sentence, and the tables of ages, samples, clocks.
 
     Args:
@@ -131,7 +132,9 @@ def _list_age_rows(log: Log, facts: JsonObject) -> list[list[str]]:
         first, *later = link["stated"]
         models = [first["link"]]
         models += [f"from {change['from_s']:g} s: {change['link']}" for change in later]
-        stated = "<br>".join(escape(typeset(model)) for model in models)
+        stated = render_macro(
+            "origin.html", "stated_delays", models=[typeset(model) for model in models]
+        )
 
         values = [link["age_ms"][key] for key in _AGE_KEYS]
         values += [to_percent(link["ticks_without_new"]), link["silence_ms"]]
@@ -139,7 +142,7 @@ def _list_age_rows(log: Log, facts: JsonObject) -> list[list[str]]:
     return rows
 
 
-def _render_samples(log: Log, facts: JsonObject) -> str:
+def _render_samples(log: Log, facts: JsonObject) -> Markup:
     """Returns the table that counts the delivered and the lost samples of each link.
 
     The columns with measured one-way delays are added only if at least one link has them.
@@ -163,7 +166,7 @@ def _render_samples(log: Log, facts: JsonObject) -> str:
     return render_table(columns, rows) + render_legend(columns)
 
 
-def _render_clocks(log: Log, facts: JsonObject) -> str:
+def _render_clocks(log: Log, facts: JsonObject) -> Markup:
     """Returns the table that compares the clock of each sender with that of the receiver.
 
     Returns:
@@ -178,6 +181,6 @@ def _render_clocks(log: Log, facts: JsonObject) -> str:
             cells = [format_cell(clock[key]) for key in _CLOCK_COLUMNS]
             rows.append([label_link(log, name), *cells])
     if not rows:
-        return ""
+        return Markup()
     columns = {"clock of the sender": "", **dict(_CLOCK_COLUMNS.values())}
     return render_table(columns, rows) + render_legend(columns)

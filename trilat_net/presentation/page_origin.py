@@ -8,26 +8,27 @@ Invariant:
 """
 
 from datetime import UTC, datetime
-from html import escape
 from pathlib import Path
+
+from markupsafe import Markup
 
 from ..log.accounting import describe_unknown_ends
 from ..log.log_reader import Log
 from ..results import JsonObject
 from ..scenario import Scenario, list_shipped, load_scenario
 from ..scenario.describe import list_arm_notes
+from .html_templates import render_macro
 from .page_html import (
     render_code,
     render_details,
     render_facts,
     render_folds,
     render_section,
-    render_text,
 )
 from .page_timeline import describe_dominance
 
 
-def render_origin(log: Log, facts: JsonObject, licence: str) -> str:
+def render_origin(log: Log, facts: JsonObject, licence: str) -> Markup:
     """Renders the section with the commands, the scenario, the assumptions and the versions.
 
     Args:
@@ -63,20 +64,16 @@ def summarise_origin(log: Log) -> str:
     return f"{scenario.name} · {length} · {driver} · seed {scenario.seed}"
 
 
-def _render_description(scenario: Scenario) -> str:
+def _render_description(scenario: Scenario) -> Markup:
     """Returns the description of a scenario as paragraphs, with text in backticks as code."""
-    paragraphs = scenario.about.strip().split("\n\n")
-    html = "".join(f"<p>{render_text(paragraph)}</p>" for paragraph in paragraphs if paragraph)
-    return html or "<p>The scenario has no description.</p>"
+    paragraphs = [text for text in scenario.about.strip().split("\n\n") if text]
+    return render_macro("origin.html", "description", paragraphs=paragraphs)
 
 
-def _render_assumptions(scenario: Scenario) -> str:
+def _render_assumptions(scenario: Scenario) -> Markup:
     """Returns the list of assumptions that the scenario declares, and the notes on its arms."""
     texts = [*scenario.assumed, *list_arm_notes(scenario)]
-    if not texts:
-        return "<p>Nothing is declared as assumed.</p>"
-    items = "".join(f"<li>{escape(text)}</li>" for text in texts)
-    return f"<ul>{items}</ul>"
+    return render_macro("origin.html", "assumptions", texts=texts)
 
 
 def _list_recording_facts(log: Log, facts: JsonObject) -> list[tuple[str, str]]:

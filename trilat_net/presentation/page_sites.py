@@ -7,6 +7,8 @@ Invariant:
     - Each section begins with a sentence, and each table has a legend.
 """
 
+from markupsafe import Markup
+
 from ..analysis.site_signals import shared_unit
 from ..errors import count_nouns
 from ..log.log_reader import Log
@@ -42,7 +44,7 @@ _ANGLE_COLUMNS = {
 }
 
 
-def render_sites(log: Log, facts: JsonObject) -> str:
+def render_sites(log: Log, facts: JsonObject) -> Markup:
     """Renders the section with the records and the motion of each site.
 
     Args:
@@ -98,7 +100,7 @@ _LOOP_COLUMNS = {
 }
 
 
-def render_loops(log: Log, facts: JsonObject, charts: str = "") -> str:
+def render_loops(log: Log, facts: JsonObject, charts: Markup = Markup()) -> Markup:  # noqa: B008
     """Renders the section with the timing of each site's control loop.
 
     Args:
@@ -108,7 +110,7 @@ def render_loops(log: Log, facts: JsonObject, charts: str = "") -> str:
     """
     reason = explain_missing_loop_times(log)
     if reason:
-        return render_section("Loop timing", f"Not measured: {reason}.", "", "loops")
+        return render_section("Loop timing", f"Not measured: {reason}.", Markup(), "loops")
     rows = []
     overruns = 0
     worst_us = 0.0

@@ -9,14 +9,14 @@ Invariant:
     - The judgement never stands alone beside a number that seems to contradict it. A sentence
       says which number it is, and why both are true.
     - A check that failed is named in the first lines, and unfolded.
-    - Every text that comes from a log is escaped.
+    - Every text that comes from a log is escaped, by the template `summary.html`.
 """
 
 from collections.abc import Sequence
-from html import escape
 from typing import NamedTuple
 
 import numpy as np
+from markupsafe import Markup
 
 from ..analysis.certificate.stability_certificate import Certificate
 from ..analysis.run_end import FORCE_NM, EndBehaviour, Stability
@@ -27,15 +27,15 @@ from ..analysis.site_signals import (
     find_largest_error,
     shared_unit,
 )
-from ..analysis.timeline import RaisedAlarm, list_alarms
+from ..analysis.timeline import list_alarms
 from ..errors import count_nouns, join_words
 from ..log.findings import Finding
 from ..log.log_reader import Log
 from ..results import JsonObject
 from ..scenario.expect import END_WINDOW_S
 from .certificate_text import describe_pace
+from .html_templates import render_macro
 from .page_html import NO_NUMBER, format_cell, render_details
-from .result_text import escape_text
 from .style import typeset
 
 _MAX_ALARMS = 8
@@ -76,7 +76,7 @@ _ENDS = {
 """How the arms moved at the end of a run, as a clause in the past tense."""
 
 
-def render_verdict(log: Log, certificate: Certificate, findings: Sequence[Finding]) -> str:
+def render_verdict(log: Log, certificate: Certificate, findings: Sequence[Finding]) -> Markup:
     """Renders the judgement whether the run was stable, with what the judgement rests on.
 
     Args:
@@ -96,13 +96,15 @@ def render_verdict(log: Log, certificate: Certificate, findings: Sequence[Findin
         css_class = "bad" if css_class == "bad" else "warn"
         sentences.append("The log failed a check, so that the judgement may be wrong.")
     remarks = [f"{_start_sentence(remark)}." for remark in certificate.remarks]
-    chip = f'<strong class="chip {css_class}">{escape(word.capitalize())}</strong>'
-    text = escape(typeset(describe_basis(certificate)))
-    more = escape(" ".join(sentences))
-    html = f"<p>{chip} {text}</p><p>{more}</p>"
-    if remarks:
-        html += f'<p class="remarks">{escape(" ".join(remarks))}</p>'
-    return f'<div id="verdict" class="{css_class}">{html}</div>'
+    return render_macro(
+        "summary.html",
+        "verdict",
+        css_class=css_class,
+        word=word.capitalize(),
+        basis=typeset(describe_basis(certificate)),
+        explanation=" ".join(sentences),
+        remarks=" ".join(remarks),
+    )
 
 
 def _start_sentence(text: str) -> str:
@@ -207,7 +209,7 @@ class _KeyNumber(NamedTuple):
     detail: str
 
 
-def render_key_numbers(log: Log, facts: JsonObject) -> str:
+def render_key_numbers(log: Log, facts: JsonObject) -> Markup:
     """Renders the numbers that describe the run best: its errors and the delay in use.
 
     Args:
@@ -219,12 +221,7 @@ def render_key_numbers(log: Log, facts: JsonObject) -> str:
         _describe_settling(log, facts),
         _describe_delay(facts),
     ]
-    items = ""
-    for number in numbers:
-        name = f"<dt>{escape(number.name)}</dt>"
-        detail = f'<dd class="soft">{escape(number.detail)}</dd>'
-        items += f"<div>{name}<dd>{escape(number.value)}</dd>{detail}</div>"
-    return f'<dl id="numbers">{items}</dl>'
+    return render_macro("summary.html", "key_numbers", numbers=numbers)
 
 
 def find_error_peak(log: Log, sites: Sequence[str] = ()) -> JointError | None:
@@ -311,7 +308,7 @@ def _describe_delay(facts: JsonObject) -> _KeyNumber:
     return _KeyNumber("Delay in use", f"{mean_ms} ms", detail)
 
 
-def render_alarms(log: Log) -> str:
+def render_alarms(log: Log) -> Markup:
     """Renders the alarms of a run as a list in large type.
 
     Faults and stops are the severe alarms. If there are any, only these are listed, because
@@ -326,27 +323,21 @@ def render_alarms(log: Log) -> str:
     """
     alarms = list_alarms(log)
     if not alarms:
-        return ""
+        return Markup()
     severe = [alarm for alarm in alarms if alarm.word in _SEVERE_ALARMS]
     candidates = severe if severe else alarms
     listed = candidates[:_MAX_ALARMS]
 
-    items = "".join(_render_alarm(alarm) for alarm in listed)
-    not_listed = len(alarms) - len(listed)
-    if not_listed:
-        items += f"<li class='mild'>and {not_listed} more: see what happened, below</li>"
-    return f'<ul class="alarms">{items}</ul>'
+    return render_macro(
+        "summary.html",
+        "alarms",
+        alarms=listed,
+        severe_words=_SEVERE_ALARMS,
+        not_listed=len(alarms) - len(listed),
+    )
 
 
-def _render_alarm(alarm: RaisedAlarm) -> str:
-    """Returns an alarm as a list item: its site, kind, time and reason."""
-    css_class = "" if alarm.word in _SEVERE_ALARMS else "mild"
-    period = f"{alarm.from_s:.3f} s to {alarm.to_s:.3f} s"
-    heading = f"<strong>{escape(alarm.site)} {alarm.word}</strong>"
-    return f'<li class="{css_class}">{heading}{period}: {escape(alarm.reason)}</li>'
-
-
-def render_checks(findings: Sequence[Finding], facts: JsonObject) -> str:
+def render_checks(findings: Sequence[Finding], facts: JsonObject) -> Markup:
     """Renders the results of the checks of the log as one line, which unfolds into a list.
 
     Args:
@@ -358,15 +349,7 @@ def render_checks(findings: Sequence[Finding], facts: JsonObject) -> str:
         HTML of the line. Empty if nothing was checked.
     """
     if not findings:
-        return ""
-    items = ""
-    for finding in findings:
-        css_class = "passed" if finding.passed else "failed"
-        mark = "✓ ok"
-        if not finding.passed:
-            mark = "✗ failed" if finding.judged else "not judged"
-        text = f"{escape(finding.check)}: {escape_text(finding.text)}"
-        items += f'<li class="{css_class}"><b>{mark}</b>{text}</li>'
+        return Markup()
     failed = [finding.check for finding in findings if finding.judged and not finding.passed]
     withheld = [finding.check for finding in findings if not finding.judged]
     summary = f"✓ {_summarise_checks(findings, facts)}"
@@ -374,8 +357,9 @@ def render_checks(findings: Sequence[Finding], facts: JsonObject) -> str:
         summary = f"✗ Failed: {', '.join(failed)}"
     elif withheld:
         summary = f"? Not judged: {', '.join(withheld)}"
-    verdicts = f'<ul class="verdicts">{items}</ul>'
-    return f'<div id="checks">{render_details(summary, verdicts, is_open=bool(failed))}</div>'
+    verdicts = render_macro("summary.html", "checks", findings=findings)
+    details = render_details(summary, verdicts, is_open=bool(failed))
+    return render_macro("summary.html", "check_line", details=details)
 
 
 def _summarise_checks(findings: Sequence[Finding], facts: JsonObject) -> str:

@@ -11,10 +11,10 @@ Invariant:
 """
 
 from collections.abc import Iterator
-from html import escape
 from typing import NamedTuple
 
 import numpy as np
+from markupsafe import Markup
 
 from ..analysis.aligned import Bools
 from ..analysis.site_signals import shared_unit, sites_with_operator
@@ -28,7 +28,8 @@ from ..errors import count_nouns, join_words
 from ..log.log_reader import Log
 from ..results import JsonObject
 from ..scenario import Scenario
-from .page_html import render_details, render_section, render_swatch
+from .html_templates import render_macro
+from .page_html import render_details, render_section
 from .page_summary import find_error_peak
 from .style import typeset
 
@@ -71,7 +72,7 @@ class RunMoment(NamedTuple):
     is_bad: bool = False
 
 
-def render_timeline(log: Log, facts: JsonObject) -> str:
+def render_timeline(log: Log, facts: JsonObject) -> Markup:
     """Renders the section with what happened, in the order of time.
 
     Args:
@@ -90,17 +91,15 @@ def render_timeline(log: Log, facts: JsonObject) -> str:
     return render_section("What happened", intro, body, "moments")
 
 
-def _render_moments(log: Log, moments: list[RunMoment]) -> str:
+def _render_moments(log: Log, moments: list[RunMoment]) -> Markup:
     """Returns moments as a list with a time, a number and a sentence each."""
-    items = ""
+    rows = []
     for moment in moments:
-        swatch = render_swatch(log, moment.site) if moment.site in log.sites else ""
-        number = "" if moment.number is None else f"<b>{moment.number}</b> "
-        css_class = ' class="bad"' if moment.is_bad else ""
-        time = f"<time>{moment.t_s:.3f} s</time>"
-        sentence = escape(typeset(moment.sentence))
-        items += f"<li{css_class}>{time}<span>{swatch}{number}{sentence}</span></li>"
-    return f'<ol class="moments">{items}</ol>'
+        row = moment._asdict()
+        row["sentence"] = typeset(moment.sentence)
+        row["index"] = log.sites.index(moment.site) if moment.site in log.sites else None
+        rows.append(row)
+    return render_macro("timeline.html", "moments", moments=rows)
 
 
 def list_moments(log: Log, facts: JsonObject) -> list[RunMoment]:

@@ -13,19 +13,18 @@ Invariant:
     - Every cell of a table is text. All three forms have the same cells in the same order.
 """
 
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from html import escape
 from importlib import import_module
 from typing import TYPE_CHECKING, NamedTuple
 
 from rich.text import Text
 
 from ..results import Result
-from .untrusted_text import MAX_LETTERS, sanitize
+from .untrusted_text import HASH, MAX_LETTERS, sanitize
 
 if TYPE_CHECKING:
+    from markupsafe import Markup
     from rich.table import Table
 
 _COLOURS = {
@@ -38,24 +37,6 @@ _COLOURS = {
 MARKS = {state: f"[{colour}]{state:<4}[/{colour}]" for state, colour in _COLOURS.items()}
 MARKS["note"] = "note"
 """Marks in Rich's markup, by the state of a finding."""
-
-HASH = re.compile(r"\b(?=[0-9a-f]*[a-f])(?=[0-9a-f]*[0-9])[0-9a-f]{12,64}\b")
-"""Pattern of a hash in hexadecimal digits, or of the first 12 or more digits of a hash.
-
-A hash is kept on one line so that it can be copied.
-"""
-
-
-def escape_text(text: str) -> str:
-    """Converts plain text to HTML, and keeps each hash on a single line.
-
-    A hash is a long hexadecimal number that identifies a file. Without a line break, a user can
-    copy it.
-
-    Args:
-        text: Plain text.
-    """
-    return HASH.sub(r'<span style="white-space:nowrap">\g<0></span>', escape(text))
 
 
 class TextTable(NamedTuple):
@@ -152,22 +133,18 @@ class TextTable(NamedTuple):
             lines.append(f"| {' | '.join(cells)} |")
         return "\n".join(lines)
 
-    def html(self) -> str:
+    def html(self) -> "Markup":
         """Renders the table in HTML, for a notebook or a page."""
-        sides = ["right" if right else "left" for right in self.to_the_right]
+        from .html_templates import render_macro
 
-        def render_row(cells: Sequence[str], tag: str) -> str:
-            """Returns a row of cells with an HTML tag, "td" or "th"."""
-            html = ""
-            for cell, side in zip(cells, sides, strict=False):
-                html += f'<{tag} style="text-align:{side}">{escape_text(cell)}</{tag}>'
-            return f"<tr>{html}</tr>"
-
-        head = ""
-        if any(self.titles):
-            head = f"<thead>{render_row(self.titles, 'th')}</thead>"
-        body = "".join(render_row(row, "td") for row in self.rows)
-        return f"<table>{head}<tbody>{body}</tbody></table>"
+        titles = self.titles
+        return render_macro(
+            "result.html",
+            "table",
+            titles=titles if any(titles) else (),
+            rows=self.rows,
+            sides=["right" if right else "left" for right in self.to_the_right],
+        )
 
     def lines(self) -> list[str]:
         """Renders the table as plain lines, with columns aligned by spaces.
@@ -229,11 +206,12 @@ class MarkedText(NamedTuple):
         mark = Text.from_markup(self.mark).plain
         return [f"{mark} {self.text}"]
 
-    def html(self) -> str:
+    def html(self) -> "Markup":
         """Renders the mark and the text as a line in HTML, without colours."""
+        from .html_templates import render_macro
+
         line = sanitize(self.lines()[0], MAX_LETTERS)
-        text = escape_text(line)
-        return f'<div style="white-space:pre-wrap">{text or "&nbsp;"}</div>'
+        return render_macro("result.html", "line", text=line)
 
 
 Block = str | MarkedText | TextTable

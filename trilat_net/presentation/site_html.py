@@ -10,17 +10,19 @@ Invariant:
 """
 
 from collections.abc import Iterator
-from html import escape
+
+from markupsafe import Markup
 
 from ..core.step.vectors import Array
 from ..log.site_log import SiteLog
+from .html_templates import render_macro
 from .result_text import TextTable, format_number
 
 FIELDS = ("q", "qd", "q_des", "e", "tau", "tau_x", "theta_hat", "x", "xd", "wrench")
 """Vectors of a record that the table shows, a row per element."""
 
 
-def render_site_html(site: SiteLog) -> str:
+def render_site_html(site: SiteLog) -> Markup:
     """Renders the records of one site as HTML, for display in a notebook.
 
     A heading is followed by a table with a row per number of a record. A row has the first,
@@ -29,7 +31,7 @@ def render_site_html(site: SiteLog) -> str:
     Args:
         site: Records of the site.
     """
-    heading = f"<p>{escape(repr(site).strip('<>'))}</p>"
+    heading = render_macro("result.html", "heading", text=repr(site).strip("<>"))
     if not len(site):
         return heading
     headers = ("quantity", "first", "last", "least", "greatest", "meaning")

@@ -128,10 +128,13 @@ class NotebookFigure(Figure):
 
     def _repr_html_(self) -> str:
         """Returns the picture as HTML. Jupyter calls this method by its name."""
+        from .html_templates import render_macro
+
         # Two pixels of the picture per pixel of the page look sharp on screens of high density.
         width = round(self.get_figwidth() * _NOTEBOOK_DPI / 2)
         picture = base64.b64encode(self._repr_png_()).decode()
-        return f'<img alt="figure" width="{width}" src="data:image/png;base64,{picture}">'
+        source = f"data:image/png;base64,{picture}"
+        return render_macro("result.html", "figure", width=width, source=source)
 
 
 def add_panels(figure: Figure, rows: int, columns: int, **options: Any) -> AxesGrid:

@@ -12,6 +12,11 @@ CONTROLS = re.compile(
 
 Line feeds and tabs are not among them.
 """
+HASH = re.compile(r"\b(?=[0-9a-f]*[a-f])(?=[0-9a-f]*[0-9])[0-9a-f]{12,64}\b")
+"""Pattern of a hash in hexadecimal digits, or of the first 12 or more digits of a hash.
+
+A hash is kept on one line so that it can be copied.
+"""
 MAX_LETTERS = 4000
 """Largest length of a printed line."""
 

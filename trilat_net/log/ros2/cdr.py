@@ -34,6 +34,11 @@ TWIST = "geometry_msgs/msg/TwistStamped"
 WRENCH = "geometry_msgs/msg/WrenchStamped"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 
+# Why no library encodes: rosbags 0.11.9 and pycdr2 1.0.0 give the same bytes. But for nine
+# channels at 60 Hz (joints, transforms and an array of three arms of six joints) they take 9
+# and 21 ms of processor time per second of data, and this module 0.6 ms. `--views full` writes
+# the same channels at 1 kHz, which is 15 % of a processor with rosbags. rosbags also adds 10 MB
+# of dependencies, and 0.18 s to the start of every process that encodes.
 _HEAD = b"\x00\x01\x00\x00"
 """Header of a message: plain CDR, little-endian, no options."""
 _LAST_S = (1 << 31) - 1

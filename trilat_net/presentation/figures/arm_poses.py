@@ -12,10 +12,10 @@ Invariant:
 """
 
 from collections.abc import Iterable, Sequence
-from html import escape
 from typing import Any, NamedTuple
 
 import numpy as np
+from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -28,6 +28,7 @@ from ...log.log_reader import Log
 from ...scenario.arms import ArmModel
 from .. import style
 from ..appearance import REPORT_SIZE, FigureSize
+from ..html_templates import render_macro
 from .figure_entry import draws
 
 INSTANTS = 6
@@ -332,7 +333,7 @@ def _draw_pose(axes: Axes, pose: ArmPose | None, colour: str) -> None:
     axes.plot(0.0, 0.0, **_BASE)
 
 
-def render_arms_svg(log: Log, bounds_m: PictureBox, factor: float) -> str:
+def render_arms_svg(log: Log, bounds_m: PictureBox, factor: float) -> Markup:
     """Draws the poses of all arms at a few times, as pictures in HTML.
 
     There is a row per site and a column per time. Sites without records are left out.
@@ -348,29 +349,30 @@ def render_arms_svg(log: Log, bounds_m: PictureBox, factor: float) -> str:
     left_m, right_m, bottom_m, top_m = bounds_m
     bounds = (factor * left_m, factor * right_m, factor * bottom_m, factor * top_m)
     times_s = choose_instants_s(log)
-    cells = ["<span></span>"]
-    cells += [f'<span class="head">t = {t_s:.4g} s</span>' for t_s in times_s]
+    rows = []
     for index, site in enumerate(log.sites):
         if not len(log[site]):
             continue
-        cells.append(f'<span class="head">{escape(site)}</span>')
+        pictures = []
         for t_s in times_s:
             pose = find_pose(log, site, t_s)
             scaled = None if pose is None else pose.scale(factor)
             label = f"{site} at {t_s:.4g} s"
-            cells.append(_render_picture(scaled, index, bounds, label))
-    columns = f"grid-template-columns: max-content repeat({len(times_s)}, 1fr)"
-    html = f'<div class="strip" style="{columns}">{"".join(cells)}</div>'
-    if any(arm.chain for arm in log.scenario.arms.values()):
-        html += (
-            '<p class="note">Gray: the shadow on a floor at the base. '
-            "Up is opposite to gravity.</p>"
-        )
-    return html
+            pictures.append(_measure_picture(scaled, index, bounds, label))
+        rows.append({"site": site, "pictures": pictures})
+    return render_macro(
+        "arms.html",
+        "strip",
+        times=[f"{t_s:.4g}" for t_s in times_s],
+        rows=rows,
+        has_shadows=any(arm.chain for arm in log.scenario.arms.values()),
+    )
 
 
-def _render_picture(pose: ArmPose | None, index: int, bounds: PictureBox, label: str) -> str:
-    """Returns a picture of a pose as SVG.
+def _measure_picture(
+    pose: ArmPose | None, index: int, bounds: PictureBox, label: str
+) -> dict[str, Any]:
+    """Returns the lines and points of a picture of a pose, as values for its template.
 
     Args:
         pose: The pose in units of the picture. None for a picture without an arm.
@@ -379,28 +381,30 @@ def _render_picture(pose: ArmPose | None, index: int, bounds: PictureBox, label:
         label: Description of the picture for screen readers.
     """
     left, right, bottom, top = bounds
-    ground = f'<line class="ground" x1="{left:.3f}" x2="{right:.3f}" y1="0" y2="0"/>'
-    base = '<rect class="base" x="-.06" y="-.06" width=".12" height=".12"/>'
-    drawing = ""
+    lines: list[tuple[str, Array]] = []
+    joints: list[tuple[str, str]] = []
+    has_shadow = False
     if pose is not None:
-        paths = [
+        has_shadow = len(pose.shadow) > 0
+        if has_shadow:
+            lines.append(("shadow", pose.shadow))
+        lines += [
             (f"path site-{index}", pose.path),
             ("desired", pose.desired),
             (f"arm site-{index}", pose.actual),
         ]
-        paths += [("body", path) for path in pose.bodies]
-        if len(pose.shadow):
-            ground = ""
-            paths.insert(0, ("shadow", pose.shadow))
-        for kind, path in paths:
-            drawing += f'<polyline class="{kind}" points="{_format_points(path)}"/>'
-        for x, y in pose.actual[1:]:
-            drawing += f'<circle class="fill-{index}" cx="{x:.3f}" cy="{-y:.3f}" r=".055"/>'
-    box = f"{left:.3f} {-top:.3f} {right - left:.3f} {top - bottom:.3f}"
-    return (
-        f'<svg viewBox="{box}" role="img" aria-label="{escape(label)}">'
-        f"{ground}{drawing}{base}</svg>"
-    )
+        lines += [("body", path) for path in pose.bodies]
+        joints = [(f"{x:.3f}", f"{-y:.3f}") for x, y in pose.actual[1:]]
+    return {
+        "box": f"{left:.3f} {-top:.3f} {right - left:.3f} {top - bottom:.3f}",
+        "left": f"{left:.3f}",
+        "right": f"{right:.3f}",
+        "label": label,
+        "index": index,
+        "has_ground": not has_shadow,
+        "paths": [(css_class, _format_points(path)) for css_class, path in lines],
+        "joints": joints,
+    }
 
 
 def _format_points(points: Array) -> str:

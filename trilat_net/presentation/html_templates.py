@@ -1,0 +1,84 @@
+"""Renders the HTML templates of this package, in the folder `templates`.
+
+`report.html` is the page that reports a run. The other templates contain macros, each for a
+piece of HTML, such as a table. A module `page_...` computes the values of its section, and the
+template of the section has all of its HTML.
+
+Invariant:
+    - Templates escape every value that is a plain string. Only values of the class `Markup` are
+      inserted as HTML. These are the results of other templates, and files of this package.
+    - A value that a template names and does not get is an error.
+    - Jinja is imported with this module, and this module only when HTML is rendered.
+"""
+
+import json
+import re
+from functools import cache, partial
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup, escape
+
+from .untrusted_text import HASH
+
+_CODE = re.compile(r"`([^`]+)`")
+"""Text in backticks, which the page shows as code."""
+
+
+def render_template(name: str, /, **values: Any) -> Markup:
+    """Renders a whole template.
+
+    Args:
+        name: File name of the template.
+        **values: Values that the template names.
+    """
+    return Markup(_make_environment().get_template(name).render(values))
+
+
+def render_macro(template: str, macro: str, /, **values: Any) -> Markup:
+    """Renders a macro of a template.
+
+    Args:
+        template: File name of the template.
+        macro: Name of the macro.
+        **values: Arguments of the macro.
+    """
+    macros = _make_environment().get_template(template).module
+    return Markup(getattr(macros, macro)(**values))
+
+
+@cache
+def _make_environment() -> Environment:
+    """Returns the environment of all templates. It compiles each template once."""
+    environment = Environment(
+        loader=PackageLoader(__package__, "templates"),
+        autoescape=True,
+        keep_trailing_newline=True,
+        undefined=StrictUndefined,
+    )
+    environment.globals["zip"] = zip
+    environment.filters["code"] = _mark_code
+    environment.filters["hashes"] = mark_hashes
+    # JSON has no NaN and no infinity. Texts are written as they are, not as escape sequences.
+    dump = partial(json.dumps, allow_nan=False, ensure_ascii=False)
+    environment.policies["json.dumps_function"] = dump
+    environment.policies["json.dumps_kwargs"] = {}
+    return environment
+
+
+def mark_hashes(text: str) -> Markup:
+    """Converts plain text to HTML, and keeps each hash on a single line.
+
+    A hash is a long hexadecimal number that identifies a file. Without a line break, a user can
+    copy it.
+
+    Args:
+        text: Plain text.
+    """
+    # `str`, because the parts that `sub` joins are escaped again if the text is `Markup`.
+    return Markup(HASH.sub(r'<span style="white-space:nowrap">\g<0></span>', str(escape(text))))
+
+
+def _mark_code(text: str) -> Markup:
+    """Converts plain text to HTML, with text in backticks as code."""
+    return Markup(_CODE.sub(r"<code>\1</code>", str(escape(text))))
