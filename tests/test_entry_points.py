@@ -30,7 +30,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[Installs]:
         def list_entries(group: str) -> list[EntryPoint]:
             return [entry for entry in found if entry.group == group]
 
-        monkeypatch.setattr(entry_points.metadata, "entry_points", list_entries)
+        monkeypatch.setattr(entry_points, "entry_points", list_entries)
         find_entries.cache_clear()
 
     yield install
