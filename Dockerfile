@@ -28,8 +28,8 @@ COPY packages /src/packages
 RUN python -m pip --python /opt/trilat/bin/python install --quiet --no-cache-dir --disable-pip-version-check \
         --no-deps --no-build-isolation --no-compile /src /src/packages/trilat-* \
     && python -m pip --python /opt/trilat/bin/python uninstall --quiet --yes setuptools \
-    && find trilat_net sites recorder live trilat_studies -exec touch -d "@$(date +%s)" {} + \
-    && /opt/trilat/bin/python -m compileall -q trilat_net sites recorder live trilat_studies
+    && find trilat_net sites recorder live trilat_ros2 trilat_studies -exec touch -d "@$(date +%s)" {} + \
+    && /opt/trilat/bin/python -m compileall -q trilat_net sites recorder live trilat_ros2 trilat_studies
 COPY containers/entry.py /opt/trilat/entry.py
 # A run and its report show that the image works, and leave what they compiled.
 ENV XDG_CACHE_HOME=/opt/trilat/cache

@@ -102,7 +102,7 @@ lint: $(VENV)/dev.stamp
 
 platforms: $(VENV)/dev.stamp
 	for other in win32 darwin; do \
-		$(BIN)/mypy --platform $$other --follow-imports silent --cache-dir .mypy_cache/$$other -p trilat_net -p trilat_studies || exit 1; \
+		$(BIN)/mypy --platform $$other --follow-imports silent --cache-dir .mypy_cache/$$other -p trilat_net -p trilat_studies -p trilat_ros2 || exit 1; \
 	done
 
 faults: $(VENV)/dev.stamp

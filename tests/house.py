@@ -11,6 +11,7 @@ ROOT = Path(__file__).parents[1]
 TOPS = {
     **dict.fromkeys(("trilat_net", "sites", "recorder", "live"), ROOT),
     "trilat_studies": ROOT / "packages" / "trilat-studies",
+    "trilat_ros2": ROOT / "packages" / "trilat-ros2",
 }
 """The packages of the program, each with the folder in which it lies."""
 BELOW_ALL = {
@@ -86,7 +87,7 @@ def room_imports() -> set[tuple[str, str]]:
     return {
         (a, b)
         for a, b in pairs
-        if a != b and not {a, b} & (BELOW_ALL | {"__init__", "__main__", "extension"})
+        if a != b and not {a, b} & (BELOW_ALL | {"__init__", "__main__"})
     }
 
 

@@ -30,7 +30,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[Installs]:
         def list_entries(group: str) -> list[EntryPoint]:
             return [entry for entry in found if entry.group == group]
 
-        monkeypatch.setattr(entry_points.metadata, "entry_points", list_entries)
+        monkeypatch.setattr(entry_points, "entry_points", list_entries)
         find_entries.cache_clear()
 
     yield install
@@ -47,7 +47,8 @@ def stated(package: str) -> dict[str, dict[str, str]]:
 @pytest.mark.parametrize("package", PACKAGE_COMMANDS)
 def test_a_package_registers_what_is_said_of_it(package: str) -> None:
     assert set(stated(package)[COMMANDS]) == set(PACKAGE_COMMANDS[package])
-    assert set(stated(package)[FUNCTIONS]) == set(PACKAGE_FUNCTIONS[package].split())
+    functions = stated(package).get(FUNCTIONS, {})
+    assert set(functions) == set(PACKAGE_FUNCTIONS.get(package, "").split())
     for group, values in stated(package).items():
         assert {name: find_entries(group)[name].value for name in values} == values
 

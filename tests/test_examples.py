@@ -15,6 +15,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from trilat_ros2.ros2_bridge import refuse_other_robots
 
 import trilat_net
 from tests.log_editing import recorded
@@ -22,7 +23,6 @@ from tests.net.waiting import until
 from tests.sites.devices import CapReports, HaplyService
 from tests.sites.relay import RelayClock
 from tests.sites.sessions import SESSION, Session, reached
-from trilat_net.app.ros2_bridge import refuse_other_robots
 from trilat_net.app.running_session import open_hand
 from trilat_net.log.ros2.topic_names import read_topic_table
 from trilat_net.net.arm_client import SwitchClient

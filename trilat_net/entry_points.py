@@ -13,7 +13,7 @@ Invariant:
 """
 
 from functools import cache
-from importlib import metadata
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from .errors import UsageError
@@ -33,14 +33,14 @@ _PACKAGE_OF = {
 
 
 @cache
-def find_entries(group: str) -> dict[str, metadata.EntryPoint]:
+def find_entries(group: str) -> dict[str, EntryPoint]:
     """Returns the entry points of a group by their names, without importing their packages.
 
     Args:
         group: `COMMANDS` or `FUNCTIONS`.
     """
-    entries: dict[str, metadata.EntryPoint] = {}
-    for entry in metadata.entry_points(group=group):
+    entries: dict[str, EntryPoint] = {}
+    for entry in entry_points(group=group):
         package = find_package(group, entry.name)
         top = entry.module.partition(".")[0]
         if not package or top == package.replace("-", "_"):

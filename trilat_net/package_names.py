@@ -15,6 +15,7 @@ PACKAGE_COMMANDS = {
         "test": "Checks scenarios against their own expectations.",
         "tune": "Finds the largest gains for an arm on links with a delay.",
     },
+    "trilat-ros2": {"ros2": "Connects a session to ROS 2."},
 }
 """The commands of each package, with the first sentence of their help."""
 PACKAGE_FUNCTIONS = {

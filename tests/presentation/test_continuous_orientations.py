@@ -17,6 +17,7 @@ import scipy.io
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
+from trilat_ros2.ros2_topics import BridgeEnds, SiteTopics
 
 import trilat_net as tn
 from tests.turning import (
@@ -32,7 +33,6 @@ from tests.turning import (
     turn,
 )
 from trilat_net.analysis.body_turns import BodyTurns
-from trilat_net.app.ros2_topics import BridgeEnds, SiteTopics
 from trilat_net.core.step.vectors import Array
 from trilat_net.log.data_tables import to_pandas_frame
 from trilat_net.log.log_reader import Log

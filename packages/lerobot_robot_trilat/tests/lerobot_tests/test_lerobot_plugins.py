@@ -97,7 +97,7 @@ def test_robot_has_no_cameras_and_ends_with_its_session(found: dict[str, ModuleT
     assert not robot.is_connected
 
 
-SPACE = Path(__file__).parents[1] / "presentation" / "cases" / "tool_down.toml"
+SPACE = Path(__file__).parents[4] / "tests" / "presentation" / "cases" / "tool_down.toml"
 
 
 @pytest.mark.parametrize(("actions", "mode"), [("tip", "tip"), ("joints", "joint")])

@@ -13,6 +13,7 @@ Invariant:
 
 from typing import NamedTuple
 
+from trilat_net.app.running_session import ShareHistory
 from trilat_net.core.step.ticks import NS_PER_S
 from trilat_net.log.ros2.published import SiteMessages
 from trilat_net.log.ros2.topic_names import TopicTable
@@ -21,8 +22,6 @@ from trilat_net.net.clock import Clock
 from trilat_net.net.messages import LinkStats, State
 from trilat_net.net.ros2_graph import QualityOfService, Ros2Graph, TopicPublisher
 from trilat_net.scenario import Scenario
-
-from .running_session import ShareHistory
 
 RELIABLE = QualityOfService()
 """Quality of service of most topics."""

@@ -19,15 +19,7 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
 from scipy.spatial.transform import Rotation
-
-import trilat_net
-from tests.log.standard_files import made
-from tests.net.local_bus import LocalNetwork
-from tests.net.manual_clock import ManualClock
-from tests.net.waiting import drained, until
-from tests.task_arms import posed_arms
-from trilat_net.analysis.dominance_history import evaluate_ramps, list_scripted_ramps
-from trilat_net.app.ros2_bridge import (
+from trilat_ros2.ros2_bridge import (
     SAFE_PERIOD_NS,
     SENDER_TIMEOUT_NS,
     SILENCE_NS,
@@ -40,7 +32,15 @@ from trilat_net.app.ros2_bridge import (
     refuse_other_robots,
     write_session_config,
 )
-from trilat_net.app.ros2_topics import BridgeEnds, SiteTopics
+from trilat_ros2.ros2_topics import BridgeEnds, SiteTopics
+
+import trilat_net
+from tests.log.standard_files import made
+from tests.net.local_bus import LocalNetwork
+from tests.net.manual_clock import ManualClock
+from tests.net.waiting import drained, until
+from tests.task_arms import posed_arms
+from trilat_net.analysis.dominance_history import evaluate_ramps, list_scripted_ramps
 from trilat_net.app.running_session import ShareHistory
 from trilat_net.core.step.ticks import Mode, TickRecord
 from trilat_net.errors import RunFailed, UsageError
@@ -204,7 +204,7 @@ FILE = "".join(re.findall(r"```\n((?:joint_states = |\[sites\.s\]).*?)```", PAGE
 
 
 def test_the_table_of_topics_has_every_topic() -> None:
-    table = Path(__file__).parents[2] / "docs" / "data" / "ros2-topics.csv"
+    table = Path(__file__).parents[4] / "docs" / "data" / "ros2-topics.csv"
     with table.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     listed = {name.rpartition("/")[2] for row in rows for name in row["topic"].split(", ")}
@@ -268,7 +268,7 @@ def test_a_robot_of_a_site_without_external_arm_is_refused(tmp_path: Path, site:
     (tmp_path / "names.toml").write_text(
         FILE.replace("sites.s", f"sites.{site}").replace("sites.m1", "sites.s")
     )
-    scenario = load_scenario(str(Path(__file__).parents[2] / "examples" / "external_arm.toml"))
+    scenario = load_scenario(str(Path(__file__).parents[4] / "examples" / "external_arm.toml"))
     with pytest.raises(
         UsageError,
         match=rf"sites\.{site}: no site of this name has an external arm; sites with an external arm: s",

@@ -27,6 +27,7 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 
+from trilat_net.app.running_session import RunningSession, open_hand
 from trilat_net.core.step.ticks import NS_PER_S
 from trilat_net.errors import TrilatError, UsageError, count_nouns
 from trilat_net.files import refuse_existing, write_whole
@@ -59,7 +60,6 @@ from trilat_net.process import LOOP_NICE, raise_priority
 from trilat_net.scenario import Scenario, parse_embedded
 
 from .ros2_topics import RELIABLE, BridgeEnds, SiteTopics
-from .running_session import RunningSession, open_hand
 
 POLL_NS = 1_000_000
 """Shortest time between two polls for messages of the session, in ns."""
