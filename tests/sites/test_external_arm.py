@@ -458,7 +458,7 @@ class Heard:
         self.ring = StampingRing(self.clock.monotonic_ns, bytes, MEASUREMENTS_KEPT)
         self.dropped: Counter[str] = Counter()
         site = Site(load_scenario("two_sites").setup("s"))
-        self.arm = ExternalArm(site, self.ring, self.clock, self.dropped, "here")
+        self.arm = ExternalArm(site, self.ring, self.clock, self.dropped, "trilat/here/s/arm")
 
     def hear(self, *payloads: bytes) -> None:
         for payload in payloads:
