@@ -56,7 +56,7 @@ def test_lines_off_a_terminal_say_what_is_done_and_how_far(
             threading.Event().wait(0.01)
     first, second, *_ = stream.getvalue().splitlines()
     assert first == "judging run.mcap ..."
-    assert re.fullmatch(r"  25 %, \d+ s so far", second)
+    assert re.fullmatch(r"  25 %, \d+ s elapsed", second)
 
 
 def test_lines_end_with_the_work(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -233,7 +233,7 @@ def progress_lines(label: str) -> Iterator[Callable[[int, int], None]]:
         elapsed_s = LINES_AFTER_S
         while not has_ended.wait(LINES_PERIOD_S):
             elapsed_s += LINES_PERIOD_S
-            err.print(f"  {percent}{elapsed_s:.0f} s so far", markup=False, soft_wrap=True)
+            err.print(f"  {percent}{elapsed_s:.0f} s elapsed", markup=False, soft_wrap=True)
 
     printer = threading.Thread(target=print_lines, daemon=True)
     printer.start()
