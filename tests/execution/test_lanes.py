@@ -47,8 +47,7 @@ STRUCTURES: tuple[tuple[str, dict[str, Any]], ...] = (
     ("free", {"scheme": "digital", "rate_hz": 333}),
     ("asymmetric", {}),
     ("contact", {}),
-    ("jitter", {}),
-    ("free", {"sites.s.on_stale": {"action": "hold", "age_ms": 60.0}}),
+    ("free", {"sites.s.on_stale": {"action": "hold", "age_ms": 205.0}}),
 )
 """Scenarios whose runs differ in their equations; the quick tests use the first three."""
 
