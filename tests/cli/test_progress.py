@@ -51,12 +51,14 @@ def test_lines_off_a_terminal_say_what_is_done_and_how_far(
     with terminal_output.progress_bar("judging run.mcap") as told:
         told(1, 4)
         for _ in range(1000):
-            if stream.getvalue().count("\n") >= 3:
+            if stream.getvalue().count("%") >= 2:
                 break
             threading.Event().wait(0.01)
-    first, second, *_ = stream.getvalue().splitlines()
+    # On a busy machine a line may precede the first progress, and has no percent then.
+    first, *others = stream.getvalue().splitlines()
     assert first == "judging run.mcap ..."
-    assert re.fullmatch(r"  25 %, \d+ s elapsed", second)
+    assert all(re.fullmatch(r"  (25 %, )?\d+ s elapsed", line) for line in others)
+    assert re.fullmatch(r"  25 %, \d+ s elapsed", others[-1])
 
 
 def test_lines_end_with_the_work(monkeypatch: pytest.MonkeyPatch) -> None:

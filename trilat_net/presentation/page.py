@@ -166,7 +166,7 @@ def _render_motion(charts: Markup) -> Markup:
         return Markup()
     intro = (
         "Drag over a chart to zoom all, double-click to see the whole run, click a name to "
-        "hide its line. Fig. 3 to 6 show the quantities of the paper's figures of these numbers."
+        "hide its line. Fig. 3 to 6 show what the paper's figures of these numbers show."
     )
     heading = "Positions, torques and estimates over time"
     return render_section(heading, intro, charts, "figures")
