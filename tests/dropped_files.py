@@ -17,14 +17,6 @@ def look(program: str, folder: Path) -> Any:
     return json.loads(out.stdout.splitlines()[-1])
 
 
-def drop(folder: Path, room: str, file: str, text: str) -> None:
-    """Puts a file beside those of a room that looks for files as it is imported: in a copy made of links."""
-    (folder / room).mkdir()
-    for one in (Path(trilat_net.__file__).parent / room).iterdir():
-        (folder / room / one.name).symlink_to(one)
-    (folder / room / file).write_text(text)
-
-
 def put_beside(folder: Path, room: str, file: str, text: str) -> None:
     """Puts a file beside those of a room of the package, in a copy made of links below `folder`."""
     at, of = folder / "trilat_net", Path(trilat_net.__file__).parent

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from tests.dropped_files import drop, look
+from tests.dropped_files import look, put_beside
 
 STUDY = '''
 """How far the slave lags for each seed, kept in a journal."""
@@ -13,10 +13,10 @@ from typing import Annotated
 import msgspec
 import typer
 
-from ..presentation import terminal_output as terminal
-from ..presentation.result_text import TextTable
-from ..studies.executor import open_worker_pool
-from ..studies.study_folder import RunJournal
+from ...presentation import terminal_output as terminal
+from ...presentation.result_text import TextTable
+from ...work.executor import open_worker_pool
+from ...work.study_folder import RunJournal
 from . import options
 
 
@@ -30,7 +30,7 @@ class Lag(msgspec.Struct, frozen=True):
 
 def measure_lag(item):
     """Measures one seed."""
-    from .. import metrics, simulate
+    from ... import metrics, simulate
 
     scenario, seed = item
     found = metrics(simulate(scenario, {"duration_s": 0.2}, seed=seed))
@@ -53,8 +53,7 @@ def lag_command(
 LOOK = """
 import contextlib, io, json, os, sys
 os.environ["COLUMNS"] = "200"
-import trilat_net
-trilat_net.__path__.insert(0, sys.argv[1])
+sys.path.insert(0, sys.argv[1])
 from trilat_net.app.cli import app
 
 def run(*words):
@@ -73,7 +72,7 @@ print(json.dumps({
 
 
 def test_file_beside_others_is_command_and_its_study(tmp_path: Path) -> None:
-    drop(tmp_path, "cli", "lag.py", STUDY)
+    put_beside(tmp_path, "app/cli", "lag.py", STUDY)
     found = look(LOOK, tmp_path)
     assert "Measures how far the slave lags, seed by seed." in found["listed"]
     assert "lag" in found["listed"].partition("─ Make your own ─")[2]
