@@ -190,7 +190,7 @@ def test_robot_of_six_joints_follows_a_push_within_its_limits() -> None:
 @pytest.mark.parametrize(
     ("example", "file"),
     [
-        ("two_operators_six_joints.toml", "robot.toml"),
+        ("two_operators_six_joints.toml", "robot_six_joints.toml"),
         ("two_operators.toml", "robot_two_joints.toml"),
         ("external_arm.toml", "robot_two_joints.toml"),
     ],

@@ -92,7 +92,9 @@ def test_limits_of_a_real_arm_are_said_first() -> None:
         "these your robot's?"
     )
     many = describe_scenario(EXAMPLES / "two_operators_six_joints.toml")[1]
-    assert many.startswith("s is a real arm: at most 60, 60, 60, 15, 15, 15 N m, 2 rad/s, ")
+    assert many.startswith(
+        "s is a real arm: at most 15, 15, 15, 2.8, 2.8, 2.8 N m, 0.3 rad/s, "
+    )
     assert not [line for line in describe_scenario("free") if "real arm" in line]
 
 

@@ -39,7 +39,7 @@ def ros2_command(
     machine needs no ROS installation. The bridge waits for the router of ROS without a limit,
     and for the session for the time of --timeout. It ends with the session. It was tested
     against programs that speak the protocol of rmw_zenoh, but not with ROS itself and not with
-    a robot. docs/sessions/ros2.md lists all topics and services.
+    a robot. docs/reference/ros2-topics.md lists all topics and services.
 
     Options:
         distro: ROS 2 distribution whose message format the bridge writes.
