@@ -2,13 +2,16 @@
 
 A program leads master m1 to a place around its start, waits there, and judges by the distance
 whether it arrived. With `--alone`, lead m1 yourself with the mouse on the page: an episode then
-succeeds if m1 ends near the place that the terminal names. Run two terminals:
+succeeds if m1 ends near the place that the terminal names. A second hand leads master m2 where
+m1 is, as `lerobot-record` does, because a policy at m2 will hold it too: a log in which nobody
+holds m2 has forces of zero there, for which LeRobot cannot find a scale. Run two terminals:
 
     trilat demo play --duration 60 -o reach-log
     python examples/record_episodes.py play
 
 When the session has ended, `trilat log export reach-log/run.mcap --to lerobot -o reach
---set episodes=marks --set task=reach` makes a dataset of the episodes.
+--set observations=plugin --set environment_state=yes --set episodes=marks --set task=reach`
+makes a dataset of the episodes (docs/studies/lerobot.md).
 """
 
 import argparse
@@ -45,10 +48,12 @@ def main() -> None:
     with (
         tn.session(options.session, connect=connect) as session,
         tn.hand(options.session, "m1", source="teacher", connect=connect) as hand,
+        tn.hand(options.session, "m2", source="follower", connect=connect) as follower,
     ):
         results = record(
             session=session,
             hand=hand,
+            follower=follower,
             leads=not options.alone,
             episodes=options.episodes,
             seconds=options.seconds,
@@ -62,6 +67,7 @@ def main() -> None:
 def record(
     session: Any,
     hand: Any,
+    follower: Any,
     *,
     leads: bool,
     episodes: int,
@@ -75,6 +81,7 @@ def record(
     Args:
         session: the running session.
         hand: the operator of m1.
+        follower: the operator of m2, which goes where m1 is.
         leads: False if a person moves m1.
         episodes: number of episodes. The end of the session ends them earlier.
         seconds: duration of an episode, s.
@@ -99,6 +106,7 @@ def record(
                     smooth = share * share * (3.0 - 2.0 * share)
                     place = zip(begin_m, goal_m, strict=True)
                     hand.move(*(begin + smooth * (goal - begin) for begin, goal in place))
+                follower.move(*hand.pose)
                 wait_s(PERIOD_S)
             results.append(math.dist(hand.pose, goal_m) <= NEAR_M)
             judge(results[-1])

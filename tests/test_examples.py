@@ -320,12 +320,14 @@ def test_recorded_episodes_are_marked_with_their_outcome(tmp_path: Path) -> None
         with (
             reached(bus, clock) as running,
             open_hand(bus, clock, SESSION, "m1", scenario) as hand,
+            open_hand(bus, clock, SESSION, "m2", scenario) as follower,
         ):
             for seconds in (4.0, 0.04):
                 found.extend(
                     example["record"](
                         running,
                         hand,
+                        follower,
                         leads=True,
                         episodes=1,
                         seconds=seconds,
@@ -345,6 +347,8 @@ def test_recorded_episodes_are_marked_with_their_outcome(tmp_path: Path) -> None
         "begins",
         "failed",
     ]
+    # Someone holds m2 in the episodes, so that the forces of its operator are not all zero.
+    assert np.abs(log["m2"].tau_x).max() > 0.0
 
 
 def test_a_person_takes_over_from_a_policy_that_fails(monkeypatch: pytest.MonkeyPatch) -> None:

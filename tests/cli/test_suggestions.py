@@ -7,11 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from trilat_net.app.cli import _SYNONYMS
+from trilat_net.app.cli import _SUBJECTS, _SYNONYMS
 from trilat_net.app.cli.options import find_split_setting
 from trilat_net.errors import find_nearest, suggest_nearest
 
 from .running import trilat, whole_command
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def in_one_line(text: str) -> str:
@@ -38,6 +40,17 @@ def test_an_unknown_command_suggests_one(
     done = trilat(*words, cwd=tmp_path)
     assert done.code == 2
     assert f"did you mean {suggestion}" in in_one_line(done.err)
+
+
+def test_subjects_without_command_lead_to_existing_pages(tmp_path: Path) -> None:
+    text = in_one_line(trilat("lerobot", cwd=tmp_path).err)
+    assert "trilat log export FILE --to lerobot" in text
+    commands = whole_command().commands
+    for subject, hint in _SUBJECTS.items():
+        assert subject not in {*commands, *_SYNONYMS["trilat"]}
+        pages = re.findall(r"\((docs/.+?)\)", hint)
+        assert pages
+        assert all((ROOT / page).is_file() for page in pages)
 
 
 def test_a_word_like_no_command_lists_all(tmp_path: Path) -> None:

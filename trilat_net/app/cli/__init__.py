@@ -74,6 +74,23 @@ _SYNONYMS = {
 Words that are only misspelt need no entry.
 """
 
+_TO_LEROBOT = (
+    "a dataset of a log is made by trilat log export FILE --to lerobot "
+    "(docs/studies/lerobot.md)"
+)
+_TO_GYMNASIUM = (
+    "an environment of Gymnasium is made in Python by trilat_net.make_env "
+    "(docs/studies/train-policies.md)"
+)
+_SUBJECTS = {
+    "lerobot": _TO_LEROBOT,
+    "dataset": _TO_LEROBOT,
+    "gym": _TO_GYMNASIUM,
+    "gymnasium": _TO_GYMNASIUM,
+    "train": f"{_TO_GYMNASIUM}; {_TO_LEROBOT}",
+}
+"""Subjects that have no command with a similar name, and where they are found instead."""
+
 
 class _Group(TyperGroup):
     """A group of commands that suggests a command in place of an unknown one.
@@ -102,7 +119,9 @@ class _Group(TyperGroup):
         suggested = _SYNONYMS.get(word, {}).get(name.casefold())
         suggested = suggested or find_nearest(name, commands)
         hint = f"did you mean {group} {suggested}?"
-        if not suggested:
+        if ctx.parent is None and name.casefold() in _SUBJECTS:
+            hint = _SUBJECTS[name.casefold()]
+        elif not suggested:
             hint = f"{group} has the commands {', '.join(commands)}"
         return ctx.fail(f"There is no command {name!r}; {hint}")
 
