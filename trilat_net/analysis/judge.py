@@ -80,6 +80,13 @@ def certify_run(
     )
 
 
+MAX_RECORDED_TICKS = 1_500_000
+"""Largest number of ticks of all sites for which a simulated run is recorded for its energies.
+
+The records of so many ticks need half a gigabyte of memory.
+"""
+
+
 class VirtualJudgement(NamedTuple):
     """Judgement of a simulated run without a log.
 
@@ -102,9 +109,9 @@ def judge_virtual_run(
     """Judges a simulated run as its certificate would, without a log.
 
     Twins, one for every joint, are executed only if they may change the decision. The run is
-    repeated with all its records only if it has settled or is open, and if its laws have an
-    energy function V or declare energies. These need the records, and may prove that the run is
-    stable, or contradict that it settled.
+    repeated with all its records only if it has settled or is open, if its laws have an energy
+    function V or declare energies, and if it has at most `MAX_RECORDED_TICKS` ticks. Energies
+    need the records, and may prove that the run is stable, or contradict that it settled.
 
     Args:
         scenario: Scenario of the run. Its duration may be shorter than that of the run.
@@ -128,7 +135,8 @@ def judge_virtual_run(
         findings = findings._replace(twins=twins)
     decision = decide_stability(findings)
     is_weak = decision.stability in (Stability.SETTLED, Stability.OPEN)
-    if is_weak and _has_energies(ended):
+    ticks = sum(site.rate_hz for site in ended.sites.values()) * ended.duration_s
+    if is_weak and ticks <= MAX_RECORDED_TICKS and _has_energies(ended):
         recorded = certify(simulate_scenario(ended), own_laws=True)
         certificate = replace(
             recorded,

@@ -1,0 +1,49 @@
+"""A simulated run is recorded for its energies only where these may change the judgement."""
+
+from typing import Any
+
+import pytest
+
+from trilat_net.analysis import judge
+from trilat_net.execution.fused import FusedRun
+from trilat_net.scenario import load_scenario
+
+LOSSY = {"link.delay_ms": 50, "link.loss": 0.3, "duration_s": 4.0, "timeline": []}
+"""Delays without exact roots, so that a run settles or is open."""
+
+
+def count_recordings(
+    monkeypatch: pytest.MonkeyPatch, name: str, settings: dict[str, Any]
+) -> tuple[int, str]:
+    """Returns how often a run was recorded to judge it, and the judgement."""
+    recorded = []
+    simulate = judge.simulate_scenario
+    monkeypatch.setattr(
+        judge, "simulate_scenario", lambda scenario: recorded.append(1) or simulate(scenario)
+    )
+    scenario = load_scenario(name, settings)
+    run = FusedRun(scenario)
+    run.advance_to(scenario.duration_s)
+    judged = judge.judge_virtual_run(scenario, run)
+    monkeypatch.undo()
+    return len(recorded), str(judged.decision.stability)
+
+
+@pytest.mark.parametrize(
+    ("law", "times"),
+    [("adaptive", 1), ("wave", 1), ("p_d", 0)],
+)
+def test_only_laws_with_energies_are_recorded(
+    law: str, times: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = {**LOSSY, "scheme": "digital", "control.law": law}
+    counted, word = count_recordings(monkeypatch, "free", settings)
+    assert word in ("settled", "open")
+    assert counted == times
+
+
+def test_a_long_run_is_not_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its records would fill the memory; roots and pushes decide."""
+    monkeypatch.setattr(judge, "MAX_RECORDED_TICKS", 11_999)
+    counted, _ = count_recordings(monkeypatch, "free", LOSSY)
+    assert counted == 0
