@@ -31,7 +31,7 @@ def count_recordings(
 
 @pytest.mark.parametrize(
     ("law", "times"),
-    [("adaptive", 1), ("wave", 1), ("p_d", 0)],
+    [("adaptive", 1), ("tanks", 1), ("p_d", 0)],
 )
 def test_only_laws_with_energies_are_recorded(
     law: str, times: int, monkeypatch: pytest.MonkeyPatch
