@@ -29,7 +29,7 @@ import sys
 import zlib
 from collections.abc import Callable
 from contextlib import suppress
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ParamSpec, TypeVar, cast
@@ -206,6 +206,15 @@ _INNER = "within"
 """Marks kept code as that of an inner leaf."""
 
 
+@cache
+def _hash_folder(folder: Path) -> str:
+    """Returns a hash of all Python files of a folder, which every function in it asks for."""
+    digest = hashlib.sha256()
+    for source in sorted(folder.glob("*.py")):
+        digest.update(source.read_bytes())
+    return digest.hexdigest()
+
+
 class _LeafLocator:
     """Locates the machine code of a function, with the interface of Numba's cache locators.
 
@@ -224,11 +233,8 @@ class _LeafLocator:
         return str(root / self._py_file.parent.name)
 
     def get_source_stamp(self) -> str:
-        digest = hashlib.sha256()
         # Functions of lanes are outside of the core, whose hash names the directory.
-        for source in sorted(self._py_file.parent.glob("*.py")):
-            digest.update(source.read_bytes())
-        return digest.hexdigest()
+        return _hash_folder(self._py_file.parent)
 
     def get_disambiguator(self) -> str:
         return str(self._line)
