@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from tests.core.compiled import printed
+from tests.execution.varying_links import VARYING_LINKS
 from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
 from trilat_net.analysis.metrics.measures import quantities
 from trilat_net.core.step.ticks import BUCKETS_PER_S, Mode, TickRecord
@@ -33,25 +34,7 @@ LINKS: tuple[dict[str, Any], ...] = (
         "link.half_width_ms": 40.0,
         "link.loss": 0.3,
     },
-    {
-        "link.model": "uniform",
-        "link.delay_ms": 40.0,
-        "link.half_width_ms": 40.0,
-        "link.order": "in_order",
-    },
-    {
-        "link.model": "normal",
-        "link.delay_ms": 30.0,
-        "link.deviation_ms": 20.0,
-        "link.playout_ms": 60.0,
-    },
-    {
-        "link.model": "sine",
-        "link.delay_ms": 50.0,
-        "link.amplitude_ms": 50.0,
-        "link.period_s": 0.3,
-    },
-    {"link.preset": "4g", "link.duplicate": 0.2},
+    *VARYING_LINKS,
 )
 
 

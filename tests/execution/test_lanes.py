@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.execution.varying_links import VARYING_LINKS
 from trilat_net.execution import virtual
 from trilat_net.execution.fused import FusedRun
 from trilat_net.execution.lanes import LANES, LEAST_RUNS, find_obstacle, group_runs
@@ -20,25 +21,7 @@ LINKS: tuple[dict[str, Any], ...] = (
     {"link.delay_ms": 33.3},
     {"link.delay_ms": 150.0, "link.loss": 0.2},
     {"link.model": "uniform", "link.delay_ms": 40.0, "link.half_width_ms": 40.0},
-    {
-        "link.model": "uniform",
-        "link.delay_ms": 40.0,
-        "link.half_width_ms": 40.0,
-        "link.order": "in_order",
-    },
-    {
-        "link.model": "normal",
-        "link.delay_ms": 30.0,
-        "link.deviation_ms": 20.0,
-        "link.playout_ms": 60.0,
-    },
-    {
-        "link.model": "sine",
-        "link.delay_ms": 50.0,
-        "link.amplitude_ms": 50.0,
-        "link.period_s": 0.3,
-    },
-    {"link.preset": "4g", "link.duplicate": 0.2},
+    *VARYING_LINKS,
 )
 STRUCTURES: tuple[tuple[str, dict[str, Any]], ...] = (
     ("free", {}),

@@ -1,0 +1,26 @@
+"""Links whose delays vary in every way: in order, played out, over time, in bursts and twice."""
+
+from typing import Any
+
+VARYING_LINKS: tuple[dict[str, Any], ...] = (
+    {
+        "link.model": "uniform",
+        "link.delay_ms": 40.0,
+        "link.half_width_ms": 40.0,
+        "link.order": "in_order",
+    },
+    {
+        "link.model": "normal",
+        "link.delay_ms": 30.0,
+        "link.deviation_ms": 20.0,
+        "link.playout_ms": 60.0,
+    },
+    {
+        "link.model": "sine",
+        "link.delay_ms": 50.0,
+        "link.amplitude_ms": 50.0,
+        "link.period_s": 0.3,
+    },
+    {"link.preset": "4g", "link.duplicate": 0.2},
+)
+"""Overrides of a scenario, one set for each kind of variation."""
