@@ -126,7 +126,10 @@ def test_a_saved_episode_says_that_a_program_moved_its_arm(tmp_path: Path) -> No
         ({"link.delay_ms": (0.0, -300.0)}, "delay_ms: expected a number >= 0.0"),
         ({"seeds": [1, 2]}, "did you mean 'seed'"),
         ({"link.delay_ms": []}, "link.delay_ms needs a pair of bounds or a list"),
-        ({"link.delay_ms": 5}, "link.delay_ms needs a pair of bounds or a list of values, not 5"),
+        (
+            {"link.delay_ms": 5},
+            "link.delay_ms needs a pair of bounds or a list of values, not 5",
+        ),
     ],
 )
 def test_varied_keys_are_checked_before_the_first_episode(
