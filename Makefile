@@ -74,10 +74,10 @@ test:
 
 pytest: $(VENV)/dev.stamp
 	@TRILAT_TEST_RUN=tests nice -n 19 $(BIN)/python -m pytest -q -p tests.progress -n $$(getconf _NPROCESSORS_ONLN) --dist worksteal \
-		-m "not live and not long" --ignore tests/live
+		-m "not live and not long" --ignore tests/live --ignore packages/trilat-people/tests/live_tests
 
 SESSIONS = TRILAT_TEST_RUN=sessions flock -o $(VENV)/sessions.lock $(BIN)/python -m pytest -q -p tests.progress \
-	-o cache_dir=.pytest_cache/sessions -m "live and not long" tests/live packages/trilat-studies/tests/sweep_tests
+	-o cache_dir=.pytest_cache/sessions -m "live and not long" tests/live packages/trilat-people/tests/live_tests packages/trilat-studies/tests/sweep_tests
 
 sessions: $(VENV)/dev.stamp
 	@$(SESSIONS) || { echo "real-time sessions depend on what else the machine does: those that failed run once more"; \
@@ -88,7 +88,7 @@ push-set: $(VENV)/dev.stamp
 
 test-long: platforms $(VENV)/long.stamp $(VENV)/docs.stamp
 	TRILAT_TEST_RUN=all-tests $(BIN)/python -m pytest -q -p tests.progress -n auto --dist worksteal -m "not live"
-	TRILAT_TEST_RUN=dealt-tests $(BIN)/python -m pytest -q -p tests.progress -p tests.dealt -n auto -m "not live and not long" --ignore tests/live
+	TRILAT_TEST_RUN=dealt-tests $(BIN)/python -m pytest -q -p tests.progress -p tests.dealt -n auto -m "not live and not long" --ignore tests/live --ignore packages/trilat-people/tests/live_tests
 	TRILAT_TEST_RUN=all-sessions $(BIN)/python -m pytest -q -p tests.progress -m live
 
 containers: setup
@@ -102,7 +102,7 @@ lint: $(VENV)/dev.stamp
 
 platforms: $(VENV)/dev.stamp
 	for other in win32 darwin; do \
-		$(BIN)/mypy --platform $$other --follow-imports silent --cache-dir .mypy_cache/$$other -p trilat_net -p trilat_studies -p trilat_ros2 || exit 1; \
+		$(BIN)/mypy --platform $$other --follow-imports silent --cache-dir .mypy_cache/$$other -p trilat_net -p trilat_people -p trilat_studies -p trilat_ros2 || exit 1; \
 	done
 
 faults: $(VENV)/dev.stamp

@@ -17,17 +17,22 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from .errors import UsageError
-from .package_names import PACKAGE_COMMANDS, PACKAGE_FUNCTIONS
+from .package_names import PACKAGE_COMMANDS, PACKAGE_FUNCTIONS, PACKAGE_HOOKS
 
 COMMANDS = "trilat_net.commands"
 """Group of the commands. A name is that of the command, with a hyphen for each space."""
 FUNCTIONS = "trilat_net.api"
 """Group of the functions and classes of the Python interface."""
+HOOKS = "trilat_net.hooks"
+"""Group of what methods of this program call in packages of this program, see `hooks`."""
 
 _PACKAGE_OF = {
     COMMANDS: {name: package for package, names in PACKAGE_COMMANDS.items() for name in names},
     FUNCTIONS: {
         name: package for package, names in PACKAGE_FUNCTIONS.items() for name in names.split()
+    },
+    HOOKS: {
+        name: package for package, names in PACKAGE_HOOKS.items() for name in names.split()
     },
 }
 
@@ -37,7 +42,7 @@ def find_entries(group: str) -> dict[str, EntryPoint]:
     """Returns the entry points of a group by their names, without importing their packages.
 
     Args:
-        group: `COMMANDS` or `FUNCTIONS`.
+        group: `COMMANDS`, `FUNCTIONS` or `HOOKS`.
     """
     entries: dict[str, EntryPoint] = {}
     for entry in entry_points(group=group):
@@ -52,7 +57,7 @@ def find_package(group: str, name: str) -> str:
     """Returns the package of this program that has a name, or "" if none has.
 
     Args:
-        group: `COMMANDS` or `FUNCTIONS`.
+        group: `COMMANDS`, `FUNCTIONS` or `HOOKS`.
         name: Name of the entry point.
     """
     return _PACKAGE_OF[group].get(name, "")
@@ -62,7 +67,7 @@ def load_entry(group: str, name: str, use: str) -> Any:
     """Imports the object of an entry point.
 
     Args:
-        group: `COMMANDS` or `FUNCTIONS`.
+        group: `COMMANDS`, `FUNCTIONS` or `HOOKS`.
         name: Name of the entry point.
         use: What the object is to a user, as in "trilat sweep", for the error.
 
