@@ -23,17 +23,18 @@ def names_of(stated: list[str]) -> set[str]:
     return {re.split(r"[^\w-]", one)[0] for one in stated}
 
 
+def bare_environment() -> dict[str, str]:
+    """The environment variables of this process, but none by which another Python would find its packages."""
+    names = (name for name in os.environ if not name.startswith(("PYTHON", "VIRTUAL")))
+    return {name: os.environ[name] for name in names}
+
+
 def run(*words: object, cwd: Path, **more: str) -> str:
     """Runs a program outside of the checkout; returns what it printed."""
-    bare = {
-        key: value
-        for key, value in os.environ.items()
-        if not key.startswith(("PYTHON", "VIRTUAL"))
-    }
     done = subprocess.run(
         [str(word) for word in words],
         cwd=cwd,
-        env={**bare, **more},
+        env={**bare_environment(), **more},
         capture_output=True,
         text=True,
     )

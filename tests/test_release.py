@@ -223,6 +223,8 @@ def test_a_package_has_the_version_and_bounds_of_the_program(name: str, sources:
     assert (released["project"]["version"], first) == (VERSION, f"{CORE}=={VERSION}")
     assert "dynamic" not in released["project"]
     assert set(libraries) <= set(PROJECT["project"]["dependencies"])
+    of_tests = released.get("dependency-groups", {}).get("test", [])
+    assert names_of(of_tests) <= locked("dev")
     assert distribution(name).version == VERSION
 
 
