@@ -340,6 +340,14 @@ def test_packages_and_those_of_others_join_the_core(
     assert len(run(trilat, *words, cwd=tmp_path).splitlines()) == 2
     called = "import trilat_net as tn; print(len(tn.measure_lags('two_sites', 2, 0.1)))"
     assert run(python, "-c", called, cwd=tmp_path) == "2\n"
+    run(trilat, "sim", "two_sites", "--duration", "2", "-o", "lagging.mcap", cwd=tmp_path)
+    lines = run(trilat, "log", "view", "lagging.mcap", "--in", "lag", cwd=tmp_path).splitlines()
+    assert [line.partition(":")[0] for line in lines] == [
+        "m, 0 s",
+        "m, 1 s",
+        "s, 0 s",
+        "s, 1 s",
+    ]
     install(clean, built["trilat-studies"][1], stated)
     grid = ("--over", "link.delay_ms=0,100", "--duration", "0.5", "--jobs", "1", "-o", "grid")
     run(trilat, "sweep", "two_sites", *grid, cwd=tmp_path)

@@ -185,7 +185,7 @@ def record_command(
     from ...log.log_layout import find_parts, parse_channel_filter
     from ...log.log_writer import LogStorage, parse_split
     from ...log.provenance import collect_provenance
-    from ...log.ros2.viz_channels import parse_viz_rate
+    from ...log.view_rates import parse_viz_rate
     from ...net.topics import RECORDER
     from ..recorded_session import make_scenario_reader
 
