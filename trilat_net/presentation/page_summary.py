@@ -160,6 +160,8 @@ def _explain_end(log: Log, certificate: Certificate) -> str:
     has_converged = end.behaviour is EndBehaviour.CONVERGED
     if has_converged and remains:
         clause = "the arms were at rest, with errors that stay"
+    elif is_stable and end.behaviour is EndBehaviour.UNDECIDED:
+        clause = "the motion showed no trend yet, which the evidence above does not need"
     else:
         clause = _ENDS[end.behaviour]
     text = f"At the end of the record, {clause}."
