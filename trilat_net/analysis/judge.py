@@ -87,7 +87,7 @@ The records of so many ticks need half a gigabyte of memory.
 """
 
 
-class VirtualJudgement(NamedTuple):
+class _VirtualJudgement(NamedTuple):
     """Judgement of a simulated run without a log.
 
     Attributes:
@@ -105,7 +105,7 @@ class VirtualJudgement(NamedTuple):
 
 def judge_virtual_run(
     scenario: Scenario, run: FusedRun, end: RunEnd | None = None
-) -> VirtualJudgement:
+) -> _VirtualJudgement:
     """Judges a simulated run as its certificate would, without a log.
 
     Twins, one for every joint, are executed only if they may change the decision. The run is
@@ -147,7 +147,7 @@ def judge_virtual_run(
         )
         decision = certificate.decision
     assert findings.roots is not None
-    return VirtualJudgement(end, findings.roots, twins, decision)
+    return _VirtualJudgement(end, findings.roots, twins, decision)
 
 
 def _has_energies(scenario: Scenario) -> bool:

@@ -295,7 +295,7 @@ def operator_displacement(log: Log, twin: Log, site: str) -> tuple[Ints, Array, 
     return common_tick, part.t_s[rows], q - twin_q
 
 
-class DecimatedTrace(NamedTuple):
+class _DecimatedTrace(NamedTuple):
     """Signals reduced to few points, so that they can be drawn quickly.
 
     A gap in the records that would be visible is marked by a row of NaN, which interrupts the
@@ -359,7 +359,7 @@ def decimate(
     t_s: Array,
     values: Array,
     buckets: int,
-) -> DecimatedTrace:
+) -> _DecimatedTrace:
     """Reduces signals to the points that a plot needs, so that no peak gets lost.
 
     The time is divided into buckets, of which each keeps at most 2 C + 3 points for C columns,
@@ -372,7 +372,7 @@ def decimate(
         buckets: Number of buckets.
     """
     if not len(tick):
-        return DecimatedTrace(tick, t_s, values)
+        return _DecimatedTrace(tick, t_s, values)
 
     # narrower gaps are narrower than a pixel, and there may be thousands of them
     ticks = tick[-1] - tick[0]
@@ -390,7 +390,7 @@ def decimate(
     nan_tick = tick[before_gap] + 1
     nan_t_s = t_s[before_gap] + period_s
     kept_values = values[keep]
-    return DecimatedTrace(
+    return _DecimatedTrace(
         tick=np.insert(tick[keep], nan_position, nan_tick),
         t_s=np.insert(t_s[keep], nan_position, nan_t_s),
         values=np.insert(kept_values, nan_position, np.nan, axis=0),

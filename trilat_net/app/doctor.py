@@ -496,12 +496,12 @@ def examine_system() -> DoctorFinding:
     return DoctorFinding("system", "warn", text)
 
 
-class Rehearsal(LoopStats):
+class _Rehearsal(LoopStats):
     """Runs the control loop of a single site without a network, to measure how late ticks are.
 
     The loop does the same work as in a session, except that no messages are exchanged. This
     object takes the place of two objects of the loop: of its statistics, so that the lateness
-    of each tick can be stored, and of the `LoopSite`, whose methods do nothing here.
+    of each tick can be stored, and of the `_LoopSite`, whose methods do nothing here.
 
     A tick is one period of the control loop. It is late if it begins after the time at which it
     was due.
@@ -569,7 +569,7 @@ class Rehearsal(LoopStats):
         """Computes one tick of the site without samples from other sites, to test its timing.
 
         A tick is one period of the control loop. The loop calls this method in place of
-        `LoopSite.step`.
+        `_LoopSite.step`.
 
         Args:
             k: Number of the tick.
@@ -592,7 +592,7 @@ class Rehearsal(LoopStats):
         """
         return False
 
-    # The other methods of `LoopSite`.
+    # The other methods of `_LoopSite`.
     publish_sample = run_housekeeping
     publish_link = run_housekeeping
     report_tick = run_housekeeping
@@ -618,7 +618,7 @@ def rehearse_rates(clock: Clock) -> list[tuple[int, int, int]]:
                 break
         scenario = load_scenario("free", {"rate_hz": rate_hz, "duration_s": REHEARSAL_S})
         warm_up(scenario, "s", clock)
-        late_us = sorted(Rehearsal(scenario, "s").run(clock))
+        late_us = sorted(_Rehearsal(scenario, "s").run(clock))
         quantile_us = late_us[int(MIN_PUNCTUAL_SHARE * len(late_us))]
         results.append((rate_hz, quantile_us, late_us[-1]))
     return results

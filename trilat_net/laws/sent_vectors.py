@@ -27,7 +27,7 @@ from ..errors import ScenarioError, count_nouns
 from ..fields import Frozen, reword_problem, split_refusal
 
 
-class SentVectorSpec(Frozen, frozen=True):
+class _SentVectorSpec(Frozen, frozen=True):
     """Declaration of a vector that a law sends at every tick, see `core.law_channel`.
 
     Attributes:
@@ -43,11 +43,11 @@ class SentVectorSpec(Frozen, frozen=True):
     per_peer: bool = False
 
 
-SentVectorSpecs = dict[str, SentVectorSpec]
+SentVectorSpecs = dict[str, _SentVectorSpec]
 
 
 def build_channel(
-    sends: Mapping[str, SentVectorSpec], layout: Layout, peers: int
+    sends: Mapping[str, _SentVectorSpec], layout: Layout, peers: int
 ) -> LawChannel:
     """Returns the vectors that a law sends from a site, with their lengths, in their order.
 

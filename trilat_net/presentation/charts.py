@@ -13,7 +13,7 @@ Invariant:
     - Every spike of the log is on the page, because decimation keeps the least and the largest
       value of a bucket.
     - Every line of a chart has a value to draw. A chart without any line is left out, and
-      `PageCharts.missing` names it, so that the page can say so.
+      `_PageCharts.missing` names it, so that the page can say so.
     - Numbers are base64 text of little-endian int32 and float32. This is a third of their
       length as decimal text.
 """
@@ -82,7 +82,7 @@ PICTURE_SIDE = 4.0
 """Longer side of a scaled picture, in the unit of the line widths of the page."""
 
 
-class PageCharts(NamedTuple):
+class _PageCharts(NamedTuple):
     """The charts of a report's page, as `ChartBuilder.build` returns them.
 
     Attributes:
@@ -145,7 +145,7 @@ class ChartBuilder:
         buckets = BUCKET_BUDGET // (columns_per_site * len(log.sites))
         self._buckets = max(_MIN_BUCKETS, min(_MAX_BUCKETS, buckets))
 
-    def build(self) -> PageCharts:
+    def build(self) -> _PageCharts:
         """Computes all charts of the page.
 
         Returns:
@@ -191,7 +191,7 @@ class ChartBuilder:
             spans=spans,
             bounds_m=[self.units_per_m * bound for bound in self.bounds_m],
         )
-        return PageCharts(data, missing)
+        return _PageCharts(data, missing)
 
     def _build_overview_charts(self) -> Iterator[TimeChart]:
         """Yields the two charts of the first screen: the error and the delay of each site.

@@ -143,7 +143,7 @@ def encode_csv(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = ()) -
     return stream.getvalue()
 
 
-class JournalEntry(Protocol):
+class _JournalEntry(Protocol):
     """Interface of an entry of a `RunJournal`: the result of a finished run.
 
     An entry is a structure of plain values. The cell and the seed together identify its run.
@@ -163,7 +163,7 @@ class JournalEntry(Protocol):
 
 P = TypeVar("P")
 T = TypeVar("T")
-E = TypeVar("E", bound=JournalEntry)
+E = TypeVar("E", bound=_JournalEntry)
 
 
 class RunJournal(Generic[E]):

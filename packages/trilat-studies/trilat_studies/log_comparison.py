@@ -100,7 +100,7 @@ class LogComparison(Result):
             for line in lines:
                 yield MarkedText("[bold]note[/bold]", f"{name}: {line}")
 
-        rows = select_most_different(self.metrics.rows)
+        rows = _select_most_different(self.metrics.rows)
         if rows:
             chosen = set(rows)
             means = [
@@ -141,7 +141,7 @@ class LogComparison(Result):
         text = f"in short: {join_words(verdicts)}"
         if not rows:
             return f"{text}; no metric differs"
-        most = max(rows, key=lambda row: measure_difference(row.values))
+        most = max(rows, key=lambda row: _measure_difference(row.values))
         values = [format_number(value, 4) for value in most.values]
         unit = f" {most.quantity.unit}" if most.quantity.unit else ""
         return (
@@ -236,7 +236,7 @@ def compare(*logs: str | Path | Log) -> LogComparison:
     )
 
 
-def measure_difference(values: Sequence[float | None]) -> float:
+def _measure_difference(values: Sequence[float | None]) -> float:
     """Returns how far values are apart, as a share of the largest of them.
 
     Args:
@@ -251,7 +251,7 @@ def measure_difference(values: Sequence[float | None]) -> float:
     return (max(known) - min(known)) / largest if largest > 0.0 else 0.0
 
 
-def select_most_different(rows: Sequence[ComparisonRow]) -> list[ComparisonRow]:
+def _select_most_different(rows: Sequence[ComparisonRow]) -> list[ComparisonRow]:
     """Returns the metrics that differ most between runs, in their order.
 
     Errors of the computation, which are rounding of different size in every run, are left out.
@@ -261,7 +261,7 @@ def select_most_different(rows: Sequence[ComparisonRow]) -> list[ComparisonRow]:
     """
     differences = {}
     for index, row in enumerate(rows):
-        difference = measure_difference(row.values)
+        difference = _measure_difference(row.values)
         if difference > 0.0 and row.quantity.key not in _ROUNDING_KEYS:
             differences[index] = difference
     ranked = sorted(differences, key=lambda index: (-differences[index], index))

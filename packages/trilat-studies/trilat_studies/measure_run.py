@@ -279,7 +279,7 @@ def run_compiled_in_batches(
     return run
 
 
-class WholeRun(NamedTuple):
+class _WholeRun(NamedTuple):
     """A simulated run with all of its records.
 
     Attributes:
@@ -293,7 +293,7 @@ class WholeRun(NamedTuple):
     run: FusedRun
 
 
-def run_whole(scenario: Scenario) -> WholeRun:
+def run_whole(scenario: Scenario) -> _WholeRun:
     """Runs a scenario in the compiled loop and keeps all records in memory.
 
     Args:
@@ -312,7 +312,7 @@ def run_whole(scenario: Scenario) -> WholeRun:
         buckets.append(site_records.reduce())
         last_tau_x.append(site_records.tau_x[-1])
     trace = RunTrace(buckets, last_tau_x, run.diverged_s)
-    return WholeRun(records, classify_run_end(scenario, trace), run)
+    return _WholeRun(records, classify_run_end(scenario, trace), run)
 
 
 class Range(NamedTuple):

@@ -226,15 +226,15 @@ class LogMetrics(Result):
         """Returns one number of a quantity for the whole run.
 
         The numbers of sites, links or walls are reduced to their maximum or sum, see
-        `reduce_to_run`.
+        `_reduce_to_run`.
 
         Args:
             quantity: The quantity.
         """
-        return reduce_to_run(quantity, self.values_of(quantity))
+        return _reduce_to_run(quantity, self.values_of(quantity))
 
 
-def reduce_to_run(quantity: Quantity, values_by_subject: Mapping[str, Metric]) -> Metric:
+def _reduce_to_run(quantity: Quantity, values_by_subject: Mapping[str, Metric]) -> Metric:
     """Reduces the numbers of a quantity to one number of the whole run.
 
     It is the largest number of all subjects (sites, links or walls), or their sum. Subjects to
@@ -389,7 +389,7 @@ def measure_run(log: Log, keys: Iterable[str]) -> dict[str, Metric]:
         values_by_subject = {}
         for subject, metrics in values[quantity.of].items():
             values_by_subject[subject] = metrics[key]
-        run_values[key] = reduce_to_run(quantity, values_by_subject)
+        run_values[key] = _reduce_to_run(quantity, values_by_subject)
     return run_values
 
 

@@ -67,7 +67,7 @@ _BATCH_RECORDS = 4096
 """Number of records of each site that are read from a simulated run at a time."""
 
 
-class EndLoop(NamedTuple):
+class _EndLoop(NamedTuple):
     """The control loop at the end of a run, with the rest about which it is linearised.
 
     Attributes:
@@ -140,7 +140,7 @@ def find_run_roots(scenario: Scenario, run: FusedRun) -> LoopRoots:
     return _compute_roots(loop)
 
 
-def find_log_loop(log: Log, *, own_laws: bool = False) -> EndLoop:
+def find_log_loop(log: Log, *, own_laws: bool = False) -> _EndLoop:
     """Finds the control loop at the end of a recorded run, and the rest next to its end.
 
     Args:
@@ -182,7 +182,7 @@ def find_log_loop(log: Log, *, own_laws: bool = False) -> EndLoop:
     return _build_end_loop(final, state, trace, own_laws=own_laws)
 
 
-def find_run_loop(scenario: Scenario, run: FusedRun) -> EndLoop:
+def find_run_loop(scenario: Scenario, run: FusedRun) -> _EndLoop:
     """Finds the control loop at the end of a simulated run, and the rest next to its end.
 
     The loop is that of a log of the same run. The code of imported control laws is executed.
@@ -280,7 +280,7 @@ class _EndState(NamedTuple):
 
 def _build_end_loop(
     final: _FixedDelays, state: _EndState, trace: RunTrace, *, own_laws: bool
-) -> EndLoop:
+) -> _EndLoop:
     """Returns the final loop, with the equilibrium nearest to a state.
 
     Args:
@@ -299,7 +299,7 @@ def _build_end_loop(
     rest = follow_equilibrium(final.scenario, settle_memories(conditions, end))
     last_q = _find_last_angles(final.scenario, trace)
     distance_rad = float(np.abs(last_q - rest.q).max())
-    return EndLoop(
+    return _EndLoop(
         scenario=final.scenario,
         conditions=conditions,
         rest=rest,
@@ -310,7 +310,7 @@ def _build_end_loop(
     )
 
 
-def _compute_roots(loop: EndLoop) -> LoopRoots:
+def _compute_roots(loop: _EndLoop) -> LoopRoots:
     """Computes the rightmost roots of a loop, as a certificate states them.
 
     Args:

@@ -73,7 +73,7 @@ class Equilibrium(NamedTuple):
     notes: tuple[str, ...] = ()
 
 
-class EffectiveDelay(NamedTuple):
+class _EffectiveDelay(NamedTuple):
     """Age of the samples that a site uses, over its ticks.
 
     Attributes:
@@ -413,7 +413,7 @@ def compute_effective_delay(
     peer: str,
     site: str,
     link: LinkBase,
-) -> EffectiveDelay:
+) -> _EffectiveDelay:
     """Computes the age of a peer's samples at the ticks of a site that use them.
 
     The ages are those of the run. If the delay repeats after a longer time, they are those of a
@@ -438,7 +438,7 @@ def compute_effective_delay(
         whole_ticks = -(-delay_us * site_hz // 1_000_000)
         ticks = max(1, whole_ticks)
         age_s = ticks / site_hz
-        return EffectiveDelay(age_s, age_s, age_s)
+        return _EffectiveDelay(age_s, age_s, age_s)
 
     duration_s = scenario.duration_s
     if is_constant:
@@ -467,7 +467,7 @@ def compute_effective_delay(
     tick_ns = np.arange(first, len(used)) * NS_PER_S // site_hz
     sample_ns = used[first:] * NS_PER_S // peer_hz
     ages_s = (tick_ns - sample_ns) * 1e-9
-    return EffectiveDelay(
+    return _EffectiveDelay(
         mean_s=float(ages_s.mean()),
         least_s=float(ages_s.min()),
         most_s=float(ages_s.max()),

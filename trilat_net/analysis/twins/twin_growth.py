@@ -767,7 +767,7 @@ def _find_departures(
                 )
 
 
-class LinearSizes(NamedTuple):
+class _LinearSizes(NamedTuple):
     """The range of sizes for which the effect of a push is proportional to its size.
 
     A push is a small disturbance in a repetition of the run. Its size is in rad, in rad/s or in
@@ -801,7 +801,7 @@ class PushedTwins(Result):
     log: Log
     at_s: float
     growth: TwinGrowth
-    linear: LinearSizes | None = None
+    linear: _LinearSizes | None = None
 
     def describe(self, pushed: PushGrowth) -> str:
         """Returns a sentence for the user on whether the effect of a push grows or dies away.
@@ -978,7 +978,7 @@ def _find_linear_sizes(
     scenario: Scenario,
     growth: TwinGrowth,
     sizes: Sequence[float],
-) -> LinearSizes:
+) -> _LinearSizes:
     """Finds the sizes of a push up to which its effect is proportional to its size.
 
     Two pushes of neighbouring sizes are compared at all times. Their effect is proportional if
@@ -1022,7 +1022,7 @@ def _find_linear_sizes(
     text = f"not linear, from {largest_linear:g} {unit} on"
     if largest_linear > sizes[0]:
         text = f"linear from {sizes[0]:g} to {largest_linear:g} {unit}"
-    return LinearSizes(sizes[0], largest_linear, text + beyond)
+    return _LinearSizes(sizes[0], largest_linear, text + beyond)
 
 
 def _has_wall(scenario: Scenario) -> bool:

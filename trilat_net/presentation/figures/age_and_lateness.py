@@ -160,7 +160,7 @@ def has_varying_delay(log: Log) -> bool:
     unless(has_varying_delay, "every link is stated as one constant delay"),
     in_report=True,
 )
-def draw_delay_distributions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+def _draw_delay_distributions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the distributions of the delay and of the age of samples on every link.
 
     The delay of a sample is the time until its arrival, its age the time until its use. A curve
@@ -394,7 +394,7 @@ def bin_loop_times(times_us: Ints, edges_us: Array) -> Ints:
     explain_missing_loop_times,
     in_report=True,
 )
-def draw_loop_timing(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+def _draw_loop_timing(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws histograms of the timing of each site's control loop, in us.
 
     They show the lateness, by which a tick began after its planned time, and the time that its

@@ -64,7 +64,7 @@ explain_absent_operator = unless(site_signals.sites_with_operator, NO_OPERATOR)
     explain_absent_operator,
     in_report=True,
 )
-def draw_operator_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
+def _draw_operator_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the torques of the operators on the arms over time, as Fig. 3 of the paper.
 
     An operator is the person or program that moves an arm. The torques are in N m.
@@ -730,7 +730,7 @@ def draw_authority(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     return plot.figure
 
 
-def list_sites_with_walls(log: Log) -> list[str]:
+def _list_sites_with_walls(log: Log) -> list[str]:
     """Lists the names of those sites whose arm can touch a wall.
 
     A site is a process that runs one arm. The sites have the order of the scenario, the
@@ -745,7 +745,7 @@ def list_sites_with_walls(log: Log) -> list[str]:
 @draws(
     "contact",
     "force of the walls, and depth in them",
-    unless(list_sites_with_walls, "no site has a wall in this run"),
+    unless(_list_sites_with_walls, "no site has a wall in this run"),
 )
 def draw_contact(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Draws the contact of the arms with walls over time.
@@ -757,7 +757,7 @@ def draw_contact(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         log: Log of the run.
         form: Width, type sizes and resolution of the figure.
     """
-    sites = list_sites_with_walls(log)
+    sites = _list_sites_with_walls(log)
     with style.time_figure(log, form, 2.9) as plot:
         force_panel, depth_panel = style.add_panels(plot.figure, 2, 1, sharex=True)[:, 0]
         for site in sites:

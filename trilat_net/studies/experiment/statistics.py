@@ -369,7 +369,7 @@ def correct_holm(p: Sequence[float | None]) -> list[float | None]:
 # --- mixed model ------------------------------------------------------------------------------
 
 
-class MixedEffect(NamedTuple):
+class _MixedEffect(NamedTuple):
     """Effect of a condition relative to the first condition.
 
     Args:
@@ -408,7 +408,7 @@ class MixedModel(NamedTuple):
 
     measure: str
     reference: str
-    effects: list[MixedEffect]
+    effects: list[_MixedEffect]
     freedom: int
     variances: dict[str, float]
     notes: list[str]
@@ -525,7 +525,7 @@ def _find_pairs(rows: Sequence[Row]) -> dict[str, str]:
     return pairs
 
 
-def _read_effect(fit: Any, condition: str, freedom: int) -> MixedEffect:
+def _read_effect(fit: Any, condition: str, freedom: int) -> _MixedEffect:
     """Returns the effect of a condition from a fit.
 
     Args:
@@ -539,7 +539,7 @@ def _read_effect(fit: Any, condition: str, freedom: int) -> MixedEffect:
     error = float(fit.bse_fe[name])
     half = float(stats.t.ppf(0.5 + CONFIDENCE / 2.0, freedom)) * error
     p = 2.0 * float(stats.t.sf(abs(estimate / error), freedom))
-    return MixedEffect(
+    return _MixedEffect(
         condition=condition,
         estimate=estimate,
         error=error,
