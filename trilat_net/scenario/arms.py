@@ -39,6 +39,7 @@ from ..core.life.live_hand import HandReach
 from ..core.step.site_setup import ChainSetup, Gains, Law, MotionLimits, RestGains, TaskSetup
 from ..core.step.vectors import Array, RowArray, Vector
 from ..errors import ScenarioError, count_nouns
+from .key_checks import VectorCounts, field_names
 from .link_inertia import LinkInertia, TensorEntries, ThreeReals
 from .urdf import UrdfChain, UrdfJoint, UrdfPayload, read_urdf
 
@@ -156,7 +157,7 @@ def start_margin(joint: ChainJoint) -> float:
 
 BASE_KEYS = ("base_xyz_m", "base_rpy_rad")
 """Keys of an arm that place its base in space."""
-CHAIN_KEYS = fields.field_names(Arm)[fields.field_names(Arm).index("base") :]
+CHAIN_KEYS = field_names(Arm)[field_names(Arm).index("base") :]
 """Keys of an arm that only a chain has."""
 
 
@@ -264,7 +265,7 @@ class ArmModel(NamedTuple):
     """
 
     theta: Array
-    counts: fields.VectorCounts
+    counts: VectorCounts
     joint_names: tuple[str, ...]
     link_names: tuple[str, ...]
     efforts: tuple[float, ...]
@@ -508,12 +509,12 @@ def build_arm(arm: Arm, task: Task, urdf_texts: Mapping[str, str], chains: bool)
             "the inertia matrix is singular in some pose: give the links mass away from their "
             "joints"
         )
-    counts = fields.VectorCounts()
+    counts = VectorCounts()
     lengths_m = (arm.l1_m, arm.l2_m)
     chain = None
     if chains:
         theta = _list_planar_bodies(arm)
-        counts = fields.VectorCounts.of_chain(2, task.shared)
+        counts = VectorCounts.of_chain(2, task.shared)
         lengths_m = (0.0, 0.0)
         chain = _build_planar_chain(arm, task)
     return ArmModel(
@@ -679,7 +680,7 @@ def _build_chain_model(arm: Arm, task: Task, urdf_chain: UrdfChain) -> ArmModel:
     joints, gravity = _place_base(arm, joints, (scale * x, scale * y, scale * z))
     return ArmModel(
         theta=np.concatenate([joint.inertia for joint in urdf_chain.joints]),
-        counts=fields.VectorCounts.of_chain(joint_count, task.shared),
+        counts=VectorCounts.of_chain(joint_count, task.shared),
         joint_names=tuple(joint.name for joint in urdf_chain.joints),
         link_names=tuple(joint.link for joint in urdf_chain.joints),
         efforts=tuple(joint.effort_limit for joint in urdf_chain.joints),

@@ -34,8 +34,9 @@ from ..core.plug.user_law import LawContext, UserLaw, UserLawFactory
 from ..errors import CodeWithheld, ScenarioError, describe_exception, suggest_nearest
 from ..files import find_page, open_regular
 from ..laws.interface import LawSettings, check_law_class
-from ..laws.sent_vectors import SentVectorSpecs, convert_sends, parse_classes
+from ..laws.sent_vectors import SentVectorSpecs, convert_sends
 from .class_arguments import make_own_instance
+from .sent_channel import parse_classes
 
 CLASS_PATTERN = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*$"
 

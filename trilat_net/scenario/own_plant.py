@@ -15,8 +15,9 @@ from typing import Annotated, Any, ClassVar
 from msgspec import Meta, field
 
 from ..errors import ScenarioError
-from ..fields import Frozen, is_number
+from ..fields import Frozen
 from .imported_code import CLASS_PATTERN, read_code
+from .key_checks import is_number
 
 _BODY_NAME = re.compile(r"[a-z][a-z0-9_]{0,29}")
 _MAX_BODIES = 32

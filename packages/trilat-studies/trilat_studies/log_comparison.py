@@ -10,22 +10,21 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from trilat_net.analysis.judge import certify_run
-from trilat_net.analysis.metrics.log_metrics import (
-    ComparisonRow,
-    MetricComparison,
-    compare_metrics,
-    comparison_to_json,
-)
+from trilat_net.analysis.metrics.log_metrics import compute_log_metrics
+from trilat_net.analysis.metrics.measures import Metric, Quantity, quantities
 from trilat_net.errors import UsageError, count_nouns, join_words
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.presentation.certificate_text import describe_judgement
 from trilat_net.presentation.result_text import Block, MarkedText, TextTable, format_number
 from trilat_net.results import Result
 from trilat_net.scenario.code_consent import may_run_user_laws
-from trilat_net.scenario.describe import ScenarioDifference, compare_scenarios
+from trilat_net.scenario.describe import (
+    ScenarioDifference,
+    compare_scenarios,
+)
 from trilat_net.scenario.scenario_reader import reseed_scenario
 from trilat_net.work.intervals import MeanInterval, mean_interval
 
@@ -42,6 +41,93 @@ _SUBJECTS = {
     "sum": "sum of {}s",
 }
 """How the number of a run follows from those of its sites, links or walls, by `reduction`."""
+
+
+class ComparisonRow(NamedTuple):
+    """One quantity in several runs, as a row of a table.
+
+    Attributes:
+        quantity: The quantity.
+        entries: The metric of the quantity in each run, in the order of the columns.
+    """
+
+    quantity: Quantity
+    entries: tuple[Metric, ...]
+
+    @property
+    def values(self) -> tuple[float | None, ...]:
+        """The value of the quantity in each of the compared runs. None where it is missing."""
+        return tuple(entry.value for entry in self.entries)
+
+
+class MetricComparison(NamedTuple):
+    """Metrics of several runs, side by side, as a table.
+
+    Attributes:
+        columns: Names of the runs.
+        rows: All quantities that apply to at least one of the runs, in the order in which they
+            are shown.
+    """
+
+    columns: tuple[str, ...]
+    rows: tuple[ComparisonRow, ...]
+
+    def row(self, key: str) -> ComparisonRow:
+        """Returns the row of this comparison that shows a quantity in all logs.
+
+        Args:
+            key: Key of the quantity, such as "sharing_off".
+
+        Raises:
+            KeyError: No row has this key.
+        """
+        row_by_key = {row.quantity.key: row for row in self.rows}
+        return row_by_key[key]
+
+
+def compare_metrics(logs: Sequence[Log], names: Sequence[str] = ()) -> MetricComparison:
+    """Computes the metrics of several logs, so that they can be shown in one table.
+
+    Args:
+        logs: The logs, which may be torn, short or empty.
+        names: Names of the columns. By default the names of the logs' files.
+
+    Raises:
+        LogError: A record cannot be read, or names a change that is not valid.
+    """
+    measured = [compute_log_metrics(log) for log in logs]
+    rows = []
+    for quantity in quantities():
+        entries = tuple(metrics.run_value(quantity) for metrics in measured)
+        if any(entry.applies for entry in entries):
+            rows.append(ComparisonRow(quantity, entries))
+    columns = list(names)
+    if not columns:
+        columns = [Path(log.source).stem for log in logs]
+    return MetricComparison(tuple(columns), tuple(rows))
+
+
+def comparison_to_json(comparison: MetricComparison) -> dict[str, Any]:
+    """Returns a comparison of runs as plain values, ready for JSON.
+
+    A missing number is None, and the reason is given next to it.
+
+    Args:
+        comparison: The comparison.
+    """
+    rows = []
+    for row in comparison.rows:
+        quantity = row.quantity
+        content = {
+            "key": quantity.key,
+            "name": quantity.name,
+            "unit": quantity.unit,
+            "group": quantity.group,
+            "values": list(row.values),
+            "unknown": [entry.why or None for entry in row.entries],
+        }
+        rows.append(content)
+    return {"columns": list(comparison.columns), "rows": rows}
 
 
 @dataclass(frozen=True, repr=False)

@@ -44,12 +44,13 @@ from trilat_net.execution import virtual
 from trilat_net.execution.fused import FusedRun
 from trilat_net.execution.virtual import simulate_scenario
 from trilat_net.execution.virtual_comparison import find_absent_samples
-from trilat_net.fields import field_names, split_unit
+from trilat_net.fields import split_unit
 from trilat_net.log.log_reader import Log
 from trilat_net.log.record_columns import Ints
 from trilat_net.log.site_log import compute_task_errors
 from trilat_net.scenario import Expect, Scenario
 from trilat_net.scenario.expect import ALL_SITES_QUANTITIES, END_WINDOW_S, ExpectWindow
+from trilat_net.scenario.key_checks import field_names
 
 BATCH_RECORDS = 1000
 """Number of records of a site in a batch."""

@@ -28,7 +28,8 @@ from ...core.step.vectors import Array
 from ...errors import count_nouns
 from ...log.log_reader import Log
 from ...results import JsonObject
-from ...scenario.describe import find_energy_laws
+from ...scenario.imported_code import ImportedLaw
+from ...scenario.scenario_types import Scenario
 from ..aligned import hold_torque
 from ..arm_rows import build_arm_rows
 from .premise_quantities import BookedTorqueQuantities, BooksQuantities, SamplingQuantities
@@ -173,6 +174,28 @@ class _SiteBooks(NamedTuple):
     taken: Array
     residual: Array
     leak: Array
+
+
+def find_energy_laws(scenario: Scenario, *, own_laws: bool = False) -> dict[str, Any]:
+    """Returns the control laws that declare energies, by site.
+
+    Args:
+        scenario: Scenario of the run.
+        own_laws: True to also create laws that are not part of this program, which runs their
+            code.
+
+    Raises:
+        ScenarioError: The file of a law that is not part of this program is missing.
+    """
+    laws: dict[str, Any] = {}
+    for site, spec in scenario.sites.items():
+        setup = scenario.setup(site)
+        is_allowed = own_laws or not isinstance(spec.control, ImportedLaw)
+        if setup.law_factory is not None and is_allowed:
+            law = setup.law_factory(setup.law_context())
+            if callable(getattr(law, "energies", None)):
+                laws[site] = law
+    return laws
 
 
 def observe_energies(log: Log, *, own_laws: bool = False) -> ObservedEnergy | None:

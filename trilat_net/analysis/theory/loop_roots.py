@@ -40,9 +40,9 @@ from ...log.record_columns import Ints
 from ...scenario import Scenario
 from ...scenario.delay_models import LinkBase
 from ...scenario.delay_models.kernel_delays import ConstantDelay
-from ...scenario.delay_period import find_final_link, is_ending_trace
 from ...scenario.imported_code import ImportedLaw
 from ...scenario.sample_uses import draw_used_samples
+from ..delay_period import find_final_link, is_ending_trace
 from ..run_end import SETTLED_SPEED_RAD_S, RunTrace, trace_log
 from ..stability_decision import LoopRoots
 from ..timeline import list_effective_commands, recorded_end_s

@@ -40,15 +40,15 @@ from ...files import find_page
 from ...laws.conditions import LinearForm, LinearSituation
 from ...scenario import Scenario
 from ...scenario.delay_models import LinkBase
-from ...scenario.delay_period import (
+from ...scenario.imported_code import ImportedLaw
+from ...scenario.sample_uses import draw_used_samples
+from ...scenario.validate import refuse_external_arms
+from ..delay_period import (
     MAX_PERIOD_TICKS,
     find_final_link,
     find_link_period_s,
     is_ending_trace,
 )
-from ...scenario.imported_code import ImportedLaw
-from ...scenario.sample_uses import draw_used_samples
-from ...scenario.validate import refuse_external_arms
 from .numeric_law import NumericLaw
 from .site_dynamics import SiteRates, evaluate_site_rates
 

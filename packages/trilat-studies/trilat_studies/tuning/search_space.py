@@ -25,7 +25,7 @@ import numpy as np
 
 from trilat_net.analysis.arm_rows import build_arm_rows
 from trilat_net.errors import ScenarioError, UsageError, suggest_nearest
-from trilat_net.fields import MAX_QUANTITY, is_number
+from trilat_net.fields import MAX_QUANTITY
 from trilat_net.laws.interface import (
     DAMPING,
     ERROR_DAMPING,
@@ -41,6 +41,7 @@ from trilat_net.scenario.imported_code import (
     import_class,
     read_code,
 )
+from trilat_net.scenario.key_checks import is_number
 from trilat_net.scenario.laws import BUILT_IN
 
 MIN_BOX = 0.1

@@ -20,8 +20,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..core.links.delay import DelayKind, TraceEnd
-from .delay_models import LinkBase
-from .scenario_types import Scenario, scheduled_links
+from ..scenario.delay_models import LinkBase
+from ..scenario.scenario_types import Scenario, scheduled_links
 
 MAX_PERIOD_TICKS = 400_000
 """Longest true period that is analysed, in ticks of the fastest site."""
