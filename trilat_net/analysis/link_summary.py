@@ -710,3 +710,43 @@ def _count_samples(
         copies=delivery.copies,
         refused=arrivals.refused,
     )
+
+
+class DelayDistribution(NamedTuple):
+    """Delays and ages of the samples on one link.
+
+    Attributes:
+        peer: Name of the sender.
+        site: Name of the receiver.
+        delay_ms: Delays of the samples, shape (S,). They follow from the link's model if the
+            scenario has one, and were measured otherwise.
+        age_ms: Age of the sample in use at each tick of the receiver, shape (K,).
+    """
+
+    peer: str
+    site: str
+    delay_ms: Array
+    age_ms: Array
+
+
+def measure_delay_distributions(log: Log) -> list[DelayDistribution]:
+    """Collects the delays and ages of the samples on every link of a run.
+
+    Args:
+        log: Log of the run.
+
+    Returns:
+        An entry per link, ordered by receiver and then by sender.
+    """
+    distributions = []
+    for site in log.sites:
+        for peer, arrivals in read_arrivals(log, site).items():
+            newest = int(arrivals.sample.max(initial=-1))
+            sent_count = count_sent(log, peer, newest)
+            delay_ms = predict_delivery(log, peer, site, sent_count).drawn_ms
+            # A link without a model has only measured delays, and only in a live session.
+            if not len(delay_ms) and log.driver == "live":
+                delay_ms = arrivals.delay_us / 1e3
+            age_ms = sample_ages_ns(log, peer, site) / 1e6
+            distributions.append(DelayDistribution(peer, site, delay_ms, age_ms))
+    return distributions

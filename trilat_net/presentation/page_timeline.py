@@ -17,7 +17,6 @@ import numpy as np
 from markupsafe import Markup
 
 from ..analysis.aligned import Bools
-from ..analysis.site_signals import shared_unit, sites_with_operator
 from ..analysis.timeline import (
     find_mode_intervals,
     list_alarms,
@@ -31,6 +30,7 @@ from ..scenario import Scenario
 from .html_templates import render_macro
 from .page_html import render_details, render_section
 from .page_summary import find_error_peak
+from .plot_signals import shared_unit, sites_with_operator
 from .style import typeset
 
 MAX_SHOWN = 5

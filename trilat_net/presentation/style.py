@@ -35,7 +35,6 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
-from ..analysis.site_signals import decimate
 from ..analysis.timeline import find_mode_intervals, list_changes, recorded_end_s
 from ..core.step.ticks import Mode
 from ..core.step.vectors import Array
@@ -45,6 +44,7 @@ from ..log.record_columns import Ints
 from ..log.site_log import SiteLog
 from ..scenario.arms import TASK_AXES
 from .appearance import REPORT_SIZE, SITE_COLOURS, FigureSize, list_site_colours
+from .plot_signals import decimate
 
 AxesGrid = NDArray[np.object_]
 """Panels of a figure, shape (rows, columns), of `Axes`."""

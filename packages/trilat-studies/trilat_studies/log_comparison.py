@@ -43,7 +43,7 @@ _SUBJECTS = {
 """How the number of a run follows from those of its sites, links or walls, by `reduction`."""
 
 
-class ComparisonRow(NamedTuple):
+class _ComparisonRow(NamedTuple):
     """One quantity in several runs, as a row of a table.
 
     Attributes:
@@ -60,7 +60,7 @@ class ComparisonRow(NamedTuple):
         return tuple(entry.value for entry in self.entries)
 
 
-class MetricComparison(NamedTuple):
+class _MetricComparison(NamedTuple):
     """Metrics of several runs, side by side, as a table.
 
     Attributes:
@@ -70,9 +70,9 @@ class MetricComparison(NamedTuple):
     """
 
     columns: tuple[str, ...]
-    rows: tuple[ComparisonRow, ...]
+    rows: tuple[_ComparisonRow, ...]
 
-    def row(self, key: str) -> ComparisonRow:
+    def row(self, key: str) -> _ComparisonRow:
         """Returns the row of this comparison that shows a quantity in all logs.
 
         Args:
@@ -85,7 +85,7 @@ class MetricComparison(NamedTuple):
         return row_by_key[key]
 
 
-def compare_metrics(logs: Sequence[Log], names: Sequence[str] = ()) -> MetricComparison:
+def compare_metrics(logs: Sequence[Log], names: Sequence[str] = ()) -> _MetricComparison:
     """Computes the metrics of several logs, so that they can be shown in one table.
 
     Args:
@@ -100,14 +100,14 @@ def compare_metrics(logs: Sequence[Log], names: Sequence[str] = ()) -> MetricCom
     for quantity in quantities():
         entries = tuple(metrics.run_value(quantity) for metrics in measured)
         if any(entry.applies for entry in entries):
-            rows.append(ComparisonRow(quantity, entries))
+            rows.append(_ComparisonRow(quantity, entries))
     columns = list(names)
     if not columns:
         columns = [Path(log.source).stem for log in logs]
-    return MetricComparison(tuple(columns), tuple(rows))
+    return _MetricComparison(tuple(columns), tuple(rows))
 
 
-def comparison_to_json(comparison: MetricComparison) -> dict[str, Any]:
+def comparison_to_json(comparison: _MetricComparison) -> dict[str, Any]:
     """Returns a comparison of runs as plain values, ready for JSON.
 
     A missing number is None, and the reason is given next to it.
@@ -144,7 +144,7 @@ class LogComparison(Result):
     """
 
     logs: tuple[Log, ...]
-    metrics: MetricComparison
+    metrics: _MetricComparison
     differences: list[ScenarioDifference]
     means: Sequence[MeanInterval | None]
     remarks: dict[str, list[str]]
@@ -215,7 +215,7 @@ class LogComparison(Result):
         else:
             yield "the same experiment"
 
-    def _sum_up(self, rows: Sequence[ComparisonRow]) -> str:
+    def _sum_up(self, rows: Sequence[_ComparisonRow]) -> str:
         """Returns the judgements and the largest difference of the runs in one sentence.
 
         Args:
@@ -337,7 +337,7 @@ def _measure_difference(values: Sequence[float | None]) -> float:
     return (max(known) - min(known)) / largest if largest > 0.0 else 0.0
 
 
-def _select_most_different(rows: Sequence[ComparisonRow]) -> list[ComparisonRow]:
+def _select_most_different(rows: Sequence[_ComparisonRow]) -> list[_ComparisonRow]:
     """Returns the metrics that differ most between runs, in their order.
 
     Errors of the computation, which are rounding of different size in every run, are left out.
@@ -377,7 +377,7 @@ def _name_columns(files: Sequence[Path]) -> list[str]:
 
 
 def _average_repeats(
-    logs: Sequence[Log], metrics: MetricComparison
+    logs: Sequence[Log], metrics: _MetricComparison
 ) -> list[MeanInterval | None]:
     """Averages each quantity over logs that repeat one experiment with different seeds.
 
@@ -399,7 +399,7 @@ def _average_repeats(
 
 
 def _tabulate_quantities(
-    metrics: Sequence[ComparisonRow],
+    metrics: Sequence[_ComparisonRow],
     columns: Sequence[str],
     means: Sequence[MeanInterval | None],
 ) -> TextTable:

@@ -16,7 +16,7 @@ The module also collects how many records were available.
 
 Invariant:
     - A premise holds, fails, or cannot be decided, and always contains the quantities that show
-      it. The package `presentation` writes the sentences about them.
+      it. `premise_text` writes the sentences about them.
     - Missing information never makes a run stable. The judgement stays open if too many records
       are missing, or if the run was repeated with the recorded motion of some sites.
     - A log that was changed after it was written does not pass.
@@ -27,7 +27,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...hooks import find_hook
 from ...log.accounting import Coverage
 from ...log.log_reader import Log
 from ...log.running_digest import Integrity
@@ -82,6 +81,7 @@ from .premise_quantities import (
     TouchedStop,
     WallQuantities,
 )
+from .premise_text import DESCRIBERS, describe_missing_functionals
 
 CONSTANT_DELAY_TOLERANCE_S = 1e-7
 """Ages of samples that differ by less than this count as equal, in s.
@@ -129,7 +129,7 @@ class Premise(NamedTuple):
     @property
     def text(self) -> str:
         """The evidence, as a sentence."""
-        return str(find_hook("describe a premise")(self.quantities))
+        return DESCRIBERS[type(self.quantities)](self.quantities)
 
     def to_json(self) -> JsonObject:
         """Returns the premise as plain values, with the keys of `trilat certify --json`."""
@@ -178,7 +178,7 @@ def explain_no_functional(scenario: Scenario) -> str:
         The names of these arms' sites and the reasons, separated by semicolons. Empty if the
         energy exists for every arm.
     """
-    return str(find_hook("describe missing functionals")(_find_missing_functionals(scenario)))
+    return describe_missing_functionals(_find_missing_functionals(scenario))
 
 
 class FunctionalFacts(NamedTuple):
@@ -782,12 +782,24 @@ class Evidence(NamedTuple):
 
         Empty if they suffice.
         """
-        return list(find_hook("list the faults of evidence")(self))
+        least = self.min_coverage
+        reasons = []
+        if not self.integrity.passed:
+            reasons.append(f"the log is not as it was made: {self.integrity.text}")
+        if self.coverage.share < least:
+            reasons.append(f"records are missing: {self.coverage.describe(least)}")
+        share = self.functional_share
+        if share is not None and share < least:
+            reasons.append(f"V is judged over {100.0 * share:.4g} % of its periods")
+        if self.unmet:
+            sites = " and ".join(self.unmet)
+            reasons.append(f"{sites}, as recorded, did not react to this run")
+        return reasons
 
     @property
     def text(self) -> str:
         """A sentence for the user: how many records exist, and whether the log is unchanged."""
-        return str(find_hook("describe evidence")(self))
+        return f"{self.coverage.describe(self.min_coverage)}; {self.integrity.text}"
 
     def to_json(self) -> dict[str, Any]:
         """Returns how complete and how authentic the records are, as plain values.

@@ -30,7 +30,6 @@ from typing import NamedTuple
 import numpy as np
 
 from ...core.step.vectors import Array
-from ...hooks import find_hook
 from ...log.accounting import MIN_COVERAGE
 from ...log.log_reader import Log
 from ...results import JsonObject, Result, finite_or_none
@@ -47,6 +46,7 @@ from .energy_balance import (
     rise_above_minimum,
 )
 from .observed_energy import ObservedEnergy, ObservedFinding, observe_energies
+from .premise_text import describe_closed_groups
 from .premises import (
     Evidence,
     FunctionalFacts,
@@ -474,7 +474,7 @@ def _judge_decidability(run: FunctionalFacts, _: Sequence[Premise]) -> _Stabilit
     are not known precisely enough to decide whether V rose.
     """
     if run.groups:
-        text = find_hook("describe closed groups")(run.groups)
+        text = describe_closed_groups(run.groups)
         return _StabilityVerdict(StabilityFinding.NOT_JUDGED, text)
     scale = run.balance.scale
     if run.tolerance <= COARSE_TOLERANCE_SHARE * scale + 2.0 * ZERO_ENERGY_J:

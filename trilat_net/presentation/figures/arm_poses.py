@@ -21,7 +21,6 @@ from matplotlib.figure import Figure
 
 from ...analysis import site_signals
 from ...analysis.arm_rows import joint_positions_m, upright_axes
-from ...analysis.site_signals import reference_angles
 from ...analysis.timeline import recorded_end_s
 from ...core.step.vectors import Array
 from ...log.log_reader import Log
@@ -29,6 +28,7 @@ from ...scenario.arms import ArmModel
 from .. import style
 from ..appearance import REPORT_SIZE, FigureSize
 from ..html_templates import render_macro
+from ..plot_signals import reference_angles
 from .figure_entry import draws
 
 INSTANTS = 6
