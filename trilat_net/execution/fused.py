@@ -71,7 +71,7 @@ def _mark_floats(dtype: np.dtype[np.generic]) -> NDArray[np.bool_]:
     return is_float
 
 
-class _RunState:
+class RunState:
     """All arrays that change during a run, viewed as 64-bit integers.
 
     A run creates one object, with which its state can be copied to another run, or mixed with
@@ -94,7 +94,7 @@ class _RunState:
             self._bits.append(flat)
             self._floats.append(np.tile(_mark_floats(array.dtype), array.size))
 
-    def scale_difference(self, other: "_RunState", factor: float) -> None:
+    def scale_difference(self, other: "RunState", factor: float) -> None:
         """Multiplies the difference between this state and another one by a factor.
 
         Every floating-point number x of this state becomes x_other + factor (x - x_other). With
@@ -153,7 +153,7 @@ def _find_largest_ratio(scenario: Scenario) -> int:
     return math.ceil(max(rates_hz) / min(rates_hz))
 
 
-class _HandActor(Protocol):
+class HandActor(Protocol):
     """Interface of a live operator in a compiled run.
 
     A live operator is a person or program that moves an arm while the run is in progress. The
@@ -240,7 +240,7 @@ def _make_prompt_inputs(sites: int) -> RunInputs:
     return RunInputs(feed)
 
 
-class _RunMemory(NamedTuple):
+class RunMemory(NamedTuple):
     """All arrays of a run, for drivers that compute several runs together.
 
     N is the number of sites.
@@ -299,7 +299,7 @@ class FusedRun:
         settled_rad: float = 0.01,
         keep: int = 0,
         inputs: RunInputs | None = None,
-        hands: Mapping[str, _HandActor] = {},
+        hands: Mapping[str, HandActor] = {},
         plants: Mapping[str, PlantPlayer] = {},
     ) -> None:
         check_fusable(scenario, plants)
@@ -311,7 +311,7 @@ class FusedRun:
         self.scenario = scenario
         self._settled_rad = settled_rad
         self._inputs = inputs or _make_prompt_inputs(count)
-        self._hands: dict[int, _HandActor] = {}
+        self._hands: dict[int, HandActor] = {}
         if inputs is None:
             self._connect_hands({**make_hand_players(scenario), **hands}, setups)
         self._changes = deque(self._inputs.changes)
@@ -370,7 +370,7 @@ class FusedRun:
         )
 
     def _connect_hands(
-        self, hands: Mapping[str, _HandActor], setups: Sequence[SiteSetup]
+        self, hands: Mapping[str, HandActor], setups: Sequence[SiteSetup]
     ) -> None:
         """Connects live operators to their sites, and allocates memory for their actions.
 
@@ -440,9 +440,9 @@ class FusedRun:
         self._law_arrays = LawArrays(addresses, rows, sent)
 
     @property
-    def memory(self) -> _RunMemory:
+    def memory(self) -> RunMemory:
         """All arrays of the run. They change while it is executed."""
-        return _RunMemory(
+        return RunMemory(
             tables=self._tables,
             progress=self._progress,
             next_samples=self._next_samples,
@@ -701,7 +701,7 @@ class FusedRun:
             self._inputs = self._inputs._replace(feed=feed._replace(hands=actions))
 
     @cached_property
-    def _state(self) -> _RunState:
+    def _state(self) -> RunState:
         """All arrays of the run that change while it is executed."""
         tables = self._tables
         arrays = [self._progress, self._next_samples, *self._sent, self._sums]
@@ -710,7 +710,7 @@ class FusedRun:
             arrays += tables.channel
         if self._law_arrays is not None:
             arrays += [self._law_arrays.rows, self._law_arrays.sent]
-        return _RunState(arrays)
+        return RunState(arrays)
 
     @property
     def has_programs(self) -> bool:
@@ -733,7 +733,7 @@ class FusedRun:
         """Multiplies the difference between the states of this run and another run by a factor.
 
         Every floating-point number x of the state becomes x_other + factor (x - x_other), see
-        `_RunState.scale_difference`. This is not possible if operators or arms are users'
+        `RunState.scale_difference`. This is not possible if operators or arms are users'
         programs, because the state of such programs is not known.
 
         Args:

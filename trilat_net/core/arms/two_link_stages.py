@@ -247,7 +247,7 @@ def update_external_torque(
 
 
 @leaf
-def _add_scaled(x: Vector, step_s: float, rate: Vector) -> Pair:
+def add_scaled(x: Vector, step_s: float, rate: Vector) -> Pair:
     """Returns x + step_s * rate, a linear step of two numbers over the duration `step_s`."""
     first = x[0] + step_s * rate[0]
     second = x[1] + step_s * rate[1]
@@ -329,8 +329,8 @@ def rk4_step(
     a1 = _acceleration(
         t_s=t_s, q=q1, qd=v1, u=u, theta=theta, g=g, lengths=lengths, actors=actors, table=table
     )
-    q2 = _add_scaled(q1, half, v1)
-    v2 = _add_scaled(v1, half, a1)
+    q2 = add_scaled(q1, half, v1)
+    v2 = add_scaled(v1, half, a1)
     a2 = _acceleration(
         t_s=t_s + half,
         q=q2,
@@ -342,8 +342,8 @@ def rk4_step(
         actors=actors,
         table=table,
     )
-    q3 = _add_scaled(q1, half, v2)
-    v3 = _add_scaled(v1, half, a2)
+    q3 = add_scaled(q1, half, v2)
+    v3 = add_scaled(v1, half, a2)
     a3 = _acceleration(
         t_s=t_s + half,
         q=q3,
@@ -355,8 +355,8 @@ def rk4_step(
         actors=actors,
         table=table,
     )
-    q4 = _add_scaled(q1, h_s, v3)
-    v4 = _add_scaled(v1, h_s, a3)
+    q4 = add_scaled(q1, h_s, v3)
+    v4 = add_scaled(v1, h_s, a3)
     a4 = _acceleration(
         t_s=t_s + h_s,
         q=q4,
@@ -372,8 +372,8 @@ def rk4_step(
     v_sum_1 = v1[1] + 2.0 * v2[1] + 2.0 * v3[1] + v4[1]
     a_sum_0 = a1[0] + 2.0 * a2[0] + 2.0 * a3[0] + a4[0]
     a_sum_1 = a1[1] + 2.0 * a2[1] + 2.0 * a3[1] + a4[1]
-    q_next = _add_scaled(q1, sixth, (v_sum_0, v_sum_1))
-    qd_next = _add_scaled(v1, sixth, (a_sum_0, a_sum_1))
+    q_next = add_scaled(q1, sixth, (v_sum_0, v_sum_1))
+    qd_next = add_scaled(v1, sixth, (a_sum_0, a_sum_1))
     return q_next, qd_next
 
 

@@ -27,7 +27,7 @@ BLOCK_TICKS = 500
 _CONSTANT = int(DelayKind.CONSTANT)
 
 
-class _LinkStates(NamedTuple):
+class LinkStates(NamedTuple):
     """State of all links of one run, for N sites with P peers each.
 
     Attributes:
@@ -48,7 +48,7 @@ class _LinkStates(NamedTuple):
     newest: IntArray
 
 
-def copy_link_states(arrays: SiteArrays) -> _LinkStates:
+def copy_link_states(arrays: SiteArrays) -> LinkStates:
     """Returns the state of the links of a run before its first tick.
 
     Args:
@@ -57,7 +57,7 @@ def copy_link_states(arrays: SiteArrays) -> _LinkStates:
     sites, peers, pages = arrays.calendars.shape
     # A sample that is sent in a block waits at most as long as the calendar has pages.
     kept = 1 << (pages + BLOCK_TICKS).bit_length()
-    return _LinkStates(
+    return LinkStates(
         links=arrays.links.copy(),
         models=arrays.models.copy(),
         dues=arrays.dues.copy(),
@@ -158,7 +158,7 @@ def _use_samples_of_link(
 
 @leaf
 def use_samples(
-    first: int, count: int, rate_hz: int, lane: int, states: _LinkStates, used: IntArray
+    first: int, count: int, rate_hz: int, lane: int, states: LinkStates, used: IntArray
 ) -> None:
     """Finds which sample of each peer every site of a run uses, for a block of ticks.
 

@@ -38,7 +38,7 @@ _STATE_FIELDS = ("q", "qd", "tau_x")
 """Fields of a link's row that contain the sample in use."""
 
 
-class _SiteTables(NamedTuple):
+class SiteTables(NamedTuple):
     """The tables of one site in all lanes, in the order of the arguments of `advance_site`.
 
     Attributes:
@@ -68,7 +68,7 @@ class _SiteTables(NamedTuple):
     progress: Any
 
 
-class _LaneLayout(NamedTuple):
+class LaneLayout(NamedTuple):
     """Layouts of the tables of a run.
 
     Attributes:
@@ -92,11 +92,11 @@ class _LaneLayout(NamedTuple):
     ramps: tuple[int, ...]
 
 
-def _find_layout(run: FusedRun) -> _LaneLayout:
+def find_layout(run: FusedRun) -> LaneLayout:
     """Returns the layouts of the tables of a run."""
     memory = run.memory
     tables = memory.tables
-    return _LaneLayout(
+    return LaneLayout(
         site=tables.site.dtype,
         link=tables.links.dtype,
         actor=tables.actors.dtype,
@@ -108,8 +108,8 @@ def _find_layout(run: FusedRun) -> _LaneLayout:
     )
 
 
-def _list_argument_types(
-    layout: _LaneLayout, structure: RunStructure, site: SiteStructure
+def list_argument_types(
+    layout: LaneLayout, structure: RunStructure, site: SiteStructure
 ) -> tuple[Any, ...]:
     """Returns Numba's types of the arguments of `advance_site` for a site.
 
@@ -120,7 +120,7 @@ def _list_argument_types(
     """
     first = site.first_environment
     environments = site.actors[first:] if first >= 0 else ()
-    tables = _SiteTables(
+    tables = SiteTables(
         site=LaneTable(layout.site, (site.constants,)),
         links=LaneTable(layout.link, ((),) * structure.peers),
         actors=LaneTable(layout.actor, site.actors),
@@ -147,7 +147,7 @@ def read_assembly(run: FusedRun, i: int) -> str:
         i: Index of the site.
     """
     structure = find_structure(run)
-    arguments = _list_argument_types(_find_layout(run), structure, structure.sites[i])
+    arguments = list_argument_types(find_layout(run), structure, structure.sites[i])
     return read_lane_assembly(advance_site, arguments)
 
 
@@ -212,7 +212,7 @@ class LaneRun:
         assert all(run.ran_s == 0.0 for run in runs)
         self.runs = list(runs)
         self._structure = structure
-        self._layout = layout = _find_layout(runs[0])
+        self._layout = layout = find_layout(runs[0])
         memories = [run.memory for run in runs]
         tables = [memory.tables for memory in memories]
         first = tables[0]
@@ -260,7 +260,7 @@ class LaneRun:
         self._put_first_states(tables)
         self._addresses = np.array(
             [
-                find_lane_address(advance_site, _list_argument_types(layout, structure, site))
+                find_lane_address(advance_site, list_argument_types(layout, structure, site))
                 for site in structure.sites
             ]
         )
@@ -286,7 +286,7 @@ class LaneRun:
         structure = self._structure
         addresses = []
         for i in range(self._sites):
-            rows = _SiteTables(
+            rows = SiteTables(
                 site=_share(self._site, i, self._sites),
                 links=_share(self._links, i, self._sites),
                 actors=_share(self._actors, i, self._sites),
@@ -446,7 +446,7 @@ def _share(table: Words, i: int, sites: int) -> Words:
     return table[i * rows : (i + 1) * rows]
 
 
-def _check_distinct(tables: _SiteTables) -> None:
+def _check_distinct(tables: SiteTables) -> None:
     """Asserts that no two tables overlap: the compiled code of `advance_site` relies on it."""
     filled = [table for table in tables if table.size]
     ranges = sorted((table.ctypes.data, table.ctypes.data + table.nbytes) for table in filled)

@@ -319,7 +319,7 @@ def find_internal_force(first: ArrayLike, second: ArrayLike) -> Array:
     return internal
 
 
-class _PairMeasures(NamedTuple):
+class PairMeasures(NamedTuple):
     """Forces and work of two users who move a shared object together in a trial.
 
     Args:
@@ -348,7 +348,7 @@ class _PairMeasures(NamedTuple):
 
 def measure_pair(
     first: ArrayLike, second: ArrayLike, velocity: ArrayLike, rate_hz: float
-) -> _PairMeasures:
+) -> PairMeasures:
     """Computes the forces and the work of two users on a shared object.
 
     Args:
@@ -380,7 +380,7 @@ def measure_pair(
     second_power = (second_force * velocities).sum(axis=1)
     first_absorbed_power = np.maximum(-first_power, 0.0)
     second_absorbed_power = np.maximum(-second_power, 0.0)
-    return _PairMeasures(
+    return PairMeasures(
         internal_rms_n=_compute_rms(internal),
         useful_rms_n=_compute_rms(useful),
         internal_share=internal_share,

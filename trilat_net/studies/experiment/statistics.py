@@ -369,7 +369,7 @@ def correct_holm(p: Sequence[float | None]) -> list[float | None]:
 # --- mixed model ------------------------------------------------------------------------------
 
 
-class _MixedEffect(NamedTuple):
+class MixedEffect(NamedTuple):
     """Effect of a condition relative to the first condition.
 
     Args:
@@ -408,7 +408,7 @@ class MixedModel(NamedTuple):
 
     measure: str
     reference: str
-    effects: list[_MixedEffect]
+    effects: list[MixedEffect]
     freedom: int
     variances: dict[str, float]
     notes: list[str]
@@ -525,7 +525,7 @@ def _find_pairs(rows: Sequence[Row]) -> dict[str, str]:
     return pairs
 
 
-def _read_effect(fit: Any, condition: str, freedom: int) -> _MixedEffect:
+def _read_effect(fit: Any, condition: str, freedom: int) -> MixedEffect:
     """Returns the effect of a condition from a fit.
 
     Args:
@@ -539,7 +539,7 @@ def _read_effect(fit: Any, condition: str, freedom: int) -> _MixedEffect:
     error = float(fit.bse_fe[name])
     half = float(stats.t.ppf(0.5 + CONFIDENCE / 2.0, freedom)) * error
     p = 2.0 * float(stats.t.sf(abs(estimate / error), freedom))
-    return _MixedEffect(
+    return MixedEffect(
         condition=condition,
         estimate=estimate,
         error=error,
