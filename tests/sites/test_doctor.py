@@ -241,6 +241,7 @@ def test_the_rate_is_told_with_how_late_ticks_were(
     assert text in found.text
 
 
+@pytest.mark.push
 def test_a_real_loop_is_measured_in_its_own_process() -> None:
     assert doctor.examine_rate().text.startswith("a site alone ")
 

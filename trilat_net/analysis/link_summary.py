@@ -172,7 +172,7 @@ class _Arrivals(NamedTuple):
         return _Arrivals(self.tick[rows], sample, self.delay_us[rows], self.refused)
 
 
-def read_arrivals(log: Log, site: str) -> dict[str, _Arrivals]:
+def _read_arrivals(log: Log, site: str) -> dict[str, _Arrivals]:
     """Reads from a log which samples of other sites arrived at a site, and when.
 
     A site is the process that runs one arm, and a sample is the state that it sends in every
@@ -211,7 +211,7 @@ def read_arrivals(log: Log, site: str) -> dict[str, _Arrivals]:
     return arrivals
 
 
-def count_sent(log: Log, peer: str, newest: int) -> int:
+def _count_sent(log: Log, peer: str, newest: int) -> int:
     """Returns the number of samples that a peer has sent, as far as the log shows.
 
     A sample is the state that a site publishes in one tick of its control loop.
@@ -498,7 +498,7 @@ def summarise_links(log: Log) -> list[LinkSummary]:
         LogError: A record names a change that is not valid.
     """
     changed = list_changes(log)
-    arrivals_by_site = {site: read_arrivals(log, site) for site in log.sites}
+    arrivals_by_site = {site: _read_arrivals(log, site) for site in log.sites}
     sent = {}
     for peer in log.sites:
         newest = max(
@@ -506,7 +506,7 @@ def summarise_links(log: Log) -> list[LinkSummary]:
             for arrivals in arrivals_by_site.values()
             if peer in arrivals
         )
-        sent[peer] = count_sent(log, peer, newest)
+        sent[peer] = _count_sent(log, peer, newest)
 
     return [
         _summarise_link(
@@ -740,9 +740,9 @@ def measure_delay_distributions(log: Log) -> list[DelayDistribution]:
     """
     distributions = []
     for site in log.sites:
-        for peer, arrivals in read_arrivals(log, site).items():
+        for peer, arrivals in _read_arrivals(log, site).items():
             newest = int(arrivals.sample.max(initial=-1))
-            sent_count = count_sent(log, peer, newest)
+            sent_count = _count_sent(log, peer, newest)
             delay_ms = predict_delivery(log, peer, site, sent_count).drawn_ms
             # A link without a model has only measured delays, and only in a live session.
             if not len(delay_ms) and log.driver == "live":
