@@ -48,13 +48,12 @@ from trilat_net.analysis.theory import (
     port_response,
 )
 from trilat_net.analysis.twins import envelope_trend, twin_growth
-from trilat_net.analysis.twins import twin_runs as twins
 from trilat_net.app.play import player
 from trilat_net.core.life import live_hand, session_life
 from trilat_net.core.links import delay, link
 from trilat_net.core.plug import user_law
 from trilat_net.core.step import site_arrays, ticks
-from trilat_net.execution import verify
+from trilat_net.execution import twins, verify
 from trilat_net.files import find_page
 from trilat_net.log import accounting, log_file, mcap_reader, mcap_records, site_log
 from trilat_net.net import arm_client, offset, requests, session, timing, zenoh_config

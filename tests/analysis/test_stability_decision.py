@@ -13,7 +13,7 @@ from trilat_net.analysis.stability_decision import (
 )
 from trilat_net.analysis.twins.envelope_trend import EnvelopeFit, EnvelopeTrend
 from trilat_net.analysis.twins.twin_growth import PushGrowth, RestDeparture, TwinGrowth
-from trilat_net.analysis.twins.twin_runs import choose_pushes
+from trilat_net.execution.twins import choose_pushes
 from trilat_net.scenario import load_scenario
 
 PUSHES = choose_pushes(load_scenario("two_sites"))

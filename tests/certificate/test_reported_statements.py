@@ -16,7 +16,7 @@ from trilat_net.analysis.certificate.observed_energy import (
 )
 from trilat_net.analysis.judge import list_law_proofs
 from trilat_net.analysis.run_end import Stability
-from trilat_net.analysis.twins.twin_runs import Push, run_virtual_twins
+from trilat_net.execution.twins import Push, run_virtual_twins
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.describe import describe_law_conditions
 

@@ -9,7 +9,8 @@ import pytest
 import trilat_net as tn
 from tests.certificate.adversaries import p_d, two_pairs
 from trilat_net.analysis.twins.twin_growth import judge_twins
-from trilat_net.analysis.twins.twin_runs import (
+from trilat_net.errors import NotRepeatable, UsageError
+from trilat_net.execution.twins import (
     LARGEST,
     Push,
     Twins,
@@ -18,7 +19,6 @@ from trilat_net.analysis.twins.twin_runs import (
     run_twins,
     run_virtual_twins,
 )
-from trilat_net.errors import NotRepeatable, UsageError
 from trilat_net.scenario import Scenario, load_scenario
 
 GOLDEN = Path(__file__).parents[1] / "golden"

@@ -34,13 +34,7 @@ from ...core.links.delay import DelayKind
 from ...core.step.ticks import BUCKETS_PER_S
 from ...core.step.vectors import Array
 from ...errors import NotRepeatable, UsageError, count_nouns
-from ...log.log_reader import Log, open_log
-from ...results import Result, finite_or_none
-from ...scenario import Scenario
-from ..delay_period import find_burst_interval_s, find_final_delay_period, find_final_link
-from ..run_end import RunEnd, classify_log_end, find_coupled_sites
-from .envelope_trend import EnvelopeFit, EnvelopeTrend, fit_envelopes
-from .twin_runs import (
+from ...execution.twins import (
     LEAST_PUSH,
     MOST_PUSH,
     PUSH_RAD,
@@ -53,6 +47,12 @@ from .twin_runs import (
     run_twins,
     run_virtual_twins,
 )
+from ...log.log_reader import Log, open_log
+from ...results import Result, finite_or_none
+from ...scenario import Scenario
+from ..delay_period import find_burst_interval_s, find_final_delay_period, find_final_link
+from ..run_end import RunEnd, classify_log_end, find_coupled_sites
+from .envelope_trend import EnvelopeFit, EnvelopeTrend, fit_envelopes
 
 LEAST_LEFT_S = 5.0
 """Shortest departure from a rest position that counts, in s."""

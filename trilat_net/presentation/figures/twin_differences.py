@@ -33,10 +33,10 @@ from ...analysis.twins.twin_growth import (
     measure_amplitude,
     measure_twins,
 )
-from ...analysis.twins.twin_runs import SMALLEST, TwinPath, Twins
 from ...core.step.ticks import BUCKETS_PER_S
 from ...core.step.vectors import Array
 from ...execution.fused import explain_not_repeatable
+from ...execution.twins import SMALLEST, TwinPath, Twins
 from ...log.log_reader import Log
 from ...scenario.code_consent import may_run_user_laws
 from .. import style

@@ -24,14 +24,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...core.step.site_setup import Law
-from ...core.step.ticks import BUCKETS_PER_S, NS_PER_S
-from ...core.step.vectors import Array
-from ...errors import NotRepeatable, UsageError, count_nouns
-from ...execution.fused import FusedRun, RunInputs, explain_not_repeatable, read_run_inputs
-from ...log.log_reader import Log
-from ...log.record_columns import Ints
-from ...scenario import Scenario
+from ..core.step.site_setup import Law
+from ..core.step.ticks import BUCKETS_PER_S, NS_PER_S
+from ..core.step.vectors import Array
+from ..errors import NotRepeatable, UsageError, count_nouns
+from ..log.log_reader import Log
+from ..log.record_columns import Ints
+from ..scenario import Scenario
+from .fused import FusedRun, RunInputs, explain_not_repeatable, read_run_inputs
 
 MAX_PUSHES = 32
 """Largest number of pushes that are chosen if the user states no number."""
