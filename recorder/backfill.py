@@ -110,7 +110,10 @@ class GapRepair:
 
     @property
     def is_active(self) -> bool:
-        """True if messages are missing that the site may still have, or a reply is awaited."""
+        """True if messages are missing that the site may still have, or if a reply is awaited.
+
+        The recorder then polls more often than it flushes the file.
+        """
         return self._open is not None or self._due_ns is not None
 
     @property
@@ -155,7 +158,15 @@ class GapRepair:
                 self._reception.give_up()
 
     def _probe_if_silent(self, now_ns: int) -> None:
-        """Schedules requests for the newest messages, if nothing arrives from the site."""
+        """Requests the newest messages of a running site from which nothing arrives.
+
+        If its last messages were lost, no later number shows a gap, so the recorder has to ask.
+        The silence is counted from the last message or the last probe. A slow site may take
+        three periods.
+
+        Args:
+            now_ns: Present time on the monotonic clock, in ns.
+        """
         last_received_ns = self._reception.last_received_ns or 0
         silence_ns = now_ns - max(last_received_ns, self._probed_ns)
         longest_ns = max(SILENT_NS, 3 * self._reception.period_ns)
@@ -372,7 +383,13 @@ class GapRepair:
             self._count_vain_request(channel)
 
     def _count_vain_request(self, channel: str) -> None:
-        """Counts a reply without any new message. After too many, the gaps are given up."""
+        """Counts a reply that filled no gap. After `MAX_VAIN_REQUESTS`, the gaps are given up.
+
+        All messages that are missing in the channel then count as missing for good.
+
+        Args:
+            channel: Channel of the missing messages.
+        """
         self._vain_requests[channel] += 1
         if self._vain_requests[channel] >= MAX_VAIN_REQUESTS:
             self._vain_requests[channel] = 0

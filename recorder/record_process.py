@@ -232,7 +232,14 @@ class Recorder:
         return recording
 
     def _find_scenario(self, epoch: Epoch) -> RecordedScenario:
-        """Returns the scenario that a member of the session has sent with its identity."""
+        """Returns the scenario to record, which a member has sent with its identity.
+
+        A recorder needs no scenario file. Members that were started again since the agreement,
+        and so have another boot (random number of a start), are ignored.
+
+        Args:
+            epoch: Agreed start of the session, with the boots of its members.
+        """
         return next(
             self._read_scenario(info.scenario, info.member)
             for info in self._joining.membership.others.values()
@@ -261,7 +268,10 @@ class Recorder:
             self._say(f"recorder: {clock_text}")
 
     def _receive_presence(self, recording: Recording) -> None:
-        """Passes the news about members that appeared or disappeared to the recording."""
+        """Tells the recording which members have appeared on the network or disappeared.
+
+        The recording decides from that which sites it still has to wait for.
+        """
         while (change := self._presence.poll()) is not None:
             key, alive = change
             recording.note_presence(key, alive)

@@ -165,7 +165,11 @@ class Recording:
             repair.probe()
 
     def assume_gone(self) -> None:
-        """Regards every site as gone until the network reports that it is present."""
+        """Regards every site as gone until the network reports that it is present.
+
+        A recorder that joins a running session cannot know which sites have left before it
+        came.
+        """
         self._gone_sites = set(self._sites)
 
     def write(self, queue: InboundQueue, now_ns: int) -> None:
@@ -190,12 +194,15 @@ class Recording:
 
     @property
     def is_repairing(self) -> bool:
-        """True if messages are missing that a site may still have."""
+        """True if messages are missing that a site may still have, or if a reply is awaited."""
         return any(repair.is_active for repair in self._repairs.values())
 
     @property
     def repaired_ns(self) -> int:
-        """Time at which a site last sent a missing message, on the monotonic clock, in ns."""
+        """Latest arrival of a missing message from any site, on the monotonic clock, in ns.
+
+        A recorder that ends stops waiting if this lies too long ago.
+        """
         return max(repair.progress_ns for repair in self._repairs.values())
 
     def _repair_gaps(self, name: str, repair: GapRepair, now_ns: int) -> None:
@@ -226,7 +233,15 @@ class Recording:
             self._note_admission(message.content)
 
     def _publish_stored(self, site: SiteReception, now_ns: int) -> None:
-        """Publishes that all messages of a site that can be obtained are stored."""
+        """Publishes the event "stored": the log has all messages of a site that it can get.
+
+        The process of the site waits for this event before it ends. The text says what stays
+        missing.
+
+        Args:
+            site: Reception of the site, which has ended.
+            now_ns: Present time on the monotonic clock, in ns.
+        """
         text = f"every record of {site.name} is stored"
         missing = site.describe_missing()
         if missing:
@@ -605,7 +620,10 @@ class Recording:
         return True
 
     def flush(self) -> None:
-        """Passes all written messages to the operating system."""
+        """Passes all written messages to the operating system.
+
+        They are then in the file even if this process crashes.
+        """
         self._writer.flush()
 
     def finish(self, queue: InboundQueue, *, rest: bool = True) -> None:
@@ -750,14 +768,18 @@ class RecorderReport:
             self.publish()
 
     def publish(self) -> None:
-        """Publishes the statistics of the recording now, and also writes them into the log."""
+        """Publishes the statistics of the recording now, and also writes them into the log.
+
+        People see losses during the session, and readers of the log see them afterwards. The
+        longest duration of a flush is counted anew for the next statistics.
+        """
         payload = encode(self._make_stats())
         self._flush_max_ns = 0
         self._queue.receive(self._key, payload)
         self._publish(payload)
 
     def _make_stats(self) -> RecorderStats:
-        """Returns the present statistics, with the counts and gaps of every channel."""
+        """Returns the present statistics: expected, received and missing messages, and gaps."""
         recording = self._recording
         now_ns = self._clock.monotonic_ns()
         stats = RecorderStats(

@@ -382,7 +382,12 @@ class SiteReception:
 
     @property
     def _possible_ticks(self) -> int:
-        """Largest number of ticks that the site can have executed by now, given the clocks."""
+        """Largest number of ticks that the site can have executed by now.
+
+        The time since its start is stretched by the tolerated drift and lead of its clock. A
+        message with a later tick is refused, because it would make all ticks before count as
+        missing.
+        """
         latest_ns = self.since_ns * (1.0 + _DRIFT) + _LEAD_NS
         return int(min(self._ticks, latest_ns * 1e-9 * self._rate_hz + 1.0))
 
@@ -502,7 +507,14 @@ class SiteReception:
                 self.add_expected(channel, count)
 
     def _exclude_skipped_ticks(self, record: State) -> None:
-        """States that no messages exist for the ticks that the site skipped before a record."""
+        """States that no messages exist for the ticks that the site skipped before a record.
+
+        A site with an external arm skips ticks that it missed. They must not count as lost
+        messages.
+
+        Args:
+            record: Record whose field `cmd` says how many ticks were skipped.
+        """
         skipped = count_skipped_ticks(record.cmd) if record.cmd else 0
         if not skipped:
             return
@@ -537,7 +549,7 @@ class SiteReception:
 
     @property
     def is_complete(self) -> bool:
-        """True if the site has ended and all messages that it can send were received."""
+        """True if the site has ended and every message that it can still send has arrived."""
         return self.final_ticks is not None and not self.lacks_messages
 
     def give_up(self) -> None:

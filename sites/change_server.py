@@ -270,7 +270,10 @@ class ChangeServer:
         return text, self._stop_tick
 
     def _update_stopped(self, k: int) -> None:
-        """Sets `stopped` if tick `k`, the next one, is the last tick before a requested end."""
+        """Sets `stopped` if tick `k`, the next one, is the last tick before a requested end.
+
+        If nobody has requested the end, nothing changes.
+        """
         if self._stop_tick is not None:
             self.stopped = k + 1 >= self._stop_tick
 

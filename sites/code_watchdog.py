@@ -238,6 +238,9 @@ class CodeWatchdog:
             self._handler_before = None
 
     def _check(self, _number: int, _frame: FrameType | None) -> None:
-        """Checks all code. It is the handler of SIGALRM."""
+        """Raises an error in a user's code that hangs. It is the handler of the signal SIGALRM.
+
+        The signal arrives every `_CHECK_S`, also while the code is in an endless loop.
+        """
         for code in self.codes:
             code.check()

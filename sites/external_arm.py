@@ -151,7 +151,11 @@ class ExternalArm:
         return False
 
     def _describe_silence(self) -> SessionError:
-        """Returns the error for a site that has waited in vain for its arm."""
+        """Returns the error of a site that has waited in vain for a measurement of its arm.
+
+        The text says how many messages were dropped and why. If none has arrived, it advises
+        how to connect the driver of the arm.
+        """
         text = f"{self._site} received no measurement from its arm on {self._address}"
         if self._dropped:
             counts = [f"{count} {reason}" for reason, count in self._dropped.items()]
@@ -354,7 +358,11 @@ class DeadManSwitch:
         ]
 
     def _is_silent(self, holder: _Holder) -> bool:
-        """Returns True if the newest report of a program is older than `SWITCH_SILENCE_NS`."""
+        """Returns True if a program has not reported a pressed switch for `SWITCH_SILENCE_NS`.
+
+        If the program held the switch, the arm then stops. A program that does not press the
+        switch counts as silent.
+        """
         if holder.pressed_ns is None:
             return True
         return self._clock.monotonic_ns() - holder.pressed_ns > SWITCH_SILENCE_NS
@@ -462,9 +470,9 @@ class DeadManSwitch:
         program.counts = True
 
     def _forget_program(self) -> None:
-        """Forgets the oldest program that does not hold the switch.
+        """Forgets the program that appeared first, to make room for a new one.
 
-        If every program holds its switch, the oldest program is forgotten.
+        Programs that do not press the switch are forgotten before those that do.
         """
         idle = [boot for boot, program in self._programs.items() if program.pressed_ns is None]
         oldest = idle[0] if idle else next(iter(self._programs))

@@ -289,7 +289,10 @@ class RemoteHand(HandPlayer):
         return False
 
     def _read_decisions(self) -> Iterator[HandMessage]:
-        """Yields the waiting decisions of the process."""
+        """Yields the waiting decisions of the user's class, which arrive from its process.
+
+        Invalid messages, and those of other senders, are counted as dropped.
+        """
         return _read_messages(self._inbox, self._site, self._dropped, self._source)
 
     def _decide(self, k: int, message: HandMessage) -> None:
@@ -320,7 +323,10 @@ class RemoteHand(HandPlayer):
 
 
 def _list_numbers(view: Any) -> dict[str, Any]:
-    """Returns the fields of a view by name, with arrays converted to lists for a message."""
+    """Returns the fields of a view by name, in the types that a message can contain.
+
+    A view is the state of the site that the user's class decides upon. Arrays become lists.
+    """
     return {
         name: value.tolist() if isinstance(value, np.ndarray) else value
         for name, value in view._asdict().items()

@@ -42,7 +42,10 @@ class LinePrinter:
             self._lines.put_nowait(text)
 
     def _print_lines(self) -> None:
-        """Prints the waiting lines until None arrives, in the thread of the printer."""
+        """Prints lines as they come, in the thread of the printer, until None tells it to end.
+
+        Errors of the output, for example a closed pipe, do not end the session.
+        """
         while (text := self._lines.get()) is not None:
             with suppress(OSError):
                 self._print_line(text)

@@ -83,7 +83,13 @@ class PeerAdmission:
         self.has_given_up = self._is_peer_away_too_long(t_ns)  # ends the loop
 
     def _is_peer_away_too_long(self, t_ns: int) -> bool:
-        """Returns True if a peer left longer ago than the user's options tolerate."""
+        """Returns True if a peer left longer ago than the option `leave_timeout_s` allows.
+
+        The run then ends. Without this option, a peer may stay away for ever.
+
+        Args:
+            t_ns: Present time, ns since the epoch.
+        """
         patience_s = self._parts.options.leave_timeout_s
         departures = self._parts.monitor.departed.values()
         if patience_s is None or not departures:

@@ -321,7 +321,11 @@ class PeerMonitor:
 
 
 def _set_membership(members: set[T], member: T, is_present: bool) -> None:
-    """Adds a member to a set, or removes the member from the set."""
+    """Puts a member into a set if it is present on the network, and takes it out if it is not.
+
+    A member that is already there, or already gone, changes nothing: tokens may be reported
+    twice.
+    """
     if is_present:
         members.add(member)
     else:

@@ -52,7 +52,10 @@ def prepare(cpu: int | None, sites: int = 1) -> dict[str, str]:
     has_room = sites <= _SITES_PER_PROCESSOR * cpus
 
     def describe_crowded_machine() -> str:
-        """Returns why no real-time scheduling is requested."""
+        """Returns why no real-time scheduling is requested: sites would share a processor.
+
+        Example: "normal (3 sites share 2 processors)".
+        """
         shares = count_nouns(sites, "site shares", "sites share")
         return f"normal ({shares} {count_nouns(cpus, 'processor')})"
 
@@ -78,7 +81,11 @@ def prepare(cpu: int | None, sites: int = 1) -> dict[str, str]:
 
 
 def _set_affinity(cpu: int | None) -> str:
-    """Binds the process to a processor, and returns the processors that it may use."""
+    """Binds the process to a processor. None leaves it as it is.
+
+    Returns:
+        The processors that the process may use, for the log: "cpu 3" or "cpu 0,1".
+    """
     if cpu is not None:
         os.sched_setaffinity(0, {cpu})
     return "cpu " + ",".join(str(n) for n in sorted(os.sched_getaffinity(0)))
@@ -113,6 +120,9 @@ def _call_libc(setting: str, function: str, *arguments: int) -> str:
 
 
 def _stop_collector() -> str:
-    """Turns off garbage collection, whose pauses would make ticks late."""
+    """Turns off garbage collection, whose pauses would make ticks late.
+
+    Returns a text for the log.
+    """
     process.disable_gc()
     return "frozen and off"

@@ -107,7 +107,7 @@ class RunningSite:
 
     @property
     def link_monitors(self) -> Sequence[LinkTimingMonitor]:
-        """Timing monitors of the links from the peers."""
+        """Timing monitors of the links from the peers, in the order of the peers."""
         return self._timing.monitors
 
     def _make_timing(self, pinger: Pinger) -> SiteTiming:

@@ -54,7 +54,10 @@ class RunOutcome(NamedTuple):
 
     @property
     def t_ns(self) -> int:
-        """Nominal time of the last tick, in ns since the epoch. It is -1 if there is none."""
+        """Nominal time of the last tick, in ns since the epoch.
+
+        It is -1 if no tick was executed.
+        """
         return -1 if self.output is None else self.output.t_ns
 
 
@@ -154,7 +157,10 @@ class SiteEnd:
 
     @property
     def _departures(self) -> str:
-        """Sentences about the sites that have left. Empty if all sites are present."""
+        """Sentences about the peers that left and did not come back.
+
+        Empty if there are none.
+        """
         return "; ".join(text for _, text in self._parts.monitor.departed.values())
 
     def _find_cause(self) -> tuple[str, str]:
@@ -186,7 +192,13 @@ class SiteEnd:
         return first_departed, f": {self._departures}"
 
     def _publish_end_event(self, kind: str, text: str, about: str = "") -> None:
-        """Publishes an event with the number of executed ticks and the time of the last one."""
+        """Publishes an event about the end of the run, with the number of its ticks.
+
+        Args:
+            kind: Kind of the event, for example "end" or "law".
+            text: Sentence for people.
+            about: Name of the site that the event is about. Empty for this site.
+        """
         self._publisher.publish(
             kind, text, t_ns=self._outcome.t_ns, ticks=self._outcome.ticks, about=about
         )

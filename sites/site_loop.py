@@ -408,7 +408,13 @@ class StateBlock:
             self._send_waiting_samples(send)
 
     def _send_waiting_samples(self, send: Callable[[TickRecord], tuple[Any, ...]]) -> None:
-        """Sends all waiting samples, and completes their records with the sending time."""
+        """Sends all waiting samples to the peers, and moves their records to the next block.
+
+        A record states when its sample was sent, so it is complete only now.
+
+        Args:
+            send: Function that sends the sample of a record, see `send_samples`.
+        """
         for entry in self._waiting_records:
             output = entry[0]
             self._records.append((*entry, *send(output)))
@@ -440,7 +446,7 @@ class _LoopSite(Protocol):
     """
 
     def should_stop(self) -> bool:
-        """Returns True if the run ends before the present tick."""
+        """Returns True if the present tick must not be executed, because the run is over."""
 
     def step(self, k: int, arrivals: Sequence[Arrival]) -> TickRecord | None:
         """Executes one tick.
@@ -454,27 +460,33 @@ class _LoopSite(Protocol):
         """
 
     def publish_sample(self, payload: bytes, /) -> object:
-        """Publishes an encoded sample to the peers."""
+        """Publishes an encoded sample, the part of a record that the peers need."""
 
     def publish_link(self, payload: bytes, /) -> object:
-        """Publishes encoded statistics."""
+        """Publishes encoded statistics of the loop and its links, which the recorder stores."""
 
     def run_housekeeping(self, output: TickRecord, /) -> object:
-        """Executes the work that need not be done in every tick.
+        """Does what is due ten times a second: replies to queries, clocks, members, news.
 
         Args:
             output: Record of the newest tick.
         """
 
     def report_tick(self, output: TickRecord, /) -> object:
-        """Publishes what has changed in a tick.
+        """Reports what has changed in a tick, such as a new mode, by events and alarms.
 
         Args:
             output: Record of the tick.
         """
 
     def use_slack(self) -> bool:
-        """Does work that can wait, and returns True if more of it may wait."""
+        """Does one piece of work that can wait, in the time that is left before the next tick.
+
+        A site answers a query of a recorder for lost messages.
+
+        Returns:
+            True if more work may wait.
+        """
 
 
 def _publish_sample(

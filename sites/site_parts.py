@@ -279,7 +279,11 @@ class SiteParts:
         )
 
     def _connect_outside_arm(self) -> None:
-        """Connects to the external arm and to its dead-man switch, if there are any."""
+        """Makes the site receive measurements and switch reports, if its arm is external.
+
+        `arm` and `switch` stay None for an arm that the site simulates, or that has no such
+        switch.
+        """
         name = self.name
         read_clock = self.clock.monotonic_ns
         if name in self.scenario.outside:
@@ -302,10 +306,12 @@ class SiteParts:
             self.switch = DeadManSwitch(name, ring, self.clock, self.stats.dropped)
 
     def _make_storing_publisher(self, channel: str) -> Callable[[list[bytes]], None]:
-        """Returns a function that publishes messages and stores them for retransmission.
+        """Returns a function that publishes messages, and keeps them for later requests.
+
+        A recorder that missed a message on the network requests it again.
 
         Args:
-            channel: Channel of the messages.
+            channel: Channel of the messages, records or statistics.
         """
         store = self.buffer.channels[channel].store
         publish = self.bus.publisher(self._key(channel))

@@ -213,7 +213,10 @@ class CodeFailed(RunFailed):
         self.tick = tick
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Returns what pickle needs to rebuild the error in another process."""
+        """Returns what pickle needs to rebuild the error, with its site, code and tick.
+
+        Worker processes report errors to the process that started them by pickle.
+        """
         rebuild = partial(type(self), site=self.site, code=self.code, tick=self.tick)
         return rebuild, (self.problem,)
 
@@ -374,7 +377,7 @@ def find_nearest(word: str, valid: Sequence[str], elsewhere: Sequence[str] = ())
 
 
 def join_words(words: Iterable[str]) -> str:
-    """Joins words as in "m1, m2 and s"."""
+    """Joins words for a sentence: "m1, m2 and s", "m1 and s", "s", and nothing for no words."""
     texts = list(words)
     if len(texts) < 2:
         return "".join(texts)

@@ -143,7 +143,13 @@ def reword_problem(problem: str) -> str:
 
 
 def _reword_types(quoted: re.Match[str]) -> str:
-    """Returns the types that msgspec quotes, such as "`float | null`", in terms of TOML."""
+    """Returns the types that an error of msgspec quotes in the terms of TOML.
+
+    Example: "`float | null`" becomes "number". Null is left out, because TOML has no null.
+
+    Args:
+        quoted: Match of the quoted types, without their backquotes as group 1.
+    """
     types = quoted[1].split(" | ")
     return " or ".join(_TYPE_NAMES.get(name, name) for name in types if name != "null")
 

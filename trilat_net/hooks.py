@@ -48,10 +48,10 @@ def find_hook(hook: str) -> Any:
 
 
 def list_hooks() -> list[str]:
-    """Returns the names of all hooks for which a function is registered."""
+    """Returns the names of all hooks for which a function is registered, for the tests."""
     return list(_loaders)
 
 
 def _import_function(module: str, name: str) -> Any:
-    """Imports a function from a module."""
+    """Imports the module of a hook, on the first use of the hook, and returns its function."""
     return getattr(import_module(module), name)

@@ -67,7 +67,10 @@ class Result:
         return pandas.DataFrame(list(self.to_rows()))
 
     def headline(self) -> str:
-        """Returns the result in one line of text, by default the first line of its summary."""
+        """Returns the result in one line: the first line of its summary that is not blank.
+
+        Texts that show a result among others use it. A result without any line is "nothing".
+        """
         for line in self.summary().splitlines():
             if line.strip():
                 return line.strip()

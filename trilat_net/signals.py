@@ -159,7 +159,7 @@ def end_process_at_signals() -> Callable[[], None]:
     unwatch = _watch_signals() if is_first_process else lambda: None
 
     def restore() -> None:
-        """Restores the handlers of the signals that were replaced."""
+        """Restores the handlers that were replaced, so that loops can poll for signals."""
         unwatch()
         for number, handler in replaced.items():
             signal.signal(number, handler)
@@ -168,7 +168,10 @@ def end_process_at_signals() -> Callable[[], None]:
 
 
 def _exit_by_signal(number: int, _frame: FrameType | None) -> None:
-    """Ends the process at once with the exit code of a signal."""
+    """Ends the process at once with the exit code that shells give to a signal, 128 + number.
+
+    It is the handler of signals during a compilation in the first process of a container.
+    """
     os._exit(128 + number)
 
 
@@ -202,7 +205,7 @@ def _watch_signals() -> Callable[[], None]:
                     os._exit(128 + number)
 
     def unwatch() -> None:
-        """Stops the thread by closing its pipe."""
+        """Ends the thread that waits for signals. Closing the pipe ends its read."""
         signal.set_wakeup_fd(previous_descriptor)
         os.close(writer)
 

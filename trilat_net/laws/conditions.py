@@ -359,7 +359,7 @@ class LinearSituation(NamedTuple):
 
     @property
     def peers(self) -> list[int]:
-        """Indices of all sites but this one, in ascending order."""
+        """Indices of all sites but this one, ascending: those whose motion the law may use."""
         return [j for j in range(len(self.names)) if j != self.site]
 
 
@@ -403,7 +403,11 @@ class LinearForm:
         self.blocks[row, column] = previous + block
 
     def list_receivers(self) -> list[int]:
-        """Returns the peers to which the law sends signals, as indices in ascending order."""
+        """Returns the peers to which the law sends signals, such as waves, as indices.
+
+        The linear analysis adds a variable for the signal to each of them. The indices ascend.
+        There are none if the law exchanges nothing but the motion.
+        """
         receivers = set()
         for row, _ in self.blocks:
             if isinstance(row, tuple):

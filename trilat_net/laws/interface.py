@@ -284,7 +284,7 @@ class LawSettings(Frozen, frozen=True):
 
     @property
     def sends(self) -> SentVectorSpecs:
-        """Vectors that the law sends to its peers, by name."""
+        """Vectors that the law sends to its peers besides the motion, by name. Often empty."""
         sends = getattr(self.kind, "sends", {})
         return convert_sends(sends, self.kind.__name__, "control")
 
@@ -322,7 +322,11 @@ class LawSettings(Frozen, frozen=True):
 
 
 def format_class_name(tag: str) -> str:
-    """Returns the name of the class in a law's file: "FourChannel" for "four_channel"."""
+    """Returns the name that the class of a law must have: "FourChannel" for "four_channel".
+
+    Laws are found by their files. The rule links the file, the class and the name in a
+    scenario.
+    """
     return "".join(word.capitalize() for word in tag.split("_"))
 
 
@@ -474,7 +478,10 @@ def _derive_settings(kind: type[ControlLaw], tag: str) -> type[LawSettings]:
 
 
 def _is_class_variable(hint: Any) -> bool:
-    """Returns True for the annotations `ClassVar` and `ClassVar[...]`, which are not gains."""
+    """Returns True for the annotations `ClassVar` and `ClassVar[...]`, which are not gains.
+
+    All other annotations of a law's class become keys of the scenario.
+    """
     origin: Any = get_origin(hint) or hint
     return origin is ClassVar
 

@@ -196,7 +196,7 @@ class Tanks(EnergyLaw):
         )
 
     def explain_no_linear_form(self) -> str:
-        """Returns the reason why the law cannot be linearised, for the user."""
+        """Returns why this law has no linear analysis (`trilat linear`), for the user."""
         return "the energy in the tank switches its torque on and off"
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:

@@ -911,7 +911,7 @@ class Tdpa(EnergyLaw):
         )
 
     def explain_no_linear_form(self) -> str:
-        """Returns the reason why the law cannot be linearised, for the user."""
+        """Returns why this law has no linear analysis (`trilat linear`), for the user."""
         return "its controllers act by energies, which are of second order in the motion"
 
     def explain_idle_shares(self, situation: LawSituation) -> str:  # noqa: ARG002

@@ -513,7 +513,11 @@ class Hand(SiteClient):
             threading.Thread(target=self._repeat_messages, daemon=True).start()
 
     def __exit__(self, *_: object) -> None:
-        """Releases the arm and waits until the site has confirmed it. The bus stays open."""
+        """Releases the arm, and waits until its record shows that nobody holds it any more.
+
+        The wait takes at most twice the time in which the grip fades, also if no record
+        arrives. The bus stays open, because the caller opened it.
+        """
         try:
             self.release()
             deadline_ns = self._clock.monotonic_ns() + 2 * GRIP_NS
@@ -658,7 +662,17 @@ class Hand(SiteClient):
         return tuple(scale * component for component in pull)
 
     def _compute_pose_rate(self, record: State) -> list[float]:
-        """Returns the rate of the pose, by a central difference along the joint velocities."""
+        """Returns the velocity of the end effector, or of the angles that the operator turns.
+
+        The pose has no closed derivative here: it is evaluated a little ahead and behind along
+        the measured joint velocities, and the difference is divided by the time between.
+
+        Args:
+            record: Record of the site, with angles and velocities of the joints.
+
+        Returns:
+            The rate of each coordinate of the pose, m/s or rad/s.
+        """
         step_s = _DERIVATIVE_STEP_S
         joints = list(zip(record.q, record.qd, strict=True))
         pose_after = self._compute_pose([q + step_s * qd for q, qd in joints])
@@ -703,7 +717,11 @@ class Hand(SiteClient):
             return self._sender.number
 
     def _repeat_messages(self) -> None:
-        """Repeats the last message regularly until the object is closed."""
+        """Repeats the last message while the program holds the arm, in a thread of its own.
+
+        Without it, the site would take a program that has no new target for one that has died,
+        and release the arm. The thread ends when the object is closed.
+        """
         while not self._ended.wait(_HEARTBEAT_S):
             with self._lock:
                 if self._message is not None:

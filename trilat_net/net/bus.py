@@ -62,7 +62,7 @@ class Query(Protocol):
         """Content of the query, as the sender encoded it. Empty if the query has no content."""
 
     def reply(self, payload: bytes) -> None:
-        """Sends a reply to the member that sent the query.
+        """Sends the answer to the member that sent the query. A query can be answered once.
 
         Args:
             payload: The encoded reply.

@@ -111,7 +111,10 @@ class SkewedClock:
         self._start_ns = clock.monotonic_ns()
 
     def monotonic_ns(self) -> int:
-        """Returns the monotonic time with the offset and the drift of this clock, in ns."""
+        """Returns the monotonic time as this wrong clock shows it, in ns.
+
+        true time + offset + drift * (time since the clock was created)
+        """
         passed_ns = self._clock.monotonic_ns() - self._start_ns
         drift_ns = passed_ns * self._drift_ppb // NS_PER_S
         return self._start_ns + self._offset_ns + passed_ns + drift_ns

@@ -45,7 +45,10 @@ def check_hosts(endpoints: Iterable[str]) -> None:
 
 
 def _is_address(host: str) -> bool:
-    """Returns True if a host is a numeric address."""
+    """Returns True if a host is a numeric address, for example 127.0.0.1 or fe80::1%eth0.
+
+    No name service needs to be asked for an address.
+    """
     try:
         ipaddress.ip_address(host.partition("%")[0])
     except ValueError:

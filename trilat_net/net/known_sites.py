@@ -76,7 +76,10 @@ class _KnownSite(msgspec.Struct, frozen=True):
 
 
 def _find_folder() -> Path:
-    """Returns the folder of the files, following the XDG convention for state files."""
+    """Returns the folder for the files of this user's running sites.
+
+    It is ~/.local/state/trilat-net/running, unless XDG_STATE_HOME names another place.
+    """
     state = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
     return Path(state) / "trilat-net" / "running"
 
@@ -163,7 +166,10 @@ def find_known_sites(session: str) -> list[_KnownSite]:
 
 
 def _is_alive(pid: int) -> bool:
-    """Returns True if a process exists. On other systems than POSIX, it is assumed to exist."""
+    """Returns True if a process with this number exists, so that its file is not a leftover.
+
+    On other systems than POSIX, where it cannot be asked without harm, it is assumed to exist.
+    """
     with suppress(PermissionError):
         try:
             if os.name == "posix":  # on other systems, `os.kill` would end the process

@@ -586,7 +586,7 @@ def _sign_member(
 
 
 def _make_subject(common_name: str) -> x509.Name:
-    """Returns a name in the form of a certificate."""
+    """Returns an X.509 name for a certificate that states whom it is for, "m1" for example."""
     return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)])
 
 
@@ -636,7 +636,11 @@ def _make_alternative_names(hosts: Sequence[str]) -> x509.SubjectAlternativeName
 
 
 def _list_hosts(certificate: x509.Certificate) -> tuple[str, ...]:
-    """Returns the host names and addresses that the certificate of a member contains."""
+    """Returns the host names and addresses for which the certificate of a member is valid.
+
+    A connection to a member is refused if the endpoint names another host. The result is empty
+    if the certificate states no hosts or cannot be read.
+    """
     try:
         names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName)
     except (ValueError, x509.ExtensionNotFound):
@@ -678,7 +682,11 @@ def _write_folder(
 
 
 def _write_new_file(path: Path, content: bytes) -> None:
-    """Writes a file that only its owner can read. The file must not exist."""
+    """Writes a file that only its owner can read, such as a private key.
+
+    Raises:
+        FileExistsError: The file exists. Keys are never overwritten.
+    """
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     with os.fdopen(descriptor, "wb") as file:
         file.write(content)

@@ -286,7 +286,15 @@ class _AdmissibleLines:
         self.exist = bool(simultaneous_gap >= 0.0 and self.flattest <= self.steepest)
 
     def _read_columns(self, limits: deque[OffsetLimit]) -> tuple[_Array, _Array]:
-        """Returns the times of limits in s relative to the present, and their offsets in ns."""
+        """Converts limits of the offset to arrays of small numbers, for precise arithmetic.
+
+        Args:
+            limits: Ceilings or floors.
+
+        Returns:
+            The time of each limit in s relative to the present, never above 0; and its offset
+            in ns relative to the latest ceiling.
+        """
         times_ns = [min(0, limit.local_ns - self._now_ns) for limit in limits]
         offsets_ns = [limit.offset_ns - self._base_ns for limit in limits]
         times_s = np.array(times_ns, dtype=np.float64) / NS_PER_S
@@ -507,7 +515,11 @@ class SlewedOffset:
         return self._select_segment(local_ns).error_bound_ns(local_ns)
 
     def _select_segment(self, local_ns: int) -> _SlewSegment:
-        """Returns the segment of the smoothed offset that contains a local time."""
+        """Returns the segment of the smoothed offset that holds at a local time.
+
+        There are two segments: the present approach to the latest estimate, and the one before,
+        for times that lie before the start of the present one.
+        """
         if local_ns >= self._segment.start_ns:
             return self._segment
         return self._previous_segment

@@ -114,7 +114,10 @@ def answer_pings(
     """
 
     def answer(_: bytes) -> bytes:
-        """Returns the reply to a ping: the times at which the ping came and the reply left."""
+        """Returns the reply to a ping: the clock's readings at its arrival and at the reply.
+
+        The sender subtracts the time between the two readings from the round trip.
+        """
         received_ns = clock.monotonic_ns()
         sent_ns = clock.monotonic_ns()
         pong = Pong(
@@ -234,7 +237,7 @@ class RoundTrips:
         drift_per_ns = self.latest.drift / NS_PER_S if self.latest else 0.0
 
         def extrapolate_limit(limit: OffsetLimit) -> float:
-            """Returns the value of a limit of the clock offset at the present time, in ns."""
+            """Returns a limit of the clock offset, moved along the drift to the present, ns."""
             return limit.offset_ns - drift_per_ns * (limit.local_ns - now_ns)
 
         ceilings, floors = zip(*self._window, strict=True)

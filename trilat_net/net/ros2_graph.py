@@ -252,13 +252,20 @@ class Ros2Member(NamedTuple):
         return f"{node}/{_mangle('/' + name)}/{_name_dds_type(kind)}/{type_hash}/{qos.encode()}"
 
     def _path(self) -> str:
-        """Returns the part of a token that names the node."""
+        """Returns the part of liveliness tokens that names the node, "%/NAMESPACE/NAME".
+
+        The first % stands for the root enclave, the place of security rules. A node without a
+        namespace has a % in its place.
+        """
         namespace = _mangle("/" + self.namespace) if self.namespace else "%"
         return f"%/{namespace}/{self.name}"
 
 
 def _mangle(name: str) -> str:
-    """Returns a name with its slashes replaced, as names within tokens are written."""
+    """Returns a name as it stands in a token, "/arm/joint_states" as "%arm%joint_states".
+
+    A token is itself a path whose parts are divided by slashes.
+    """
     return name.replace("/", "%")
 
 
@@ -357,7 +364,12 @@ class Refusals:
         """
 
         def guarded(*args: P.args, **named: P.kwargs) -> None:
-            """Calls `act`. If it raises an error, counts the message as refused."""
+            """Passes a message to `act`.
+
+            If `act` raises an error, counts the message as refused.
+
+            An error would otherwise end in a thread of Zenoh, where nobody sees it.
+            """
             try:
                 act(*args, **named)
             except (ValueError, TrilatError) as error:
@@ -565,7 +577,11 @@ class Ros2Graph:
         """
 
         def check_publisher(token: zenoh.Sample) -> None:
-            """Reports a publisher that has appeared, if its messages cannot be received."""
+            """Counts a refusal if a publisher appears whose messages this node cannot receive.
+
+            Zenoh calls it with a token for each publisher that appears or disappears. A
+            mismatch is, for example, another message type under the name of the topic.
+            """
             has_appeared = token.kind == zenoh.SampleKind.PUT
             mismatch = describe_mismatch(str(token.key_expr), self._node.domain, kind)
             if has_appeared and mismatch:

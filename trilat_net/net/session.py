@@ -281,7 +281,10 @@ class SessionJoin:
         indices = {name: index for index, name in enumerate(self._sites)}
 
         def rank(info: Info) -> tuple[bool, int]:
-            """Returns the sort key: sites on this machine first, then the scenario's order."""
+            """Returns the sort key: sites on this machine first, then the scenario's order.
+
+            A site on this machine has the same clock, so its epoch needs no conversion.
+            """
             return info.clock != local_clock, indices.get(info.member, -1)
 
         for info in sorted(running, key=rank):

@@ -446,7 +446,7 @@ def make_reader(
     decoder = make_decoder(kind, layout=layout)
 
     def read(payload: bytes) -> Any | WireError:
-        """Returns the decoded message, or a `WireError` if the payload is not valid."""
+        """Returns the decoded message. If the payload is not valid, returns the `WireError`."""
         try:
             return decoder(payload)
         except WireError as error:

@@ -94,9 +94,12 @@ class _ZenohRing(Generic[T]):
         self._read = read
 
     def poll(self) -> T | None:
-        """Removes the next entry from the queue and returns it.
+        """Removes the oldest usable entry from the queue and returns it.
 
-        Returns None if the queue is empty.
+        None if there is no such entry.
+
+        Entries for which `read` returns None, such as error replies, are skipped. The queue of
+        a query also counts as empty once all replies have arrived.
         """
         try:
             while (received := self._try_recv()) is not None:
@@ -139,12 +142,15 @@ def _make_sample_handler(receive: Callable[[Any], None]) -> Any:
 
 
 def _read_sample(sample: Any) -> tuple[str, bytes]:
-    """Returns the key and the payload of a message."""
+    """Returns the key under which a message was published, and its bytes."""
     return str(sample.key_expr), sample.payload.to_bytes()
 
 
 class _ZenohQuery(NamedTuple):
-    """A query that has arrived, with the key under which it is answered."""
+    """A query of another member that waits for a reply, with the key of the reply.
+
+    It implements `Query` of the interface `bus`.
+    """
 
     query: zenoh.Query
     key: str
@@ -263,11 +269,21 @@ class ZenohBus:
         return put
 
     def _subscribe(self, key: str, handler: Any) -> Any:
-        """Creates a Zenoh subscriber, which ignores messages of this session itself."""
+        """Creates a Zenoh subscriber that ignores what this connection publishes itself.
+
+        Args:
+            key: Key of the messages; it may contain wildcards.
+            handler: Handler of Zenoh that receives the messages.
+        """
         return self._session.declare_subscriber(key, handler, allowed_origin=Locality.REMOTE)
 
     def _serve(self, key: str, handler: Any) -> Any:
-        """Creates a Zenoh object that receives queries, except those of this session itself."""
+        """Creates a Zenoh object that receives queries, except those of this connection itself.
+
+        Args:
+            key: Key of the queries.
+            handler: Handler of Zenoh that receives the queries.
+        """
         return self._session.declare_queryable(key, handler, allowed_origin=Locality.REMOTE)
 
     def inbox(self, key: str, capacity: int = RING_CAPACITY) -> Inbox:
@@ -339,7 +355,10 @@ class ZenohBus:
         """
 
         def answer_at_once(query: zenoh.Query) -> None:
-            """Calls `answer` with a query, and sends the result as reply unless it is None."""
+            """Replies to a query in the thread of Zenoh.
+
+            If `answer` returns None, there is no reply.
+            """
             # A query ends for its sender only when the query object is dropped.
             with query:
                 payload = answer(_ZenohQuery(query, key).payload)
@@ -482,7 +501,11 @@ def _parse_json5(source: str, text: str) -> object:
 
 
 def _find_refusal(settings: Mapping[str, Any]) -> str:
-    """Returns the reason why Zenoh refuses settings. Empty if it accepts them."""
+    """Returns the reason why Zenoh refuses a configuration. Empty if Zenoh accepts it.
+
+    Args:
+        settings: The configuration, or a part of it.
+    """
     try:
         zenoh.Config.from_json5(json.dumps(settings))
     except zenoh.ZError as error:
@@ -491,10 +514,14 @@ def _find_refusal(settings: Mapping[str, Any]) -> str:
 
 
 def _first_line(error: zenoh.ZError) -> str:
-    """Returns the first line of a Zenoh error, without the position in Zenoh's source code."""
+    """Returns the first line of a Zenoh error, as the reason in a message to the user.
+
+    The position in Zenoh's source code is removed, and a very long line is cut after 400
+    characters.
+    """
     return re.sub(r" at /\S+:\d+\.?", "", str(error).strip().splitlines()[0])[:400]
 
 
 def _endpoint_texts(endpoints: Sequence[Endpoint]) -> str:
-    """Returns endpoints as one text for messages to the user."""
+    """Returns endpoints as one text for messages: "tcp/127.0.0.1:7447, tcp/10.0.0.2:7447"."""
     return ", ".join(map(str, endpoints))

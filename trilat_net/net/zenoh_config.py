@@ -459,7 +459,10 @@ def _drop_key(settings: dict[str, Any], path: str) -> None:
 
 
 def _remove_nulls(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns a copy of nested settings without the keys whose value is null."""
+    """Returns a copy of nested settings without the keys whose value is null.
+
+    A key with null states nothing, so it must not be checked as a choice of the user.
+    """
     return {
         key: _remove_nulls(value) if isinstance(value, dict) else value
         for key, value in settings.items()

@@ -509,7 +509,10 @@ def propagate_motion(
 
 @leaf
 def _motion_cross(V: Spatial, W: Spatial) -> Spatial:
-    """Returns V x W of two spatial velocities."""
+    """Returns the spatial cross product V x W, the rate at which W changes if it moves with V.
+
+    For V = (v, w) and W = (v', w') in (linear, angular) parts it is (w x v' + v x w', w x w').
+    """
     V_lin, V_ang = V
     W_lin, W_ang = W
     turned_W = cross(V_ang, W_lin)
@@ -521,7 +524,10 @@ def _motion_cross(V: Spatial, W: Spatial) -> Spatial:
 
 @leaf
 def _force_cross(V: Spatial, f: Spatial) -> Spatial:
-    """Returns V x* f of a spatial velocity and a spatial force."""
+    """Returns the spatial cross product V x* f, the rate at which f changes if it moves with V.
+
+    For V = (v, w) and f = (force, torque) it is (w x force, w x torque + v x force).
+    """
     V_lin, V_ang = V
     force, torque = f
     linear = cross(V_ang, force)

@@ -72,7 +72,17 @@ def update_errors(s: Row, chain: RowArray) -> None:
 
 @leaf
 def _update_joint_errors(s: Row, joints: int) -> None:
-    """Writes e, ed, v, a and r for sites that share joint angles."""
+    """Writes the errors of a site that compares joint angles with its peers, Eqs. (9) and (10).
+
+    For each joint, e = q - q_des is the position error, ed its derivative, v = -Lambda e the
+    reference velocity, a its derivative, and r = qd - v the filtered error on which the control
+    law acts.
+
+    Args:
+        s: Row of the site. It holds q, qd, the reference q_des with qd_des, and the rate
+            Lambda, 1/s.
+        joints: Number of joints.
+    """
     for i in range(joints):
         s.e[i] = s.q[i] - s.q_des[i]
         s.ed[i] = s.qd[i] - s.qd_des[i]

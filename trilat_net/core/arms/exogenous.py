@@ -387,7 +387,10 @@ def _recorded_torque(actor: Row, t_s: float, table: TorqueTable) -> Pair:
 
 @leaf
 def _sine_of_turns(turns: float) -> float:
-    """Returns sin(2 pi turns), with the whole turns removed first."""
+    """Returns sin(2 pi turns) for any number of turns.
+
+    The whole turns are removed first, because the sine of a large angle would lose digits.
+    """
     fraction = turns - math.floor(turns)
     s, _ = sincos(2.0 * math.pi * fraction)
     return s
@@ -487,7 +490,11 @@ def _wall_force(actor: Row, at: Pair, speed: Pair) -> Pair:
 
 @leaf
 def _is_at_end_effector(actor: Row) -> bool:
-    """Returns True if an actor acts on the end effector, False if it acts on the joints."""
+    """Returns True if the force of an actor acts on the end effector, False if on the joints.
+
+    An actor is an operator or an environment. A force at the end effector has to be converted
+    to joint torques by the transposed Jacobian.
+    """
     kind: int = actor.kind
     return kind in (_TASK_HAND, _WALL, _OWN_TIP, _LIVE_TIP, _LIVE_FORCE)
 

@@ -156,7 +156,10 @@ def relative_rotation(R: Array | Matrix, other: Array | Matrix) -> Three:
 
 @leaf
 def _times_rows(row: Three, a: Three, b: Three, c: Three) -> Three:
-    """Returns the scalar products of `row` with the three rows a, b and c."""
+    """Returns a row of a matrix times the transpose of a matrix with the rows a, b and c.
+
+    Its three numbers are the scalar products of `row` with a, b and c.
+    """
     x = row[0]
     y = row[1]
     z = row[2]

@@ -302,7 +302,13 @@ def _factor_damped(s: Row) -> None:
 
 @leaf
 def _update_axis_errors(s: Row) -> None:
-    """Writes e and ed of the task; they are zero along axes that are not followed."""
+    """Writes the error e of the end effector and its derivative ed, for each axis of the task.
+
+    For a position, e is the difference from the reference, m. For a pose, the last three
+    numbers of e are the rotation vector from the reference orientation to the present one, rad.
+    Both are zero along axes that the task does not follow, so that the control law does nothing
+    along them.
+    """
     for j in range(s.shared):
         s.e[j] = s.x[j] - s.q_des[j]
         s.ed[j] = s.xd[j] - s.qd_des[j]

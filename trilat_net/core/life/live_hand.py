@@ -600,7 +600,18 @@ def _release(memory: HandMemory, number: int) -> HandMemory:
 
 
 def _find_fading_rate(rules: HandRules, memory: HandMemory) -> tuple[float, ...]:
-    """Returns the velocity of a target that comes to rest while its grip fades."""
+    """Returns the velocity of the target while its grip fades, after the hand let go.
+
+    The speed falls with the largest deceleration that `rules` allow, in the direction of
+    motion, until the target stands still.
+
+    Args:
+        rules: Limits of the target's motion, and the rate of the control loop.
+        memory: State of the hand, with the present velocity of the target.
+
+    Returns:
+        The velocity, one number per coordinate, in the unit of the target per second.
+    """
     speed = math.sqrt(sum(v * v for v in memory.rate))
     slower = speed - rules.acceleration_limit / rules.rate_hz
     if slower <= 0.0:

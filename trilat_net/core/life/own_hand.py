@@ -157,11 +157,19 @@ class OwnHand:
         self._newest = -1
 
     def is_decision_tick(self, k: int) -> bool:
-        """Returns True if the user's program makes a decision in control period k."""
+        """Returns True if tick k asks the user's program for a decision.
+
+        This is every `period_ticks`-th tick: 0, 20, 40 and so on for a program that decides 50
+        times a second in a loop of 1 kHz.
+        """
         return k % self.period_ticks == 0
 
     def find_next_event(self, k: int) -> int:
-        """Returns the first tick after `k` at which a decision is made or starts to act."""
+        """Returns the first tick after `k` in which the program decides or a decision acts.
+
+        Until that tick there is no new command. Therefore `advance_span` computes the ticks
+        before it in one compiled call.
+        """
         next_decision = (k // self.period_ticks + 1) * self.period_ticks
         return min([next_decision, *(due for due, _ in self._due if due > k)])
 

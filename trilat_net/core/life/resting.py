@@ -147,7 +147,13 @@ def enter_rest(t_ns: int, mode: int, reason: int, site: SiteRow) -> None:
 
 @leaf
 def _read_rest_reference(site: SiteRow, i: int) -> tuple[float, float]:
-    """Returns the rest reference of joint i, rad, and its rate, rad/s."""
+    """Returns the position that joint i follows while the arm comes to rest, and its velocity.
+
+    `_write_rest_reference` says why joint space and task space keep them in different fields.
+
+    Returns:
+        The position, rad or m, and the velocity, rad/s or m/s.
+    """
     if site.task:
         return site.q_rest[i], site.qd_rest[i]
     return site.q_held[i], site.qd_held[i]
@@ -288,7 +294,16 @@ def put_rest_reference(site: SiteRow, q: Array, qd: Array) -> None:
 
 @leaf
 def _find_slip(site: SiteRow, i: int) -> float:
-    """Returns s = qd - qd_ref + Lambda (q - q_ref) of joint i, rad/s."""
+    """Returns the filtered deviation of joint i from its rest reference.
+
+        s = qd - qd_ref + Lambda (q - q_ref)
+
+    The damping and the integral term of an arm at rest act on s. Lambda is the rate of the
+    adaptive law in joint space, and `REST_RATE_1_S` with any other law, which has no such rate.
+
+    Returns:
+        The deviation s, rad/s or m/s.
+    """
     q_ref, qd_ref = _read_rest_reference(site, i)
     Lambda = REST_RATE_1_S
     if site.law == _ADAPTIVE and not site.task:
@@ -300,7 +315,12 @@ def _find_slip(site: SiteRow, i: int) -> float:
 
 @leaf
 def _shrink(torque: float, change: float) -> float:
-    """Returns a torque less a change of the same sign, or zero if the change is larger."""
+    """Returns a torque moved towards zero by `change`, but not past zero.
+
+    Args:
+        torque: The torque, N m.
+        change: Amount by which it shrinks, N m, with the sign of the torque.
+    """
     return torque - change if abs(torque) > abs(change) else 0.0
 
 

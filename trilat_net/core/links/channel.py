@@ -43,7 +43,15 @@ _CUSTOM = int(DelayKind.CUSTOM)
 
 @leaf
 def _in_outage(stamp_ns: int, link: LinkRow, points: Points) -> bool:
-    """Returns True if a stamp lies in an outage of the link, its end excluded."""
+    """Returns True if a sample was sent during an outage, in which the link delivers nothing.
+
+    An outage includes its start and excludes its end.
+
+    Args:
+        stamp_ns: Stamp of the sample, ns since the epoch, the common start of the session.
+        link: Row of the link. It states which rows of `points` are its outages.
+        points: Table of points; the row of an outage has its start and its end, ns.
+    """
     for n in range(link.outage_first, link.outage_first + link.outage_count):
         if points[n, 0] <= stamp_ns < points[n, 1]:
             return True

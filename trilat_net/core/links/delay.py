@@ -392,6 +392,9 @@ def custom_delay_us(
 
 @leaf
 def clamp_delay_us(delay_us: float) -> int:
-    """Returns a delay in whole microseconds, limited to the range from 0 to `MAX_DELAY_US`."""
+    """Returns a delay in whole microseconds, from 0 to `MAX_DELAY_US`.
+
+    A distribution such as the normal one can draw a negative delay, which becomes 0.
+    """
     rounded_us = math.floor(delay_us + 0.5)
     return int(min(max(rounded_us, 0.0), float(MAX_DELAY_US)))

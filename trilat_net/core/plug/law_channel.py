@@ -101,7 +101,11 @@ class LawChannel(NamedTuple):
 
     @property
     def received_size(self) -> int:
-        """Count of the numbers that one peer receives with each sample."""
+        """Count of the numbers that one peer receives from the law with each sample.
+
+        These are the vectors for all peers and one vector of each kind that is for a single
+        peer.
+        """
         return sum(vector.length for vector in self.vectors)
 
     @property

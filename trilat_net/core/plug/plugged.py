@@ -91,7 +91,16 @@ def _call_compiled(_context: Any, address: Any, arguments: Any) -> Any:
 
 
 def _call_plain(address: int, arguments: tuple[Any, ...]) -> None:
-    """Calls a function by the number that replaces its address while Numba is disabled."""
+    """Calls a Python function by its number in `_PLAIN`, when Numba is disabled.
+
+    Without Numba there is no machine code and so no address. `compile_to_address` then
+    registers the Python function under a number and returns this number in place of the
+    address.
+
+    Args:
+        address: The number.
+        arguments: Arguments of the function.
+    """
     function = _PLAIN[address]
     function(*arguments)
 
@@ -131,7 +140,12 @@ def find_address(compiled: Any) -> int:
 
 
 def _find_numbers(model: Any) -> dict[str, Array]:
-    """Returns the fields of a model that are numbers, by name, as arrays of floats."""
+    """Returns the parameters of a user's model as arrays: those fields that are numbers.
+
+    The compiled function of the model receives them as a row with these field names. Fields of
+    other types, such as texts, are left out. Example: a field `stiffness_n_m = 200` becomes
+    {"stiffness_n_m": array(200.0)}.
+    """
     numbers = {}
     for name in model.__struct_fields__:
         value = np.asarray(getattr(model, name))

@@ -327,7 +327,11 @@ def describe_failure(
 
 
 def _flatten(value: Any) -> Iterator[float]:
-    """Yields the numbers of a value in order: of a number, or of nested lists."""
+    """Yields the numbers of a value in order, for the memory of a law in the record.
+
+    A number yields itself; nested lists yield their numbers row by row: [[1, 2], [3]] yields 1,
+    2 and 3, as floats.
+    """
     if isinstance(value, Real):
         yield float(value)
         return

@@ -168,7 +168,7 @@ def robust_torque(rho: float, width: float, r: float) -> float:
 
 @leaf
 def _clip(value: float, low: float, high: float) -> float:
-    """Returns a value, limited to the range from low to high."""
+    """Returns a value, limited to the range from low to high. NaN stays NaN."""
     if value < low:
         return low
     return high if value > high else value

@@ -31,7 +31,13 @@ _LINK = LinkModel(kind=DelayKind.GAMMA, extra=2.7, scale=900.0, playout_us=2_000
 
 @leaf
 def _compute_sines(angles: Array, results: Array) -> None:
-    """Writes the sines and cosines of angles into the two rows of `results`."""
+    """Writes the sine and the cosine of each angle into `results`, for the fingerprint.
+
+    Args:
+        angles: The angles, shape (n,), rad.
+        results: Receives the sines in its first row and the cosines in its second, shape (2,
+            n).
+    """
     for n in range(angles.shape[0]):
         results[0, n], results[1, n] = sincos(angles[n])
 

@@ -70,7 +70,11 @@ _CORE_PACKAGE = __package__.rpartition(".")[0]
 
 
 def _cache_root() -> Path:
-    """Returns the user's cache directory, by the convention of the platform."""
+    """Returns the directory for the caches of this user's programs.
+
+    It follows the convention of the platform: ~/.cache on Linux, unless XDG_CACHE_HOME names
+    another directory.
+    """
     if sys.platform == "win32":
         return Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
     if sys.platform == "darwin":
@@ -166,7 +170,10 @@ class _CompilingNotice(event.Listener):
             self.report(COMPILING)
 
     def on_end(self, _: Any) -> None:
-        """Restores the handling of signals."""
+        """Restores the handlers of signals that were in force before a compilation.
+
+        Numba calls it.
+        """
         restore = self._restorers.pop()
         restore()
 
@@ -208,7 +215,11 @@ _INNER = "within"
 
 @cache
 def _hash_folder(folder: Path) -> str:
-    """Returns a hash of all Python files of a folder, which every function in it asks for."""
+    """Returns a hash of all Python files of a folder, for functions outside of the core.
+
+    If a file changes, so does the hash, and compiled code that was stored with the old hash is
+    not used any more. All functions of a folder ask for the same hash.
+    """
     digest = hashlib.sha256()
     for source in sorted(folder.glob("*.py")):
         digest.update(source.read_bytes())
@@ -517,7 +528,11 @@ class _LeafCompiler(Compiler):
 
 
 class _LaneLibrary(_LeafLibrary):
-    """The code of a function of lanes, in which all functions that it calls are inlined."""
+    """The code of a function of lanes, which computes a tick of several runs side by side.
+
+    All functions that it calls are inlined, because the compiler turns a loop over runs into
+    vector instructions only if the loop contains no calls.
+    """
 
     def _optimize_final_module(self) -> None:
         for function in self._final_module.functions:
@@ -528,7 +543,10 @@ class _LaneLibrary(_LeafLibrary):
 
 
 class _LaneCompiler(_LeafCompiler):
-    """Compiles a function of lanes. Its arguments do not overlap in memory."""
+    """Compiles a function of lanes, which computes a tick of several runs side by side.
+
+    The compiler may assume that the arguments do not overlap in memory.
+    """
 
     library_class = _LaneLibrary
     has_distinct_arguments = True
@@ -564,9 +582,10 @@ class _Leaf(CPUDispatcher):
         self._compiler._get_implementation = self._choose_implementation
 
     def _choose_implementation(self, arguments: tuple[Any, ...], _keywords: Any) -> Any:
-        """Returns the Python function to compile for given types of arguments.
+        """Returns the Python function to compile for given types of arguments. Numba calls it.
 
-        Numba calls this method.
+        This is the leaf itself, unless an argument is a row in lanes (several runs side by
+        side) and the leaf has an implementation of its own for lanes, see `set_lane_form`.
         """
         if self.choose_lane_form is not None and any(map(_is_in_lanes, arguments)):
             return self.choose_lane_form(arguments)

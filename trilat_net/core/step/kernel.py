@@ -74,7 +74,12 @@ def _place_arm(
 
 @leaf
 def _update_errors(s: SiteRow, chain: RowArray | None) -> None:
-    """Runs stage 4: the errors, the filtered error r, and the dynamics that the law needs."""
+    """Runs stage 4: writes the errors e, ed and r, and the dynamics that the law needs.
+
+    Args:
+        s: Row of the site; changed.
+        chain: Rows of the joints of a chain. None for the planar two-link arm.
+    """
     if chain is None:
         two_link_stages.update_errors(s)
     else:

@@ -526,7 +526,16 @@ def stack_site_arrays(
 
 
 def _share_tables(sites: Sequence[SiteArrays]) -> None:
-    """Shifts the indices of each site's points and torques to the rows of joined tables."""
+    """Adds to each site's indices the place of its rows in the joined tables of all sites.
+
+    The points of delay traces and outages and the torques of operators lie in two tables per
+    site. `stack_site_arrays` joins the tables of all sites, so the rows of the second site
+    begin after those of the first.
+
+    Args:
+        sites: Arrays of the sites, in the order of the joined tables. Their indices are
+            changed.
+    """
     first_point = 0
     first_torque = 0
     for site in sites:
@@ -610,7 +619,10 @@ def _stack_channels(
 
 
 def _stack_padded(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Returns arrays stacked, each filled up with zeros to the longest along every axis."""
+    """Stacks arrays of different lengths along a new first axis, filled up with zeros.
+
+    Example: arrays of the shapes (3,) and (5,) become one array of shape (2, 5).
+    """
     shapes = [array.shape for array in arrays]
     shape = np.max(shapes, axis=0)
     padded = []

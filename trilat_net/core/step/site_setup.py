@@ -385,7 +385,10 @@ class SiteSetup(NamedTuple):
 
     @property
     def layout(self) -> Layout:
-        """Lengths of the site's vectors."""
+        """Lengths of the vectors in the site's row, for example one number per joint.
+
+        Each body of the simulated scene adds seven numbers, its pose.
+        """
         layout = make_layout(self.chain, self.channel.record_size, self.actors)
         return layout._replace(bodies=7 * self.bodies)
 
@@ -403,7 +406,10 @@ class SiteSetup(NamedTuple):
         return join_received([*channels, self.channel])
 
     def law_context(self) -> LawContext:
-        """Returns the facts about the site that a user's law receives when it is created."""
+        """Returns the facts about the arm and its peers with which a user's law is created.
+
+        The dynamic parameters theta are empty if the scenario does not let the law know them.
+        """
         return LawContext(
             site=self.name,
             rate_hz=self.rate_hz,

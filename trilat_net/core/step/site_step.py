@@ -344,7 +344,14 @@ class Site:
         return memory
 
     def _write_measurement(self, measured: PlantState) -> None:
-        """Writes the state and the external torque of a measured arm into the site's row."""
+        """Writes the motion of an external arm, which its driver measured, into the site's row.
+
+        In a tick with a measurement, these numbers replace the simulated state of the arm.
+
+        Args:
+            measured: Angles, rad, and velocities, rad/s, of the joints, and the external torque
+                tau_x, N m. An empty torque counts as zero.
+        """
         s: Row = self._site[0]
         s.q = measured.q
         s.qd = measured.qd
@@ -389,7 +396,7 @@ class Site:
 
     @property
     def speed_limits(self) -> list[float]:
-        """Largest speed of each joint, rad/s."""
+        """Largest permitted speed of each joint, rad/s or m/s: the key `qd_limit_rad_s`."""
         limits: list[float] = self._site[0]["qd_limit"].tolist()
         return limits
 
@@ -410,7 +417,10 @@ class Site:
 
     @property
     def q(self) -> list[float]:
-        """Joint angles at the next tick, rad."""
+        """Joint angles at the next tick, rad, one per joint.
+
+        The last record has those of its own tick.
+        """
         joints = self.layout.joints
         angles: list[float] = self._site[0]["q"][:joints].tolist()
         return angles
@@ -542,10 +552,12 @@ class Site:
         return bool(model["kind"] == DelayKind.MEASURED)
 
     def peer_rate_hz(self, peer: int) -> int:
-        """Returns the tick rate of a peer, Hz.
+        """Returns the rate of a peer's control loop, Hz.
+
+        It may differ from the rate of this site.
 
         Args:
-            peer: Index of the peer.
+            peer: Index of the peer among the peers of this site.
         """
         return int(self._links[peer]["rate_hz"])
 

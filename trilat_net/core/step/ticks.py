@@ -341,7 +341,14 @@ def find_alarm(
 
 
 def _find_lost_alarm(lost: Sequence[str]) -> LifeAlarm | None:
-    """Returns the alarm of a site that goes on without lost peers, or None."""
+    """Returns the alarm of a site that goes on without lost peers. None if no peer is lost.
+
+    Example of its word: "WITHOUT m2". The alarm asks for no order, because a lost peer gets its
+    share back by itself.
+
+    Args:
+        lost: Names of the peers whose shares the others have.
+    """
     if not lost:
         return None
     names = ", ".join(lost)

@@ -47,7 +47,12 @@ def five(a: Vector) -> Five:
 
 @leaf
 def put(a: Any, values: Any) -> None:
-    """Copies the array `values` into the array `a` of the same length."""
+    """Copies numbers into an array, one by one, because compiled code must not allocate memory.
+
+    Args:
+        a: The array, which is changed.
+        values: At least as many numbers as `a` has entries.
+    """
     for i in range(a.shape[0]):
         a[i] = values[i]
 
