@@ -291,5 +291,5 @@ class DeviceHand:
 
 
 def _compute_product(first: Sequence[float], second: Sequence[float]) -> float:
-    """Returns the scalar product of two vectors."""
+    """Returns the scalar product of two vectors of equal length."""
     return sum(a * b for a, b in zip(first, second, strict=True))

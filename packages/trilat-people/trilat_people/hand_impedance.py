@@ -137,7 +137,11 @@ class HandImpedance(Result):
         }
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a table of the hand's motion and force, one row per shaking frequency."""
+        """Returns a table of the measured responses, one row per frequency of the sines.
+
+        A row has the magnitude and phase of the hand's motion and force at that frequency, so
+        that the fit can be checked.
+        """
         return [response._asdict() for response in self.responses]
 
     def to_hand(self) -> dict[str, Any]:
@@ -197,12 +201,19 @@ class HandImpedance(Result):
 
 
 def _format_response(response: SineResponse) -> tuple[str, ...]:
-    """Returns the numbers of a response as texts with three digits."""
+    """Returns the numbers of a response to one sine as table cells with three digits."""
     return tuple(f"{value:.3g}" for value in response)
 
 
 def _round_diagonal(matrix: Array) -> list[float]:
-    """Returns the diagonal of a matrix with four digits, where negative entries become 0."""
+    """Returns the diagonal of a matrix with four digits, for a scenario that models the hand.
+
+    A negative entry is an error of the measurement, because mass, damping and stiffness are not
+    negative. It becomes 0.
+
+    Args:
+        matrix: Identified mass, damping or stiffness, shape (D, D).
+    """
     rounded: list[float] = []
     for value in np.diag(matrix):
         four_digits = float(f"{value:.4g}")
@@ -326,10 +337,13 @@ class _Sines(NamedTuple):
 
 
 def _find_sines(scenario: Scenario) -> _Sines:
-    """Finds the sines that simulated operators of a scenario apply, at any site.
+    """Finds the sines with which simulated operators shake the arms, at any site.
+
+    The hand is identified by its response to these sines.
 
     Raises:
-        UsageError: The scenario has no sines.
+        UsageError: No operator of the scenario is of the kind `multisine`. The error says why
+            the hand cannot be identified then.
     """
     multisines: list[Multisine] = []
     for spec in scenario.sites.values():
@@ -552,7 +566,10 @@ def _can_distinguish(motions: Complex) -> bool:
 def _stack_real_and_imaginary(phasors: Complex) -> Array:
     """Returns the real parts followed by the imaginary parts, along the first axis.
 
-    This turns complex equations into twice as many real ones.
+    This turns K complex equations into 2 K real ones, whose unknowns stay real.
+
+    Args:
+        phasors: Array of the shape (K, ...).
     """
     return np.concatenate((phasors.real, phasors.imag))
 

@@ -9,7 +9,10 @@ from trilat_net.app.cli.options import flag, value
 
 
 class PageServing(NamedTuple):
-    """The options of a command that serves a page to browsers."""
+    """The options of a command that serves a page to browsers: address, encryption, browser.
+
+    `trilat live`, `trilat watch` and experiments with people share them.
+    """
 
     host: Annotated[
         str,

@@ -89,10 +89,11 @@ class CompletionComparison(NamedTuple):
 
 
 def is_completed(row: Row) -> bool:
-    """Tells whether a trial was completed and its time is therefore known.
+    """Returns True if a trial was completed, so that its completion time is known.
 
     Args:
-        row: The trial. A row without the key `succeeded` counts as completed.
+        row: The trial, with values or with the texts of a CSV file. A row without the key
+            `succeeded` counts as completed.
     """
     return str(row.get(SUCCESS, 1)).strip() not in ("0", "0.0", "False")
 
@@ -291,16 +292,19 @@ def _find_median_difference(pairs: Sequence[tuple[float, float]]) -> float | Non
 
 
 def _replace_infinity(time_s: float) -> float | None:
-    """Returns a median, or None for an infinite median, which was not reached."""
+    """Returns a median for a result: None instead of infinity, if it was not reached."""
     return time_s if math.isfinite(time_s) else None
 
 
 def to_table(
     results: Sequence[CompletionTime] | Sequence[CompletionComparison],
 ) -> list[dict[str, Any]]:
-    """Converts results to a table of plain values, one row per condition or comparison.
+    """Converts results to rows of plain values for CSV and JSON.
 
     Args:
         results: Completion times of conditions, or their comparisons.
+
+    Returns:
+        A row per condition or comparison, with the field names as keys.
     """
     return [result._asdict() for result in results]

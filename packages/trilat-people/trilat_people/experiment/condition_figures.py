@@ -140,7 +140,12 @@ def _list_unit_lines(
 
 
 def _label_conditions(axes: Axes, values: Mapping[str, Mapping[str, float]]) -> None:
-    """Labels the horizontal axis with the conditions and their numbers of units."""
+    """Labels the horizontal axis with each condition and its number of participants or pairs.
+
+    Args:
+        axes: The panel.
+        values: Values by condition and then by participant or pair.
+    """
     labels: list[str] = []
     for condition, values_by_unit in values.items():
         unit_count = len(values_by_unit)
@@ -179,7 +184,14 @@ def _plot_times(
 def _mark_beyond_limit(
     axes: Axes, positions: Sequence[float], limit_s: float, look: Look
 ) -> None:
-    """Draws open markers on the line of the time limit, one at each position."""
+    """Draws open markers on the line of the time limit, for medians that were not reached.
+
+    Args:
+        axes: The panel.
+        positions: Horizontal positions of the markers.
+        limit_s: Time limit of a trial, in s.
+        look: Plot options of the condition, from which the markers get form and colour.
+    """
     open_marker: Look = {
         "marker": look["marker"],
         "markersize": look["markersize"] + 1.0,
@@ -232,7 +244,10 @@ def draw_learning(
 
 
 def _assign_looks(rows: Sequence[Row]) -> dict[str, Look]:
-    """Returns the options of each condition's line, in the order of the rows."""
+    """Returns the plot options of the line of each condition, which differ in their colour.
+
+    Colours follow the order in which conditions appear in the rows, and repeat after the last.
+    """
     conditions = dict.fromkeys(row["condition"] for row in rows)
     looks: dict[str, Look] = {}
     for index, condition in enumerate(conditions):
@@ -248,7 +263,7 @@ def _label_trials(axes: Axes) -> None:
 
 
 def _group_by_trial(rows: Sequence[Row], condition: str) -> dict[Any, list[Row]]:
-    """Returns the rows of a condition by the number of the trial, in ascending order."""
+    """Returns the rows of a condition by the number of the trial in its block, ascending."""
     groups: dict[Any, list[Row]] = {}
     for row in rows:
         if row["condition"] == condition:
@@ -258,7 +273,16 @@ def _group_by_trial(rows: Sequence[Row], condition: str) -> dict[Any, list[Row]]
 
 
 def _draw_learning_times(rows: Sequence[Row], limit_s: float, unit: str) -> Figure:
-    """Draws completion times over the trials, for trials with a time limit."""
+    """Draws the median completion time over the trials of a block.
+
+    The task has a time limit, and some trials were not completed. Trials whose median was not
+    reached have an open marker on the line of the limit.
+
+    Args:
+        rows: Rows of the trials.
+        limit_s: Time limit of a trial, in s.
+        unit: "participant" or "pair".
+    """
     with style.styled_figure(_FORM, _HEIGHT_IN) as figure:
         axes = _add_panel(figure, COMPLETION)
         axes.axhline(limit_s, **_LIMIT)
@@ -280,7 +304,10 @@ def _draw_learning_times(rows: Sequence[Row], limit_s: float, unit: str) -> Figu
 
 
 def _add_panel(figure: Figure, measure: str) -> Axes:
-    """Adds the only panel of a figure, labelled with a measure and its unit."""
+    """Adds the only panel of a figure, labelled with a measure and its unit.
+
+    The unit is the end of the name: "path_m" is labelled "path, m".
+    """
     panels = style.add_panels(figure, 1, 1)
     axes: Axes = panels[0, 0]
     name, unit = split_unit(measure)
@@ -290,6 +317,13 @@ def _add_panel(figure: Figure, measure: str) -> Axes:
 
 
 def _plot_interval(axes: Axes, position: float, mean: ConditionMean, look: Look) -> None:
-    """Draws the vertical line of an interval, or a point at the mean without an interval."""
+    """Draws the vertical line of a confidence interval, or a point if there is no interval.
+
+    Args:
+        axes: The panel.
+        position: Horizontal position of the condition.
+        mean: Mean of the condition. With a single participant it has no interval.
+        look: Plot options.
+    """
     ends = mean.interval or (mean.mean, mean.mean)
     axes.plot([position, position], ends, **look)

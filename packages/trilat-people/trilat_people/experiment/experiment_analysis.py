@@ -173,10 +173,10 @@ class ExperimentAnalysis(Result):
         self.paths: list[Path] = []
 
     def _check_excluded(self) -> None:
-        """Checks that the excluded participants or pairs exist.
+        """Checks that the participants or pairs that the user excludes exist.
 
         Raises:
-            UsageError: One of them does not exist.
+            UsageError: An excluded name is not in the plan. The error lists the names that are.
         """
         groups = self._experiment.plan.protocol.groups
         names = {"-".join(group) for group in groups}
@@ -188,23 +188,45 @@ class ExperimentAnalysis(Result):
             )
 
     def _is_counted(self, row: Mapping[str, Any]) -> bool:
-        """Returns True if a trial counts: not excluded, not for practice and no catch trial."""
+        """Returns True if a trial enters the statistics.
+
+        Trials for practice, catch trials (which check attention), and the trials of excluded
+        participants do not.
+
+        Args:
+            row: Row of the trial, as in trials.csv.
+        """
         if row[self.unit] in self._exclude:
             return False
         return not (row["practice"] or row["catch"])
 
     def _sort_by_condition(self, rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-        """Returns rows in the protocol's order of conditions."""
+        """Returns rows in the order in which the protocol lists the conditions.
+
+        Tables and figures then show the conditions in the order of the author. Rows of one
+        condition keep their order.
+        """
         conditions = list(self._experiment.plan.protocol.conditions)
         return sorted(rows, key=lambda row: conditions.index(row["condition"]))
 
     def _list_unit_measures(self) -> list[str]:
-        """Lists the measures that each unit has once per condition: gains, thresholds."""
+        """Lists the measures that a participant or pair has only once per condition.
+
+        These are gains by a training and perception thresholds: names that begin with "gain_"
+        or "threshold_".
+        """
         keys = [key for row in (*self.gain_rows[:1], *self.threshold_rows[:1]) for key in row]
         return [key for key in keys if key.startswith(("gain_", "threshold_"))]
 
     def _compare_measure(self, measure: str) -> None:
-        """Summarises and compares a measure, if it has a number in any trial."""
+        """Stores the means of a measure per condition, and the tests between conditions.
+
+        A measure without a number in any trial is left out. So are completion times of which
+        some are censored (known only to exceed the limit), because their mean would be biased.
+
+        Args:
+            measure: Name of the measure, for example "path_m".
+        """
         # A mean of censored times is biased: `times` has their medians instead.
         if measure == COMPLETION and self._has_censored_times():
             return
@@ -214,30 +236,42 @@ class ExperimentAnalysis(Result):
             self.comparisons[measure] = compare_conditions(rows, measure, unit=self.unit)
 
     def _has_censored_times(self) -> bool:
-        """Returns True if some of the trials that count were not completed."""
+        """Returns True if some of the trials that count were not completed.
+
+        Their completion times are censored: known only to be longer than the limit. Then the
+        analysis uses medians in place of means.
+        """
         return any(time.censored for time in self.times)
 
     @property
     def _limit_s(self) -> float:
-        """Time limit of a trial, in s."""
+        """Time limit of a trial after its target has appeared, in s."""
         return self._experiment.plan.protocol.task.longest_s
 
     @property
     def _is_reaching(self) -> bool:
-        """True if the task is to reach targets."""
+        """True if the task is to reach targets, which is the only task with a throughput."""
         return self._experiment.plan.protocol.task.description.startswith("reaching")
 
     def _summarise_times(self) -> None:
-        """Summarises the completion times, and compares them if some are missing."""
+        """Stores the median completion time of each condition.
+
+        If some trials were not completed, it also compares the conditions by sign tests,
+        because a t test needs means.
+        """
         self.times = summarise_times(self.rows, self._limit_s, unit=self.unit)
         if self._has_censored_times():
             self.time_comparisons = compare_times(self.rows, unit=self.unit)
 
     def _find_absent(self, forms: Sequence[str]) -> dict[str, str]:
-        """Returns the reason for each measure that this experiment could have and lacks.
+        """Explains measures that this experiment could have and lacks, for the report.
 
         Args:
-            forms: Names of the questionnaires.
+            forms: Names of the questionnaires that are answered after each block.
+
+        Returns:
+            The reason by the name of the measure, for example {"tlx": "nobody has answered
+            it"}.
         """
         absent = {}
         for name in forms:
@@ -316,9 +350,13 @@ class ExperimentAnalysis(Result):
         return [row for row in self._scores if measure in row]
 
     def _find_throughput(self) -> Iterator[dict[str, Any]]:
-        """Yields the throughput of each unit and condition, if the task is reaching.
+        """Yields the throughput of each participant or pair under each condition, in bit/s.
 
-        The throughput combines speed and accuracy. It needs at least two completed trials.
+        The throughput combines the speed and the accuracy of aimed movements. It needs at least
+        two completed trials, and only the reaching task has it.
+
+        Yields:
+            Rows with the name, the condition and "throughput_bits_s".
         """
         if not self._is_reaching:
             return
@@ -365,7 +403,14 @@ class ExperimentAnalysis(Result):
                 yield {self.unit: unit, "condition": condition, **gains}
 
     def _is_censored(self, measure: str) -> bool:
-        """Returns True if a measure is the completion time and some of them are missing."""
+        """Returns True if a measure is the completion time and some trials were not completed.
+
+        The trials of all phases of a training count here, in contrast to `_has_censored_times`.
+        The answer decides between means and medians.
+
+        Args:
+            measure: Name of a measure.
+        """
         has_limit = self._experiment.plan.protocol.task.has_limit
         if measure != COMPLETION or not has_limit:
             return False
@@ -389,9 +434,14 @@ class ExperimentAnalysis(Result):
         return reached
 
     def _find_thresholds(self) -> Iterator[dict[str, Any]]:
-        """Yields the threshold of each unit and condition, if the protocol has a staircase.
+        """Yields the perception threshold of each participant under each condition.
 
-        Staircases without enough reversals have no threshold.
+        The threshold is the difference at which a share of the answers is right that the
+        staircase determines. Blocks with too few reversals of the staircase have no threshold,
+        and protocols without a staircase have none at all.
+
+        Yields:
+            Rows with the name, the condition, and the threshold under the name of its measure.
         """
         plan = self._experiment.plan
         choices = self._experiment.list_choices()
@@ -412,7 +462,11 @@ class ExperimentAnalysis(Result):
                 }
 
     def _write_methods(self) -> str:
-        """Returns the methods paragraph of a paper, with the numbers of this experiment."""
+        """Returns the methods paragraph of a paper, with the numbers of this experiment.
+
+        It states participants, design, delays, control law, gains, measures, the tests that
+        were computed, and the digest of the plan. `write_methods` forms the sentences.
+        """
         plan = self._experiment.plan
         protocol = plan.protocol
         scenario = next(iter(plan.scenarios.values()))
@@ -456,7 +510,11 @@ class ExperimentAnalysis(Result):
         return write_methods(facts)
 
     def _list_computed(self) -> list[str]:
-        """Lists which analyses were computed, of those that a methods paragraph describes."""
+        """Lists the analyses that were computed, so that the methods paragraph names no others.
+
+        Example: ["intervals", "t tests", "effect sizes"]. With one participant the list is
+        empty.
+        """
         tests = list(chain.from_iterable(self.comparisons.values()))
         means = list(chain.from_iterable(self.means.values()))
         is_computed = {
@@ -471,7 +529,11 @@ class ExperimentAnalysis(Result):
         return [analysis for analysis, computed in is_computed.items() if computed]
 
     def _describe_times(self) -> str:
-        """Returns the sentence about trials that were not completed. Empty if all were."""
+        """Returns the sentence of the methods paragraph about trials that were not completed.
+
+        It states how many ran into the time limit and how many failed sooner. Empty if all
+        trials were completed.
+        """
         trials = sum(time.trials for time in self.times)
         censored = sum(time.censored for time in self.times)
         if not censored:
@@ -487,7 +549,10 @@ class ExperimentAnalysis(Result):
         )
 
     def _describe_missing_answers(self) -> str:
-        """Returns the sentence about missing answers. Empty if no answer is missing."""
+        """Returns the sentence of the methods paragraph about missing answers.
+
+        Empty if no answer to a questionnaire is missing.
+        """
         missing = sum(answers.missing for answers in self.missing_answers)
         question_count = sum(answers.asked for answers in self.missing_answers)
         unscored = sum(answers.unscored for answers in self.missing_answers)
@@ -525,7 +590,10 @@ class ExperimentAnalysis(Result):
         return self
 
     def _encode_files(self) -> dict[str, str]:
-        """Returns the contents of the text files by file name."""
+        """Returns the contents of the tables, the methods paragraph and the JSON by file name.
+
+        Tables about completion times and missing answers exist only if they have a row.
+        """
         tables = {
             "conditions.csv": self._list_means(),
             "comparisons.csv": self.to_rows(),
@@ -545,7 +613,12 @@ class ExperimentAnalysis(Result):
         return texts
 
     def _draw_figures(self) -> dict[str, Any]:
-        """Draws the figures, and returns them by name."""
+        """Draws a figure for each measure, and one that shows learning over the trials.
+
+        Returns:
+            The figures by the names of their files without the ending. "learning" exists only
+            if there is more than one trial in a block.
+        """
         figures = {
             name: draw_conditions(self.of(name), name, unit=self.unit) for name in self.means
         }
@@ -606,14 +679,17 @@ class ExperimentAnalysis(Result):
                 yield fit_mixed_model(rows, f"{measure}_n")
 
     def _list_means(self) -> list[dict[str, Any]]:
-        """Returns a row for each measure and condition."""
+        """Returns the table conditions.csv: a row for each measure and condition."""
         rows: list[dict[str, Any]] = []
         for measure, means in self.means.items():
             rows += [{"measure": measure, **mean._asdict()} for mean in means]
         return rows
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns the comparisons as a table, one row per measure and pair of conditions."""
+        """Returns the comparisons as a table, one row per measure and pair of conditions.
+
+        This is the file comparisons.csv, and the data frame of this result.
+        """
         return [test._asdict() for test in chain.from_iterable(self.comparisons.values())]
 
     def to_dict(self) -> dict[str, Any]:
@@ -672,7 +748,11 @@ class ExperimentAnalysis(Result):
         yield self.methods
 
     def _write_time_blocks(self) -> Iterator[Block]:
-        """Yields the numbers of completed trials, and the completion times."""
+        """Yields a table of completion times: trials, failures and median for each condition.
+
+        A second table compares the conditions if some trials were not completed. Nothing is
+        yielded for a task without a time limit.
+        """
         if not self.times:
             return
         yield (
@@ -711,7 +791,10 @@ class ExperimentAnalysis(Result):
             yield ""
 
     def _write_measure_blocks(self) -> Iterator[Block]:
-        """Yields a table of conditions and a table of comparisons for each measure."""
+        """Yields two tables for each measure: means of the conditions, and their comparisons.
+
+        The second table is left out if there is only one condition.
+        """
         for measure, means in self.means.items():
             yield f"{measure}, mean over {self.unit}s, {100 * CONFIDENCE:g} % interval"
             rows = [
@@ -744,7 +827,10 @@ class ExperimentAnalysis(Result):
                 yield ""
 
     def _write_model_blocks(self) -> Iterator[Block]:
-        """Yields a table of effects for each mixed model."""
+        """Yields a table for each mixed model: effects of the conditions on the users' forces.
+
+        There are models only if users act in pairs, see `fit_models`.
+        """
         for model in self.models:
             yield f"{model.measure} of each user, mixed model against {model.reference}"
             rows = [
@@ -761,7 +847,10 @@ class ExperimentAnalysis(Result):
             yield ""
 
     def _write_single_unit_block(self, unit: str) -> Iterator[Block]:
-        """Yields a table of all measures, with a column for each condition.
+        """Yields one table of all measures, with a column for each condition.
+
+        It replaces the tables of means and comparisons, because one participant or pair allows
+        no interval and no test.
 
         Args:
             unit: Name of the only participant or pair.
@@ -911,7 +1000,7 @@ def compute_experiment_power(
 
 
 def _describe_mean(mean: ConditionMean) -> str:
-    """Returns a mean as text, with the number of missing values if there are any."""
+    """Returns a mean as text: "1.234", or "1.234 (2 missing)" if values are missing."""
     missing = f" ({mean.missing} missing)" if mean.missing else ""
     return f"{mean.mean:.4g}{missing}"
 
@@ -927,7 +1016,11 @@ def _list_points(rows: Sequence[Row], name: str) -> Array:
 
 
 def _format_interval(interval: tuple[float, float | None] | None) -> str:
-    """Returns an interval as text. An upper end of None was not reached."""
+    """Returns an interval as text, for example "[3.06, 3.22]".
+
+    An upper end of None lies beyond the time limit, and is written as `NOT_REACHED`. Without an
+    interval the text is "-".
+    """
     if interval is None:
         return "-"
     low, high = interval
@@ -936,7 +1029,10 @@ def _format_interval(interval: tuple[float, float | None] | None) -> str:
 
 
 def _flatten(row: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Yields the cells of a row. An interval has a cell for each end."""
+    """Yields the cells of a CSV row.
+
+    An interval becomes two cells, for example "interval_low".
+    """
     for key, value in row.items():
         if key in ("interval", "bootstrap"):
             low, high = value or (None, None)

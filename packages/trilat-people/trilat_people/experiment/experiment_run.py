@@ -145,7 +145,10 @@ class Experiment(Result):
         return RunJournal(self.folder / NOTES_FILE, self.plan.digest, Note, self._remedy)
 
     def read_entries(self) -> dict[int, TrialEntry]:
-        """Returns the results of the finished trials, by their numbers in the plan."""
+        """Returns the results of the finished trials, by their numbers in the plan.
+
+        Example: {1: TrialEntry(...), 2: TrialEntry(...)}. Empty before the first trial.
+        """
         with self.open_trials() as journal:
             return {entry.cell: entry for entry in journal.done.values()}
 
@@ -161,9 +164,14 @@ class Experiment(Result):
             return list(journal.done.values())
 
     def list_choices(self) -> Choices:
-        """Returns which trial participants chose in each pair of a staircase.
+        """Returns the choices of participants in the perception test of the experiment.
 
-        A staircase presents pairs of trials, and asks in which one the difference was larger.
+        A staircase presents pairs of trials, and asks in which one the quantity was larger. The
+        choices decide how different the next pair is.
+
+        Returns:
+            The chosen trial, 1 or 2, by the number of the second trial of the pair. Empty
+            without a staircase, and for pairs without an answer.
         """
         if self.plan.protocol.staircase is None:
             return {}
@@ -217,7 +225,10 @@ class Experiment(Result):
                 notes.add(note)
 
     def status(self) -> ExperimentStatus:
-        """Returns how many trials are done, and which trial is next."""
+        """Returns the progress: how many trials are done, and which trial is next.
+
+        It is read from the journal, so another process may be running the experiment.
+        """
         done = self.read_entries()
         remaining = [trial for trial in self.plan.trials if trial.number not in done]
         next_trial = remaining[0] if remaining else None
@@ -275,7 +286,13 @@ class Experiment(Result):
     def _describe_trial(
         self, planned: PlannedTrial, entry: TrialEntry, choices: Choices
     ) -> dict[str, Any]:
-        """Returns the row of a trial: its place in the plan, result, measures and log."""
+        """Returns the row of a finished trial in trials.csv.
+
+        Args:
+            planned: The trial in the plan: number, participants, condition, block.
+            entry: Its result from the journal: success, measures, and the digest of its log.
+            choices: Choices of the participants in a staircase, see `list_choices`.
+        """
         row: dict[str, Any] = {
             "trial_number": planned.number,
             self.unit: "-".join(planned.group),
@@ -299,16 +316,22 @@ class Experiment(Result):
         }
 
     def _describe_pair(self, planned: PlannedTrial, choices: Choices) -> dict[str, Any]:
-        """Returns the columns of a trial in a staircase. Practice trials have no values."""
+        """Returns the two columns that a trial of a staircase has in addition.
+
+        Returns:
+            "difference", between the two trials of the pair, and "right", 1 if the choice was
+            right and 0 if not. Both are None for practice, and "right" is None before the
+            choice.
+        """
         if planned.practice:
             return {"difference": None, "right": None}
         difference, right = self.plan.find_pair(planned, choices)
         return {"difference": difference, "right": None if right is None else int(right)}
 
     def list_answers(self) -> list[dict[str, Any]]:
-        """Returns a row for each item of a questionnaire that people have completed.
+        """Returns what people answered, with a row for each item of each questionnaire.
 
-        The value of a missing answer is None.
+        The file questionnaires.csv has these rows. The value of a missing answer is None.
         """
         rows: list[dict[str, Any]] = []
         for columns, note in self._read_answer_notes():
@@ -337,7 +360,11 @@ class Experiment(Result):
         return rows
 
     def _read_answer_notes(self) -> Iterator[tuple[dict[str, Any], Note]]:
-        """Yields the notes with answers, each with the first columns of its row."""
+        """Yields the notes with answers to a questionnaire, each with its first columns.
+
+        These columns say whose answers they are and which condition the block before had.
+        Choices of a staircase are such notes, too.
+        """
         conditions: dict[tuple[tuple[str, ...], int], str] = {}
         for trial in self.plan.trials:
             if not trial.catch:
@@ -386,7 +413,10 @@ class Experiment(Result):
         return self.folder / TRIALS_FILE
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns the progress, which `trilat experiment status --json` prints."""
+        """Returns the progress as plain values, which `trilat experiment status --json` prints.
+
+        "trials" is the number of planned trials, and "done" that of finished ones.
+        """
         status = self.status()
         protocol = self.plan.protocol
         return {
@@ -433,13 +463,22 @@ _SHOWN_MEASURES = ("error_end_mm", "error_rms_mm", "path_m", "sparc")
 
 
 def _describe_mean(rows: list[dict[str, Any]], measure: str) -> str:
-    """Returns the text of the mean of a measure over trials."""
+    """Returns the mean of a measure over trials as text, with three digits.
+
+    Args:
+        rows: Rows of finished trials, at least one.
+        measure: Name of the measure, for example "path_m".
+    """
     mean = sum(row[measure] for row in rows) / len(rows)
     return f"{mean:.3g}"
 
 
 def _describe_median(rows: list[dict[str, Any]]) -> str:
-    """Returns the text of the median completion time of trials, in s."""
+    """Returns the median completion time of trials as text, in s.
+
+    A trial that was not completed counts as longer than any other. If this concerns the median,
+    the text is "not reached".
+    """
     times_s = [row[COMPLETION] if is_completed(row) else math.inf for row in rows]
     median_s = find_median(times_s)
     return f"{median_s:.3g}" if math.isfinite(median_s) else "not reached"

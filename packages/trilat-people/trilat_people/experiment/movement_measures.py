@@ -57,7 +57,10 @@ def _read(name: str, values: ArrayLike, dimensions: int) -> Array:
 
 
 def _read_same_shape(**values: ArrayLike) -> list[Array]:
-    """Returns several arrays of samples, all of the same shape (K, D).
+    """Returns several arrays of samples as floats, after checking that their shapes agree.
+
+    Args:
+        **values: Arrays of K samples with D axes, shape (K, D), by the name for messages.
 
     Raises:
         UsageError: The shapes differ, or a sample is not finite.
@@ -71,7 +74,15 @@ def _read_same_shape(**values: ArrayLike) -> list[Array]:
 
 
 def _integrate(values: Array, rate_hz: float) -> float:
-    """Returns the integral over time of samples, shape (K,), by the trapezoidal rule."""
+    """Returns the integral over time of K samples, shape (K,), by the trapezoidal rule.
+
+    Args:
+        values: The samples, at a constant rate.
+        rate_hz: Rate of the samples, 1/s.
+
+    Returns:
+        The integral, in the unit of the samples times s.
+    """
     return float(np.trapezoid(values)) / rate_hz
 
 
@@ -399,7 +410,10 @@ TLX_SCALES = ("mental", "physical", "temporal", "performance", "effort", "frustr
 
 
 def _list_ratings(ratings: Mapping[str, float]) -> list[float]:
-    """Returns the six ratings in the order of `TLX_SCALES`.
+    """Returns the six ratings of NASA-TLX in the order of `TLX_SCALES`.
+
+    Args:
+        ratings: Rating from 0 to 100 by the name of the scale.
 
     Raises:
         UsageError: A scale is missing or unknown, or a rating is not between 0 and 100.

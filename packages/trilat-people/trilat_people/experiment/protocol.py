@@ -91,10 +91,11 @@ class Training(Frozen, frozen=True):
     rest_s: Annotated[float, Meta(ge=0.0, le=1e6)] = 600.0
 
     def describe(self) -> str:
-        """Describes how the authority over the slave moved from the expert to the learner.
+        """Describes in a sentence how the training was laid out, for the methods of a paper.
 
-        Returns:
-            A sentence for the methods section of a paper.
+        In a training, an expert first leads the slave, and the learner gets more and more of
+        the authority. The sentence states the course of the expert's part, as in "0.9 to 0.1
+        (guided)", and the numbers of trials before, after and for retention.
         """
         courses: list[str] = []
         for condition, (first, last) in self.lead.items():
@@ -215,7 +216,11 @@ class Protocol(Frozen, frozen=True):
 
     @property
     def groups(self) -> list[tuple[str, ...]]:
-        """Participants who take part together, as tuples of one or two pseudonyms."""
+        """Participants who take part together, as tuples of one or two pseudonyms.
+
+        The protocol lists pseudonyms or states a number. A number of 12 gives P01 to P12. With
+        two users in the task, consecutive participants form pairs.
+        """
         participants = self.participants
         if isinstance(participants, int):
             digits = len(str(participants))
@@ -269,7 +274,10 @@ class PlannedTrial(NamedTuple):
 
     @property
     def file(self) -> str:
-        """File name of the trial's log."""
+        """File name of the trial's log: number, participants, block, trial and condition.
+
+        Example: "00017-P01-P02-b1-t03-near.mcap".
+        """
         group = "-".join(self.group)
         position = f"b{self.block}-t{self.trial:02d}"
         return f"{self.number:05d}-{group}-{position}-{self.condition}.mcap"
@@ -297,7 +305,11 @@ class Step(NamedTuple):
 
     @property
     def key(self) -> str:
-        """Identifier of the step, with which notes and messages refer to it."""
+        """Identifier of the step, by which notes in the journal and messages refer to it.
+
+        It consists of the kind, the number of the trial and, for a questionnaire, its name:
+        "trial 17", "questionnaire 24 tlx".
+        """
         key = f"{self.kind} {self.planned.number}"
         if self.form is not None:
             return f"{key} {self.form.name}"
@@ -326,7 +338,8 @@ class ExperimentPlan(Result):
         """Summarises the plan, as `trilat experiment check --json` prints it.
 
         Returns:
-            Plain values, ready for JSON.
+            Counts, conditions, and the order of the conditions for each group, ready for JSON.
+            "counted" is the number of trials that are neither for practice nor catch trials.
         """
         protocol = self.protocol
         uncounted = [trial for trial in self.trials if trial.practice or trial.catch]
@@ -451,6 +464,9 @@ class ExperimentPlan(Result):
     def rest_before_s(self, planned: PlannedTrial) -> float:
         """Returns how long participants must at least rest before a trial, in s.
 
+        The rest precedes the first trial of each later block, and the retention test of a
+        training. It is 0 before all other trials.
+
         Args:
             planned: The trial in the plan.
         """
@@ -468,7 +484,8 @@ class ExperimentPlan(Result):
         """Returns the order in which each group of participants gets the conditions.
 
         Returns:
-            Names of the conditions in order, by the name of the group.
+            Names of the conditions in order, by the name of the group: {"P01-P02": ["near",
+                "far"]}.
         """
         orders: dict[str, list[str]] = {}
         for trial in self.trials:
@@ -481,7 +498,11 @@ class ExperimentPlan(Result):
         return orders
 
     def blocks(self) -> Iterator[Block]:
-        """Yields the parts of the text that `trilat experiment check` prints."""
+        """Yields the parts of the text that `trilat experiment check` prints.
+
+        Before any person is invited, the experimenter reads there how many trials there are,
+        how long each takes at most, and in which order each group gets the conditions.
+        """
         protocol = self.protocol
         facts = self.to_dict()
         unit = "pair" if len(protocol.users) > 1 else "participant"
@@ -591,7 +612,11 @@ def _list_keys(table: Mapping[str, Any], path: str = "") -> dict[str, Any]:
 
 
 def _find_problems(protocol: Protocol) -> Iterator[str]:
-    """Yields the problems of a protocol that are visible without its scenario."""
+    """Yields the problems of a protocol that are visible without its scenario.
+
+    Each problem is a sentence that names the key. The author sees all of them at once.
+    `_check_scenario` finds the problems with the scenario.
+    """
     shortest_s, longest_s = protocol.foreperiod_s
     if shortest_s > longest_s:
         foreperiod_s = list(protocol.foreperiod_s)
@@ -603,12 +628,12 @@ def _find_problems(protocol: Protocol) -> Iterator[str]:
 
 
 def _list_pseudonyms(protocol: Protocol) -> list[str]:
-    """Returns the pseudonyms of all participants."""
+    """Returns the pseudonyms of all participants, in the order of the groups."""
     return [name for group in protocol.groups for name in group]
 
 
 def _find_pseudonym_problems(protocol: Protocol) -> Iterator[str]:
-    """Yields the problems with the pseudonyms of participants."""
+    """Yields a sentence for each pseudonym that two participants have, or nobody has."""
     names = _list_pseudonyms(protocol)
     if len(set(names)) < len(names):
         yield "two participants have the same pseudonym"
@@ -618,7 +643,11 @@ def _find_pseudonym_problems(protocol: Protocol) -> Iterator[str]:
 
 
 def _find_table_problems(protocol: Protocol) -> Iterator[str]:
-    """Yields the problems with catch trials, a training, or a staircase."""
+    """Yields a sentence for each contradiction in the optional tables of a protocol.
+
+    These are [catch] (trials that check attention), [training] and [staircase] (a perception
+    test), of which some exclude each other.
+    """
     catch = protocol.catch
     training = protocol.training
     staircase = protocol.staircase
@@ -638,7 +667,7 @@ def _find_table_problems(protocol: Protocol) -> Iterator[str]:
 
 
 def _find_form_problems(protocol: Protocol) -> Iterator[str]:
-    """Yields the problems with the questionnaires."""
+    """Yields a sentence for each questionnaire that is unknown or has a name twice."""
     names = [form.name for form in protocol.forms]
     if len(set(names)) < len(names):
         yield "two questionnaires have the same name"
@@ -675,7 +704,15 @@ def _find_group_problems(protocol: Protocol) -> Iterator[str]:
 
 
 def _find_staircase_problems(protocol: Protocol, staircase: Staircase) -> Iterator[str]:
-    """Yields the problems of a protocol with a staircase."""
+    """Yields a sentence for each rule of a perception test that the protocol breaks.
+
+    A staircase needs exactly one user, an even number of trials, and a key that no condition
+    sets.
+
+    Args:
+        protocol: The protocol.
+        staircase: Its table [staircase].
+    """
     if len(protocol.users) != 1:
         yield "staircase: needs exactly one user, who answers after each pair of trials"
     if protocol.trials % 2:

@@ -65,7 +65,7 @@ class Questionnaire(Frozen, frozen=True):
 
     @property
     def is_forced(self) -> bool:
-        """True if every item must be answered."""
+        """True if every item must be answered, as for the choice of a perception test."""
         return self.name == CHOICE
 
     def read(self, values: Sequence[float | None]) -> dict[str, float | None]:
@@ -91,7 +91,10 @@ class Questionnaire(Frozen, frozen=True):
         return dict(zip(self.items, values, strict=True))
 
     def _is_valid(self, value: float | None) -> bool:
-        """Returns True if a value is on the scale, or is a missing answer that is allowed."""
+        """Returns True if a value is on the scale, or is a missing answer that is allowed.
+
+        A scale of 0 to 100 in steps of 5 has the values 0, 5, 10 and so on.
+        """
         if value is None:
             return not self.is_forced
         return value in range(self.least, self.most + 1, self.step)
@@ -119,7 +122,7 @@ class Questionnaire(Frozen, frozen=True):
 
 @cache
 def _read_shipped() -> dict[str, Any]:
-    """Returns the shipped questionnaires as tables, by name."""
+    """Returns the questionnaires of this package as TOML tables, by name, such as "tlx"."""
     source = resources.files(__package__) / "questionnaires.txt"
     tables: dict[str, Any] = tomllib.loads(source.read_text(encoding="utf-8"))
     return tables

@@ -70,7 +70,7 @@ class Staircase(Frozen, frozen=True):
 
     @property
     def form(self) -> Questionnaire:
-        """Questionnaire that participants answer after each pair of trials.
+        """Questionnaire with the question that participants answer after each pair of trials.
 
         The answer is 1 or 2, the trial of the pair in which the value seemed larger.
         """
@@ -173,7 +173,11 @@ class Staircase(Frozen, frozen=True):
         return comparison if difference + error > 0.0 else standard
 
     def describe(self) -> str:
-        """Describes in a sentence how the perception threshold was measured, for a paper."""
+        """Describes in a sentence how the perception threshold was measured, for a paper.
+
+        The sentence states the key, its standard value, the rule for the differences, and the
+        share of right answers to which the threshold belongs.
+        """
         right_percent = 100.0 * 0.5 ** (1.0 / self.down)
         return (
             f"{self.key} was adapted in a two-interval forced choice against "

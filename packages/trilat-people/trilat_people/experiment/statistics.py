@@ -42,7 +42,10 @@ _ROUNDING = 1e-12
 
 
 def import_scipy_stats() -> Any:
-    """Imports and returns the module `scipy.stats`, which only the statistics need."""
+    """Imports and returns the module `scipy.stats`.
+
+    It takes longer to import than everything else of an experiment, and trials do not need it.
+    """
     # The import takes half a second, and most commands do not need it.
     from scipy import stats
 
@@ -179,7 +182,16 @@ def summarise_conditions(
 
 
 def _summarise(condition: str, values: list[float], seed: int) -> ConditionMean:
-    """Returns mean, spread and intervals of the means of the units."""
+    """Returns mean, deviation and confidence intervals of one condition.
+
+    Args:
+        condition: Name of the condition.
+        values: Mean over trials of each participant or pair, at least one.
+        seed: Seed of the bootstrap, which draws the participants anew.
+
+    Returns:
+        The summary. With a single participant it has no deviation and no interval.
+    """
     mean = mean_interval(values)
     if mean is None:
         return ConditionMean(
@@ -504,7 +516,7 @@ def _fit(formulas: Any, frame: Any, measure: str) -> Any:
 
 
 def _find_pairs(rows: Sequence[Row]) -> dict[str, str]:
-    """Returns the pair of each participant.
+    """Returns the pair to which each participant belongs, by the participant's pseudonym.
 
     Raises:
         UsageError: A participant is in two pairs, or no pair has two participants.
@@ -676,7 +688,7 @@ def simulate_power(
 
 
 def _list_rows(values: Array, means: Mapping[str, float]) -> list[Row]:
-    """Returns a row for each simulated trial.
+    """Returns simulated trials in the form of rows, as an experiment would have them.
 
     Args:
         values: Deviations from the means, by participant, condition and trial.
@@ -795,6 +807,8 @@ def write_methods(facts: Mapping[str, Any]) -> str:
 def _check_facts(facts: Mapping[str, Any]) -> None:
     """Checks that the facts of a methods paragraph are known and complete.
 
+    A misspelt fact would otherwise be missing in the paper without anybody noticing.
+
     Raises:
         UsageError: A fact is missing or unknown, or a condition has no delay.
     """
@@ -864,7 +878,15 @@ def _capitalise(sentence: str) -> str:
 
 
 def _format_fact(value: Any, key: str = "") -> str:
-    """Returns a fact as text, with all digits of its numbers and the unit of its key."""
+    """Returns a fact of the methods paragraph as text, with all digits of its numbers.
+
+    A number gets the unit at the end of its key: {"delay_ms": 50} becomes "delay 50 ms".
+    Several entries or items are joined by commas.
+
+    Args:
+        value: The fact: a number, a text, a mapping or a sequence.
+        key: Its name, whose ending states the unit.
+    """
     if isinstance(value, str):
         return value
     if isinstance(value, Mapping):

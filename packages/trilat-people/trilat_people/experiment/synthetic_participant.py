@@ -67,13 +67,13 @@ class ParticipantModel(Frozen, frozen=True):
     spread: Share = 0.15
 
     def draw(self, seed: int) -> "ParticipantModel":
-        """Draws the parameters of one participant, who differs from the mean by chance.
+        """Returns the model of one participant, who differs from this mean model by chance.
+
+        Five parameters are multiplied by log-normal factors of the deviation `spread`: reaction
+        time, both constants of Fitts' law, noise and crossover frequency.
 
         Args:
-            seed: Seed of the random numbers.
-
-        Returns:
-            A model with these parameters.
+            seed: Seed of the random numbers. Equal seeds give the same participant.
         """
         random = np.random.default_rng(seed)
         logarithms = self.spread * random.standard_normal(5)
@@ -249,11 +249,14 @@ class SyntheticParticipant:
         return full_step_m * missing_share
 
     def _start_movement(self, t_s: float, step_m: Array) -> None:
-        """Starts a movement by a step, with noise in proportion to the step's length.
+        """Starts a movement of minimum jerk, whose end scatters around the intended one.
+
+        The scatter is proportional to the length of the step, and the duration follows Fitts'
+        law and the practice so far.
 
         Args:
             t_s: Present time, in s.
-            step_m: The step, in m.
+            step_m: The intended step of the slave, in m.
         """
         model = self._model
         length_m = float(np.linalg.norm(step_m))

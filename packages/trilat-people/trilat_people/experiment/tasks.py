@@ -57,7 +57,8 @@ class TrialTask(Frozen, frozen=True, tag_field="kind"):
     def longest_s(self) -> float:
         """Longest duration of a trial after its target appears, in s.
 
-        A trial that lasts longer has failed, unless every trial lasts exactly that long.
+        With a time limit (`has_limit`), a trial that has not succeeded by then has failed.
+        Without one, every trial lasts exactly that long.
         """
         raise NotImplementedError
 
@@ -65,13 +66,16 @@ class TrialTask(Frozen, frozen=True, tag_field="kind"):
     def has_limit(self) -> bool:
         """True if a trial fails when `longest_s` is over.
 
-        Otherwise every trial lasts that long.
+        False if every trial lasts that long.
         """
         return True
 
     @property
     def needs_pair(self) -> bool:
-        """True if the task is for two users together."""
+        """True if the task is for two users together.
+
+        The protocol must then name two masters.
+        """
         return False
 
     def make_goal(self, start_m: Array, number: int, seed: int) -> "TrialGoal":
@@ -194,11 +198,22 @@ class TrialGoal:
         return {}
 
     def _find_target_m(self, after_s: float, user: int | None) -> Array:
-        """Returns the target at a time after the target's appearance."""
+        """Returns the target position after the target has appeared. Each task implements it.
+
+        Args:
+            after_s: Time since the target's appearance, in s.
+            user: Index of the user, or None, see `find_target_m`.
+
+        Returns:
+            The position, shape (2,) or (3,), in m.
+        """
         raise NotImplementedError
 
     def _judge(self, t_s: float, position_m: Array, force_n: float) -> "Outcome | None":
-        """Returns the outcome of the trial at a time after the target's appearance."""
+        """Judges whether the trial ends now, after the target has appeared.
+
+        Each task implements it. The arguments and the result are those of `judge`.
+        """
         raise NotImplementedError
 
 
@@ -300,7 +315,15 @@ class ReachTrial(TrialTask, frozen=True, tag="reach"):
         return _ReachGoal(self, start_m, [target_m, next_target_m])
 
     def _place_target_m(self, start_m: Array, number: int) -> Array:
-        """Returns the position of a target, in m. Consecutive targets are nearly opposite."""
+        """Returns the position of a target on the ring around the start, in m.
+
+        Consecutive targets are nearly opposite, so that each movement crosses the ring (ISO
+        9241-411). The ring lies in the plane of the first two axes.
+
+        Args:
+            start_m: Centre of the ring, in m.
+            number: Number of the target, from 0. Numbers beyond the last target begin anew.
+        """
         # Targets with even numbers advance around the ring. Those with odd numbers are half a
         # ring further.
         half_ring = self.targets // 2
@@ -316,9 +339,10 @@ class ReachTrial(TrialTask, frozen=True, tag="reach"):
 
 
 class _DwellGoal(TrialGoal):
-    """A goal that is reached once a condition has been met for some time without a break.
+    """A goal that is reached once a condition has held for some time without a break.
 
-    Subclasses define the condition by `_is_inside`.
+    A user who only passes through the target has not reached it. Subclasses define the
+    condition by `_is_inside`, for example that the end effector is in the target.
     """
 
     def __init__(self, task: "ReachTrial | ContactTrial", start_m: Array) -> None:
@@ -329,11 +353,17 @@ class _DwellGoal(TrialGoal):
         self._inside_since_s = math.inf
 
     def _is_inside(self, after_s: float, position_m: Array, force_n: float) -> bool:
-        """Returns True if the condition of the goal is met."""
+        """Returns True if the condition that must hold for some time holds now.
+
+        Args:
+            after_s: Time since the target's appearance, in s.
+            position_m: Position of the slave's end effector, in m.
+            force_n: Magnitude of the force on the end effector, in N.
+        """
         raise NotImplementedError
 
     def _judge(self, t_s: float, position_m: Array, force_n: float) -> Outcome | None:
-        """Ends the trial if the condition was met long enough, or if the time is over."""
+        """Ends the trial with success after the dwell time, or as failed after `longest_s`."""
         after_s = t_s - self.appears_s
         if self._is_inside(after_s, position_m, force_n):
             self._inside_since_s = min(self._inside_since_s, t_s)
@@ -405,19 +435,30 @@ class _ReachGoal(_DwellGoal):
         return start_m, self._corridor_m
 
     def _find_segment(self, after_s: float) -> Sequence[Array]:
-        """Returns the start and the end of the present movement, in m."""
+        """Returns the start and the end of the present movement, in m.
+
+        Before a handover this is the way from the start to the first target, afterwards that
+        from the first to the second target.
+
+        Args:
+            after_s: Time since the first target's appearance, in s.
+        """
         has_second_appeared = 0.0 <= self._second_appears_s <= after_s
         if has_second_appeared:
             return self._waypoints_m[1:]
         return self._waypoints_m[:2]
 
     def _find_target_m(self, after_s: float, user: int | None) -> Array:  # noqa: ARG002 - all users see the same
-        """Returns the end of the present movement, which all users see alike."""
+        """Returns the end of the present movement, which all users see alike, in m."""
         _, end_m = self._find_segment(after_s)
         return end_m
 
     def _is_inside(self, after_s: float, position_m: Array, force_n: float) -> bool:  # noqa: ARG002 - no force
-        """Returns True if the end effector is in the last target that will appear."""
+        """Returns True if the end effector is in the target at which the trial can succeed.
+
+        In a task with a handover, this is the second target: until it has appeared, the result
+        is False even in the first target.
+        """
         target_m = self._find_target_m(after_s, None)
         error_m = float(np.linalg.norm(position_m - target_m))
         is_in_target = error_m <= self.width_m / 2.0
@@ -425,7 +466,10 @@ class _ReachGoal(_DwellGoal):
         return is_in_target and after_s >= self._second_appears_s
 
     def _judge(self, t_s: float, position_m: Array, force_n: float) -> Outcome | None:
-        """Ends the trial as failed if the end effector left the corridor."""
+        """Ends the trial as failed if the end effector left the corridor to the target.
+
+        Otherwise, and in a task without a corridor, the rule for the dwell time decides.
+        """
         if self._corridor_m is not None:
             after_s = t_s - self.appears_s
             start_m, end_m = self._find_segment(after_s)
@@ -471,16 +515,25 @@ class ContactTrial(TrialTask, frozen=True, tag="contact"):
 
     @property
     def longest_s(self) -> float:
-        """Time from the appearance of the target after which a trial has failed, in s."""
+        """Time after which a trial has failed if the force was not held, in s."""
         return self.timeout_s
 
     def make_goal(self, start_m: Array, number: int, seed: int) -> TrialGoal:  # noqa: ARG002 - there is one wall
-        """Creates the goal of a trial: where the wall is, and with which force to press it."""
+        """Creates the goal of a trial: where to touch the wall, and how strongly to press it.
+
+        Args:
+            start_m: Position of the slave's end effector at the start, in m.
+            number: Not used, because there is one wall.
+            seed: Not used.
+        """
         return _ContactGoal(self, start_m)
 
 
 class _ContactGoal(_DwellGoal):
-    """Goal of a trial of `ContactTrial`: to press a wall with a force for some time."""
+    """Goal of a trial of `ContactTrial`: to press a wall with a force for some time.
+
+    The position plays no role: only the force is judged.
+    """
 
     def __init__(self, task: ContactTrial, start_m: Array) -> None:
         super().__init__(task, start_m)
@@ -490,7 +543,10 @@ class _ContactGoal(_DwellGoal):
         self._target_m: Array = start_m + task.distance_m * direction
 
     def _find_target_m(self, after_s: float, user: int | None) -> Array:  # noqa: ARG002 - it does not move
-        """Returns the target at the wall, which does not move."""
+        """Returns the point at the wall that users see as the target, in m.
+
+        It does not move.
+        """
         return self._target_m
 
     def compute_measures(
@@ -518,7 +574,7 @@ class _ContactGoal(_DwellGoal):
         }
 
     def _is_inside(self, after_s: float, position_m: Array, force_n: float) -> bool:  # noqa: ARG002 - only the force counts
-        """Returns True if the force is right within the tolerance."""
+        """Returns True if the force differs from the required one by at most the tolerance."""
         error_n = abs(force_n - self.force_n)
         return error_n <= self._tolerance_n
 
@@ -553,10 +609,7 @@ class TrackTrial(TrialTask, frozen=True, tag="track"):
 
     @property
     def has_limit(self) -> bool:
-        """False, because a tracking trial cannot run out of time.
-
-        Every trial lasts exactly `duration_s`, and none fails.
-        """
+        """False, because every tracking trial lasts exactly `duration_s`, and none fails."""
         return False
 
     @property
@@ -570,10 +623,7 @@ class TrackTrial(TrialTask, frozen=True, tag="track"):
 
     @property
     def longest_s(self) -> float:
-        """Duration of a tracking trial after its target has appeared, in s.
-
-        All trials have the same duration.
-        """
+        """Duration of every tracking trial after its target has appeared, in s."""
         return self.duration_s
 
     def make_goal(self, start_m: Array, number: int, seed: int) -> TrialGoal:  # noqa: ARG002 - the seed draws the path
@@ -632,7 +682,13 @@ class _TrackGoal(TrialGoal):
         return {"first_settled": first_settled}
 
     def _find_target_m(self, after_s: float, user: int | None) -> Array:
-        """Returns the point of the path, with the offset of a user's target."""
+        """Returns the target on its moving path, in m.
+
+        Args:
+            after_s: Time since the target's appearance, in s.
+            user: Index of a user, whose target is half of `apart_m` away from the path: the
+                first user's on the positive side. None for the path itself.
+        """
         task = self._task
         rates_rad_s = 2.0 * math.pi * np.array(task.frequencies_hz)
         # The path begins at the start: each sine is 0 when the target appears.
@@ -650,7 +706,7 @@ class _TrackGoal(TrialGoal):
         return target_m
 
     def _judge(self, t_s: float, position_m: Array, force_n: float) -> Outcome | None:  # noqa: ARG002 - by its time
-        """Ends the trial as completed when its time is over."""
+        """Ends the trial as completed when its duration is over. It cannot fail."""
         ends_s = self.appears_s + self._task.duration_s
         if t_s >= ends_s:
             return Outcome(True, t_s)

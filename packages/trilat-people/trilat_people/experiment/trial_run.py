@@ -251,18 +251,34 @@ class ExperimentTrial:
         return float(forces_n[0])
 
     def _find_forces_n(self, q: Array, tau_x: Array) -> Array:
-        """Returns the magnitude of the external force in K records, shape (K,), in N."""
+        """Returns the magnitude of the external force on the slave's end effector, in N.
+
+        Args:
+            q: Joint positions in K records, shape (K, n), in rad or m.
+            tau_x: Minus the external torques on the joints, same shape, in N m or N.
+
+        Returns:
+            The magnitudes, shape (K,).
+        """
         forces = self._place_end_effector(q).find_force(tau_x)
         magnitude_n: Array = np.linalg.norm(forces, axis=1)
         return magnitude_n
 
     def _place_end_effector(self, q: Array) -> EndEffectorRows:
-        """Returns the positions of the slave's end effector, and the Jacobians, at rest."""
+        """Returns the slave's end effector in K records: positions and Jacobians.
+
+        Args:
+            q: Joint positions, shape (K, n), in rad or m. The joints count as being at rest.
+        """
         speed = 0.0 * q
         return self._rows.place_end_effector(q, speed)
 
     def make_goal(self) -> TrialGoal:
-        """Creates the goal of the trial, which states its target and decides when it ends."""
+        """Creates the goal of the trial, which knows the target and decides on the end.
+
+        Each judge of the trial needs a goal of its own, because a goal remembers since when the
+        end effector has been in the target.
+        """
         planned = self.planned
         task = self.protocol.task
         goal = task.make_goal(self._start_m, planned.target, planned.seed)
@@ -303,7 +319,13 @@ class ExperimentTrial:
         )
 
     def _judge_log(self, log: Log) -> Outcome | None:
-        """Returns the outcome of the trial in a log. None if the log ends before the trial."""
+        """Judges a recorded trial, record by record, as a live trial is judged.
+
+        A run that diverged, because an arm exceeded its limits, has failed at that time.
+
+        Returns:
+            The outcome. None if the log ends before the trial does.
+        """
         judge = TrialJudge(self)
         records = log[self.slave]
         times_s = records.t_s.tolist()
@@ -356,7 +378,15 @@ class ExperimentTrial:
     def _sample_motion(
         self, records: SiteLog | AlignedRecords, start_s: float, end_s: float
     ) -> _MotionSamples:
-        """Returns the motion of the slave's end effector between two times."""
+        """Returns the motion of the slave's end effector between two times, at a reduced rate.
+
+        Only every `RECORD_STEP`-th record is used. Velocities are differences of positions.
+
+        Args:
+            records: Records of the slave.
+            start_s: First time, in s.
+            end_s: Last time, in s.
+        """
         has_started = records.t_s >= start_s
         is_between = has_started & (records.t_s <= end_s)
         indices = np.flatnonzero(is_between)[::RECORD_STEP]
@@ -398,7 +428,17 @@ class ExperimentTrial:
         return {name: value for name, value in measures.items() if value is not None}
 
     def _measure_motion(self, log: Log, ended_s: float) -> dict[str, float]:
-        """Computes the measures of the slave's motion after the target has appeared."""
+        """Computes the measures of the slave's motion after the target has appeared.
+
+        Examples: "completion_s", "path_m", "error_end_mm". The task adds its own measures.
+
+        Args:
+            log: Log of the trial.
+            ended_s: End of the trial, in s.
+
+        Returns:
+            The measures by name, with the unit at the end of the name.
+        """
         goal = self.make_goal()
         records = log[self.slave]
         motion = self._sample_motion(records, goal.appears_s, ended_s)
@@ -444,13 +484,21 @@ class ExperimentTrial:
 class SyntheticTrial(ExperimentTrial):
     """A trial in which models of people (synthetic participants) move the master arms.
 
-    It runs in virtual time, without a network.
+    It runs in virtual time, without a network, in less time than the trial lasts. It serves to
+    test a protocol and its analysis before people take part.
     """
 
     people = False
 
     def _make_players(self, scenario: Scenario) -> dict[str, HandPlayer]:
-        """Returns the synthetic participants of the trial, by their sites."""
+        """Returns the synthetic participants of the trial, by the sites whose arms they move.
+
+        Each call returns participants at the start of the trial, because a player keeps a
+        state.
+
+        Args:
+            scenario: Scenario of the trial.
+        """
         players: dict[str, HandPlayer] = {}
         pairs = zip(self.protocol.users, self.planned.group, strict=True)
         for user_index, (site, name) in enumerate(pairs):
@@ -477,7 +525,14 @@ class SyntheticTrial(ExperimentTrial):
         return players
 
     def _draw_model(self, participant: str) -> ParticipantModel:
-        """Returns the parameters of a participant, which are the same in every trial."""
+        """Returns the model of a participant: reaction time, speed, noise, and so on.
+
+        The parameters are drawn by the protocol's seed and the pseudonym, so that a participant
+        stays the same in all trials.
+
+        Args:
+            participant: Pseudonym of the participant.
+        """
         text = f"{self.protocol.seed}/{participant}"
         digest = hashlib.sha256(text.encode()).digest()
         participant_seed = int.from_bytes(digest[:4], "big")
@@ -520,7 +575,10 @@ class SyntheticTrial(ExperimentTrial):
         return self.longest_s
 
     def write(self, path: Path) -> TrialEntry:
-        """Runs the trial, writes its log, and returns its result.
+        """Runs the trial in virtual time, writes its log, and returns its result.
+
+        A first run without a log finds out when the trial ends, so that the log stops soon
+        after.
 
         Args:
             path: Path of the log.

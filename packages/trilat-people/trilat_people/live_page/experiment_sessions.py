@@ -230,12 +230,24 @@ class ExperimentSessions:
             rest_s = 0.0  # the users have rested before the first attempt
 
     def _list_attempts(self, planned: PlannedTrial) -> list[Path]:
-        """Returns the folders of the attempts at a trial, the oldest first."""
+        """Returns the folders of all attempts at a trial, the oldest first.
+
+        A trial is attempted again if its session was aborted or its log is not valid. The name
+        of a folder begins with the number of the trial.
+        """
         attempts = self.experiment.folder / ATTEMPTS
         return sorted(attempts.glob(f"{planned.number:05d}-*"))
 
     def _record_aborted(self, planned: PlannedTrial, reason: str) -> None:
-        """Notes why the newest attempt does not count, unless the reason is noted already."""
+        """Notes in the journal why the newest attempt at a trial does not count.
+
+        The trial is then repeated. If the reason of this attempt is noted already, nothing
+        changes.
+
+        Args:
+            planned: The trial.
+            reason: Why the attempt does not count, for the experimenter.
+        """
         last_attempt = self._list_attempts(planned)[-1]
         self._add_note(
             cell=f"aborted {last_attempt.name}",
@@ -275,7 +287,8 @@ class ExperimentSessions:
         def begins() -> bool:
             """Returns True once all participants have said on their pages that they are ready.
 
-            At that moment the pages change to the picture of the trial.
+            The session waits for this before its first tick. When it is so, the pages change to
+            the picture of the trial.
             """
             nonlocal has_begun
             if not has_begun and request.replies.keys() >= set(self.stage.users):
@@ -419,7 +432,7 @@ def run_with_people(
                 return result
 
             def ends() -> bool:
-                """Returns True once a signal or a page has requested the end."""
+                """Returns True once Ctrl-C or an experimenter's page has requested the end."""
                 return interrupt.is_requested() or page.end_requested.is_set()
 
             sessions = ExperimentSessions(

@@ -73,7 +73,11 @@ class TrialWatch:
 
     @property
     def over(self) -> bool:
-        """True once the session of the trial can end."""
+        """True once the session of the trial can end.
+
+        This is so at once after an abort, and `END_DELAY_NS` after the outcome, so that the log
+        contains what follows.
+        """
         if self.aborted:
             return True
         has_outcome = self.judge.outcome is not None
@@ -109,10 +113,16 @@ class TrialWatch:
         return self._judge_records(view)
 
     def _judge_records(self, view: SessionView) -> list[str]:
-        """Judges the complete records up to the outcome of the trial.
+        """Judges the slave's new records in order, up to the outcome of the trial.
+
+        A record is judged only when no earlier one can still arrive. The evaluation of the log
+        then comes to the same outcome. Records that are lost for good are skipped.
+
+        Args:
+            view: State of the session.
 
         Returns:
-            Texts that the log should keep as marks of this moment.
+            Texts that the log should keep as marks of this moment, such as "trial 3 begins".
         """
         slave = view.sites[self.trial.slave]
         number = self.trial.planned.number
@@ -246,7 +256,7 @@ class Stage:
         return request
 
     def show_trial(self, watch: TrialWatch) -> None:
-        """Shows the pages that the session of a trial is about to begin.
+        """Tells all pages that the session of a trial is about to begin.
 
         Args:
             watch: Object that judges the trial while its session runs.
@@ -256,7 +266,7 @@ class Stage:
         self._phase = "starting"
 
     def show_checking(self) -> None:
-        """Shows that a trial has ended and its log is being checked."""
+        """Tells all pages that a trial has ended and that its log is being checked."""
         self._watch = None
         self._phase = "checking"
 
@@ -275,7 +285,7 @@ class Stage:
             self._feedback["succeeded"] = entry.succeeded
 
     def show_end(self) -> None:
-        """Shows that the experiment has ended."""
+        """Tells all pages that the experiment has ended."""
         self._request = None
         self._step = None
         self._phase = "over"
@@ -349,7 +359,12 @@ class Stage:
         return True
 
     def _abort_trial(self, site: str, why: str) -> bool:
-        """Aborts the running trial. Returns False if no trial runs."""
+        """Aborts the running trial, which is repeated later. Returns False if no trial runs.
+
+        Args:
+            site: Site of the user who aborts it. Empty for the experimenter.
+            why: The reason, for the journal; it may be empty.
+        """
         watch = self._watch
         if watch is None or watch.over:
             return False
@@ -408,11 +423,14 @@ class Stage:
         return fields
 
     def _describe_users(self, step: Step, done_sites: Collection[str]) -> list[Json]:
-        """Describes the users: pseudonym, and whether they are present or done.
+        """Describes the users for all pages: pseudonym, and whether they are present or done.
 
         Args:
-            step: The step.
-            done_sites: Sites of the users who have completed the step.
+            step: The step that they have to complete.
+            done_sites: Sites of the users who have completed it.
+
+        Returns:
+            An entry per user, whose "state" is "done", "here" or empty.
         """
         users: list[Json] = []
         for site, pseudonym in zip(self.users, step.planned.group, strict=True):
@@ -423,7 +441,13 @@ class Stage:
         return users
 
     def _describe_for_experimenter(self, step: Step) -> Json:
-        """Returns the fields that only experimenters may see, such as the condition."""
+        """Returns the fields of a step that only experimenters may see, such as the condition.
+
+        Participants who knew the condition might expect an effect.
+
+        Args:
+            step: The present step.
+        """
         planned = step.planned
         condition = planned.condition
         if planned.phase:
@@ -437,9 +461,13 @@ class Stage:
         }
 
     def _describe_for_user(self, step: Step, site: str, page: int) -> Json:
-        """Returns the fields for the page of a user, such as the questionnaire.
+        """Returns the fields of a step for the page of a user, such as a text or questionnaire.
 
-        The field "second" tells that another page of the same site counts.
+        Args:
+            step: The present step.
+            site: Site of the user.
+            page: Number of the page. Of several pages of one site only the first counts; the
+                others show so by the field "second".
         """
         pseudonyms = dict(zip(self.users, step.planned.group, strict=True))
         fields: Json = {

@@ -45,7 +45,14 @@ class Strangers:
         self._refused = refused
 
     def add(self, connection: ServerConnection) -> None:
-        """Adds a new connection, and closes the oldest connection if there are too many."""
+        """Adds a new connection. If there are too many, the oldest one is closed and counted.
+
+        The oldest one has had the most time to say what it wants, so a flood of connections
+        cannot keep newcomers out.
+
+        Args:
+            connection: The new connection, whose role is not known yet.
+        """
         if len(self._connections) >= MAX_STRANGERS:
             oldest = next(iter(self._connections))
             self.remove(oldest)
@@ -54,7 +61,10 @@ class Strangers:
         self._connections[connection] = None
 
     def remove(self, connection: ServerConnection) -> None:
-        """Removes a connection that was closed, or that has become a page with a known role."""
+        """Removes a connection that was closed, or that has become a page with a known role.
+
+        A connection that is not in the list changes nothing.
+        """
         self._connections.pop(connection, None)
 
 
@@ -112,7 +122,12 @@ def choose_page_to_close(pages: Iterable[Page], role: Role) -> Page | None:
 
 
 def _list_pages_of_role(pages: Iterable[Page], role: Role) -> list[Page]:
-    """Lists the pages of a role. For a user, these are the pages of users of the same site."""
+    """Lists the pages that compete with a new page of a role for a place.
+
+    Args:
+        pages: The open pages.
+        role: Role of the new page. For a user, only pages of users of the same site compete.
+    """
     role_pages: list[Page] = []
     for page in pages:
         is_same_site = page.role.site == role.site

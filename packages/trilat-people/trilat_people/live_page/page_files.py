@@ -59,7 +59,7 @@ class PageFiles:
     def add_results(self, paths: Iterable[Path]) -> None:
         """Makes the report and the log of the ended session available for download.
 
-        Files that are too large are left out.
+        Each call uses a new secret in the addresses. Files above `MAX_FILE_BYTES` are left out.
 
         Args:
             paths: The files.
@@ -92,7 +92,13 @@ class PageFiles:
 
 
 def _list_assets() -> dict[str, tuple[str, bytes]]:
-    """Returns the media type and the content of the page's own files, by their addresses."""
+    """Returns the page's own files by their addresses, such as "/page.js".
+
+    They come from this package and from the package of the report, whose plots the page uses.
+
+    Returns:
+        The media type and the content of each file.
+    """
     plot_assets = (resources.files("trilat_net.presentation") / "assets").iterdir()
     page_assets = (resources.files(__package__) / "assets").iterdir()
     assets = {}

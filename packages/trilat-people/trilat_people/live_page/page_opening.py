@@ -33,9 +33,10 @@ class BrowserOpening:
         self._folder: Path | None = None
 
     def open(self) -> None:
-        """Opens a browser at the link, if there is a browser.
+        """Opens a browser at the link, by a file that redirects to it.
 
-        Failures do not matter, because the link is also printed for the user.
+        If there is no browser, or the file cannot be written, nothing happens. The user has the
+        printed link.
         """
         # A RuntimeError means that the user has no home directory.
         with suppress(OSError, webbrowser.Error, RuntimeError):
@@ -63,14 +64,14 @@ class BrowserOpening:
         return file
 
     def remove_file(self) -> None:
-        """Removes the file, if it exists."""
+        """Removes the file with the link, once the page is open or the server ends."""
         if self._folder is not None:
             shutil.rmtree(self._folder, ignore_errors=True)
             self._folder = None
 
 
 def _make_template() -> Template:
-    """Returns the template of the file, which escapes the link."""
+    """Returns the template of the file that redirects to the link, with HTML escaping."""
     environment = Environment(
         loader=PackageLoader(__package__, "templates"),
         autoescape=True,

@@ -68,7 +68,8 @@ class PageMessage(
 ):
     """Base class of the messages that a page sends to its server.
 
-    The field `do` of the JSON text names the kind of message.
+    The field `do` of the JSON text names the kind of message, for example {"do": "mark",
+    "text": "contact"}. Unknown fields are refused.
     """
 
 
@@ -110,7 +111,10 @@ class AnswerPage(PageMessage, frozen=True, kw_only=True, tag="answer"):
 
 
 class StopArms(PageMessage, frozen=True, kw_only=True, tag="stop"):
-    """Request of a page to stop all arms at once. The session continues."""
+    """Request of a page to stop all arms at once. Every role may send it, also a watcher.
+
+    The session continues: the arms come to rest until somebody releases them.
+    """
 
 
 class ReleaseArms(PageMessage, frozen=True, kw_only=True, tag="release"):
@@ -155,10 +159,10 @@ class SetShares(PageMessage, frozen=True, kw_only=True, tag="shares"):
 
 
 class MarkMoment(PageMessage, frozen=True, kw_only=True, tag="mark"):
-    """Request of a page to write a text into the log as an event at the present time.
+    """Request of a page to mark the present moment in the log by an event with a text.
 
     Attributes:
-        text: The text.
+        text: The text, for example "contact".
     """
 
     text: Annotated[str, Meta(min_length=1, max_length=80)]
@@ -192,7 +196,10 @@ class MoveHand(PageMessage, frozen=True, kw_only=True, tag="hand"):
 
 
 class EndSession(PageMessage, frozen=True, kw_only=True, tag="end"):
-    """Request of a page to end the session in an orderly way, so that its log is complete."""
+    """Request of a page to end the session in an orderly way, so that its log is complete.
+
+    Only sessions that were started together with their page accept it.
+    """
 
 
 class DoStep(PageMessage, frozen=True, kw_only=True, tag="step"):
@@ -350,7 +357,7 @@ class Role:
 
     @property
     def noun(self) -> str:
-        """Name of the person at the page for event texts, such as "the user of m1"."""
+        """Who sits at the page, as the events of sites name the person: "the user of m1"."""
         if self.kind == "experimenter":
             return "the experimenter"
         if self.kind == "user":
@@ -424,13 +431,20 @@ class RoleLinks:
         return None
 
     def _make_token(self, role: Role) -> str:
-        """Returns the token of a role, which nobody can guess without the server's secret."""
+        """Returns the secret token in the link of a role. It grants the rights of the role.
+
+        The token is a keyed digest of the role. Nobody without the server's secret can guess
+        it.
+        """
         text = f"{role.kind} {role.site}".encode()
         digest = hmac.digest(self._secret, text, "sha256")
         return digest[:TOKEN_BYTES].hex()
 
     def _is_token(self, token: str, role: Role) -> bool:
-        """Returns True if a token is that of a role."""
+        """Returns True if a token is that of a role.
+
+        The comparison takes the same time for any token.
+        """
         role_token = self._make_token(role)
         # The time of this comparison does not reveal how many characters are right.
         return hmac.compare_digest(
@@ -491,7 +505,7 @@ class PageHands:
         sender.send(HandMessage, **content)
 
     def release(self) -> None:
-        """Releases all arms that the page holds."""
+        """Releases all arms that the page holds, for example because the page was closed."""
         for site in list(self._held_sites):
             message = MoveHand(site=site, grip=False)
             self.move(message, pushes=False)
@@ -511,12 +525,12 @@ class PageHands:
 
 
 class _OpenQuery(NamedTuple):
-    """A request that waits for the reply of a site.
+    """A request that was sent to a site, whose reply has not come yet.
 
     Attributes:
         inbox: Inbox that receives the reply.
-        sent_ns: Time of sending, in ns.
-        request: The request.
+        sent_ns: Time of sending on the monotonic clock, in ns.
+        request: The request, to repeat it in another form if an older site refuses it.
     """
 
     inbox: Inbox
@@ -592,6 +606,8 @@ class OrderDesk:
     def stop(self, sites: Iterable[str], source: str = "") -> None:
         """Orders sites to stop at once, ahead of all waiting orders.
 
+        Orders that would release the same arms are withdrawn.
+
         Args:
             sites: Names of the sites.
             source: Who sends the order, for the sites' events.
@@ -624,14 +640,26 @@ class OrderDesk:
     def _enqueue(self, site: str, subject: str, request: ChangeRequest) -> None:
         """Queues a request, which replaces a waiting request about the same subject.
 
-        A request about a new subject is dropped if too many requests wait.
+        A slider of a page sends many values, of which only the latest matters. A request about
+        a new subject is dropped if too many wait.
+
+        Args:
+            site: Name of the site.
+            subject: What the request is about, for example the name of a link.
+            request: The request.
         """
         is_replacement = (site, subject) in self._pending
         if is_replacement or len(self._pending) < MAX_PENDING:
             self._pending[site, subject] = request
 
     def _send_request(self, site: str, channel: str, request: ChangeRequest) -> None:
-        """Sends a request to a site, and waits for the reply in `poll`."""
+        """Sends a request to a site. `poll` receives the reply.
+
+        Args:
+            site: Name of the site.
+            channel: Channel for changes or for stops.
+            request: The request.
+        """
         key = topics.key(self._session, site, channel)
         inbox = self._bus.query(key, encode(request))
         sent_ns = self._clock.monotonic_ns()
@@ -641,8 +669,8 @@ class OrderDesk:
         """Queues a text that a site publishes as an event, to mark this moment in the log.
 
         Args:
-            site: Name of the site.
-            text: The text.
+            site: Name of the site that publishes the event.
+            text: The text, for example "trial 3 begins".
         """
         subject = f"mark {text}"
         request = ChangeRequest(mark=text)
@@ -697,7 +725,7 @@ class OrderDesk:
 
 
 def _add_source(request: ChangeRequest, source: str) -> ChangeRequest:
-    """Returns a request that names its source. An empty source leaves it unchanged."""
+    """Returns a request that says who sent it. With an empty source it stays as it is."""
     if not source:
         return request
     return msgspec.structs.replace(request, source=source)
@@ -723,5 +751,5 @@ def _make_link_request(order: SetLink) -> ChangeRequest:
 
 
 def _is_zero(value: float | str) -> bool:
-    """Returns True if a setting is the number 0. A text is not, and the site will refuse it."""
+    """Returns True if a setting is the number 0. A text is not; the site will refuse it."""
     return str(value) in ("0.0", "-0.0")

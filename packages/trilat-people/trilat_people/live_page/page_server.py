@@ -139,7 +139,7 @@ class Visitor(ServerConnection):
     _is_counted = False
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Adds a new connection to the connections that do not belong to a web page yet.
+        """Counts a new connection as a stranger, until the role of its page is known.
 
         Args:
             transport: The connection.
@@ -148,7 +148,7 @@ class Visitor(ServerConnection):
         self.strangers.add(self)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Notes that the connection was closed.
+        """Removes a closed connection from the strangers.
 
         Args:
             exc: Reason why it was closed. None if it was closed in order.
@@ -366,7 +366,10 @@ class PageServer:
         self._thread = threading.Thread(target=self._run, name="page", daemon=True)
 
     def __enter__(self) -> "PageServer":
-        """Starts the server, prints its link and opens a browser.
+        """Starts the server in its thread, prints the experimenter's link, and opens a browser.
+
+        A browser is opened only if the options allow it, the output is a terminal, and the
+        machine has a screen.
 
         Raises:
             UsageError: The server cannot listen at its address.
@@ -384,7 +387,10 @@ class PageServer:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Ends the server. Waits at most five seconds for its thread."""
+        """Ends the server and closes its pages.
+
+        It waits at most five seconds for the thread.
+        """
         self._ending.set()
         if self._loop is not None and self._stop is not None:
             # The loop of the server may have ended already.
@@ -408,7 +414,11 @@ class PageServer:
             self._clock.sleep_until(self._clock.monotonic_ns() + SWITCH_POLL_NS)
 
     def _switch_session_if_requested(self) -> None:
-        """Switches to the session of the last call of `show`, in the server's thread."""
+        """Switches to the session of the last call of `show`, in the thread of the server.
+
+        Only this thread uses the view of a session. `show` waits until the switch is done, also
+        if it fails.
+        """
         if self._next_session is not None:
             bus, session = self._next_session
             try:
@@ -467,18 +477,17 @@ class PageServer:
             self._ready.set()
 
     def report_refusals(self) -> None:
-        """Prints for the user how many messages and requests were refused, with the reasons.
-
-        Prints nothing if there were none.
-        """
+        """Prints how many messages and requests of pages were refused, a line per reason."""
         for reason, count in sorted((+self.refused).items()):
             self._say(f"the page refused {count_nouns(count, 'message')} or requests: {reason}")
 
     def _count_failure(self, part: str, error: Exception) -> None:
         """Counts a failure of the page, and prints the first failure of each kind.
 
+        The page is no part of the session, so the server continues after any error.
+
         Args:
-            part: Part of the page that failed.
+            part: Part of the page that failed, for example "frame".
             error: The error.
         """
         reason = f"{part} failed: {type(error).__name__}"
@@ -489,7 +498,11 @@ class PageServer:
                 self._say(f"the page continues, though its {reason}: {error}")
 
     async def _serve(self) -> None:
-        """Serves pages until the end is requested."""
+        """Listens for browsers and serves pages, until the end of the server is requested.
+
+        It sets `address`, the link with the port that was chosen, and then reports that it is
+        ready.
+        """
         self._loop = asyncio.get_running_loop()
         self._stop = asyncio.Event()
         members = {"refused": self.refused, "strangers": Strangers(self.refused)}
@@ -525,12 +538,15 @@ class PageServer:
 
     @property
     def _base_address(self) -> str:
-        """Address of the page, without query and token."""
+        """Address of the page without its token, for example "http://127.0.0.1:8080/"."""
         host = f"[{self._host}]" if ":" in self._host else self._host
         return f"{self._scheme}://{host}:{self._port}/"
 
     def _print_links(self) -> None:
-        """Prints the links for users and watchers, once the users are known."""
+        """Prints the links for users and watchers, once the scenario says who the users are.
+
+        Users are the masters, or the participants of an experiment. The links are printed once.
+        """
         scenario = self.view.scenario
         if self._links_are_printed or (scenario is None and self._stage is None):
             return
@@ -548,7 +564,8 @@ class PageServer:
     async def _tick(self) -> None:
         """Receives the session's messages and makes a frame, thirty times a second.
 
-        If one step fails, the failure is counted and the other steps continue.
+        If one step fails, the failure is counted, and the other steps continue. In the end of
+        each round, the pages may send the new frame.
         """
         while True:
             begun_ns = self._clock.monotonic_ns()
@@ -572,7 +589,11 @@ class PageServer:
             await asyncio.sleep(max(0.002, 1.0 / FRAMES_PER_S - spent_s))
 
     def _poll_stage(self) -> None:
-        """Lets the experiment judge the new records, and marks its moments in the log."""
+        """Lets the experiment judge the new records, and marks its moments in the log.
+
+        Moments are, for example, the beginning of a trial. Without an experiment nothing
+        happens.
+        """
         if self._stage is None:
             return
         users = [
@@ -582,7 +603,11 @@ class PageServer:
             self._desk.mark(next(iter(self.view.sites)), moment)
 
     def _make_frame(self) -> None:
-        """Makes the next frame, and collects the sites' replies to orders for the pages."""
+        """Makes the next frame, the message from which pages draw the present state.
+
+        It also collects the sites' replies to orders, of which the latest 20 are kept for
+        pages.
+        """
         self._frame_number += 1
         for site, channel, is_accepted, text in self._desk.replies:
             notice = {
@@ -684,7 +709,13 @@ class PageServer:
             self._pages.discard(page)
 
     def _close_page_for(self, role: Role) -> None:
-        """Closes an older page if there are too many pages of a role for a new one."""
+        """Closes an older page if there are too many pages of a role for a new one.
+
+        The arms that the closed page holds are released.
+
+        Args:
+            role: Role of the new page.
+        """
         page = choose_page_to_close(self._pages, role)
         if page is None:
             return
@@ -811,11 +842,19 @@ class PageServer:
 
     @property
     def experimenters(self) -> set[Page]:
-        """The open pages of experimenters, who may control the session."""
+        """The open pages of experimenters. Those of them that take part control the session."""
         return {page for page in set(self._pages) if page.role.kind == "experimenter"}
 
     def _answer_request(self, page: Page, answer: AnswerPage) -> None:
-        """Applies the answer of a page to another page's request to take part."""
+        """Applies the answer of a page to another page's request to take part in the control.
+
+        An answer to a request that does not exist, or was put to other pages, is counted as
+        refused.
+
+        Args:
+            page: The page that answers.
+            answer: Whether the other page may take part.
+        """
         for other in self._pages:
             if other.number == answer.page and other.asks is not None and page in other.asks[0]:
                 other.takes_part = answer.yes
@@ -841,7 +880,10 @@ class PageServer:
                 page.asks = None
 
     def _list_held_sites(self, page: Page) -> list[str]:
-        """Lists the sites whose arms a page holds, according to the newest frame."""
+        """Lists the sites whose arms a page holds, according to the newest frame.
+
+        Only the sites' records say who holds an arm. Before the first frame the list is empty.
+        """
         sites = (self._frame or {}).get("sites", {})
         held_sites: list[str] = []
         for name, site in sites.items():
@@ -850,7 +892,11 @@ class PageServer:
         return held_sites
 
     async def _send(self, page: Page) -> None:
-        """Sends a page the newest frame, each time the page has drawn an earlier frame."""
+        """Sends a page the newest frame, each time the page has drawn an earlier frame.
+
+        The first message is a greeting with the constants of the session. A page for a site
+        that the session does not have is closed. The coroutine ends with the connection.
+        """
         encode: Callable[[Any], bytes] = msgspec.json.encode
         with suppress(ConnectionClosed):
             while True:
@@ -973,7 +1019,7 @@ class PageServer:
         }
 
     def _list_requests(self, page: Page) -> list[int]:
-        """Lists the numbers of the pages that ask this page whether they may take part."""
+        """Lists the numbers of the pages that wait for this page's permission to take part."""
         numbers: list[int] = []
         for other in self._pages:
             if other.asks is not None:
@@ -999,7 +1045,14 @@ class PageServer:
         return refused_stops
 
     def _describe_as_site(self, site: str) -> dict[str, Any]:
-        """Returns the frame for the user of a site, who sees the other arms delayed."""
+        """Returns the frame for the user of a site, who sees the other arms delayed.
+
+        It has no plots and no events, which would reveal the present state. All pages of the
+        site get the same frame.
+
+        Args:
+            site: Name of the site.
+        """
         if site not in self._frames_as_site:
             assert self._frame is not None
             self._frames_as_site[site] = self._frames.describe_as(
@@ -1010,7 +1063,11 @@ class PageServer:
     def _describe_all(self, page: Page) -> dict[str, Any]:
         """Returns the frame for a page that sees everything, with new points and events.
 
-        The first frame of a page has all points that are kept.
+        The page remembers how many points and events were sent to it. Its first frame has all
+        that are kept.
+
+        Args:
+            page: The page of an experimenter or watcher.
         """
         frames = self._frames
         view = self.view
@@ -1027,7 +1084,10 @@ class PageServer:
 
 
 def _has_screen() -> bool:
-    """Returns True if this machine can show a browser."""
+    """Returns True if this machine can show a browser, so that opening one makes sense.
+
+    On Linux, this is read from the variables DISPLAY and WAYLAND_DISPLAY.
+    """
     if not sys.platform.startswith("linux"):
         return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -63,7 +63,7 @@ Json = dict[str, Any]
 
 
 def _round(values: Array, digits: int = 5) -> list[Any]:
-    """Returns an array as nested lists of rounded numbers."""
+    """Returns an array as nested lists of rounded numbers, which make a short JSON text."""
     rounded: list[Any] = np.round(values, digits).tolist()
     return rounded
 
@@ -135,7 +135,10 @@ class ArmFrames:
         }
 
     def _describe_hand(self) -> Json | None:
-        """Returns how people can hold the arm. Returns None if nobody can hold it."""
+        """Returns how people can hold the arm, for example its reach and the mode of the hand.
+
+        None if the scenario has no live hand at this site, so that nobody can hold the arm.
+        """
         hand = self._hand
         if hand is None:
             return None
@@ -288,7 +291,15 @@ class ArmFrames:
         }
 
     def _compute_hand_force(self, records: AlignedRecords, split: TorqueSplit) -> Array:
-        """Returns the force of people at the end effector, shape (K, 2) or (K, 3), in N."""
+        """Returns the force of people at the end effector, shape (K, 2) or (K, 3), in N.
+
+        It is zero for an arm that nobody can hold, where a tiny torque is only a rounding
+        error.
+
+        Args:
+            records: K records of the site.
+            split: Parts of the external torque in these records.
+        """
         torque = split.operator
         if not self._spec.hands:
             # Without a hand in the scenario, a tiny torque is a rounding error of the split.
@@ -323,7 +334,12 @@ class ArmFrames:
         return _round(last_force, 3)
 
     def _compute_wall_force(self, records: AlignedRecords, split: TorqueSplit) -> Array:
-        """Returns the force of all walls at the end effector, shape (K, 2) or (K, 3), in N."""
+        """Returns the force of all walls on the end effector, shape (K, 2) or (K, 3), in N.
+
+        Args:
+            records: K records of the site.
+            split: Parts of the external torque in these records, with the end effector.
+        """
         total = np.zeros_like(split.end_effector.position)
         for wall in self._walls:
             size_n = wall_force(wall, records.nominal_s, split.end_effector)
@@ -405,7 +421,11 @@ class SessionFrames:
         }
 
     def _describe_waiting(self, scenario: Scenario | None) -> Json:
-        """Returns the members of a session that has not begun."""
+        """Returns the frame of a session that has not begun: which members are here or missing.
+
+        Args:
+            scenario: Scenario of the session. None until a member has sent it.
+        """
         members = self._view.members
         names = [] if scenario is None else scenario.names
         missing = [name for name in names if name not in members]
@@ -464,7 +484,13 @@ class SessionFrames:
         }
 
     def _add_point(self, t_s: float, values: list[float | None]) -> None:
-        """Adds a point to the plots, with values of five digits."""
+        """Adds a point to the plots, with five digits per value.
+
+        Args:
+            t_s: Time of the point, in s.
+            values: The number of each curve: extremes of each site, then the age of each link's
+                samples in ms. None leaves a gap.
+        """
         point: list[float | None] = [round(t_s, 4)]
         for value in values:
             rounded = None if value is None else float(f"{value:.5g}")
@@ -472,7 +498,11 @@ class SessionFrames:
         self.points.add(point)
 
     def _add_energies(self) -> None:
-        """Adds points to the energy plot, at most one per `ENERGY_PERIOD_S`."""
+        """Adds the new values of the energies V and supplied to the energy plot.
+
+        There is a value for each complete tick. At most one per `ENERGY_PERIOD_S` becomes a
+        point.
+        """
         course = self._view.advance_energy()
         if course is None:
             return
@@ -674,7 +704,14 @@ class SessionFrames:
         return state, extremes, has_new_records
 
     def _describe_link(self, name: str) -> Json:
-        """Returns the present state of a link: age of samples, settings and counts."""
+        """Returns the present state of a link: age of samples in use, settings and counts.
+
+        Args:
+            name: Name of the link, for example "m1->s".
+
+        Returns:
+            Plain values. The age is None before the first sample came into use.
+        """
         view = self._view
         peer, _, receiver = name.partition("->")
         receiving = view.sites[receiver]
@@ -710,7 +747,16 @@ class SessionFrames:
 
 
 def _count_samples(receiving: SiteView, peer: str) -> Json:
-    """Returns delay and counts of a peer's samples. Empty before the first statistics."""
+    """Returns the delay and the counts of a peer's samples, as a site's statistics state them.
+
+    Args:
+        receiving: View of the site.
+        peer: Name of the peer.
+
+    Returns:
+        Delay in us, and numbers of accepted, late and lost samples. Empty before the first
+        statistics.
+    """
     stats = receiving.stats
     if stats is None:
         return {}

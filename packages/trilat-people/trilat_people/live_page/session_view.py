@@ -72,10 +72,12 @@ class Tail(Generic[T]):
         self.count = 0
 
     def add(self, entry: T) -> None:
-        """Adds an entry to the list. If there are too many, the oldest one is removed.
+        """Adds an entry. If the list is full, its oldest entry is dropped.
+
+        A reader that was too slow then misses the dropped entry.
 
         Args:
-            entry: The entry.
+            entry: The entry, for example a point of a plot.
         """
         self._entries.append(entry)
         self.count += 1
@@ -197,7 +199,7 @@ class SiteView:
 
     @property
     def ended(self) -> bool:
-        """True once the site has published its end."""
+        """True once the site has published its end, so that no further records are expected."""
         return self.reception.final_ticks is not None
 
     @property
@@ -266,12 +268,16 @@ class SessionView:
 
     @property
     def running(self) -> bool:
-        """True once every site runs."""
+        """True once every site has replied that it runs. Before that, `sites` is empty."""
         return bool(self.sites)
 
     @property
     def ended(self) -> bool:
-        """True once every site has published its end or has left, or `finish` was called."""
+        """True once there is nothing more to observe.
+
+        This is the case if every site has published its end or has left the network, or if
+        `finish` was called. A session that has not begun has not ended.
+        """
         if not self.running:
             return False
         if self._finished or self.has_left:
@@ -280,7 +286,11 @@ class SessionView:
 
     @property
     def has_left(self) -> bool:
-        """True if the network has reported for `AWAY_NS` that every site has left."""
+        """True if every site has disappeared from the network for longer than `AWAY_NS`.
+
+        The time counts from the last sign of a site: the end of its liveliness token, or its
+        last message. A short loss of the connection therefore does not end the observation.
+        """
         if self._left_ns is None:
             return False
         arrivals_ns = [site.reception.last_received_ns or 0 for site in self.sites.values()]
@@ -288,9 +298,9 @@ class SessionView:
         return self._clock.monotonic_ns() - since_ns > AWAY_NS
 
     def finish(self) -> None:
-        """Marks the session as ended.
+        """Marks the session as ended, also if the end of a site was not received.
 
-        The process that runs the session calls this when it has seen all sites end.
+        The process that runs the session calls this when the processes of all sites have ended.
         """
         self._finished = True
 
@@ -316,7 +326,11 @@ class SessionView:
 
     @property
     def session_silence_s(self) -> float:
-        """Time for which all running sites have been silent, in s."""
+        """Time for which no running site has been heard, in s. 0 while any of them is heard.
+
+        Displays then say that they wait, because either the session or their own connection is
+        gone.
+        """
         silences_s: list[float] = []
         for site in self.sites.values():
             if not site.ended:
@@ -327,7 +341,8 @@ class SessionView:
     def poll(self) -> None:
         """Receives the messages that have arrived, and requests those that are missing.
 
-        The owner of this object must call this regularly. It never waits.
+        The owner of this object calls it regularly, for example 30 times a second. It never
+        waits. Before the session runs, it only looks for the sites.
         """
         now_ns = self._clock.monotonic_ns()
         self._note_presence(now_ns)
@@ -352,7 +367,9 @@ class SessionView:
         self.links.advance_to(newest_ns)
 
     def _note_presence(self, now_ns: int) -> None:
-        """Notes which sites have appeared on the network or disappeared from it.
+        """Notes which sites have appeared on the network or disappeared, for `has_left`.
+
+        Recorders do not count.
 
         Args:
             now_ns: Present time on the monotonic clock, in ns.
@@ -415,7 +432,10 @@ class SessionView:
         return peer_ticks
 
     def _connect_to_sites(self) -> None:
-        """Receives the replies of members, and creates the sites once all of them run."""
+        """Receives the replies of members, and creates the sites once all of them run.
+
+        The scenario comes with the first reply. An invalid scenario is counted as dropped.
+        """
         for info in self._query.poll():
             self.members[info.member] = info
             if self.scenario is None and info.scenario:
@@ -432,7 +452,11 @@ class SessionView:
             self._create_sites(self.scenario)
 
     def _create_sites(self, scenario: Scenario) -> None:
-        """Creates the views of all sites, which must have replied and run."""
+        """Creates the view of each site, the tables of the links and the energy of the session.
+
+        Args:
+            scenario: Scenario of the session. All of its sites must have replied and run.
+        """
         windows = {name: RecordWindow(scenario, name) for name in scenario.names}
         self.links = LinkTables(scenario.links, scenario.timeline)
         self.dominance = {site: dict(scenario.dominance[site]) for site in scenario.names}
@@ -536,7 +560,14 @@ class SessionView:
     def _store(
         self, name: str, site: SiteView, channel: str, content: State | LinkStats | Event
     ) -> None:
-        """Stores the contents of a message."""
+        """Stores the content of a new message where pages look for it.
+
+        Args:
+            name: Name of the site that sent it.
+            site: View of this site.
+            channel: Channel of the message.
+            content: A record, statistics, or an event.
+        """
         if isinstance(content, State):
             self._store_record(name, site, content)
         elif isinstance(content, LinkStats):
@@ -545,7 +576,16 @@ class SessionView:
             self._store_event(name, site, content)
 
     def _store_record(self, name: str, site: SiteView, record: State) -> None:
-        """Stores a record, and applies the changes in it."""
+        """Stores a record in the window of its site, and applies the changes that it states.
+
+        Records that were sent again may come late. Only a newer one becomes the site's
+        `record`.
+
+        Args:
+            name: Name of the site.
+            site: View of the site.
+            record: The record.
+        """
         if site.record is None or record.tick > site.record.tick:
             site.record = record
         site.window.receive(record)
@@ -559,7 +599,16 @@ class SessionView:
             self._apply_change(name, change)
 
     def _store_event(self, name: str, site: SiteView, event: Event) -> None:
-        """Stores an event, and applies the news about the arm's holder and changes in it."""
+        """Stores an event for the pages, and the news about an arm that it contains.
+
+        An event of the kind "hand" names who took hold of the arm. An event of the kind
+        "change" names who requested a stop, and may contain a change of links or weights.
+
+        Args:
+            name: Name of the site.
+            site: View of the site.
+            event: The event.
+        """
         self.events.add(event)
         if event.kind == "hand":
             holder, separator, _ = event.text.partition(f" {TAKEN} ")

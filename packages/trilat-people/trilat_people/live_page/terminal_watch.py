@@ -276,9 +276,10 @@ def show_in_terminal(
 
 @contextmanager
 def _read_keys() -> Iterator[Callable[[], str] | None]:
-    """Yields a function that returns the keys pressed since its last call.
+    """Yields a function that returns the keys pressed since its last call, without waiting.
 
-    Yields None if this process does not own a terminal.
+    Meanwhile the terminal passes on each key at once and shows none. Its settings are restored
+    at the end. Yields None if this process does not own a terminal: then no key stops the arms.
     """
     try:
         import termios
@@ -295,7 +296,10 @@ def _read_keys() -> Iterator[Callable[[], str] | None]:
         return
 
     def read() -> str:
-        """Returns the keys pressed since the last call. Empty if the terminal has gone."""
+        """Returns the keys pressed since the last call, as a text.
+
+        Empty if the terminal has gone.
+        """
         with suppress(OSError):
             if select.select([keyboard], [], [], 0.0)[0]:
                 return os.read(keyboard, 64).decode(errors="replace")
