@@ -133,7 +133,7 @@ class TrilatRobot(Robot):
 
     @property
     def is_calibrated(self) -> bool:
-        """True, because there is nothing to calibrate."""
+        """True, because the scenario describes the arms and there is nothing to calibrate."""
         return True
 
     def calibrate(self) -> None:
@@ -192,12 +192,15 @@ class TrilatRobot(Robot):
             self._receive_newest()
 
     def _receive_newest(self) -> None:
-        """Receives all new records, and keeps the newest record of each site."""
+        """Receives all new records, the states of sites, and keeps the newest of each site."""
         for record in self._receive_records():
             self._records[record.site] = record
 
     def get_observation(self) -> dict[str, float]:
-        """Returns the newest states of the slave and of the driven master.
+        """Returns the newest states of the slave and of the driven master, for the policy.
+
+        For each of both, these are angles, velocities and external torques of the joints. The
+        position of the operator follows, and the reaction to its force.
 
         Returns:
             Numbers with the keys of `observation_features`.
@@ -230,7 +233,7 @@ class TrilatRobot(Robot):
         return goal
 
     def disconnect(self) -> None:
-        """Releases the arm and leaves the session. The session continues."""
+        """Releases the master and leaves the session, which continues with its other users."""
         self._require_hand()
         self._hand = None
         self._stack.close()
@@ -251,10 +254,10 @@ class TrilatRobot(Robot):
         return hand
 
     def _require_hand(self) -> Any:
-        """Returns the connection of the operator.
+        """Returns the connection with which the policy acts as an operator.
 
         Raises:
-            DeviceNotConnectedError: The robot is not connected.
+            DeviceNotConnectedError: The robot is not connected; call `connect` first.
         """
         if self._hand is None:
             raise DeviceNotConnectedError(f"{self} is not connected.")
@@ -361,7 +364,12 @@ def load_policy(folder: str) -> Callable[[dict[str, list[float]]], list[float]]:
     policy.reset()
 
     def decide(state: dict[str, list[float]]) -> list[float]:
-        """Returns the action of the policy for an observation."""
+        """Returns the action of the policy for an observation, as plain numbers.
+
+        Args:
+            state: Numbers of each feature of the observation. Features that the policy was not
+                trained with are left out.
+        """
         tensors = {
             key: torch.tensor([numbers], dtype=torch.float32)
             for key, numbers in state.items()
@@ -375,7 +383,7 @@ def load_policy(folder: str) -> Callable[[dict[str, list[float]]], list[float]]:
 
 
 def main() -> None:
-    """Runs a trained policy in a session, as the command line says."""
+    """Runs a trained policy in a session: the command `python -m lerobot_robot_trilat`."""
     parser = argparse.ArgumentParser(prog="python -m lerobot_robot_trilat")
     parser.add_argument("folder", help="folder of the policy, which ends in pretrained_model")
     parser.add_argument("--site", default="m2", help="master that the policy drives")

@@ -122,7 +122,7 @@ class TrilatTeleoperator(Teleoperator):
 
     @property
     def is_calibrated(self) -> bool:
-        """True, because there is nothing to calibrate."""
+        """True, because the scenario describes the arm and there is nothing to calibrate."""
         return True
 
     def calibrate(self) -> None:
@@ -202,11 +202,14 @@ class TrilatTeleoperator(Teleoperator):
             command(*goal)
 
     def enable_torque(self) -> None:
-        """Allows `send_feedback` to move the arm."""
+        """Allows `send_feedback` to move the arm, for example before the person intervenes."""
         self._torque_enabled = True
 
     def disable_torque(self) -> None:
-        """Releases the arm, so that only the person moves it and feedback has no effect."""
+        """Releases the arm, so that only the person moves it and feedback has no effect.
+
+        `enable_torque` ends this.
+        """
         self._torque_enabled = False
         self._require_hand().release()
 
@@ -228,16 +231,16 @@ class TrilatTeleoperator(Teleoperator):
         }
 
     def disconnect(self) -> None:
-        """Releases the arm and leaves the session. The session continues."""
+        """Releases the arm and leaves the session, which continues with its other users."""
         self._require_hand()
         self._hand = None
         self._stack.close()
 
     def _require_hand(self) -> Any:
-        """Returns the connection of the operator.
+        """Returns the connection with which feedback moves the person's arm.
 
         Raises:
-            DeviceNotConnectedError: The teleoperator is not connected.
+            DeviceNotConnectedError: The teleoperator is not connected; call `connect` first.
         """
         if self._hand is None:
             raise DeviceNotConnectedError(f"{self} is not connected.")

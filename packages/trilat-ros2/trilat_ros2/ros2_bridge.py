@@ -205,7 +205,10 @@ class TargetTopic:
                 self._release_hand()
 
     def _release_hand(self) -> None:
-        """Releases the arm if the topic commands it at present."""
+        """Releases the arm if the topic commands it at present.
+
+        The next target then takes hold of the arm anew.
+        """
         if self._received_ns is not None:
             self._received_ns = None
             self.hand.release()
@@ -381,7 +384,10 @@ class RobotArm:
             self._commands.put(self._pack(*ordered_torque))
 
     def _may_apply(self, torque: Sequence[float]) -> bool:
-        """Returns True if the robot is armed, and the torque has one number for each joint."""
+        """Returns True if the robot may receive a torque.
+
+        It must be armed, and the torque must have one number for each joint.
+        """
         return self.armed and len(torque) == len(self._joint_order)
 
     def send_safe_command(self) -> None:
@@ -596,7 +602,15 @@ class _Bridge:
         _serve_orders(graph, running, scenario.names)
 
     def _subscribe_dominance(self, site: str, running: RunningSession) -> None:
-        """Subscribes to the topic that sets the weights of a site."""
+        """Subscribes to the topic that sets the weights with which a site follows its peers.
+
+        The changes before the bridge was started are read first, because they determine the
+        present weights, which the bridge publishes.
+
+        Args:
+            site: Name of the site.
+            running: Connection that requests the changes.
+        """
         ends = self._ends
         # The changes before the bridge was started determine the site's present shares.
         shares = self._sites[site].shares
@@ -610,7 +624,11 @@ class _Bridge:
         ends.graph.subscribe(topic, cdr.FLOAT64_ARRAY, dominance.receive)
 
     def _subscribe_target(self, site: str) -> None:
-        """Subscribes to the topic that commands the arm of a site."""
+        """Subscribes to the topic with which a ROS program moves an arm, as its operator.
+
+        Args:
+            site: Name of the arm's site, whose scenario must allow a live hand.
+        """
         ends = self._ends
         hand = open_hand(
             bus=ends.bus,
@@ -673,7 +691,7 @@ class _Bridge:
         return False
 
     def _have_sites_left(self) -> bool:
-        """Returns True if sites were present, and none is present any more."""
+        """Returns True if sites were present and all have left, so that the bridge may end."""
         return self._has_seen_site and not self._present
 
     def _publish_messages(self, rate_hz: float) -> bool:
@@ -710,7 +728,10 @@ class _Bridge:
         return has_new_epoch
 
     def _publish_diagnostics(self) -> None:
-        """Publishes the diagnostics of all sites, if a ROS program subscribes to them."""
+        """Publishes the state of all sites on /diagnostics, where tools of ROS show it.
+
+        Nothing is composed while no ROS program subscribes.
+        """
         if not self._diagnostics.has_subscribers:
             return
         newest = [site_topics.newest for site_topics in self._sites.values()]

@@ -66,7 +66,11 @@ def ros2_command(
     running = RunningSession(name, reach.resolve(operates=False).require(BRIDGE))
 
     def open_graph(refusals: Refusals) -> Ros2Graph:
-        """Joins the network of ROS as a node with the name of the session."""
+        """Joins the network of ROS as a node that is called trilat, in the session's namespace.
+
+        Args:
+            refusals: Counts the messages of ROS programs that the bridge refuses.
+        """
         return Ros2Graph(
             refusals=refusals,
             routers=ros or [options.ROS_ROUTER],

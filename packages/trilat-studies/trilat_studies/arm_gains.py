@@ -161,7 +161,7 @@ class ArmGains(Result):
     curve: list[tuple[float, float]]
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row per joint of the arm: its inertia and tuned gains, for a CSV file."""
+        """Returns a row per joint of the arm, with its inertia and gains, for a CSV file."""
         return self.joints
 
     def blocks(self) -> Iterator[Block]:
@@ -226,7 +226,10 @@ class ArmGains(Result):
 
 
 def _format_cell(value: Any) -> str:
-    """Returns the text of a table cell: a number with four digits, a text, or "-" if empty."""
+    """Returns the text of a table cell.
+
+    A number has four digits. Any other value is its own text, and an empty one is "-".
+    """
     if isinstance(value, float):
         return f"{value:.4g}"
     return value or "-"

@@ -56,7 +56,7 @@ class _ComparisonRow(NamedTuple):
 
     @property
     def values(self) -> tuple[float | None, ...]:
-        """The value of the quantity in each of the compared runs. None where it is missing."""
+        """The value of the quantity in each of the compared runs. None where a run has none."""
         return tuple(entry.value for entry in self.entries)
 
 
@@ -150,7 +150,10 @@ class LogComparison(Result):
     remarks: dict[str, list[str]]
 
     def headline(self) -> str:
-        """Returns a sentence that names the compared logs and the number of quantities."""
+        """Returns a sentence that names the compared logs and the number of quantities.
+
+        Example: "a, b: 14 quantities".
+        """
         quantities = count_nouns(len(self.metrics.rows), "quantity")
         return f"{', '.join(self.metrics.columns)}: {quantities}"
 
@@ -202,7 +205,11 @@ class LogComparison(Result):
         yield f"--all prints all {count}, and why numbers are missing"
 
     def _compose_differences(self) -> Iterator[Block]:
-        """Yields the differences of the experiments, as a table or as a sentence."""
+        """Yields how the experiments of the logs differ, as a table with a row per difference.
+
+        Logs of scenarios with different names get a sentence in addition. If nothing differs, a
+        sentence says so.
+        """
         names = {log.scenario.name for log in self.logs}
         if len(names) > 1:
             sorted_names = ", ".join(sorted(names))
@@ -235,7 +242,11 @@ class LogComparison(Result):
         )
 
     def _explain_missing_values(self) -> Iterator[str]:
-        """Yields a sentence for each metric that applies to a log but has no value."""
+        """Yields a sentence for each metric that applies to a log but has no value there.
+
+        Example: "b: no settling time: the arms were still moving". Metrics that do not apply,
+        such as those of a wall in a run without one, need no explanation.
+        """
         for row in self.metrics.rows:
             for name, entry in zip(self.metrics.columns, row.entries, strict=True):
                 is_missing = entry.value is None

@@ -129,7 +129,12 @@ class RecordBatch(NamedTuple):
         )
 
     def _slice(self, first: int, stop: int | None) -> "RecordBatch":
-        """Returns the records from index `first` up to, but not including, index `stop`."""
+        """Returns the records with the indices from `first` up to, but not including, `stop`.
+
+        Args:
+            first: First index.
+            stop: End of the range. None for all following records.
+        """
         columns = [column[first:stop] for column in self]
         return RecordBatch._make(columns)
 
@@ -195,7 +200,14 @@ def run_in_batches(
     diverged_at_s: float | None = None
 
     def flush(name: str) -> None:
-        """Passes the collected records of a site to its receiver, and clears them."""
+        """Passes the collected records of a site to its receiver as arrays, and clears them.
+
+        Statistics over arrays are much faster than record by record. Nothing happens if no
+        records were collected.
+
+        Args:
+            name: Name of the site.
+        """
         records = pending[name]
         if not records:
             return
@@ -571,7 +583,10 @@ class SiteStats:
 
     @property
     def last_ns(self) -> int:
-        """Nominal time of the last record, in ns. It is -1 before the first record."""
+        """Nominal time of the last record, in ns since the epoch. -1 before the first record.
+
+        The metrics of the last second, and the length of the run, count from it.
+        """
         if not self._tail:
             return -1
         last_batch = self._tail[-1]
@@ -628,7 +643,11 @@ class SiteStats:
 
     @property
     def tau_x(self) -> Array:
-        """Torque of operator and environment in the last record, in N m, shape (n,)."""
+        """Torque of operator and environment in the last record, in N m, shape (n,).
+
+        By it, the judgement of the end tells whether an operator still acts on the arm. Before
+        the first record it is a single zero.
+        """
         if not self._tail:
             return np.zeros(1)
         last_batch = self._tail[-1]
@@ -1005,7 +1024,15 @@ def evaluate_expectations(expect: Expect, metrics: RunMetrics) -> list[Expectati
 
 
 def _evaluate_stability(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
-    """Yields the outcome of `stable`, if the scenario expects it or if the run diverged."""
+    """Yields whether the run is as stable as the key `stable` of the scenario expects.
+
+    A run that diverged is evaluated also if the scenario does not state the key. A run alone
+    proves no stability, so "settled" is the best judgement, and counts as stable.
+
+    Args:
+        expect: Table [expect] of the scenario.
+        metrics: Metrics of the run.
+    """
     expects_stable = expect.stable is not False
     end = metrics.end
     if expect.stable is not None or end.diverged_at_s is not None:
@@ -1106,7 +1133,14 @@ def _evaluate_poses(expect: Expect, metrics: RunMetrics) -> Iterator[Expectation
 
 
 def _evaluate_windows(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
-    """Yields the outcome of each limited quantity of each window."""
+    """Yields the outcome of each quantity that a window of the table [expect] limits.
+
+    A window is a period of the run, such as 9 s to 15 s, with limits of its own.
+
+    Args:
+        expect: Table [expect] of the scenario.
+        metrics: Metrics of the run.
+    """
     for window, ranges in zip(expect.windows, metrics.windows, strict=True):
         site = f" {window.site}" if window.site else ""
         period = f"{window.from_s:g}-{window.to_s:g} s"
@@ -1118,7 +1152,14 @@ def _evaluate_windows(expect: Expect, metrics: RunMetrics) -> Iterator[Expectati
 
 
 def _evaluate_metrics(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
-    """Yields the outcome of each limited metric of docs/reference/metrics.md."""
+    """Yields the outcome of each metric that the table [expect] limits, such as "path_m".
+
+    A metric that the run cannot give fails its limit, with the reason in place of a number.
+
+    Args:
+        expect: Table [expect] of the scenario.
+        metrics: Metrics of the run.
+    """
     for key, limits in expect.metrics.items():
         value, reason, _ = metrics.metrics[key]
         measured = None if value is None else Range(value, value)

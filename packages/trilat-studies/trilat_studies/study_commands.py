@@ -198,7 +198,17 @@ def _run_virtual(trials: "list[Trial]", jobs: int | None, on: str | None) -> "Tr
 
 
 def _run_live(trials: "list[Trial]") -> "TrialReport":
-    """Runs trials live, one after the other, and evaluates their logs."""
+    """Runs trials live, one after the other, and evaluates their logs.
+
+    Live sessions share the processors and ports of the machine, so they do not run side by
+    side.
+
+    Args:
+        trials: The trials: a scenario with a seed each.
+
+    Returns:
+        The report, with the time that each trial took.
+    """
     from .trials import TrialReport, evaluate_live_log
 
     clock = SystemClock()

@@ -91,7 +91,7 @@ class TrialResult(NamedTuple):
 
     @property
     def held(self) -> bool:
-        """True if the run was completed and met all expectations of its scenario."""
+        """True if the run was completed and met every expectation of its scenario."""
         return not self.error and all(outcome.held for outcome in self.outcomes)
 
     @property
@@ -131,14 +131,17 @@ class Trial(NamedTuple):
 
     @property
     def again(self) -> str:
-        """Shell command that repeats this trial, for the user to copy."""
+        """Shell command that repeats this trial, for the user to copy.
+
+        Example: "trilat test jitter --seeds 3".
+        """
         live = ["--live"] if self.live else []
         seeds = ["--seeds", str(self.scenario.seed)]
         return format_command("test", self.source, *live, *seeds, *set_options(self.overrides))
 
     @property
     def look(self) -> str:
-        """Shell command that simulates this trial and records its log, for inspection."""
+        """Shell command that simulates this trial and records its log, to inspect a failure."""
         arguments = ["--seed", str(self.scenario.seed), "-o", f"{self}.mcap"]
         return format_command("sim", self.source, *arguments, *set_options(self.overrides))
 
@@ -374,12 +377,12 @@ class TrialReport(Result):
 
     @property
     def held(self) -> bool:
-        """True if all runs met all expectations."""
+        """True if all runs met all expectations. `trilat test` then ends with exit code 0."""
         return all(result.held for result in self.results)
 
     @property
     def scenarios(self) -> dict[str, list[TrialResult]]:
-        """The results of each scenario, by the name or path of the scenario."""
+        """The results of each scenario, by its name or path, in the order of the trials."""
         groups: dict[str, list[TrialResult]] = {}
         for result in self.results:
             groups.setdefault(result.trial.source, []).append(result)
@@ -422,9 +425,9 @@ class TrialReport(Result):
         return rows
 
     def failures(self) -> list[str]:
-        """Returns lines about the failed runs, with the commands that repeat them.
+        """Returns lines about the failed runs, each with the commands that repeat and show it.
 
-        Empty if all runs met their expectations.
+        At most `MAX_FAILURES_SHOWN` runs of a scenario are explained. Empty if no run failed.
         """
         lines = []
         for results in self.scenarios.values():
@@ -496,12 +499,18 @@ class TrialReport(Result):
         yield from [*self.failures(), *self.remarks()]
 
     def headline(self) -> str:
-        """Returns a sentence with the number of runs that met all expectations."""
+        """Returns a sentence with the number of runs that met all expectations.
+
+        Example: "19 of 20 runs as expected".
+        """
         held = sum(result.held for result in self.results)
         return f"{held} of {count_nouns(len(self.results), 'run')} as expected"
 
     def to_dict(self) -> dict[str, Any]:
-        """Converts the results to plain values, as `trilat test --json` prints them."""
+        """Converts the results to plain values, as `trilat test --json` prints them.
+
+        "again" is the command that repeats a run, and "log" the path of its log or null.
+        """
         runs = [
             {
                 "scenario": result.trial.source,
@@ -517,7 +526,10 @@ class TrialReport(Result):
         return {"held": self.held, "wall_s": self.wall_s, "runs": runs}
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a table of plain values, one row for each expectation of each run."""
+        """Returns a table of plain values, one row for each expectation of each run.
+
+        A data frame of these rows shows how close runs came to their limits.
+        """
         return [
             {
                 "scenario": result.trial.source,
@@ -660,7 +672,10 @@ def format_margin(margin: float | None) -> str:
 
 
 def _list_repeat_commands(result: TrialResult) -> list[str]:
-    """Returns lines with the command that repeats a run, and the command that shows it."""
+    """Returns two lines with the commands that repeat a failed run and show what happened.
+
+    A live run has its log already, so that it is shown by a report of the log.
+    """
     look = f"trilat report {result.log}" if result.log else result.trial.look
     return [f"again: {result.trial.again}", f"look:  {look}"]
 
@@ -765,12 +780,19 @@ def _add_case(suite: Xml.Element, result: TrialResult) -> None:
 
 
 def _describe_outcome(outcome: ExpectationResult) -> str:
-    """Returns a line with the measured value, the limit and the margin of an expectation."""
+    """Returns a line about an expectation: the measured value, the limit and the margin.
+
+    Example: "FAIL error_rad: 0.031 rad, expected at most 0.02 rad".
+    """
     mark = "ok" if outcome.held else "FAIL"
     margin = "" if outcome.margin is None else f" ({format_margin(outcome.margin)})"
     return f"{mark} {outcome.key}: {outcome.measured}, expected {outcome.limit}{margin}"
 
 
 def _replace_forbidden(text: str) -> str:
-    """Returns a text in which the characters that XML forbids are replaced by U+FFFD."""
+    """Returns a text in which the characters that XML forbids are replaced by U+FFFD.
+
+    An error message of a user's code may contain any character, and a build server would refuse
+    the whole report.
+    """
     return _NOT_XML.sub("\N{REPLACEMENT CHARACTER}", text)

@@ -230,7 +230,13 @@ def _compute_number(result: BenchCellResult, quantity: str) -> float | None:
 
 
 def _label_laws(axes: Axes, results: BenchResults, task: str) -> None:
-    """Writes the names of the laws beside the rows of a task's panel."""
+    """Writes the names of the laws beside the rows of a task's panel.
+
+    Args:
+        axes: The panel.
+        results: Results of the suite.
+        task: Name of the task.
+    """
     laws = _list_laws(results, task)
     labels = [name_law(law, form) for law, form in laws]
     rows = range(len(laws))
@@ -240,7 +246,15 @@ def _label_laws(axes: Axes, results: BenchResults, task: str) -> None:
 
 
 def _mark_cells(axes: Axes, results: BenchResults, task: str) -> None:
-    """Marks the cells of a task's panel that have runs that are not stable or open."""
+    """Marks cells of a task's panel whose mean hides runs that are not stable, or are open.
+
+    A cross stands for a run that is not stable, a dot for a run whose stability is open.
+
+    Args:
+        axes: The panel.
+        results: Results of the suite.
+        task: Name of the task.
+    """
     laws = _list_laws(results, task)
     links = results.plan.links
     for result in results.select(task):

@@ -712,7 +712,7 @@ class BenchCell(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Name of the cell in results, as in "contact/wave/rtt272"."""
+        """Name of the cell in results: task, law and link, as in "contact/wave/rtt272"."""
         return f"{self.task}/{self.law}/{self.link}"
 
     @property
@@ -770,17 +770,26 @@ class BenchPlan(NamedTuple):
 
     @property
     def tasks(self) -> list[str]:
-        """Names of the tasks that run in the benchmark, each once, in running order."""
+        """Names of the tasks that run in the benchmark, each once, in running order.
+
+        A study may select only some of the tasks of the suite.
+        """
         return list(dict.fromkeys(cell.task for cell in self.cells))
 
     @property
     def links(self) -> list[str]:
-        """Names of the links over which the benchmark runs, each once, in running order."""
+        """Names of the links over which the benchmark runs, each once, in running order.
+
+        These are also the columns of its figures.
+        """
         return list(dict.fromkeys(cell.link for cell in self.cells))
 
     @property
     def runs(self) -> int:
-        """Number of runs of all cells."""
+        """Number of runs of all cells: one per seed.
+
+        Confirming repetitions come in addition.
+        """
         return sum(len(cell.seeds) for cell in self.cells)
 
     def cell(self, name: str) -> BenchCell:
@@ -801,7 +810,14 @@ class BenchPlan(NamedTuple):
 
 @cache
 def _load_base_text(form: str) -> str:
-    """Returns the TOML text of a form's scenario, with all defaults written out."""
+    """Returns the TOML text of a form's scenario, with all defaults written out.
+
+    A form is the kind of shipped scenario on which tasks are based. Its text enters the
+    fingerprint of the gains, because other defaults would need another tuning.
+
+    Args:
+        form: A key of `BASES`.
+    """
     return load_tuning_scenario(BASES[form]).scenario.text
 
 

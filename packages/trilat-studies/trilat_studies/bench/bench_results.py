@@ -147,7 +147,11 @@ class BenchRun(msgspec.Struct, frozen=True):
 
     @property
     def confirmation_s(self) -> float:
-        """Duration of the repetition that confirms or refutes this run, in s."""
+        """Duration for which this run is repeated if it was judged not stable, in s.
+
+        The repetition is longer than the run. If it is not stable either, it confirms the
+        judgement; if it is stable, it refutes it.
+        """
         return CONFIRMATION_LENGTHS * self.length_s
 
     @property
@@ -205,11 +209,14 @@ class BenchCellResult(NamedTuple):
 
     @property
     def stable(self) -> int:
-        """Number of runs of the cell that are judged stable."""
+        """Number of runs of the cell that are judged stable.
+
+        Runs that only came to rest do not count.
+        """
         return self.count(Stability.STABLE)
 
     def count(self, stability: Stability) -> int:
-        """Counts the runs with a given judgement of their stability.
+        """Counts the runs of the cell with a given judgement of their stability.
 
         Args:
             stability: The judgement to count, for example `Stability.NOT_STABLE`.
@@ -262,9 +269,9 @@ class BenchCellResult(NamedTuple):
 
     @property
     def interval(self) -> tuple[float, float] | None:
-        """95 % confidence interval of the fraction of stable runs, by Wilson's method.
+        """95 % confidence interval of the share of stable runs, by Wilson's method.
 
-        None for fewer than `LEAST_SEEDS` runs.
+        None for fewer than `LEAST_SEEDS` runs, of which an interval would say nothing.
         """
         if len(self.runs) < LEAST_SEEDS:
             return None
@@ -340,7 +347,11 @@ class BenchResults(Result):
         return f"{self.plan.study}: {cells}, {runs}"
 
     def to_dict(self) -> dict[str, Any]:
-        """Converts the results to plain values, as `trilat bench --json` prints them."""
+        """Converts the results to plain values, as `trilat bench --json` prints them.
+
+        Returns:
+            The study, the gains that its cells use, and the rows of all cells ("places").
+        """
         entries = [
             msgspec.to_builtins(gains) | {"outcome": "settled"}
             for gains in _list_used_gains(self)
@@ -348,7 +359,10 @@ class BenchResults(Result):
         return {"study": self.plan.study, "gains": entries, "places": self.to_rows()}
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns the results as a table of plain values, one row per cell of the suite."""
+        """Returns the results as a table of plain values, one row per cell of the suite.
+
+        A cell is a law in a task over a link. The rows are those of the CSV file.
+        """
         return list(map(_build_row, self.places))
 
     def select(self, task: str, law: str = "", link: str = "") -> Iterator[BenchCellResult]:
@@ -379,7 +393,7 @@ class BenchResults(Result):
 
 
 def _list_used_gains(results: BenchResults) -> list[TunedGains]:
-    """Returns the gains of all cells, without repetitions."""
+    """Returns the tuned gains of all cells. Gains that several cells share occur once."""
     return list({str(cell.tuned): cell.tuned for cell in results.plan.cells}.values())
 
 
@@ -791,12 +805,21 @@ _CELL_COLUMNS = ("task", "law", "link", "form")
 
 
 def _build_cell_columns(cell: BenchCell) -> dict[str, Any]:
-    """Returns the columns that identify a cell: task, law, link and form."""
+    """Returns the columns that identify a cell: task, law, link and form.
+
+    The form is the kind of scenario: how many arms, and whether gravity acts on them.
+    """
     return {name: getattr(cell, name) for name in _CELL_COLUMNS}
 
 
 def _build_row(result: BenchCellResult) -> dict[str, Any]:
-    """Returns the row of a cell in JSON and CSV. Unknown numbers are None."""
+    """Returns the row of a cell in JSON and CSV: judgements, and means with intervals.
+
+    Unknown numbers are None, for example the force of the wall in a task without a wall.
+
+    Args:
+        result: Results of the cell.
+    """
     share_low = None
     share_high = None
     if result.interval is not None:

@@ -149,7 +149,7 @@ class JudgedRun(NamedTuple):
 
     @property
     def diverged(self) -> bool:
-        """True if a site exceeded its limits, which ended the run."""
+        """True if an arm exceeded its limits, which ended the run before its time."""
         return self.end.diverged_at_s is not None
 
 
@@ -460,7 +460,14 @@ def _measure_contact(run: BenchRun, item: BenchRunItem, far: JudgedRun) -> Bench
 
 
 def _find_contact_s(scenario: Scenario, records: dict[str, RecordBatch]) -> float | None:
-    """Returns the time at which the slave first touches a wall, in s. None if it does not."""
+    """Returns the time at which the slave first touches a wall, in s. None if it does not.
+
+    The rendered stiffness is measured a fixed time after this contact.
+
+    Args:
+        scenario: Scenario of the run, with the walls.
+        records: Records of each site.
+    """
     record = records[SLAVE]
     tip = build_arm_rows(scenario, SLAVE).place_end_effector(record.q, record.qd)
     t_s = record.t_ns / NS_PER_S
@@ -670,7 +677,15 @@ def _run_window(
 
 
 def _compute_impedance(shaken: _TipMotion, still: _TipMotion) -> float:
-    """Computes |Z| from a shaken run and the same run without the sine, in N s/m."""
+    """Computes the impedance |Z| that the user feels at one frequency, in N s/m.
+
+    The user's arm is shaken by a sine in one of two otherwise equal runs. The difference of the
+    two runs is the response to the sine alone; Z is its force over its velocity.
+
+    Args:
+        shaken: Motion of and force on the user's end effector in the run with the sine.
+        still: The same in the run without the sine.
+    """
     count = len(shaken.force_n)
     turns = IMPEDANCE_PERIODS * np.arange(count) / count
     wave = np.exp(-2j * np.pi * turns)

@@ -326,7 +326,15 @@ def _draw_cells(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
 
 
 def _hatch_undecided(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
-    """Hatches the undecided cells. Neighbouring cells of a row form one rectangle."""
+    """Hatches the cells of which half or more of the runs are undecided.
+
+    Neighbouring cells of a row form one rectangle, because the hatching would show seams.
+
+    Args:
+        axes: The panel of the figure.
+        plane: Axes of the map.
+        panel: Results of the panel.
+    """
     x = compute_borders(plane.x)
     y = compute_borders(plane.y)
     undecided_rows = _find_undecided(plane, panel)
@@ -339,7 +347,16 @@ def _hatch_undecided(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
 
 
 def _draw_verdict_edges(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
-    """Draws the measured edges of the classes in each column as vertical lines."""
+    """Draws where the runs change between stable and not stable, in each column.
+
+    The edge of a column lies between two grid points, and is drawn as a vertical line between
+    them. On a map of growth exponents the lines show whether both ways of judging agree.
+
+    Args:
+        axes: The panel of the figure.
+        plane: Axes of the map.
+        panel: Results of the panel.
+    """
     for x_value, edge in find_map_edges(plane, panel):
         x = _find_position(plane.x, x_value)
         low = _find_position(plane.y, edge.low)
@@ -348,13 +365,23 @@ def _draw_verdict_edges(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
 
 
 def _find_position(axis: PlaneAxis, value: float) -> float:
-    """Returns the position at which a value is drawn, interpolated between the axis values."""
+    """Returns the position at which a value is drawn on an axis.
+
+    It is interpolated between the values of the axis, whose positions need not be equally
+    spaced.
+    """
     position = np.interp(value, axis.values, axis.positions)
     return float(position)
 
 
 def _list_stretches(flags: Array) -> list[tuple[int, int]]:
-    """Returns the ranges of consecutive True values in a row, as pairs (first, last + 1)."""
+    """Returns the ranges of consecutive True values, as pairs (first, last + 1).
+
+    Example: [True, True, False, True] has the ranges (0, 2) and (3, 4).
+
+    Args:
+        flags: Truth values, shape (K,).
+    """
     padded = np.concatenate([[False], flags, [False]])
     is_change = padded[1:] != padded[:-1]
     changes = np.flatnonzero(is_change).tolist()
@@ -400,13 +427,19 @@ def _draw_line(axes: Axes, plane: MapPlane, line: MapLine) -> None:
 
 
 def _find_line_style(line: MapLine) -> dict[str, Any]:
-    """Returns the style of a line, which follows from its rank."""
+    """Returns the plot options of a line.
+
+    Lines of the same kind have the same rank and style.
+    """
     style_index = line.rank % len(_LINE_STYLES)
     return _LINE_STYLES[style_index]
 
 
 def _extend_positions(axis: PlaneAxis) -> Array:
-    """Returns the positions of the values of an axis, between the two borders of the panel."""
+    """Returns the positions of an axis's values with the borders of the panel at both ends.
+
+    A line that is known at the first and the last value is thereby drawn up to the border.
+    """
     borders = compute_borders(axis)
     first_border = borders[:1]
     last_border = borders[-1:]
@@ -626,7 +659,10 @@ def _draw_legend(figure: Figure, plane: MapPlane, lines: Sequence[Sequence[MapLi
 
 
 def _list_class_handles(plane: MapPlane) -> list[Patch]:
-    """Returns the legend entries of the classes that occur in a map, except "undecided"."""
+    """Returns the legend entries of the classes that occur in a map, with their colours.
+
+    The class "undecided" has no colour of its own: its cells are hatched.
+    """
     counts_of_panels = [panel.counts.sum(axis=(0, 1)) for panel in plane.panels]
     counts = sum(counts_of_panels)
     handles = []
@@ -711,7 +747,10 @@ def build_map_page(chart: StabilityMap, picture: str) -> str:
 
 
 def _list_notes(chart: StabilityMap) -> list[str]:
-    """Returns the notes of a map's page, on the lines and on the gains that were not swept."""
+    """Returns the notes below a map: the origin of its lines, and gains that were not swept.
+
+    A line that several panels have is explained once.
+    """
     origins = []
     for lines in chart.lines:
         for line in lines:
@@ -805,14 +844,22 @@ def _list_crossings(line: MapLine, plane: MapPlane) -> Iterator[tuple[float, Sta
 
 
 def _format_edge(edge: StabilityEdge) -> str:
-    """Returns the text of an edge: its interval, or its value if the interval is empty."""
+    """Returns an edge of stability as text: "40 to 60", the values between which it lies.
+
+    A line of theory has a single value, "52.3".
+    """
     if edge.low == edge.high:
         return f"{edge.low:.4g}"
     return f"{edge.low:g} to {edge.high:g}"
 
 
 def _format_nearest_edge(value: float, edges: Sequence[StabilityEdge]) -> str:
-    """Returns the text of the edge that is nearest to a value, or "-" if there are no edges."""
+    """Returns the text of the edge that is nearest to a value. "-" if there are no edges.
+
+    Args:
+        value: Value on the vertical axis, usually that of a line of theory.
+        edges: Edges of the column.
+    """
     if not edges:
         return "-"
     nearest = min(edges, key=lambda edge: abs(edge.middle - value))

@@ -404,7 +404,10 @@ def _search_margin_task(task: _MarginItem) -> GridPointMargin:
 
 
 def _find_nearest(value: float, edges: Sequence[float]) -> float | None:
-    """Returns the edge that is nearest to a value. None if there are no edges."""
+    """Returns the edge that is nearest to a value, to show theory beside a measured edge.
+
+    None if there are no edges.
+    """
     return min(edges, key=lambda edge: abs(edge - value), default=None)
 
 
@@ -483,11 +486,14 @@ class SweepMargins(Result):
         return TextTable(tuple(heads), rows)
 
     def blocks(self) -> Iterator[TextTable]:
-        """Yields the table of the limits of stability, which is the printed text."""
+        """Yields the table of the measured and predicted limits of stability."""
         yield self.table()
 
     def headline(self) -> str:
-        """Returns a sentence with the number of limits of stability, and the searched range."""
+        """Returns a sentence with the number of limits of stability, and the searched range.
+
+        Example: "paper: 2 edges of control.d from 0 to 40".
+        """
         edges = sum(len(point.margin.spans) for point in self.found)
         low = self.within.low
         high = self.within.high
@@ -497,7 +503,10 @@ class SweepMargins(Result):
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Converts the result to plain values, as `trilat sweep --margin --json` prints it."""
+        """Converts the result to plain values, as `trilat sweep --margin --json` prints it.
+
+        "places" has an entry for each grid point, and "command" repeats the search.
+        """
         return {
             "command": self.command,
             "scenario_sha256": self.plan.base.sha256,
@@ -506,7 +515,11 @@ class SweepMargins(Result):
         }
 
     def _describe_point(self, point: GridPointMargin) -> dict[str, Any]:
-        """Returns the plain values of a grid point, for `to_dict`."""
+        """Returns the plain values of a grid point for `to_dict`: position, seed and edges.
+
+        Args:
+            point: Margin of the grid point.
+        """
         margin = point.margin
         position: dict[str, Any] = {}
         for axis, value in zip(self.plan.axes[:-1], point.cell.values, strict=True):

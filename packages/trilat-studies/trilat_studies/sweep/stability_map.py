@@ -80,7 +80,10 @@ class PlaneAxis(NamedTuple):
 
     @property
     def is_evenly_spaced(self) -> bool:
-        """True if the values are equally spaced, up to rounding."""
+        """True if the values are equally spaced, up to rounding.
+
+        Fewer than three values are.
+        """
         steps = np.diff(self.values)
         if len(steps) < 2:
             return True
@@ -123,13 +126,13 @@ class MapPanel(NamedTuple):
 
     @property
     def runs(self) -> RunCounts:
-        """Number of all runs at each grid point, shape (y, x)."""
+        """Number of all runs at each grid point, decided or not, shape (y, x)."""
         total: RunCounts = self.counts.sum(axis=2)
         return total
 
     @property
     def stable(self) -> RunCounts:
-        """Number of stable runs per grid point, shape (y, x)."""
+        """Number of runs per grid point that were judged stable, shape (y, x)."""
         is_stable = [verdict.stable is True for verdict in CELL_CLASSES]
         stable: RunCounts = self.counts[:, :, is_stable].sum(axis=2)
         return stable
@@ -187,7 +190,7 @@ class MapPlane(NamedTuple):
 
     @property
     def seeds(self) -> int:
-        """Largest number of runs at any grid point. Runs of a point differ in their seeds."""
+        """Largest number of runs at any grid point. 1 if the sweep has a single seed."""
         return max(int(panel.runs.max()) for panel in self.panels)
 
 
@@ -834,7 +837,10 @@ class MapLine(NamedTuple):
 
     @property
     def drawn_excess(self) -> Array:
-        """The quantity at the columns between which the line is drawn."""
+        """The quantity whose zero is the line, at the columns between which the line is drawn.
+
+        These are the fine columns if the line was computed there, otherwise those of the map.
+        """
         return self.fine_excess if self.fine_positions else self.excess
 
     def thin_out(self, columns: FineColumns) -> "MapLine":

@@ -48,7 +48,10 @@ class CellClass(StrEnum):
 
     @property
     def stable(self) -> bool | None:
-        """True if a run with this result is stable. False if it is not. None if undecided."""
+        """True if a run of this class counts as stable, False if not, None if it is undecided.
+
+        Only converged runs count as stable.
+        """
         if self is CellClass.UNDECIDED:
             return None
         return self is CellClass.CONVERGED
@@ -175,20 +178,28 @@ class _CellInProgress:
         self.run = FusedRun(scenario, SETTLED_ERROR_RAD)
 
     def note_first_end(self) -> None:
-        """Evaluates the run at the end of the scenario's duration."""
+        """Evaluates the run at the end of the scenario's duration.
+
+        Totals, such as the RMS error, are taken here, before any extension. A run that chatters
+        at a wall is not extended, see `classify_cell`.
+        """
         self._totals = self.run.totals
         self._outcome = self._build_result()
         if self._end_s < self._longest_s and _chatters(self._scenario, self.run):
             self._longest_s = self._end_s
 
     def find_next_end(self) -> float | None:
-        """Returns the time up to which the run has to continue, in s. None if it has not."""
+        """Returns the time up to which the run has to continue, in s. None if it is finished.
+
+        A run is finished if a longer one would end in the same way, or at the longest duration.
+        Otherwise its duration is doubled.
+        """
         if is_conclusive(self._outcome) or self._end_s >= self._longest_s:
             return None
         return min(2.0 * self._end_s, self._longest_s)
 
     def note_extension(self, end_s: float) -> None:
-        """Evaluates the run, which was extended.
+        """Evaluates the run again after an extension, which may have shown how it ends.
 
         Args:
             end_s: New end of the run, in s.
@@ -198,7 +209,11 @@ class _CellInProgress:
         self._outcome = self._build_result()
 
     def judge(self) -> CellResult:
-        """Returns the result of the cell, after the last extension."""
+        """Returns the result of the cell, with the decision of the stability certificate.
+
+        It is called once, after the last extension, because the decision needs the roots of the
+        loop and takes longer than an evaluation.
+        """
         judged = judge_virtual_run(self._scenario, self.run)
         decision = judged.decision
         return msgspec.structs.replace(
@@ -210,7 +225,7 @@ class _CellInProgress:
         )
 
     def _build_result(self) -> CellResult:
-        """Returns the result of the run up to the time that it has reached."""
+        """Returns the measured result of the run so far, from which extensions are decided."""
         return _build_result(self.run, self._scenario, self._totals, self._extended)
 
 
@@ -379,7 +394,13 @@ def _has_pronounced_trend(outcome: CellResult) -> bool:
 
 
 def _log_changes(outcome: CellResult) -> tuple[float, float]:
-    """Returns the changes of log |e| and of log |qd| over the second half of a run."""
+    """Returns the changes of log |e| and log |qd| over the second half of a run.
+
+    A change of 0.69 is a doubling. An amplitude without a trend counts as unchanged.
+
+    Args:
+        outcome: Result of the run, with the rates of both amplitudes.
+    """
     half_s = 0.5 * outcome.ran_s
     error_change = half_s * (outcome.error_rate_per_s or 0.0)
     speed_change = half_s * (outcome.speed_rate_per_s or 0.0)

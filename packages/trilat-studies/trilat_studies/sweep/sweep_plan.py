@@ -105,7 +105,7 @@ class _SweepAxis(NamedTuple):
 
     @property
     def numeric(self) -> bool:
-        """True if all values of the axis are numbers."""
+        """True if all values of the axis are numbers, so that it can be an axis of a map."""
         if isinstance(self.texts, _Steps):
             return True
         return all(is_number(_parse_value(text)) for text in self.texts)
@@ -287,7 +287,10 @@ def _split_outside_brackets(text: str, separator: str) -> list[str]:
 
 
 def _parse_value(text: str) -> Any:
-    """Returns the TOML value of a text, or the text itself if it is not valid TOML."""
+    """Returns the value that a text stands for: 0.2 for "0.2", True for "true".
+
+    A text that is not valid TOML, such as gamma without quotes, stands for itself.
+    """
     try:
         return tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
@@ -381,7 +384,7 @@ class SweepPlan(NamedTuple):
 
     @property
     def cells(self) -> int:
-        """Number of cells of the grid."""
+        """Number of cells of the grid: the product of the numbers of values and of laws."""
         return math.prod(self.shape)
 
     def cell(self, number: int) -> SweepCell:
@@ -740,9 +743,13 @@ def _check_axes(plan: SweepPlan, law_index: int) -> None:
 
 
 def _spread_indices(count: int) -> list[int]:
-    """Returns at most `_CHECKED_VALUES` indices, evenly spread over `count` values.
+    """Returns the indices of the values that are checked before a sweep, at most a few.
 
-    The first and the last value are always included.
+    They are evenly spread over `count` values, and include the first and the last one. A grid
+    may be too large to check every cell.
+
+    Args:
+        count: Number of values.
     """
     checked = min(count, _CHECKED_VALUES)
     intervals = max(1, checked - 1)

@@ -85,7 +85,11 @@ class SweepResults(Result):
         return self.rows
 
     def to_dict(self) -> dict[str, Any]:
-        """Converts the results to plain values, as `trilat sweep --json` prints them."""
+        """Converts the results to plain values, as `trilat sweep --json` prints them.
+
+        Returns:
+            The facts of the plan, and a row per run with the columns of the CSV table.
+        """
         runs = [dict(row) for row in self.rows]
         return {"plan": self.plan.facts(), "runs": runs}
 
@@ -129,7 +133,10 @@ def build_result_rows(plan: SweepPlan, entries: Sequence[CellRun]) -> list[Resul
     runs_of_cell = Counter(entry.cell for entry in entries)
 
     def rank(entry: CellRun) -> tuple[int, int]:
-        """Returns the position of a run in the table: its cell, then its seed."""
+        """Returns the sort key of a run: its cell, then the position of its seed in the plan.
+
+        Worker processes finish in any order, and the table must not depend on it.
+        """
         return entry.cell, seed_rank[entry.seed]
 
     rows: list[ResultRow] = []
@@ -263,7 +270,10 @@ def _list_result_columns(plan: SweepPlan) -> dict[str, type]:
 
 
 def _list_axis_columns(plan: SweepPlan) -> dict[str, type]:
-    """Returns the columns that identify a cell: its number, its axis values and its law."""
+    """Returns the columns that identify a cell, with their types: number, axes and law.
+
+    The types serve to read the CSV table again.
+    """
     column_types: dict[str, type] = {"cell": int}
     for axis in plan.axes:
         column_types[axis.key] = float if axis.numeric else str
@@ -387,13 +397,13 @@ class GridPoint(NamedTuple):
 
     @property
     def decided(self) -> int:
-        """Number of runs that were judged stable or not stable. Undecided runs do not count."""
+        """Number of runs that were judged stable or not stable. Undecided runs are left out."""
         classes = zip(self.counts, CellClass, strict=True)
         return sum(count for count, verdict in classes if verdict.stable is not None)
 
     @property
     def stable(self) -> int:
-        """Number of runs of the cell that were judged stable."""
+        """Number of runs of the cell that were judged stable. It is at most `decided`."""
         classes = zip(self.counts, CellClass, strict=True)
         return sum(count for count, verdict in classes if verdict.stable)
 
@@ -407,9 +417,10 @@ class GridPoint(NamedTuple):
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95 % confidence interval of the fraction of decided runs that are stable.
+        """95 % confidence interval of the share of stable runs among the decided ones.
 
-        It is computed by Wilson's method.
+        The method is Wilson's. Also if 10 runs of 10 are stable, the lower end is below 1,
+        because other seeds might give another result.
         """
         return wilson_interval(self.stable, self.decided)
 
@@ -613,7 +624,12 @@ def _list_ranges(plan: SweepPlan, rows: Sequence[ResultRow]) -> list[str]:
 
 
 def _list_values(rows: Sequence[ResultRow], key: str) -> list[float]:
-    """Returns the values of one column, without the rows in which the value is missing."""
+    """Returns the numbers of one column of a table, without the rows that have none.
+
+    Args:
+        rows: Rows of the table.
+        key: Name of the column.
+    """
     values = [row.get(key) for row in rows]
     return [value for value in values if value is not None]
 

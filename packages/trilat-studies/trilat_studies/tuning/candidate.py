@@ -548,7 +548,14 @@ class _RunMeasures(NamedTuple):
 
 
 def _measure_run(scenario: Scenario) -> _RunMeasures:
-    """Runs a scenario in virtual time, and measures the run."""
+    """Runs a scenario in virtual time, and measures the distances that the score combines.
+
+    The arms are compared with the consensus pose, or with the motion that their law promises,
+    at times that all sites have in common.
+
+    Args:
+        scenario: Scenario of the candidate, with its gains.
+    """
     records_by_site, end, _ = run_whole(scenario)
     records = list(records_by_site.values())
     t_s, q, e, tau_x = _sample_at_common_times(records)
@@ -707,7 +714,7 @@ def _sample_at_common_times(
 
 
 def _rms(values: Array) -> float:
-    """Returns the root mean square of all values of an array."""
+    """Returns the root mean square of all values of an array, in their unit."""
     return float(np.sqrt(np.mean(values**2)))
 
 
@@ -728,7 +735,7 @@ class TuningScenario(NamedTuple):
 
     @property
     def source(self) -> str:
-        """Name or path of the scenario, as it is given to a command of `trilat`."""
+        """Name or path of the scenario, as commands take it: "paper" or "mine.toml"."""
         return self.experiment.label
 
     def with_controls(self, controls: SiteControls) -> "TuningScenario":
@@ -783,7 +790,10 @@ class TuningScenario(NamedTuple):
 
     @property
     def command(self) -> str:
-        """The command with which a user can simulate the scenario and record a log."""
+        """The command with which a user can simulate the scenario and record a log.
+
+        Example: "trilat sim paper --set link.delay_ms=200".
+        """
         options = set_options(self.overrides)
         return format_command("sim", self.source, *options)
 

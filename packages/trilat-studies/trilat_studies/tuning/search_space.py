@@ -49,7 +49,11 @@ MIN_BOX = 0.1
 
 
 def _round_parameter(value: float) -> float:
-    """Returns a parameter rounded to 12 significant digits, so that commands stay short."""
+    """Returns a parameter rounded to 12 significant digits.
+
+    Scaling by a factor gives numbers such as 0.30000000000000004, which would make the printed
+    commands long.
+    """
     return float(f"{value:.12g}")
 
 
@@ -120,7 +124,10 @@ class ModelInformation(NamedTuple):
 
     @property
     def text(self) -> str:
-        """Clause for the user that states what the control laws are told about the arms."""
+        """Clause for reports that states what the laws are told about the arms.
+
+        Example: "every law gets 90 % of the true gravity parameters, and no inertia".
+        """
         if self.gravity == 1.0:
             gravity = "the exact gravity parameters"
         else:

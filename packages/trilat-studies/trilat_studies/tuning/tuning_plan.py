@@ -79,7 +79,7 @@ class Objective(StrEnum):
 
     @property
     def unit(self) -> str:
-        """Unit of the quantity, for tables and axes."""
+        """Unit for tables and axes: rad for the error, s for the settling time."""
         return "rad" if self is Objective.ERROR else "s"
 
     def point(self, score: CandidateScore) -> ObjectivePoint | None:
@@ -573,12 +573,20 @@ class TuningResult(Result):
         return compose_tuning(self)
 
     def headline(self) -> str:
-        """Returns a sentence that states how many points the Pareto front of each law has."""
+        """Returns a sentence with the number of points on the Pareto front of each law.
+
+        Example: "paper: points on the front: p_d 4, adaptive 7".
+        """
         fronts = ", ".join(f"{search.space.law} {len(search.front)}" for search in self.found)
         return f"{self.plan.base.scenario.name}: points on the front: {fronts}"
 
     def to_dict(self) -> dict[str, Any]:
-        """Converts the result to plain values, as `trilat compare --tune --json` prints it."""
+        """Converts the result to plain values, as `trilat compare --tune --json` prints it.
+
+        Returns:
+            The scenario, the procedure, the results of each law, and the scores of the
+            published gains, each with the command that repeats its run.
+        """
         printed = []
         for result in self.printed:
             facts = msgspec.to_builtins(result.score)
@@ -592,7 +600,10 @@ class TuningResult(Result):
         }
 
     def _describe_scenario(self) -> dict[str, Any]:
-        """Returns the plain values that describe the scenario, for `to_dict`."""
+        """Returns what is needed to know in which situation the laws were tuned, for `to_dict`.
+
+        This includes the seed, the torque limits and the number of sites.
+        """
         base = self.plan.base
         scenario = base.scenario
         limits_nm = {name: spec.limits.tau_limit_nm for name, spec in scenario.sites.items()}
@@ -607,7 +618,10 @@ class TuningResult(Result):
         }
 
     def _describe_procedure(self) -> dict[str, Any]:
-        """Returns the plain values that describe how the gains were tuned, for `to_dict`."""
+        """Returns how the gains were searched, for `to_dict`: budget, seeds, steps and so on.
+
+        Whoever tunes another law for comparison needs these numbers.
+        """
         plan = self.plan
         procedure: dict[str, Any] = {
             "candidates_per_law": plan.budget,
@@ -632,7 +646,11 @@ class TuningResult(Result):
         return procedure
 
     def _describe_law(self, search: CandidateSearch) -> dict[str, Any]:
-        """Returns the search space, front and candidates of a law, for `to_dict`."""
+        """Returns the search space, the front and all candidates of a law, for `to_dict`.
+
+        Args:
+            search: The finished search of the law.
+        """
         candidates = []
         for gains, score in zip(search.tried, search.scores, strict=True):
             candidates.append({"gains": gains, **msgspec.to_builtins(score)})

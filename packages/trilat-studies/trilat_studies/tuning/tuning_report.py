@@ -207,7 +207,7 @@ _SCORE_HEADS = ("error rad", "spread rad", "pose rad", "effort N m", "settling s
 
 
 def _format_score(score: CandidateScore) -> tuple[str, ...]:
-    """Returns the table cells of a score, in the order of `_SCORE_HEADS`."""
+    """Returns the table cells of a candidate's score, in the order of `_SCORE_HEADS`."""
     return (
         _format_mean(score.error_rad, score.error_half_rad),
         format_number(score.spread_rad),
@@ -351,12 +351,12 @@ def _build_tuning_page(tuned: "TuningResult") -> str:
 
 
 def _format_list(lines: Sequence[str]) -> str:
-    """Returns lines as a bulleted list in Markdown."""
+    """Returns lines as a bulleted list in Markdown, one bullet per line."""
     return "\n".join(f"- {line}" for line in lines)
 
 
 def _format_code(lines: Sequence[str]) -> str:
-    """Returns lines as a block of code in Markdown."""
+    """Returns lines as a block of code in Markdown, between fences."""
     return "\n".join(["```", *lines, "```"])
 
 
