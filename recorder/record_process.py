@@ -66,9 +66,11 @@ A longer period costs less computing time.
 class RecordedScenario(NamedTuple):
     """Scenario of a session, as far as the recorder needs it.
 
+    The recorder does not import the scenario's own package, so the caller provides both parts.
+
     Attributes:
-        scenario: Facts about the scenario from which the messages of the session follow.
-        make_views: Creates the messages for viewers. With None, the log contains none.
+        scenario: Names, rates and sizes of the sites, from which the messages to expect follow.
+        make_views: Creates the messages for viewers of logs. With None, the log contains none.
     """
 
     scenario: SessionScenario

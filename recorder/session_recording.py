@@ -309,7 +309,10 @@ class Recording:
                 self._gone_sites.discard(name)
 
     def _note_start(self, name: str, payload: bytes) -> None:
-        """Notes the next start of a site, if a message is its event of joining.
+        """Notes that a site was started again, if a message is its event of joining.
+
+        From then on, messages of the new start are expected. A message that announces another
+        member, or a scenario in which sites may not return, changes nothing.
 
         Args:
             name: Name of the site under whose key the message arrived.

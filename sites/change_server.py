@@ -208,11 +208,14 @@ class ChangeServer:
         return None
 
     def _add_mark(self, k: int, text: str) -> str:
-        """Stores a mark until it is published as an event, and returns the text of the reply.
+        """Stores a mark, a text for the log, until its event is published.
 
         Args:
             k: Next tick, which the mark names.
-            text: Text of the mark.
+            text: Text of the mark, for example "contact".
+
+        Returns:
+            The reply to the user, for example "s marks tick 1200".
 
         Raises:
             ScenarioError: Too many marks wait.

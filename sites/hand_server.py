@@ -296,11 +296,15 @@ class RemoteHand(HandPlayer):
         return _read_messages(self._inbox, self._site, self._dropped, self._source)
 
     def _decide(self, k: int, message: HandMessage) -> None:
-        """Schedules a decision of the process, so that it takes effect at its planned tick.
+        """Schedules a decision of the user's class, to take effect at its planned tick.
+
+        A decision that arrives after this tick is counted as late, and takes effect at once.
+        Decisions about views that were not sent, and all after a failure, are ignored.
 
         Args:
             k: Present tick.
             message: The decision. Its number n refers to the view of tick n * `period_ticks`.
+                Without a grip it releases the arm.
         """
         view_tick = message.n * self.hand.period_ticks
         # The process announces itself with a message that contains no decision. It may arrive

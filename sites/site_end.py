@@ -37,7 +37,7 @@ _POLL_NS = 5_000_000
 
 
 class RunOutcome(NamedTuple):
-    """Result of the control loop of a site.
+    """How the control loop of a site ended, from which its last event and exit code follow.
 
     Attributes:
         output: Record of the last tick. None if no tick was executed.

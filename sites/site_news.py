@@ -174,11 +174,11 @@ class SiteNews:
             parts.say(self._describe_status(output))
 
     def _publish_entries(self, kind: str, news: list[tuple[int, str]]) -> None:
-        """Publishes an event for each entry of a list, and empties the list.
+        """Publishes an event for each entry of a list of news, and empties the list.
 
         Args:
-            kind: Kind of the events.
-            news: The entries: the tick in which something happened, and a sentence about it.
+            kind: Kind of the events, for example "mark".
+            news: Pairs of the tick in which something happened and a sentence about it.
         """
         rate_hz = self._parts.site.rate_hz
         for tick, text in news:

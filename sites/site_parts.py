@@ -361,7 +361,11 @@ class SiteParts:
         return changes
 
     def _make_order_change(self, k: int, order: SiteOrder, skipped: int = 0) -> CoreChange:
-        """Returns the change with which an order takes effect in a tick.
+        """Returns the change with which an order of the site itself takes effect in a tick.
+
+        Such orders follow from an external arm, for example "released" if its dead-man switch
+        was released. As a change, the order is part of the record, so that the run can be
+        repeated.
 
         Args:
             k: The tick.

@@ -482,7 +482,10 @@ def _select_master_hands(
 
 
 def _describe_stiffest_wall(situation: LawSituation, slave: int) -> str:
-    """Returns a phrase about the walls that a slave in free motion may touch.
+    """Returns a phrase about the walls against which a slave in free motion is stable.
+
+    Example: "at a spring of up to 250 N m/rad at the slave ...". The bound is the smallest over
+    all combinations of hands at the masters. Without a bound, the phrase gives the reason.
 
     Args:
         situation: All sites, their laws and their hands.

@@ -625,8 +625,12 @@ def _check_site_count(kind: Any, code: str, path: str, sites: int) -> None:
 def _find_written_attributes(kind: Any) -> list[str]:
     """Returns the names of the attributes that a class assigns to itself outside of `__init__`.
 
-    The source of each method is searched for assignments to `self`. Changes by method calls, as
-    of a list's `append`, are not found.
+    An attribute that changes during a run is a memory, which the law must declare so that runs
+    can be repeated from the log. The source of each method is searched for assignments to
+    `self`. Changes by method calls, as of a list's `append`, are not found.
+
+    Args:
+        kind: The class of a law.
     """
     written = []
     for base in kind.__mro__:

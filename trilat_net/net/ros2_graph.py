@@ -364,11 +364,9 @@ class Refusals:
         """
 
         def guarded(*args: P.args, **named: P.kwargs) -> None:
-            """Passes a message to `act`.
+            """Passes a message to `act`. An error of `act` counts as a refusal.
 
-            If `act` raises an error, counts the message as refused.
-
-            An error would otherwise end in a thread of Zenoh, where nobody sees it.
+            It would otherwise end in a thread of Zenoh, where nobody sees it.
             """
             try:
                 act(*args, **named)

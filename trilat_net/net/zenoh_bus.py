@@ -94,9 +94,7 @@ class _ZenohRing(Generic[T]):
         self._read = read
 
     def poll(self) -> T | None:
-        """Removes the oldest usable entry from the queue and returns it.
-
-        None if there is no such entry.
+        """Removes the oldest usable entry from the queue and returns it. None if there is none.
 
         Entries for which `read` returns None, such as error replies, are skipped. The queue of
         a query also counts as empty once all replies have arrived.

@@ -139,8 +139,8 @@ class HandImpedance(Result):
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns a table of the measured responses, one row per frequency of the sines.
 
-        A row has the magnitude and phase of the hand's motion and force at that frequency, so
-        that the fit can be checked.
+        A row has the amplitudes of motion and force, their coherence, and the part of the force
+        that mass, damping and stiffness do not explain.
         """
         return [response._asdict() for response in self.responses]
 

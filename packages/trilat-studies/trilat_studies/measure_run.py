@@ -329,7 +329,7 @@ def run_whole(scenario: Scenario) -> _WholeRun:
 
 
 class Range(NamedTuple):
-    """Smallest and largest value of a quantity during a window of time.
+    """Smallest and largest value of a quantity during a window of time, to compare with limits.
 
     A quantity with a single value, such as a mean, has this value as both ends.
     """
@@ -400,11 +400,11 @@ class WindowStats:
             self._add_wall_force(total_force)
 
     def _raise_peak(self, key: str, values: Array) -> None:
-        """Raises a peak to the largest absolute value, if this is larger.
+        """Raises a peak of the window to the largest absolute value of new records, if larger.
 
         Args:
             key: Name of the peak.
-            values: New values, of any shape.
+            values: New values, of any shape, not empty.
         """
         previous = self._peaks[key]
         largest = float(np.abs(values).max())
@@ -770,13 +770,13 @@ def _compute_run_metrics(
     sites_by_window = zip(*windows_by_site, strict=True)
 
     def find_largest(name: str) -> float | None:
-        """Returns the largest value of a statistic over all arms.
+        """Returns the largest value of a statistic over all sites.
 
         Args:
             name: Name of the statistic, an attribute of `SiteStats`.
 
         Returns:
-            The largest value. None if no arm has recorded anything.
+            The largest value. None if no site has recorded anything.
         """
         values = [getattr(stats, name) for stats in with_records.values()]
         return max(values, default=None)

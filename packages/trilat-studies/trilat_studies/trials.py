@@ -718,11 +718,13 @@ def encode_junit_xml(report: TrialReport, began_unix_ns: int, host: str) -> byte
 
 
 def _add_properties(suite: Xml.Element, results: Sequence[TrialResult]) -> None:
-    """Adds the properties that are common to all runs of a scenario to its suite.
+    """Adds to a suite what all runs of its scenario have in common, as JUnit properties.
+
+    Examples are the driver (live or virtual), the overrides and the duration.
 
     Args:
         suite: Suite of the scenario.
-        results: Results of the scenario.
+        results: Results of the scenario, at least one.
     """
     properties = Xml.SubElement(suite, "properties")
     trial = results[0].trial
@@ -754,7 +756,10 @@ def _build_count_attributes(results: Sequence[TrialResult]) -> dict[str, str]:
 
 
 def _add_case(suite: Xml.Element, result: TrialResult) -> None:
-    """Adds the test case of a run to a suite.
+    """Adds the test case of a run to a suite, with its problem if there is one.
+
+    A run without a result is an error. Unmet expectations together are one failure, whose text
+    has the commands that repeat the run.
 
     Args:
         suite: Suite of the scenario.

@@ -589,11 +589,14 @@ def _aim(
 
 
 def _release(memory: HandMemory, number: int) -> HandMemory:
-    """Returns the state of a fading grip.
+    """Returns the state after the holder has released the arm: nobody holds it, the grip fades.
+
+    The grip, the target and its velocity continue, so that the force fades without a jump.
 
     Args:
         memory: State before the release.
-        number: Messages of the sender up to this number are outdated.
+        number: Messages of the former holder up to this number are outdated. They do not take
+            hold of the arm again.
     """
     before = (memory.source, number)
     return HandMemory(grip=memory.grip, target=memory.target, rate=memory.rate, before=before)
@@ -668,10 +671,16 @@ def _find_limited_rate(
 def _find_rate(rules: HandRules, memory: HandMemory, t_ns: int) -> tuple[float, ...]:
     """Returns the velocity of a target towards its goal, within the limits of the hand.
 
+    The target moves straight, and arrives when the next message is expected, unless this needs
+    more than the largest speed. With a limit of the acceleration, it also slows down in time.
+
     Args:
         rules: Limits of the hand.
-        memory: State, with the target already moved.
+        memory: State, with the target already moved to this tick.
         t_ns: Nominal time of the tick, ns since the epoch.
+
+    Returns:
+        The velocity, one number per coordinate, in the unit of the target per second.
     """
     left_s = max((memory.arrives_ns - t_ns) * 1e-9, 1.0 / rules.rate_hz)
     if rules.acceleration_limit < math.inf:

@@ -184,11 +184,14 @@ def _write_rest_reference(site: SiteRow, i: int, q: float, qd: float) -> None:
 
 @leaf
 def _find_remaining_s(elapsed_s: float, site: SiteRow) -> float:
-    """Returns the time T_left until the reference rests, s.
+    """Returns the time T_left that the arm still takes to come to rest, s.
+
+    It is at least the rest of LEAST_STOP_S, and long enough for each joint to stop with the
+    deceleration that half of its torque limit gives.
 
     Args:
         elapsed_s: Time since the start of the rest, s.
-        site: Row of the site.
+        site: Row of the site, with the velocity of the reference.
     """
     remaining_s = LEAST_STOP_S - elapsed_s
     for i in range(site.joints):

@@ -373,6 +373,10 @@ def _explain(error: Exception, law: Any) -> str:
 def _reads_own_attribute(law: Any, name: str) -> bool:
     """Returns True if the method `torque` of a law reads an attribute of the law itself.
 
+    Numba's error names an unknown attribute, but not its object. The explanation for the user
+    depends on whether it is `self.NAME` or an attribute of the law's input. The byte code of
+    the method shows this.
+
     Args:
         law: An instance of the law's class.
         name: Name of the attribute.

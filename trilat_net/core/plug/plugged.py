@@ -194,11 +194,14 @@ def _compile(
     compute = numba.njit(**_OPTIONS)(function)
 
     def call(numbers: Any, now: Any) -> None:
-        """Calls the function with the parameters of its model as a record.
+        """Calls the user's function with the parameters of its model as a record.
+
+        The kernel stores the parameters of all models as floats in one table. Their record
+        gives the function its field names back.
 
         Args:
             numbers: The parameters, possibly followed by other floats.
-            now: The row.
+            now: Row with the input of the function, into which it writes its result.
         """
         model = numbers[:count].view(form)[0]
         compute(model, now)

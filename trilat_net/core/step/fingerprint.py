@@ -35,8 +35,8 @@ def _compute_sines(angles: Array, results: Array) -> None:
 
     Args:
         angles: The angles, shape (n,), rad.
-        results: Receives the sines in its first row and the cosines in its second, shape (2,
-            n).
+        results: Array of the shape (2, n). Its first row receives the sines, its second the
+            cosines.
     """
     for n in range(angles.shape[0]):
         results[0, n], results[1, n] = sincos(angles[n])

@@ -234,9 +234,13 @@ def links_bytes(setup: SiteSetup, pages: int) -> int:
 
 
 def _count_kept_dues(setup: SiteSetup) -> int:
-    """Returns the number of due times that a link keeps.
+    """Returns the number of due times that a link keeps, one per sample.
 
-    The due times span the stamps from the latest possible sample to the sample farthest ahead.
+    A due time is kept for as long as its sample may still arrive, late or as a duplicate. The
+    longest possible delay and the farthest stamp ahead of the receiver bound this time.
+
+    Args:
+        setup: Setup of the site. The fastest loop on either end determines the number.
     """
     peer_rates_hz = [link.rate_hz for link in setup.links]
     fastest_hz = max(setup.rate_hz, *peer_rates_hz)

@@ -408,7 +408,7 @@ class SiteSetup(NamedTuple):
     def law_context(self) -> LawContext:
         """Returns the facts about the arm and its peers with which a user's law is created.
 
-        The dynamic parameters theta are empty if the scenario does not let the law know them.
+        The dynamic parameters theta are empty for an external arm that was not identified.
         """
         return LawContext(
             site=self.name,

@@ -346,7 +346,8 @@ class Site:
     def _write_measurement(self, measured: PlantState) -> None:
         """Writes the motion of an external arm, which its driver measured, into the site's row.
 
-        In a tick with a measurement, these numbers replace the simulated state of the arm.
+        The site does not simulate such an arm. The measured numbers take the place of a
+        simulated state.
 
         Args:
             measured: Angles, rad, and velocities, rad/s, of the joints, and the external torque

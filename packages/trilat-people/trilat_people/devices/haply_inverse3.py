@@ -164,5 +164,5 @@ class HaplyInverse3:
 
 
 def _parse_vector(point: dict[str, float]) -> Vector:
-    """Returns a point of the service, {"x": ..., "y": ..., "z": ...}, as a vector in m."""
+    """Returns a point of the service, {"x": ..., "y": ..., "z": ...}, as a tuple of floats."""
     return float(point["x"]), float(point["y"]), float(point["z"])

@@ -241,12 +241,12 @@ def compare_times(
 def _compare(
     first: str, second: str, pairs: Sequence[tuple[float, float]]
 ) -> CompletionComparison:
-    """Compares the completion times of two conditions.
+    """Compares the completion times of two conditions by a sign test, which needs no means.
 
     Args:
         first: Name of the first condition.
         second: Name of the second condition.
-        pairs: Medians of each unit under both conditions, in s.
+        pairs: Medians of each unit under both conditions, in s. Infinite if not reached.
     """
     longer = sum(second_s > first_s for first_s, second_s in pairs)
     shorter = sum(second_s < first_s for first_s, second_s in pairs)

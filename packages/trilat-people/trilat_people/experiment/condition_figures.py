@@ -123,10 +123,14 @@ def draw_times(rows: Sequence[Row], limit_s: float, *, unit: str = "participant"
 def _list_unit_lines(
     values: Mapping[str, Mapping[str, float]],
 ) -> Iterator[tuple[list[int], list[float]]]:
-    """Yields the line of each participant or pair: columns of conditions, and values.
+    """Yields the points of each participant or pair, which a thin line joins in the figure.
 
     Args:
         values: A value by condition and unit. Each condition is a column of the figure.
+
+    Yields:
+        The indices of the columns, and the values there. Conditions without a value are left
+        out.
     """
     all_units = chain.from_iterable(values.values())
     for unit in dict.fromkeys(all_units):

@@ -362,8 +362,8 @@ class Experiment(Result):
     def _read_answer_notes(self) -> Iterator[tuple[dict[str, Any], Note]]:
         """Yields the notes with answers to a questionnaire, each with its first columns.
 
-        These columns say whose answers they are and which condition the block before had.
-        Choices of a staircase are such notes, too.
+        These columns say whose answers they are, in which block they were given, and which
+        condition the block had. Choices of a staircase are such notes, too.
         """
         conditions: dict[tuple[tuple[str, ...], int], str] = {}
         for trial in self.plan.trials:

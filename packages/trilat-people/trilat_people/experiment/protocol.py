@@ -484,8 +484,8 @@ class ExperimentPlan(Result):
         """Returns the order in which each group of participants gets the conditions.
 
         Returns:
-            Names of the conditions in order, by the name of the group: {"P01-P02": ["near",
-                "far"]}.
+            Names of the conditions in order, by the name of the group, for example {"P01-P02":
+            ["near", "far"]}.
         """
         orders: dict[str, list[str]] = {}
         for trial in self.trials:

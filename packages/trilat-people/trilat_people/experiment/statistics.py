@@ -318,13 +318,19 @@ def compare_conditions(
 def _compare(
     measure: str, first: str, second: str, means: Mapping[str, Mapping[str, float]]
 ) -> Comparison:
-    """Compares two conditions over the units that have both.
+    """Compares two conditions by paired tests over the units that have values for both.
+
+    A unit is a participant or a pair. A test needs at least two units, and means that differ by
+    more than rounding between them.
 
     Args:
         measure: Name of the measure.
         first: Name of the first condition.
         second: Name of the second condition.
-        means: Means by condition and unit.
+        means: Means over trials by condition and unit.
+
+    Returns:
+        The difference second minus first, with its interval and tests if there are any.
     """
     units = [unit for unit in means[first] if unit in means[second]]
     first_means = np.array([means[first][unit] for unit in units])
@@ -538,11 +544,11 @@ def _find_pairs(rows: Sequence[Row]) -> dict[str, str]:
 
 
 def _read_effect(fit: Any, condition: str, freedom: int) -> MixedEffect:
-    """Returns the effect of a condition from a fit.
+    """Returns the effect of a condition, its interval and test, from a fitted mixed model.
 
     Args:
         fit: The fit of statsmodels.
-        condition: Name of the condition.
+        condition: Name of the condition, which is compared with the reference condition.
         freedom: Degrees of freedom of the t statistic.
     """
     stats = import_scipy_stats()
@@ -704,12 +710,12 @@ def _list_rows(values: Array, means: Mapping[str, float]) -> list[Row]:
 
 
 def _count_significant(runs: Sequence[Comparison], d_z: float, alpha: float) -> SimulatedPower:
-    """Returns the share of comparisons of two conditions whose p is below alpha.
+    """Returns the power: the share of simulated experiments that find a difference.
 
     Args:
-        runs: Comparison of the two conditions in each simulated experiment.
-        d_z: Size of the simulated effect.
-        alpha: Significance level.
+        runs: Comparison of the same two conditions in each simulated experiment.
+        d_z: Size of the simulated effect, the mean difference over its deviation.
+        alpha: Significance level. A p below it counts as found, also after Holm's correction.
     """
     significant = sum(run.p is not None and run.p < alpha for run in runs)
     significant_holm = sum(run.p_holm is not None and run.p_holm < alpha for run in runs)
@@ -836,13 +842,13 @@ def _check_facts(facts: Mapping[str, Any]) -> None:
 
 
 def _describe_computed(computed: frozenset[str], texts: Mapping[str, str]) -> Iterator[str]:
-    """Yields a sentence for each analysis that was computed.
+    """Yields a sentence of the methods paragraph for each analysis that was computed.
 
     If the conditions were not compared by any test, a sentence says so.
 
     Args:
-        computed: Names of the analyses that were computed.
-        texts: Facts of the paragraph as texts.
+        computed: Names of the analyses that were computed, for example "t tests".
+        texts: Facts of the paragraph as texts, for example the correction of p.
     """
     correction = f"with p corrected by {texts['correction']} over all comparisons of a measure"
     level = f", at alpha = {texts['alpha']}" if texts.get("alpha") else ""

@@ -218,10 +218,10 @@ class TrialGoal:
 
 
 class Outcome(NamedTuple):
-    """How a trial ended: with success or not, and when.
+    """How a trial ended. A trial without an outcome is still running.
 
     Attributes:
-        succeeded: True if the task was done.
+        succeeded: True if the task was done. False after the time limit or a broken rule.
         ended_s: Time of the end, in s since the start of the session.
     """
 

@@ -210,7 +210,10 @@ class ExperimentTrial:
         sum_of_shares = row[first] + row[second]
 
         def divide_shares(lead: float) -> dict[str, float]:
-            """Returns the weights with which the slave arm follows the other arms.
+            """Returns the weights with which the slave follows the other arms, in this trial.
+
+            Both users together keep the sum of their weights in the scenario: with a sum of 1,
+            lead = 0.7 gives 0.7 and 0.3.
 
             Args:
                 lead: First user's part of the authority over the slave, from 0 to 1. The second

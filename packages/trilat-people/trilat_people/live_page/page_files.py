@@ -92,7 +92,7 @@ class PageFiles:
 
 
 def _list_assets() -> dict[str, tuple[str, bytes]]:
-    """Returns the page's own files by their addresses, such as "/page.js".
+    """Returns the page's own files by their addresses, such as "/main.js".
 
     They come from this package and from the package of the report, whose plots the page uses.
 

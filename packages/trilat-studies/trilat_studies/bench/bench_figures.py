@@ -84,7 +84,7 @@ def _list_figures_with_values(results: BenchResults) -> list[str]:
 
 
 def _collect_fields(results: BenchResults, name: str) -> dict[str, Array]:
-    """Collects the numbers of a figure.
+    """Collects the numbers of a figure, a field of laws and links for each of its panels.
 
     Args:
         results: The results of the suite.
@@ -158,6 +158,8 @@ def _draw_bench(results: BenchResults, name: str) -> Figure:
 def _choose_scale(fields: list[Array]) -> Normalize:
     """Returns a logarithmic colour scale from the smallest to the largest number of a figure.
 
+    All panels have the same scale. If there are no numbers, it goes from 0.1 to 1.
+
     Args:
         fields: The numbers of the panels. NaN is ignored.
     """
@@ -189,7 +191,7 @@ def _list_laws(results: BenchResults, task: str) -> list[tuple[str, str]]:
 
 
 def _collect(results: BenchResults, task: str, quantity: str) -> Array:
-    """Collects the numbers of a panel.
+    """Collects the numbers of a panel, by which its cells are coloured.
 
     Args:
         results: The results of the suite.

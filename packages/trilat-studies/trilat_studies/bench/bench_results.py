@@ -668,16 +668,19 @@ def _tabulate_round_trips(results: BenchResults) -> TextTable:
 
 
 def _find_error(results: BenchResults, task: str, law: str, link: str) -> float | None:
-    """Returns the mean error of a cell, in rad. None if the cell did not run or has no mean."""
+    """Returns the mean error of a cell, in rad, for comparisons between links.
+
+    None if the cell did not run, or if a run of it diverged or missed its wall.
+    """
     result = results.find(task, law, link)
     mean = None if result is None else result.compute_mean("error_rad")
     return mean.mean if isinstance(mean, MeanInterval) else mean
 
 
 def _format_ratio(numerator: float | None, denominator: float | None) -> str:
-    """Returns a ratio as an entry of a table.
+    """Returns a ratio of two means as a table cell with three digits.
 
-    The entry is a dash if a number is missing, or if the denominator is 0.
+    The cell is "-" if a mean is missing, or if the denominator is 0.
     """
     if numerator is None or not denominator:
         return "-"

@@ -339,7 +339,9 @@ def _measure(run: BenchRun, judged: JudgedRun, duration_s: float) -> BenchRun:
 
 
 def _is_bounded(scenario: Scenario, records: dict[str, RecordBatch]) -> bool:
-    """Returns True if all joints stayed slower than `BOUND_RAD_S` and near their start.
+    """Returns True if no joint was thrown far away or became too fast in a run.
+
+    A run can be judged as settled and still be unusable, because an arm swung round before.
 
     Args:
         scenario: The scenario, which has the start angles.
@@ -482,7 +484,10 @@ def _find_contact_s(scenario: Scenario, records: dict[str, RecordBatch]) -> floa
 def _run_variant(
     item: BenchRunItem, settings: Settings, duration_s: float
 ) -> tuple[Scenario, dict[str, RecordBatch]] | None:
-    """Executes a run with other settings, without a judgement.
+    """Executes a benchmark run with other settings, without a judgement.
+
+    Two variants of a run, for example with and without a sine, show a response by their
+    difference.
 
     Args:
         item: The run.
@@ -761,7 +766,9 @@ def prepare_bench_folder(plan: BenchPlan, path: Path | None = None) -> BenchFold
 
 
 def _check_origin(path: Path, folder_origin: str, origin: str) -> None:
-    """Refuses a folder whose runs come from another version or arithmetic.
+    """Refuses a folder whose runs come from another version or arithmetic than this program.
+
+    Runs of both would not be comparable, because equal scenarios might give other numbers.
 
     Args:
         path: The folder.

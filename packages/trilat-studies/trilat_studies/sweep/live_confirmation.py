@@ -72,7 +72,7 @@ class _ConfirmedCell(NamedTuple):
 
     @property
     def same(self) -> bool:
-        """True if the simulated run and the run over the network ended in the same way.
+        """True if the live run has the same class as the run in virtual time.
 
         For example, both converged.
         """
@@ -145,9 +145,13 @@ def _select_nearest(distances: Mapping[GridIndex, int], count: int) -> list[Grid
 
 
 def _rank_along_edge(index: GridIndex) -> tuple[Any, ...]:
-    """Returns a sorting key that puts runs of the same panel, law and seed side by side.
+    """Returns the sort key by which neighbouring cells beside an edge are found side by side.
 
-    Within these, the runs are sorted by the two axes that a map draws.
+    Runs of the same panel, law and seed come together. Within these, the runs are sorted by the
+    two axes that a map draws. A selection at equal distances is then spread along the edge.
+
+    Args:
+        index: Indices of the run along both axes, then those of panel, law and seed.
     """
     return (*map(str, index[2:]), *index[:2])
 

@@ -201,6 +201,8 @@ def draw_stability_map(
 def _count_columns(panels: int, form: FigureSize) -> int:
     """Returns the number of columns in which the panels of a figure are arranged.
 
+    Narrow figures have two columns, others as many as leave few gaps in the last row.
+
     Args:
         panels: Number of panels.
         form: Width, type sizes and resolution of the figure.
@@ -296,10 +298,15 @@ def _draw_panel(axes: Axes, plane: MapPlane, panel: MapPanel, lines: Sequence[Ma
 
 
 def _draw_cells(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
-    """Draws the coloured cells of a panel.
+    """Draws the coloured cells of a panel. Cells without runs stay empty.
 
-    The colour shows the growth exponent, the fraction of seeds with a stable run, or the class
-    of the single run.
+    The colour shows the growth exponent if the sweep measured it, else the share of stable runs
+    if there are several seeds, else the class of the single run.
+
+    Args:
+        axes: The panel of the figure.
+        plane: Axes of the map.
+        panel: Results of the panel.
     """
     colours: dict[str, Any]
     values: Any
@@ -449,6 +456,8 @@ def _extend_positions(axis: PlaneAxis) -> Array:
 def _extrapolate_rows(rows: Array, positions: Array) -> Array:
     """Returns a field with an extrapolated row before the first and after the last row.
 
+    The lines of a map are thereby drawn up to its border, half a cell beyond the grid points.
+
     Args:
         rows: The field, shape (n, m).
         positions: Positions of the rows of the result, shape (n + 2,).
@@ -497,11 +506,11 @@ def _find_undecided(plane: MapPlane, panel: MapPanel) -> Any:
 
 
 def _set_scale(axes: Axes, plane: MapPlane) -> None:
-    """Sets the limits and ticks of a panel.
+    """Sets the limits of a panel to the borders of its outer cells, and sets its ticks.
 
     Args:
         axes: The panel in the figure.
-        plane: The measured part of the map.
+        plane: The measured part of the map. With a single axis, the vertical one has no ticks.
     """
     x = compute_borders(plane.x)
     y = compute_borders(plane.y)
@@ -829,9 +838,14 @@ def tabulate_edges(plane: MapPlane, panel: MapPanel, lines: Sequence[MapLine]) -
 
 
 def _list_crossings(line: MapLine, plane: MapPlane) -> Iterator[tuple[float, StabilityEdge]]:
-    """Yields the crossings of a line with the columns of a map, as edges of zero width.
+    """Yields where a line of theory crosses the columns of a map, for the table of edges.
 
-    Each crossing comes with the value of x of its column.
+    Args:
+        line: The line.
+        plane: Axes of the map.
+
+    Yields:
+        The value of x of a column, and the crossing as an edge of zero width.
     """
     for column, x in enumerate(plane.x.values):
         crossings = line.crossings(column, plane.y)

@@ -109,8 +109,8 @@ def search_key_margin(
     def classify(value: float) -> bool | None:
         """Returns whether the scenario is stable at a value of the searched key.
 
-        The scenario is run only if the value has not been run before. None means that the run
-        is undecided.
+        Scan and bisection may come to the same value. It is run once, and the result is kept.
+        None means that the run is undecided.
         """
         if value not in results:
             results[value] = stable(value)
@@ -368,7 +368,7 @@ def _search_margin_task(task: _MarginItem) -> GridPointMargin:
     key, low, high, tolerance = task.range
 
     def load(value: float) -> Scenario:
-        """Returns the scenario with a value of the searched key.
+        """Returns the scenario of this grid point and seed with a value of the searched key.
 
         Args:
             value: Value of the scenario key along which the limit of stability is searched.
@@ -377,9 +377,13 @@ def _search_margin_task(task: _MarginItem) -> GridPointMargin:
         return task.plan.scenario(*task.cell.overrides, override, f"seed={task.seed}")
 
     def is_stable(value: float) -> bool | None:
-        """Runs the scenario with a value of the searched key, and returns whether it is stable.
+        """Runs the scenario with a value of the searched key, as a cell of a sweep is run.
 
-        None means that the run is undecided.
+        Args:
+            value: Value of the searched key.
+
+        Returns:
+            True if the run is stable, False if it is not. None if it is undecided.
         """
         scenario = load(value)
         longest_s = max(task.plan.longest_s, scenario.duration_s)
@@ -590,11 +594,12 @@ class SweepMargins(Result):
 
 
 def _format_edge(margin: KeyMargin, span: StabilityEdge | None) -> list[str]:
-    """Returns the table cells of an edge and of its stable side.
+    """Returns the table cells of an edge, as in "40 to 41", and of its stable side.
 
     Args:
         margin: The edges of the grid point.
-        span: The edge. None if the grid point has no edges.
+        span: The edge. None if the grid point has no edges: the cell then says whether all
+            values were stable or none.
     """
     if span is None:
         texts = {
@@ -611,11 +616,11 @@ def _format_edge(margin: KeyMargin, span: StabilityEdge | None) -> list[str]:
 
 
 def _format_theory(span: StabilityEdge | None, value: float | None) -> list[str]:
-    """Returns the table cells of an edge from theory, and of its relative difference.
+    """Returns the table cells of an edge from theory and of its relative difference.
 
     Args:
-        span: The measured edge, or None.
-        value: The edge from theory, or None.
+        span: The measured edge, from which the difference is counted, or None.
+        value: The edge from theory, or None. Then both cells are "-".
     """
     if value is None:
         return ["-", "-"]

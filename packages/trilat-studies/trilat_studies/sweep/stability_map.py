@@ -1026,7 +1026,9 @@ def trace_linear_analysis(
 def _find_sign_changes(values: Sequence[float]) -> list[int]:
     """Returns the indices n at which the values n and n + 1 have different signs.
 
-    Zero counts as negative. Values that are not finite take part in no change of sign.
+    Between such values lies an edge of stability, for example where a growth rate becomes
+    positive. Zero counts as negative. Values that are not finite take part in no change of
+    sign.
     """
     indices = list[int]()
     for n, (value, following) in enumerate(pairwise(values)):
@@ -1235,7 +1237,9 @@ def _choose_columns(loaders: Sequence[PanelLoader], x: PlaneAxis, y: PlaneAxis) 
 
 
 def _analyse_column(task: tuple[PanelLoader, float, PlaneAxis]) -> GrowthColumn:
-    """Computes the linear analysis of one column of a panel, in any worker process.
+    """Computes the linear analysis of one column of a panel: growth rates along y.
+
+    Any worker process can call it, so that columns are computed at the same time.
 
     Args:
         task: Function that loads scenarios of the panel, the column's value of x, and the

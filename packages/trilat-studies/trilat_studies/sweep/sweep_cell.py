@@ -290,7 +290,10 @@ def classify_cells(texts: Iterable[str], longest_s: float) -> Iterator[_JudgedCe
 
 
 def _run_group(group: "RunGroup", cells: Sequence[_CellInProgress]) -> None:
-    """Runs the cells of a group, and extends those that are not conclusive.
+    """Runs the cells of a group side by side, and extends those that are not conclusive.
+
+    A run is conclusive if a longer one would end in the same way. Finished cells leave the
+    group, and the others continue to twice the duration.
 
     Args:
         group: Group of the runs of some cells. They have the same duration.
@@ -383,9 +386,13 @@ def is_conclusive(outcome: CellResult) -> bool:
 
 
 def _has_pronounced_trend(outcome: CellResult) -> bool:
-    """Returns True if the largest speed doubled over the second half of a run.
+    """Returns True if the trend of a growing motion is clear enough to stop watching it.
 
-    Also returns True if the largest error and the largest speed both halved.
+    This is so if the largest speed doubled over the second half of the run, or if the largest
+    error and the largest speed both halved.
+
+    Args:
+        outcome: Result of the run.
     """
     error_change, speed_change = _log_changes(outcome)
     doubled = speed_change >= math.log(2.0)

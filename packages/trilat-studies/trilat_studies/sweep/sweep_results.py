@@ -150,7 +150,7 @@ def build_result_rows(plan: SweepPlan, entries: Sequence[CellRun]) -> list[Resul
 
 
 def _build_row(plan: SweepPlan, entry: CellRun, log: str) -> ResultRow:
-    """Builds the row of a finished run.
+    """Returns the row of a finished run: cell, results, and the command that repeats it.
 
     Args:
         plan: The sweep: its scenario, axes, control laws and seeds.

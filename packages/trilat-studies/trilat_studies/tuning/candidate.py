@@ -215,11 +215,14 @@ class _SpringHistory(NamedTuple):
 
 
 def _list_springs(scenario: Scenario, t_s: Array) -> Iterator[_SpringHistory]:
-    """Yields the operators of all sites that pull like a spring.
+    """Yields the operators that pull at an arm like a spring, for the consensus pose.
 
     Args:
         scenario: Scenario in which the laws are compared.
         t_s: Times, shape (K,), in s.
+
+    Yields:
+        Stiffness and target of each spring at these times, and whether it acts.
     """
     for name, spec in scenario.sites.items():
         for hand in spec.hands:
@@ -828,12 +831,15 @@ def build_candidate_item(seeds: Sequence[TuningScenario]) -> CandidateItem:
 
 
 def measure_candidate_task(task: CandidateItem) -> CandidateScore:
-    """Runs a candidate with all of its seeds, and returns its average score.
+    """Runs a candidate, a law with chosen gains, with all of its seeds.
 
-    The function needs nothing but its argument. Therefore any worker process can call it.
+    Any worker process can call it, because it needs nothing but its argument.
 
     Args:
         task: The runs of the candidate.
+
+    Returns:
+        The average score over the seeds.
     """
     scores = [measure_candidate(text, twin_text) for text, twin_text in task.runs]
     return average_scores(scores)

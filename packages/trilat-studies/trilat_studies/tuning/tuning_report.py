@@ -117,7 +117,7 @@ def tabulate_laws(tuned: "TuningResult") -> TextTable:
 
 
 def _format_front_ends(search: "CandidateSearch") -> list[str]:
-    """Returns the table cells of the two ends of a law's front.
+    """Returns the table cells of the two ends of a law's front: best objective, least effort.
 
     Returns:
         The least objective with its effort, and the least effort with its objective. All cells
