@@ -312,9 +312,9 @@ class Recorder:
     def _repair_until(self, recording: Recording, until_ns: int) -> None:
         """Waits until a given time. Meanwhile missing messages are requested and written.
 
-        A site replies with few messages at a time, so as not to delay its ticks. If the next
-        request waited for the next flush, a recorder that was delayed on a busy machine would
-        never catch up.
+        A site replies with few messages at a time, so as not to delay its control loop. If the
+        next request waited for the next flush, a recorder that was delayed on a busy machine
+        would never catch up.
 
         Args:
             recording: The recording.

@@ -336,9 +336,9 @@ class Recording:
 
         - "admit": The reporting site has admitted the new start to the session. If this start
           is not recorded yet, it will be recorded now.
-        - `LAST`: The number of ticks that the reporting site had received before the new start.
-          It is evaluated when the new start is being recorded, because it shows how many
-          messages of the previous start are missing.
+        - `LAST`: The number of ticks (records of control periods) that the reporting site had
+          received before the new start. It is evaluated when the new start is being recorded,
+          because it shows how many messages of the previous start are missing.
 
         Args:
             event: Any decoded message of a site. Messages other than these events are ignored.

@@ -480,7 +480,7 @@ class SiteReception:
         """Takes into account how many ticks the previous start of the site executed at least.
 
         The previous start may have been killed. In that case it could not state this number
-        itself, but other sites have received its samples.
+        itself, but other sites have received its samples (sent states).
 
         Args:
             ticks: Number of ticks that another site reports.

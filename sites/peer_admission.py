@@ -122,7 +122,7 @@ class PeerAdmission:
         """Publishes the last tick that was received from a peer before the peer was restarted.
 
         The previous process of the peer may have been killed before it could publish its end.
-        From its last tick, the recorder knows how many records to expect.
+        From its last tick, the recorder knows how many records (results of ticks) to expect.
 
         Args:
             index: Index of the peer.

@@ -41,9 +41,9 @@ _EVENTS_BYTES = 4_000_000
 class ChannelBuffer:
     """Stores the latest messages of one channel, numbered consecutively.
 
-    A channel is for example that of a site's records. The messages are stored one after another
-    in a ring of bytes that is allocated at the start, so that no memory is allocated while the
-    control loop runs. New messages overwrite the oldest ones.
+    A channel is for example that of a site's records (results of its ticks). The messages are
+    stored one after another in a ring of bytes that is allocated at the start, so that no
+    memory is allocated while the control loop runs. New messages overwrite the oldest ones.
 
     Args:
         capacity: Largest number of messages.

@@ -54,7 +54,7 @@ class RunOutcome(NamedTuple):
 
     @property
     def t_ns(self) -> int:
-        """Nominal time of the last tick, in ns since the epoch.
+        """Nominal time of the last tick, in ns since the start of the session.
 
         It is -1 if no tick was executed.
         """
@@ -67,8 +67,8 @@ class SiteEnd:
     Args:
         parts: Parts of the site.
         publisher: Publishes the events of the site.
-        link_monitors: Timing monitors of the links, which know whether the peers have received
-            the last samples of this site.
+        link_monitors: Timing monitors of the links, which know whether the peers (the other
+            sites) have received the last samples of this site.
         outcome: Result of the control loop.
     """
 

@@ -52,8 +52,8 @@ class LawSituation(NamedTuple):
         laws: Settings of the control law of each site.
         alpha: Dominance matrix, shape (N, N): row i contains the weights with which site i
             follows the other sites.
-        delay_s: Delay of the link from j to i, row i, column j, at least one tick, s; NaN if it
-            varies.
+        delay_s: Delay of the link from j to i, row i, column j, at least one tick (period of
+            the control loop), s; NaN if it varies.
         tau_limit_nm: Largest torques of the site's joints, N m.
         rate_hz: Tick rate of the site, Hz.
         gravity_nm: Largest gravity torque of the site's planar arm, N m per joint; () for a
@@ -80,7 +80,7 @@ class LawSituation(NamedTuple):
 
     @property
     def longest_s(self) -> float:
-        """Longest delay of the links over which a site receives the peers that it follows, s.
+        """Longest delay of the links over which a site receives the sites that it follows, s.
 
         It is NaN if any of these delays varies.
         """
@@ -147,7 +147,7 @@ def find_least_reversible(alpha: Array) -> float | None:
 def judge_position_exchange(
     situation: LawSituation, stiffness: str, damping: str
 ) -> StabilityCondition:
-    """Returns the stability condition of P+d, a spring to the peers and a damper.
+    """Returns the stability condition of P+d, a spring to the other arms and a damper.
 
     The condition holds for arms of any mass. For two sites, it is due to Nuno, Basanez, Ortega
     and Spong, IJRR 28, 2009. More than two sites need reversible dominance factors, see

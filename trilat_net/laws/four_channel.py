@@ -49,7 +49,7 @@ def _send_acceleration(law: Any, now: LawInput) -> None:
 
     Args:
         law: The law, whose `rows` are the work space.
-        now: Inputs and outputs of the law in this tick.
+        now: Inputs and outputs of the law in this tick (period of the control loop).
     """
     n = now.joints
     rows = law.rows

@@ -340,8 +340,8 @@ class ControlLaw:
     Attributes:
         Settings: Class that stores the gains of the law in a scenario, the description of an
             experiment.
-        remembers: Names of the instance attributes that keep the state of the law between
-            ticks.
+        remembers: Names of the instance attributes that keep the state of the law between ticks
+            (periods of the control loop).
         tune: Range of each gain that is tuned, by name.
         known_facts: Sentence for the user. It states which facts about the arm the law needs.
     """
@@ -555,9 +555,9 @@ def check_law_class(
 def _check_methods(kind: Any, code: str, path: str) -> None:
     """Refuses a class without `torque`, and a class that does not declare its memory.
 
-    The memory of a law is everything that it must know in the next tick. It is recorded, so
-    that a run can be verified from any record. A class declares it by `remembers`, or by the
-    methods `memory` and `recall`.
+    The memory of a law is everything that it must know in the next tick, a period of the
+    control loop. It is recorded, so that a run can be verified from any record. A class
+    declares it by `remembers`, or by the methods `memory` and `recall`.
 
     Args:
         kind: The class.

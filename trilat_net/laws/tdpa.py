@@ -691,18 +691,18 @@ def _follow_peers(law: Any, now: LawInput, i: int) -> None:
 class Tdpa(EnergyLaw):
     """Time-domain passivity control: each end observes and limits the energy it takes out.
 
-    A spring K and a damper B move each site towards the integral of its peers' velocities,
-    weighted by the dominance factors, and the peers feel the torque of K and B. With K = 0 and
-    B = 0 a site only leads.
+    A spring K and a damper B move each site towards the integral of the velocities of its peers
+    (the arms that it follows), weighted by the dominance factors, and the peers feel the torque
+    of K and B. With K = 0 and B = 0 a site only leads.
 
     Source: Ryu, Artigas and Preusche (2010); for several sites Panzirsch and others (2012).
 
     Attributes:
         K: Spring by which the site follows, per joint, N m/rad; 0: the site follows nobody.
         B: Damper by which the site follows, per joint, N m s/rad.
-        acceleration_rad_s2: Largest change per tick of a joint's acceleration by torques other
-            than the law's that the leaders' controllers plan for. Half of the reserve pays for
-            larger changes.
+        acceleration_rad_s2: Largest change per tick (period of the control loop) of a joint's
+            acceleration by torques other than the law's that the leaders' controllers plan for.
+            Half of the reserve pays for larger changes.
         drift_rad_s: Largest velocity by which positions that have drifted apart are brought
             together again; 0: positions drift.
         reserve_J: Initial energy of an end per joint and peer, J.

@@ -187,7 +187,7 @@ def _receive_wave(
     Args:
         law: The law, with its energy accounts.
         now: Inputs and outputs of the law in this tick.
-        j: Index of the peer at the other end of the line.
+        j: Index of the peer, the site at the other end of the line.
         i: Index of the joint.
         missed: Number of samples between the sample in use and the previous one; -1 if there
             is no new sample.
@@ -434,8 +434,9 @@ class Wave(EnergyLaw):
         lines: Impedances of single lines, for all joints, as in { "m1-s" = 18.0 }, N m s/rad; 0
             removes a line, and lines that are not named have b. "shares": impedances that give
             the dominance factors at the start, b on average, if these factors are reversible;
-            otherwise b. Dominance factors are the weights with which an arm follows its peers.
-            They are reversible if positive weights D_i exist with D_i alpha_ij = D_j alpha_ji.
+            otherwise b. Dominance factors are the weights with which an arm follows its peers,
+            the other arms. They are reversible if positive weights D_i exist with D_i alpha_ij
+            = D_j alpha_ji.
         beta: Divisor of the site's torque, dimensionless; it scales the forces that the users
             feel relative to each other.
         reception: Which wave is played if samples are late or lost. "replay": the last wave is

@@ -402,8 +402,8 @@ def _compute_phasors(
     and overlap by half. The spectrum of the window is zero at the other sines, which are two or
     more multiples of 1 / segment_s away. The spectrum falls with the third power of the
     frequency. Therefore transients and drift, which are slower than the sines, hardly
-    contribute. The first half segment is left out. Segments with too many missing records are
-    skipped.
+    contribute. The first half segment is left out. Segments with too many missing records
+    (results of control periods) are skipped.
 
     Args:
         records: Records of the site.

@@ -137,8 +137,8 @@ class ArmGains(Result):
         runs: Simulated runs that check the gains. The entry `share` is None for the gains
             themselves. For the other runs it is the value of k as a fraction of that at the
             edge. Each run has two growth rates: one that was measured from the largest speed,
-            which is None if the motions were not small, and one that the roots of the loop
-            predict.
+            which is None if the motions were not small, and one that the characteristic roots
+            of the linearised loop predict.
         agree: True if all runs behave as the roots predict, and the run with the gains decays.
         line: The gains as a line to paste above the tables of a scenario.
         curve: Pairs of a delay, in s, and k at the edge in the same pose. Empty unless
@@ -415,7 +415,8 @@ class _GainSearch:
         poses: Poses in which the loop is analysed, shape (count, n).
         margin: Factor by which the stiffness lies below the edge.
         damping: Damping ratio of the gains.
-        quantile: Quantile of varying sample ages that stands for a constant age.
+        quantile: Quantile of varying ages of samples (received states) that stands for a
+            constant age.
 
     Attributes:
         conditions: Linearised conditions of the loop.

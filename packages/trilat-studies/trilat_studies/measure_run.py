@@ -658,7 +658,8 @@ class SiteStats:
 class LinkAge(msgspec.Struct, frozen=True):
     """Age of the samples in use of one link, which leads from one site to another.
 
-    Ticks before the first sample do not count.
+    A sample is the state that a site sends in a tick. Its age is the time since then. Ticks
+    before the first sample do not count.
 
     Attributes:
         mean_ms: Mean age, in ms. None if the link never delivered a sample.
@@ -722,7 +723,7 @@ def _compute_run_metrics(
         site_stats: Statistics of each site, in the order of the scenario.
         diverged_at_s: Time at which the first site left the limits of its arm, in s. None if
             no site did.
-        late_samples: Number of samples that arrived too late.
+        late_samples: Number of samples (states that a site sent) that arrived too late.
         missing: Number of ticks without a record.
 
     Returns:
@@ -1052,8 +1053,8 @@ def _read_metric(key: str, metrics: RunMetrics) -> float | None:
     """Returns the metric that a key of [expect] limits.
 
     The name of the metric follows from the key: "peak_error_max_rad" limits `peak_error_rad`,
-    and "synchronised_by_s" limits `synchronised_at_s`. Keys in ms limit the ages of samples,
-    of which the worst link counts.
+    and "synchronised_by_s" limits `synchronised_at_s`. Keys in ms limit the ages of samples
+    (received states), of which the worst link counts.
 
     Returns:
         The metric. None if the run does not have it, or if a link never delivered a sample.

@@ -305,7 +305,7 @@ def _put_acceleration(
     The torque is the held u plus the torque of the actors at the time and state of the stage.
 
     Args:
-        t_s: Time of the stage, s since the epoch.
+        t_s: Time of the stage, s since the start of the session.
         s: Row of the site, with `stage_q` and `stage_qd`.
         chain: Rows of the joints.
         actors: Rows of operators and environments.

@@ -78,7 +78,7 @@ class TorqueSource(NamedTuple):
 
     Attributes:
         kind: The kind of operator or environment.
-        start_s: Start of the action, s since the epoch.
+        start_s: Start of the action, s since the start of the session.
         end_s: End of the action, s.
         move_start_s: Start of the target's motion, s; CHIRP: start of the first sweep.
         move_end_s: End of the target's motion, s; CHIRP: end of the first sweep.
@@ -91,7 +91,7 @@ class TorqueSource(NamedTuple):
         K: Stiffness: HAND N m/rad, TASK_HAND N/m per axis, WALL N/m (first number).
         B: Damping: HAND and VISCOUS N m s/rad, TASK_HAND N s/m per axis, WALL N s/m (first
             number).
-        sampled: True: evaluated once per tick and held.
+        sampled: True: evaluated once per tick (period of the control loop) and held.
         table: RECORDED: rows of time, s, and torque ON each joint, N m, shape (rows, 1 + n).
             MULTISINE: Rows of frequency, Hz, and phase at the start, turns; further columns are
             not used.
@@ -317,7 +317,7 @@ def _spring_force(actor: Row, t_s: float, at: Vector, speed: Vector) -> Pair:
 
     Args:
         actor: Row of the operator, see `torque_source_dtype`.
-        t_s: Time since the epoch, s.
+        t_s: Time since the start of the session, s.
         at: Position of the arm along the coordinates, rad or m.
         speed: Derivative of the position, rad/s or m/s.
 
@@ -345,7 +345,7 @@ def _find_table_rows(actor: Row, t_s: float, table: TorqueTable) -> tuple[int, i
 
     Args:
         actor: Row of the actor.
-        t_s: Time since the epoch, s.
+        t_s: Time since the start of the session, s.
         table: Tables of all actors.
 
     Returns:
@@ -372,7 +372,7 @@ def _recorded_torque(actor: Row, t_s: float, table: TorqueTable) -> Pair:
 
     Args:
         actor: Row of the actor.
-        t_s: Time since the epoch, s.
+        t_s: Time since the start of the session, s.
         table: Tables of all actors.
     """
     low, high, x = _find_table_rows(actor, t_s, table)
@@ -407,7 +407,7 @@ def _chirp_size(actor: Row, t_s: float) -> float:
 
     Args:
         actor: Row of the actor.
-        t_s: Time since the epoch, s.
+        t_s: Time since the start of the session, s.
     """
     first_hz = actor.b[0]
     last_hz = actor.b[1]
@@ -427,7 +427,7 @@ def _multisine_size(actor: Row, t_s: float, table: TorqueTable) -> float:
 
     Args:
         actor: Row of the actor.
-        t_s: Time since the epoch, s.
+        t_s: Time since the start of the session, s.
         table: Tables of all actors, here rows of frequency, Hz, and phase, turns.
     """
     total = 0.0
@@ -450,7 +450,7 @@ def _scripted_size(actor: Row, t_s: float, table: TorqueTable) -> float:
 
     Args:
         actor: Row of the actor.
-        t_s: Time since the epoch, s.
+        t_s: Time since the start of the session, s.
         table: Tables of all actors.
     """
     if actor.kind == _PULSE:
@@ -528,7 +528,7 @@ def _user_effort(actor: Row, t_s: float, at: Vector, speed: Vector, table: Torqu
 
     Args:
         actor: Row of the actor.
-        t_s: Time since the epoch, s.
+        t_s: Time since the start of the session, s.
         at: Position along the joints or axes, rad or m.
         speed: Its derivative.
         table: Tables of all actors.
@@ -548,7 +548,7 @@ def _end_effector_torque(
 
     Args:
         actor: Row of the actor.
-        t_s: Time since the epoch, s.
+        t_s: Time since the start of the session, s.
         q: Joint angles, rad.
         qd: Joint velocities, rad/s.
         lengths: Lengths of the two links, m.
@@ -697,7 +697,7 @@ def _force_in_space(
 
     Args:
         actor: Row of the actor.
-        t_s: Time since the epoch, s.
+        t_s: Time since the start of the session, s.
         at: Position of the end effector, m.
         speed: Its velocity, m/s.
         table: Tables of all actors.
@@ -755,7 +755,7 @@ def _add_joint_torque(
 
     Args:
         actor: Row of the actor.
-        t_s: Time since the epoch, s.
+        t_s: Time since the start of the session, s.
         q: Joint positions, shape (n,).
         qd: Joint velocities, shape (n,).
         joints: Number n of joints.

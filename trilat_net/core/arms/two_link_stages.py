@@ -271,7 +271,7 @@ def _acceleration(
     The torque is the held u plus the torque of the actors at the time and state of the stage.
 
     Args:
-        t_s: Time of the stage, s since the epoch.
+        t_s: Time of the stage, s since the start of the session.
         q: Joint angles, rad.
         qd: Joint velocities, rad/s.
         u: Held torque, shape (2,), N m.
@@ -387,7 +387,7 @@ def advance_arm(
     are written into the row of the site.
 
     Args:
-        t_s: Time at the beginning of the period, s since the epoch.
+        t_s: Time at the beginning of the period, s since the start of the session.
         h_s: The period, s.
         s: Row of the site; written.
         actors: Rows of operators and environments.

@@ -151,7 +151,7 @@ class HandCommand(NamedTuple):
 
 
 class HandMemory(NamedTuple):
-    """State of a live hand, a person or program that moves an arm, from tick to tick.
+    """State of a live hand, a person or program that moves an arm, between two control periods.
 
     Attributes:
         source: Sender that holds the arm; 0: nobody, though a grip may still fade.
@@ -182,7 +182,7 @@ class HandMemory(NamedTuple):
 class HandInForce(NamedTuple):
     """What a live hand, a person or program that moves an arm, does in one tick.
 
-    The fields are in the order of the record's field `hand`.
+    A tick is a control period. The fields are in the order of the field `hand` of its record.
 
     Attributes:
         grip: Firmness of the grip, 0 to 1.
@@ -387,7 +387,8 @@ def glide(
         first: The first tick.
         rate_hz: Tick rate of the site, Hz.
         grip: Firmness of the grip before, 0 to 1.
-        arrives_ns: Time at which the target arrives at the goal, ns since the epoch.
+        arrives_ns: Time at which the target arrives at the goal, ns since the start of the
+            session.
         speed_limit: Largest speed of the target, m/s or rad/s.
         acceleration: Largest acceleration of the target, m/s^2 or rad/s^2; inf: no limit.
         goal: The goal, shape (size,).
@@ -488,7 +489,7 @@ def _accept_command(
     Args:
         rules: Limits of the hand.
         memory: State before the message.
-        t_ns: Nominal time of the tick, ns since the epoch.
+        t_ns: Nominal time of the tick (control period), ns since the start of the session.
         command: The message.
         locate: Function that returns the arm's pose now.
 
@@ -543,7 +544,8 @@ def _take_hold(
     Args:
         rules: Limits of the hand.
         memory: State before the message. Nobody holds the arm.
-        t_ns: Nominal time of the tick, ns since the epoch, the common start of the session.
+        t_ns: Nominal time of the tick (control period), ns since the epoch, the common start of
+            the session.
         command: The message.
         locate: Function that returns the arm's pose now.
 
@@ -580,7 +582,8 @@ def _aim(
         rules: Limits of the hand.
         memory: State before the message.
         command: The message.
-        arrives_ns: Time at which the target arrives at the goal, ns since the epoch.
+        arrives_ns: Time at which the target arrives at the goal, ns since the start of the
+            session.
     """
     goal = rules.reach.find_nearest(command.target)
     return memory._replace(
@@ -677,7 +680,7 @@ def _find_rate(rules: HandRules, memory: HandMemory, t_ns: int) -> tuple[float, 
     Args:
         rules: Limits of the hand.
         memory: State, with the target already moved to this tick.
-        t_ns: Nominal time of the tick, ns since the epoch.
+        t_ns: Nominal time of the tick (control period), ns since the start of the session.
 
     Returns:
         The velocity, one number per coordinate, in the unit of the target per second.

@@ -79,7 +79,7 @@ class HandView(NamedTuple):
 
     Attributes:
         k: The tick.
-        t_s: Nominal time of the tick since the epoch, s.
+        t_s: Nominal time of the tick since the start of the session, s.
         q: Joint angles of the arm, rad, shape (n,).
         qd: Joint velocities, rad/s.
         pose: Pose of the arm in the coordinates of the hand: its end effector, m, or its

@@ -27,9 +27,9 @@ BLEND_S = 0.1
 def limit_reference(k: int, site: SiteRow) -> None:
     """Limits the speed of the reference, the position that the arm follows.
 
-    The reference moves from its value in the previous tick by at most the permitted step. A
-    reference that was held back catches up later. At the first tick it starts from the pose of
-    the arm.
+    The reference moves from its value in the previous tick (period of the control loop) by at
+    most the permitted step. A reference that was held back catches up later. At the first tick
+    it starts from the pose of the arm.
 
     Args:
         k: The tick.

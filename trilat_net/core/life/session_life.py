@@ -103,8 +103,8 @@ _ORDER_HELD = int(LifeOrder.HELD)
 def _all_heard(t_ns: int, silence_ns: int, links: RowArray) -> bool:
     """Returns True if no peer that the site follows is silent.
 
-    A peer is silent if none of its samples came into use within the last `silence_ns`. Peers
-    with a dominance factor of zero are not followed.
+    A peer is silent if none of its samples (sent states) came into use within the last
+    `silence_ns`. Peers with a dominance factor of zero are not followed.
 
     Args:
         t_ns: Time, ns since the epoch, the common start of the session.

@@ -94,7 +94,7 @@ def _delay_us(
 
     Args:
         sample: Index of the sample.
-        stamp_ns: Stamp of the sample, ns since the epoch.
+        stamp_ns: Stamp of the sample, ns since the start of the session.
         fresh: True for the first sample of the model.
         link: Row of the link.
         model: Model in force.

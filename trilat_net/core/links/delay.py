@@ -78,7 +78,7 @@ class LinkModel(NamedTuple):
     The stamp of a sample is the time at which it was sent.
 
     Attributes:
-        from_ns: First stamp to which the model applies, ns since the epoch.
+        from_ns: First stamp to which the model applies, ns since the start of the session.
         kind: A `DelayKind`, which defines `location`, `scale`, `extra` and `weight`.
         at_end: A `TraceEnd`, for a trace.
         trace_first: First row in the site's table of the points of a trace, or of the numbers
@@ -94,7 +94,7 @@ class LinkModel(NamedTuple):
         call: Address of the function of a CUSTOM model, see `plugged`.
         key: Input of that function: the key of the link.
         sample: Input: the index of the sample.
-        stamp_ns: Input: the stamp of the sample, ns since the epoch.
+        stamp_ns: Input: the stamp of the sample, ns since the start of the session.
         drawn_us: Output: the delay, us.
     """
 
@@ -321,7 +321,8 @@ def trace_delay_us(stamp_ns: int, model: Row, points: Points) -> int:
     after its last point, which lasts as long as the point before it.
 
     Args:
-        stamp_ns: Stamp of the sample, the time at which it was sent, ns since the epoch.
+        stamp_ns: Stamp of the sample, the time at which it was sent, ns since the start of the
+            session.
         model: Model of the delay, a row of LINK_MODEL_DTYPE.
         points: Points of all traces, rows of time and delay, us.
 

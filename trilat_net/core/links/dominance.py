@@ -177,7 +177,7 @@ def _interpolate(
     """Returns the factor at time t of a linear change from `before` to `after`.
 
     Args:
-        t_ns: Time t, ns since the epoch.
+        t_ns: Time t, ns since the start of the session.
         start_ns: Start of the change.
         end_ns: End of the change.
         before: Factor at the start.
@@ -193,9 +193,9 @@ def _interpolate(
 def apply_ramps(t_ns: int, count: int, ramps: Array, links: RowArray) -> None:
     """Computes the dominance factors and their derivatives at time t, for each link.
 
-    A dominance factor is the weight with which the site follows a peer. It changes by ramps,
-    linear changes over time. A ramp starts at the factors that the previous ramp has at that
-    time, complete or not.
+    A dominance factor is the weight with which the site follows a peer, another site. It
+    changes by ramps, linear changes over time. A ramp starts at the factors that the previous
+    ramp has at that time, complete or not.
 
     Args:
         t_ns: The time, ns since the epoch, the common start of the session.

@@ -207,7 +207,10 @@ def _is_far_ahead(k: int, rate_hz: int, tick: int, peer_rate_hz: int) -> bool:
 
 @leaf
 def _file_sent(channel: ChannelArrays | None, page: int, sent: Array) -> None:
-    """Files the numbers that a peer's law sent with a sample in a page of the calendar.
+    """Files the numbers that the law of a peer sent with a sample in a page of the calendar.
+
+    A peer is the site at the sending end of the link. The numbers wait together with the sample
+    until its delay has passed.
 
     Args:
         channel: Arrays of these numbers; None if the receiver's law ignores them.

@@ -115,7 +115,8 @@ class PeerView(NamedTuple):
     Attributes:
         alpha: Dominance factor of the peer now, the weight with which this site follows it.
         tick: Stamp of the sample in use, a tick of the peer; -1 before the first sample.
-        age_s: Age of that sample, s; before the first sample, the time since the epoch.
+        age_s: Age of that sample, s; before the first sample, the time since the start of the
+            session.
         new: 1 if the sample came into use at this tick, else 0.
         q: Joint angles or coordinates of the sample, rad or m.
         qd: Derivative of q, rad/s or m/s.
@@ -144,7 +145,7 @@ class LawInput(NamedTuple):
 
     Attributes:
         k: The tick.
-        t_s: Nominal time since the epoch, s.
+        t_s: Nominal time since the start of the session, s.
         h_s: The period, s.
         q: Joint angles, rad.
         qd: Joint velocities, rad/s.

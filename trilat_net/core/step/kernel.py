@@ -264,7 +264,7 @@ def _update_external_torque(
     """Writes the torque of operators and environments at time t_k, which stage 6 may use.
 
     Args:
-        t_s: Time since the epoch, s.
+        t_s: Time since the start of the session, s.
         s: Row of the site.
         chain: Rows of the chain, or None.
         actors: Operators and environments.
@@ -290,7 +290,7 @@ def _advance_arm(
     """Advances q and qd by one period.
 
     Args:
-        t_s: Time at the beginning of the period, s since the epoch.
+        t_s: Time at the beginning of the period, s since the start of the session.
         h_s: The period, s.
         s: Row of the site.
         chain: Rows of the chain, or None.
@@ -326,7 +326,7 @@ def _advance(
 
     Args:
         k: The tick.
-        t_ns: Nominal time of the tick, ns since the epoch.
+        t_ns: Nominal time of the tick, ns since the start of the session.
         s: Row of the site.
         chain: Rows of the chain, or None.
         actors: Operators and environments.

@@ -313,7 +313,7 @@ class Site:
 
         Args:
             k: The tick.
-            t_ns: Nominal time of the tick, ns since the epoch.
+            t_ns: Nominal time of the tick, ns since the start of the session.
             count: Number of arrivals in the buffers.
 
         Returns:
@@ -372,7 +372,7 @@ class Site:
 
         Args:
             k: The tick.
-            t_ns: Nominal time of the tick, ns since the epoch.
+            t_ns: Nominal time of the tick, ns since the start of the session.
 
         Raises:
             LawFailed: The law failed, and the site is not under the rule `glide`.

@@ -121,11 +121,11 @@ class LifeOrder(IntEnum):
 
 
 class DominanceRamp(NamedTuple):
-    """Linear change over time of a site's dominance factors, the weights of its peers.
+    """Linear change over time of a site's dominance factors, with which it follows other sites.
 
     Attributes:
-        start_ns: Start of the change, ns since the epoch.
-        end_ns: End of the change, ns since the epoch, not before `start_ns`.
+        start_ns: Start of the change, ns since the start of the session.
+        end_ns: End of the change, ns since the start of the session, not before `start_ns`.
         alpha: Factors at the end, per peer in scenario order.
     """
 

@@ -346,7 +346,7 @@ class ExperimentTrial:
         """Computes the measures of a trial, with units in the names.
 
         They are the measures of the slave's motion, the forces and the work of each user, and
-        the mean age of the first user's samples at the slave.
+        the mean age of the first user's samples (sent states) at the slave.
         """
         measures = self._measure_motion(log, outcome.ended_s)
         aligned = align_records(log)

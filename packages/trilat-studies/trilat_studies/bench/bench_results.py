@@ -74,7 +74,8 @@ class BenchRun(msgspec.Struct, frozen=True):
         length_s: Duration of the judged run, in s.
         to_s: Requested duration, in s, of a run that was repeated because it was not stable. 0
             for a first run.
-        at_limit: True if the run would have needed more ticks than the safety limit allows.
+        at_limit: True if the run would have needed more ticks (control periods) than the safety
+            limit allows.
         confirmed: True if the repeated run was not stable either. False if it was, so that it
             refuted the first run. None if there is no repeated run, because the first run was
             not judged "not stable", or diverged.

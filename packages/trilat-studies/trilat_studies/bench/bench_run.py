@@ -133,7 +133,8 @@ class JudgedRun(NamedTuple):
         roots: Characteristic roots of the loop at the end of the run.
         stability: The judgement.
         text: Explanation of the judgement.
-        at_limit: True if the run would have needed more than `MAX_RUN_TICKS` ticks.
+        at_limit: True if the run would have needed more than `MAX_RUN_TICKS` ticks (control
+            periods).
         rests_on: What the judgement rests on, as in the stability certificate.
     """
 

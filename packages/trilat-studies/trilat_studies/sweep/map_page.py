@@ -838,7 +838,9 @@ def tabulate_edges(plane: MapPlane, panel: MapPanel, lines: Sequence[MapLine]) -
 
 
 def _list_crossings(line: MapLine, plane: MapPlane) -> Iterator[tuple[float, StabilityEdge]]:
-    """Yields where a line of theory crosses the columns of a map, for the table of edges.
+    """Yields where a line of theory crosses the columns of a map.
+
+    The table of edges, the measured limits of stability, compares them with these crossings.
 
     Args:
         line: The line.

@@ -94,7 +94,7 @@ class CellResult(msgspec.Struct, frozen=True):
         end_speed_rad_s: Largest |qd| of the last second, in rad/s.
         error_rate_per_s: Rate of the trend exp(rate t) of |e| over the second half of the run,
             in 1/s. None without a trend.
-        speed_rate_per_s: Rate of the trend of |qd|, likewise.
+        speed_rate_per_s: Rate of the trend of |qd|, in 1/s. None without a trend.
         peak_error_rad: Largest |e| of the run, in rad.
         settled_s: Time from which |e| stays below 0.01 rad, in s. None if |e| is not below
             0.01 rad at the end.
@@ -105,11 +105,13 @@ class CellResult(msgspec.Struct, frozen=True):
         force_peak_n: See `RunTotals`.
         walls_j: See `RunTotals`.
         reasons: Reasons why the run is undecided, as a string.
-        exponent_per_s: Growth exponent of the run's twins over the scenario's duration, in 1/s,
-            see `measure_exponent`. None without twins, or if no twin moved.
+        exponent_per_s: Growth exponent over the scenario's duration, from twins (repetitions
+            with a small push), in 1/s, see `measure_exponent`. None without twins, or if no
+            twin moved.
         stability: The decision whether the run is stable, as in the stability certificate.
             Empty in results of older versions.
-        rests_on: What the decision rests on, likewise.
+        rests_on: What the decision rests on, for example exact roots. Empty in results of older
+            versions.
     """
 
     verdict: CellClass
@@ -343,8 +345,8 @@ def measure_exponent(scenario: Scenario) -> float | None:
 def _chatters(scenario: Scenario, run: FusedRun) -> bool:
     """Returns True if small motions of a run grow in contact with a sampled wall.
 
-    The force of a sampled wall is computed once per tick and held. Such a wall can generate
-    energy.
+    The force of a sampled wall is computed once per control period and held. Such a wall can
+    generate energy.
 
     Args:
         scenario: Scenario of the run.

@@ -339,7 +339,7 @@ def check_final_posture(log: Log) -> list[str]:
         The warnings, one sentence each. Empty if the log is complete and its arms did not fall.
 
     Raises:
-        LogError: A record cannot be read.
+        LogError: A record (the result of a control period) cannot be read.
     """
     parts = {site: log[site] for site in log.sites if len(log[site])}
     diverged = [site for site, part in parts.items() if part.record(-1).mode == "diverged"]
@@ -418,7 +418,8 @@ class CandidateScore(msgspec.Struct, frozen=True):
         pose_rad: Part of the error that is the distance of the arms' mean from q*.
         effort_nm: RMS of the torque minus the gravity torque at the arm's own pose, in N m.
         settled_s: Time from which the largest |e| stays below 0.01 rad, in s, where e is the
-            error of a site against its peers. None if |e| is larger at the end.
+            error of a site against its peers, the arms that it follows. None if |e| is larger
+            at the end.
         saturated: Fraction of all joint torques that were at the torque limit.
         diverged_s: Time at which the first site left its limits, in s. None if no site did.
         seeds: Number of runs over which the score is averaged. The class is the worst class
