@@ -34,7 +34,7 @@ ROOT = Path(trilat_net.__file__).resolve().parents[1]
 
 
 class Cluster:
-    """A scheduler and workers, each a process of its own."""
+    """A scheduler and its workers, each a process of its own."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -70,7 +70,7 @@ class Cluster:
         return process
 
     def add_worker(self, path: Path = ROOT) -> "subprocess.Popen[bytes]":
-        """Starts a worker of one thread, without a nanny: one that is killed stays dead."""
+        """Starts a worker of one thread without a nanny, so that a killed worker is not restarted."""
         return self._start("worker", self.address, "--nthreads", "1", "--no-nanny", path=path)
 
     def close(self) -> None:
@@ -87,7 +87,9 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
 
 
 def run_on_cluster(cluster: Cluster, folder: Path, count: int) -> None:
-    """A sweep on two workers, of which one is killed half way, and the same sweep in this process."""
+    """Returns a sweep on two workers, one of which is killed half way, and the same sweep in
+    this process.
+    """
     (folder / "trio.toml").write_text(SHORT.replace("duration_s = 0.5", "duration_s = 4.0"))
     sweep = plan(folder, over=[f"control.Kd=1:{1 + 0.1 * (count - 1):g}:0.1"], longest_s=4.0)
     assert sweep.cells == count
@@ -121,20 +123,20 @@ def workers_of(cluster: Cluster) -> int:
 
 @pytest.mark.long
 @pytest.mark.timeout(120)
-def test_a_sweep_with_a_killed_worker_gives_the_same_bytes(
-    cluster: Cluster, tmp_path: Path
-) -> None:
+def test_losing_a_worker_changes_no_byte(cluster: Cluster, tmp_path: Path) -> None:
     run_on_cluster(cluster, tmp_path, 300)
 
 
 @pytest.mark.long
 @pytest.mark.timeout(300)
-def test_so_does_one_of_2000_cells(cluster: Cluster, tmp_path: Path) -> None:
+def test_losing_a_worker_of_2000_cells_changes_nothing(
+    cluster: Cluster, tmp_path: Path
+) -> None:
     run_on_cluster(cluster, tmp_path, 2000)
 
 
 @pytest.mark.long
-def test_trials_margins_and_tuning_run_there_too(cluster: Cluster, tmp_path: Path) -> None:
+def test_trials_margins_and_tuning_run_on_a_cluster(cluster: Cluster, tmp_path: Path) -> None:
     cluster.add_worker()
     (tmp_path / "trio.toml").write_text(SHORT)
     on = ("--on", cluster.address)
@@ -169,7 +171,7 @@ def test_trials_margins_and_tuning_run_there_too(cluster: Cluster, tmp_path: Pat
 
 
 @pytest.mark.long
-def test_a_worker_with_another_program_is_refused_even_later(
+def test_workers_with_another_program_are_refused_even_later(
     cluster: Cluster, tmp_path: Path
 ) -> None:
     shutil.copytree(
@@ -199,7 +201,7 @@ def test_a_worker_with_another_program_is_refused_even_later(
 
 
 @pytest.mark.long
-def test_a_worker_without_the_file_of_a_law_is_refused(
+def test_a_worker_without_the_laws_file_is_refused(
     cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shutil.copy(ROOT / "tests" / "golden" / "spring_law.py", tmp_path / "lonely_law.py")
@@ -212,7 +214,7 @@ def test_a_worker_without_the_file_of_a_law_is_refused(
         trilat_net.check(scenario, on=cluster.address)
 
 
-def test_what_differs_is_named_on_both_sides() -> None:
+def test_differences_are_named_on_both_sides() -> None:
     here = describe_worker()
     assert explain_unfit_worker(WorkerRequirements(here), here, []) == ""
     for name in ("trilat-net", "arithmetic", "Python", "numpy", "numba", "scipy"):

@@ -1,4 +1,4 @@
-"""Hands that are known: springs of the kernel, and bodies with mass that also do things by themselves."""
+"""Hands with known impedance: springs of the kernel, and bodies with mass that also move on their own."""
 
 import dataclasses
 import json
@@ -84,8 +84,8 @@ def test_spring_and_damper_of_the_kernel_are_found(spring: HandImpedance) -> Non
     assert (spring.segments, spring.segment_s) == (5, 8.0)
 
 
-def test_only_segments_count_in_which_sines_act(spring: HandImpedance) -> None:
-    """A run that goes on for 12 s after its sines, with the same spring at the same arm."""
+def test_only_segments_with_active_sines_count(spring: HandImpedance) -> None:
+    """A run that continues for 12 s after its sines, with the same spring at the same arm."""
     changes = moved_from("m1", 2.0, 40.0)
     changes["sites.m1.hands"] = [
         SPRING,
@@ -96,7 +96,7 @@ def test_only_segments_count_in_which_sines_act(spring: HandImpedance) -> None:
     assert np.allclose(found.K, spring.K, atol=1e-6)
 
 
-def test_found_hand_is_one_of_a_scenario(spring: HandImpedance) -> None:
+def test_an_identified_hand_works_in_a_scenario(spring: HandImpedance) -> None:
     hand = spring.to_hand()
     scenario = tn.load_scenario("free", {"sites.m1.hands": [hand]})
     assert scenario.sites["m1"].hands[0].stiffness_n_m == tuple(hand["stiffness_n_m"])
@@ -112,7 +112,7 @@ def test_json_of_a_hand_is_read_again(spring: HandImpedance, tmp_path: Path) -> 
     assert spring.summary().count(" +- ") == 12
 
 
-def test_mass_hidden_by_its_own_motion_is_found_over_networks() -> None:
+def test_mass_behind_own_motion_is_identified_over_networks() -> None:
     true, found = held(3, 40.0)
     assert covered(true, found).mean() >= 0.75
     assert np.allclose(found.M, true.M, atol=0.2)
@@ -131,7 +131,7 @@ def test_intervals_hold_nine_tenths_of_twenty_hands() -> None:
         (moved_from("s", 5.0, 6.0), "m1: the log has 0 whole segments of 8 s .* at least 28 s"),
     ],
 )
-def test_a_run_that_tells_nothing_is_refused(changes: dict[str, Any], problem: str) -> None:
+def test_a_run_without_excitation_is_refused(changes: dict[str, Any], problem: str) -> None:
     log = tn.simulate("free", {"duration_s": 1.0, "rate_hz": 250, **changes})
     with pytest.raises(UsageError, match=problem):
         identify_hand(log, "m1")

@@ -1,4 +1,4 @@
-"""Means over seeds: what is drawn spreads them, and their intervals hold the truth as often as they say."""
+"""Means over seeds: random draws spread them, and their intervals have the stated coverage."""
 
 import json
 import shlex
@@ -55,7 +55,7 @@ def file(tmp_path: Path) -> Path:
     return path
 
 
-def test_an_interval_holds_the_truth_in_95_of_100_cases() -> None:
+def test_intervals_hold_the_truth_in_95_of_100() -> None:
     draws = np.random.default_rng(1).normal(3.0, 1.0, (2000, 5))
     found = [mean_interval(row.tolist()) for row in draws]
     holds = [abs(one.mean - 3.0) <= one.half for one in found if one is not None]
@@ -64,7 +64,7 @@ def test_an_interval_holds_the_truth_in_95_of_100_cases() -> None:
     assert mean_interval([1.0]) is mean_interval([1.0, None]) is None
 
 
-def test_trials_of_drawn_starts_differ_and_say_by_how_much(file: Path) -> None:
+def test_trials_of_drawn_starts_report_their_spread(file: Path) -> None:
     report = run_trials(trials(file, SEEDS), jobs=1)
     (row,) = report.rows()
     values = [result.outcomes[0].value for result in report.results]
@@ -76,7 +76,7 @@ def test_trials_of_drawn_starts_differ_and_say_by_how_much(file: Path) -> None:
     assert report.results[-1].trial.scenario == again
 
 
-def test_trial_of_distribution_names_command_that_repeats_it(file: Path) -> None:
+def test_trial_of_distribution_names_its_repeating_command(file: Path) -> None:
     trial = trials(file, [3], {"control.d": {"normal": [15.0, 1.0]}})[0]
     words = shlex.split(trial.look)
     settings = [words[n + 1] for n, word in enumerate(words) if word == "--set"]

@@ -1,4 +1,4 @@
-"""Laws of one's own in studies: given as classes, in scenarios that are tables, or loaded."""
+"""Users' own laws in studies: given as classes, in scenarios that are tables, or loaded."""
 
 from pathlib import Path
 from typing import Any
@@ -68,7 +68,7 @@ def test_ranges_come_from_the_class() -> None:
     assert told["s"] == {"law": "tests.own_laws:PD", "K": 7.0, "d": 2.0, "gravity": 0.9}
 
 
-def test_ranges_that_are_none_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invalid_ranges_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     for entry in ((3.0, 1.0), (0.0, 1.0), "wide", (1.0, 2.0, 3.0), (1.0,)):
         monkeypatch.setattr(PD, "tune", {"K": entry})
         with pytest.raises(UsageError, match=r"tune\['K'\] must be"):
@@ -76,8 +76,8 @@ def test_ranges_that_are_none_are_refused(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 @pytest.mark.long
-def test_a_users_law_is_tuned_and_swept_as_built_in(tmp_path: Path) -> None:
-    """The same numbers: it computes what p_d does, and both get the same candidates."""
+def test_users_laws_are_tuned_like_built_in_ones(tmp_path: Path) -> None:
+    """The user's law computes p_d, so both laws get the same numbers."""
     found = tn.tune("free", [CompiledPD, "p_d"], budget=2, duration_s=2, jobs=1)
     ours, theirs = (one.scores for one in found.found)
     assert found.found[0].space.law == "tests.own_laws:CompiledPD"

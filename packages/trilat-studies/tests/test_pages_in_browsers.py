@@ -59,7 +59,7 @@ def open_folder(watched: WatchedPage, folder: Path, html: str) -> None:
 def assert_page_of_study_is_whole(
     browser: Browser, folder: Path, html: str, pictures: int, tables: int
 ) -> None:
-    """Asserts that a page has so many pictures and at least so many tables, all of them with content."""
+    """Asserts that a page has `pictures` pictures and at least `tables` tables, all with content."""
     with watched_page(browser) as watched:
         open_folder(watched, folder, html)
         watched.assert_whole()
@@ -72,7 +72,7 @@ def assert_page_of_study_is_whole(
 def assert_markdown_is_whole(
     browser: Browser, page: Path, pictures: int, tables: int = 1
 ) -> None:
-    """The same of a page in Markdown, as viewers of Markdown show it."""
+    """Asserts the same of a Markdown page, as viewers of Markdown show it."""
     html = MarkdownIt("commonmark").enable("table").render(page.read_text(encoding="utf-8"))
     assert_page_of_study_is_whole(browser, page.parent, html, pictures, tables)
 

@@ -1,4 +1,6 @@
-"""A policy at m2 and a person at m1 of one session, moved through the plugins, and what is to come of it."""
+"""A session in which a policy moves m2 and a person moves m1 through the plugins, and its
+expected results.
+"""
 
 from collections.abc import Callable
 from types import ModuleType
@@ -17,7 +19,7 @@ ROBOT, TELEOPERATOR = "lerobot_robot_trilat", "lerobot_teleoperator_trilat"
 def drive(
     found: dict[str, ModuleType], running: Any, wait_s: Callable[[float], Any], **reach: Any
 ) -> dict[str, Any]:
-    """Moves both arms through the plugins for two seconds; returns what they said."""
+    """Moves both arms through the plugins for two seconds and returns the reported observations."""
     robot = make_device(found[ROBOT].TrilatRobotConfig(**reach))
     teleoperator = make_device(found[TELEOPERATOR].TrilatTeleoperatorConfig(**reach))
     robot.connect()

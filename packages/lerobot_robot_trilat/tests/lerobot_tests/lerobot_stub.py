@@ -1,7 +1,9 @@
-"""LeRobot's interfaces of robots and teleoperators as far as a plugin sees them, if it is not installed.
+"""Stand-ins for LeRobot's robot and teleoperator interfaces, used where LeRobot is not
+installed.
 
-By facts of its source, version 0.6: names of modules, of abstract methods, of events, and how a configuration
-is registered and its device found. Where LeRobot can be imported, the tests run against LeRobot.
+They reproduce the names of modules, abstract methods and events of LeRobot 0.6, and how LeRobot
+registers a configuration and finds its device. Where LeRobot can be imported, the tests run
+against LeRobot.
 """
 
 import abc
@@ -89,7 +91,7 @@ def _modules() -> dict[str, ModuleType]:
 
 @contextmanager
 def plugins() -> Iterator[dict[str, ModuleType]]:
-    """Imports all plugins by the names of their folders, under LeRobot or in its place."""
+    """Imports all plugins by the names of their folders, with LeRobot or with the stand-ins."""
     before = dict(sys.modules)
     try:
         importlib.import_module("lerobot")
@@ -108,7 +110,9 @@ def plugins() -> Iterator[dict[str, ModuleType]]:
 
 
 def make_device(config: Any) -> Any:
-    """Makes a device as LeRobot does: of its configuration's module, by its name without `Config`."""
+    """Makes a device as LeRobot does: from the module of its configuration, by the name without
+    `Config`.
+    """
     kind = type(config)
     return getattr(
         importlib.import_module(kind.__module__), kind.__name__.removesuffix("Config")

@@ -32,10 +32,10 @@ def found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str,
         yield modules
 
 
-def test_a_plugin_is_found_by_the_name_of_its_distribution(
+def test_lerobot_finds_a_plugin_by_its_distribution_name(
     found: dict[str, ModuleType],
 ) -> None:
-    """LeRobot imports the module of that name, which registers its configuration."""
+    """LeRobot imports the module of that name, and the module registers its configuration."""
     assert sorted(found) == [ROBOT, TELEOPERATOR]
     for folder, (name, module) in zip(PLUGINS, found.items(), strict=True):
         project = tomllib.loads((folder / "pyproject.toml").read_text(encoding="utf-8"))
@@ -78,8 +78,8 @@ def test_features_follow_from_the_scenario_before_any_connection(
         robot.get_observation()
 
 
-def test_robot_has_no_cameras_and_ends_with_its_session(found: dict[str, ModuleType]) -> None:
-    """`lerobot-record` counts the cameras, and disconnects only what is connected."""
+def test_robot_has_no_cameras_and_ends_with_session(found: dict[str, ModuleType]) -> None:
+    """`lerobot-record` counts the cameras and disconnects only connected devices."""
     robot = make_device(found[ROBOT].TrilatRobotConfig())
     assert robot.cameras == {}
     closed: list[str] = []
@@ -102,10 +102,10 @@ SPACE = Path(__file__).parents[4] / "tests" / "presentation" / "cases" / "tool_d
 
 @pytest.mark.parametrize(("actions", "mode"), [("tip", "tip"), ("joints", "joint")])
 @pytest.mark.parametrize("space", [False, True])
-def test_a_dataset_has_the_actions_that_the_plugin_accepts(
+def test_a_dataset_has_the_actions_the_plugin_accepts(
     found: dict[str, ModuleType], tmp_path: Path, actions: str, mode: str, space: bool
 ) -> None:
-    """Names and order are the plugin's features, and the numbers where the hand of the user was."""
+    """Names and order are the plugin's features; the numbers are the position of the user's hand."""
     site, slave = ("m", "s") if space else ("m2", "s")
     hands = {f"sites.{site}.hands": [{"kind": "live", "mode": mode}], "duration_s": 0.1}
     scenario = load_scenario(str(SPACE) if space else "play", hands)
@@ -153,10 +153,12 @@ def test_a_dataset_has_the_observations_of_the_plugin(
         assert info["features"]["action"]["names"] == list(robot.action_features)
 
 
-def test_a_policy_is_asked_at_its_rate_with_both_states(
+def test_a_policy_gets_both_states_at_its_rate(
     found: dict[str, ModuleType], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Names of the dataset, the numbers of the robot in its order, and actions by their keys."""
+    """The names are the dataset's, the numbers the robot's in its own order, and actions go by
+    their keys.
+    """
     now_s = 0.0
     sent, asked = list[Any](), list[float]()
 
@@ -194,10 +196,9 @@ def test_an_arm_that_nobody_can_hold_is_refused(
         make_device(getattr(module, config)(session="paper", site="m1"))
 
 
-def test_policy_and_person_share_a_slave_and_one_takes_over(
+def test_a_person_takes_over_from_a_policy(
     found: dict[str, ModuleType], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The policy moves m2 by 10 cm, the person takes over half-way, and feedback pulls the person's arm."""
     scenario = load_scenario("play", {"duration_s": 4.0, "rate_hz": 200})
     session, seen = Session.whole(scenario, tmp_path), dict[str, Any]()
 
@@ -227,7 +228,7 @@ def test_policy_and_person_share_a_slave_and_one_takes_over(
 
 
 def assert_observed(observed: dict[str, float], log: Log, folder: Path) -> None:
-    """The dataset has a frame with what the plugin saw of each arm, and the policy is its program."""
+    """Asserts that a frame of the dataset has each arm's observation, with the policy as its program."""
     trilat_net.export(log, "lerobot", folder, observations="plugin", fps=200)
     frames = pl.read_parquet(folder / "data" / "chunk-000" / "file-000.parquet")
     state = frames["observation.state"].to_numpy()

@@ -1,4 +1,6 @@
-"""The suite: its runs are the program's runs, interruptions leave no trace, and its intervals are SciPy's."""
+"""The suite: its runs are the program's runs, interruptions leave no trace, and its intervals
+equal SciPy's.
+"""
 
 import shlex
 from collections.abc import Iterator
@@ -79,7 +81,7 @@ LEVEL = {"laws": ["p_d"], "study": "round-trips"}
 
 
 def asked(**more: Any) -> BenchPlan:
-    """Two cells of two sites, one of them with two seeds."""
+    """Returns a request for two cells of two sites, one cell with two seeds."""
     return plan_bench(
         **{**LEVEL, "tasks": ["free"], "links": ["rtt8", "rtt68-loss25"], "seeds": 2, **more}
     )
@@ -99,7 +101,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> BenchResults:
     return run_bench(folder, jobs=1)
 
 
-def test_an_interrupted_suite_goes_on_to_the_same_bytes(
+def test_an_interrupted_suite_resumes_to_the_same_bytes(
     whole: BenchResults, tmp_path: Path
 ) -> None:
     folder, made = prepare_bench_folder(asked(), tmp_path / "parts"), []
@@ -118,13 +120,15 @@ def test_an_interrupted_suite_goes_on_to_the_same_bytes(
 
 
 @pytest.mark.long
-def test_what_runs_the_cells_enters_no_result(whole: BenchResults, tmp_path: Path) -> None:
+def test_the_executor_of_the_cells_changes_no_result(
+    whole: BenchResults, tmp_path: Path
+) -> None:
     with ThreadPoolExecutor(1) as executor:
         found = run_bench(prepare_bench_folder(asked(), tmp_path / "elsewhere"), on=executor)
     assert files(found) == files(whole)
 
 
-def test_seeds_are_other_runs_where_anything_is_drawn(whole: BenchResults) -> None:
+def test_seeds_differ_only_where_numbers_are_drawn(whole: BenchResults) -> None:
     still, first, second = whole.runs
     assert (still.random, first.random) == (False, True)
     assert first.error_rad != second.error_rad
@@ -132,7 +136,7 @@ def test_seeds_are_other_runs_where_anything_is_drawn(whole: BenchResults) -> No
     assert run_bench_task(BenchRunItem(lossy, 2)) == second
 
 
-def test_a_cell_is_the_log_that_its_command_makes(whole: BenchResults) -> None:
+def test_a_cell_equals_the_log_of_its_command(whole: BenchResults) -> None:
     cell = whole.plan.cells[1]
     words = shlex.split(cell.build(1).command)
     assert words[:3] == ["trilat", "sim", "_bench_two"]
@@ -145,7 +149,7 @@ def test_a_cell_is_the_log_that_its_command_makes(whole: BenchResults) -> None:
     assert run.hand_nm == pytest.approx(np.sqrt(np.mean(hand**2)), rel=1e-12)
 
 
-def test_effort_is_that_of_the_compiled_run(whole: BenchResults) -> None:
+def test_effort_equals_that_of_the_compiled_run(whole: BenchResults) -> None:
     scenario = whole.plan.cells[0].build(1).scenario
     run = FusedRun(scenario)
     run.advance_to(scenario.duration_s)
@@ -153,7 +157,7 @@ def test_effort_is_that_of_the_compiled_run(whole: BenchResults) -> None:
 
 
 def rest_in_contact(K: float, settings: Any) -> tuple[Array, Array]:
-    """Pose of the user's arm at rest under P+d, and the torque of the hand on it."""
+    """Returns the pose of the user's arm at rest under P+d, and the torque of the hand on that arm."""
     target = np.array(settings["sites.m1.hands"][0]["to_rad"])
 
     def unbalanced(q: Array) -> Array:
@@ -166,8 +170,8 @@ def rest_in_contact(K: float, settings: Any) -> tuple[Array, Array]:
     return q, 50.0 * (target - q)
 
 
-def test_stiffness_at_the_hand_is_that_of_statics() -> None:
-    """Two springs and the wall of P+d, which is nearly at rest 2 s after contact."""
+def test_stiffness_at_the_hand_is_static() -> None:
+    """Two springs and the wall under P+d, nearly at rest 2 s after contact."""
     (cell,) = asked(tasks=["contact"], links=["rtt8"]).cells
     ends = []
     for settings in (SHORTER_REACH, TASKS["contact"].settings):
@@ -179,7 +183,7 @@ def test_stiffness_at_the_hand_is_that_of_statics() -> None:
     assert run.stiffness_n_m == pytest.approx((far_n - near_n) / (far_m - near_m), rel=5e-2)
 
 
-def test_stiffness_is_that_of_the_logs_two_seconds_after_contact() -> None:
+def test_stiffness_is_measured_two_seconds_after_contact() -> None:
     (cell,) = asked(tasks=["contact"], links=["rtt8"]).cells
     cell = with_gains(cell, K=60.0, d=6.0)
     built, ends = cell.build(1), []
@@ -202,7 +206,7 @@ def test_stiffness_is_that_of_the_logs_two_seconds_after_contact() -> None:
     assert run.stiffness_n_m == pytest.approx((far_n - near_n) / (far_m - near_m), rel=1e-6)
 
 
-def test_impedance_in_free_motion_is_that_of_two_coupled_arms() -> None:
+def test_free_impedance_is_that_of_coupled_arms() -> None:
     """P+d over 4 ms: D = M s^2 + (d + 0.5) s + K - K e^-sT (M s^2 + d s + K)^-1 K e^-sT."""
     (cell,) = asked(tasks=["contact"], links=["rtt8"]).cells
     K, d, s = 60.0, 12.0, 2j * np.pi
@@ -223,7 +227,7 @@ def test_impedance_in_free_motion_is_that_of_two_coupled_arms() -> None:
 
 
 def reach(q: Array) -> tuple[Array, Array]:
-    """The end effector of two links of 1 m, and its Jacobian."""
+    """Returns the end effector of two links of 1 m, and its Jacobian."""
     a, b = q[0], q[0] + q[1]
     tip = np.array([np.cos(a) + np.cos(b), np.sin(a) + np.sin(b)])
     return tip, np.array([[-tip[1], -np.sin(b)], [tip[0], np.cos(b)]])
@@ -233,7 +237,7 @@ def with_gains(cell: BenchCell, **gains: float) -> BenchCell:
     return cell._replace(tuned=msgspec.structs.replace(cell.tuned, gains=gains))
 
 
-def test_a_wall_that_is_hardly_touched_masks_the_numbers() -> None:
+def test_a_barely_touched_wall_masks_the_numbers() -> None:
     (cell,) = asked(tasks=["contact"], links=["rtt8"]).cells
     run = run_bench_task(BenchRunItem(with_gains(cell, K=2.0, d=20.0), 1))
     assert run.wall_n is not None
@@ -246,7 +250,7 @@ def test_a_wall_that_is_hardly_touched_masks_the_numbers() -> None:
     assert "no contact" in build_bench_page(results, "trilat bench")
 
 
-def test_what_is_not_stable_stays_so_over_twice_the_length(tmp_path: Path) -> None:
+def test_a_longer_run_stays_unstable(tmp_path: Path) -> None:
     (cell,) = asked(links=["rtt272"]).cells
     plan = BenchPlan("round-trips", [with_gains(cell, K=60.0, d=0.5)], [("p_d", "level")])
     (run,) = run_bench(prepare_bench_folder(plan, tmp_path / "suite"), jobs=1).runs
@@ -259,15 +263,15 @@ def test_what_is_not_stable_stays_so_over_twice_the_length(tmp_path: Path) -> No
 
 
 def batch(t_ns: Array, qd: Array, tau_x: Array) -> RecordBatch:
-    """Records of one joint."""
+    """Returns records of one joint."""
     zero = np.zeros((len(t_ns), 1))
     return RecordBatch(
         t_ns, zero, qd[:, None], zero, zero, tau_x[:, None], np.zeros((len(t_ns), 0), int)
     )
 
 
-def test_least_energy_is_that_of_outside_until_any_instant() -> None:
-    """It puts in 3 J in the first second, takes out 5 J in the second, and puts in 4 J more."""
+def test_least_energy_counts_energy_from_outside() -> None:
+    """The outside puts in 3 J in the first second, takes out 5 J in the second, and puts in 4 J more."""
     t_ns = np.arange(3001) * 1_000_000
     power = np.select([t_ns < 1e9, t_ns < 2e9], [3.0, -5.0], 4.0)
     assert find_least_energy(
@@ -276,7 +280,7 @@ def test_least_energy_is_that_of_outside_until_any_instant() -> None:
     assert find_least_energy({"s": batch(t_ns, np.ones(3001), np.zeros(3001))}) == 0.0
 
 
-def test_an_interrupted_confirmation_goes_on(
+def test_an_interrupted_confirmation_resumes(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Every run is repeated once over twice its length, and no finished run a second time."""
@@ -337,7 +341,7 @@ def judged_run(rate_per_s: float | None, **more: Any) -> JudgedRun:
         (-1.0, 20.0, ""),
     ],
 )
-def test_length_follows_the_slowest_time_constant(
+def test_run_length_follows_the_slowest_time_constant(
     rate_per_s: float | None, length_s: float, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     judged = judged_run(rate_per_s)
@@ -353,7 +357,7 @@ def test_length_follows_the_slowest_time_constant(
     assert words in longer.text
 
 
-def test_a_decided_run_at_rest_is_long_enough() -> None:
+def test_a_decided_run_at_rest_is_not_extended() -> None:
     fit = EnvelopeFit(EnvelopeTrend.DECAYS, -0.02)
     end = RunEnd(EndBehaviour.CONVERGED, fit, fit, 0.0, 0.0)
     judged = judged_run(-0.001, end=end, stability=Stability.SETTLED)
@@ -377,7 +381,7 @@ def test_a_longer_run_refutes_or_confirms() -> None:
         assert (found.stability, found.confirmed) == (stability, confirmed)
 
 
-def test_a_law_without_stable_gains_has_an_empty_row(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_law_without_stable_gains_has_empty_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     kept = {
         key: msgspec.structs.replace(one, gains={}) if one.law == "pd_d" else one
         for key, one in read_gains().items()
@@ -393,7 +397,7 @@ def test_a_law_without_stable_gains_has_an_empty_row(monkeypatch: pytest.MonkeyP
 
 
 def test_laws_of_equal_torque_run_once() -> None:
-    """`six_channel` is `four_channel` with a check of the shares, so it would run the same."""
+    """`six_channel` is `four_channel` with a check of the shares, so both have the same runs."""
     for law, equal in EQUAL_LAWS.items():
         kind, equal_kind = BUILT_IN[law], BUILT_IN[equal]
         assert (kind.torque, kind.begin) == (equal_kind.torque, equal_kind.begin)
@@ -416,7 +420,7 @@ def test_laws_get_nine_tenths_of_gravity() -> None:
     assert [control.gravity for control in found] == [0.9, 1.0]  # type: ignore[attr-defined]
 
 
-def test_a_law_whose_shares_stay_hands_nothing_over() -> None:
+def test_a_law_with_constant_shares_hands_nothing_over() -> None:
     tasks = {cell.task for cell in plan_bench("full", laws=["wave"], links=["rtt68"]).cells}
     assert tasks == TASKS.keys() - {"handover"}
 
@@ -439,8 +443,8 @@ def test_a_run_lasts_for_forty_round_trips() -> None:
 
 
 @pytest.mark.long
-def test_shared_slave_errs_by_its_distance_from_mean_by_dominance() -> None:
-    """After the handover the second user has three quarters; the error is of the present shares."""
+def test_sharing_error_counts_dominance_at_that_time() -> None:
+    """After the handover the second user has three quarters; the error refers to the present shares."""
     plan = plan_bench("full", laws=["p_d"], tasks=["handover"], links=["rtt68"])
     run = run_bench_task(BenchRunItem(plan.cells[0], 1))
     log = trilat_net.simulate(plan.cells[0].build(1).scenario)
@@ -468,7 +472,7 @@ def place(*errors: float | None) -> BenchCellResult:
     )
 
 
-def test_intervals_over_twenty_seeds_are_those_of_scipy() -> None:
+def test_intervals_over_twenty_seeds_equal_scipys() -> None:
     errors = tuple(0.3 + 0.01 * (7 * n % 20) for n in range(20))
     found: Any = place(*errors).compute_mean("error_rad")
     low, high = stats.t.interval(0.95, 19, np.mean(errors), stats.sem(errors))
@@ -488,7 +492,7 @@ FULL = plan_bench("full", tasks=["handover", "outage"], links=["rtt272"])
 
 
 @pytest.mark.parametrize("cell", FULL.cells, ids=lambda cell: f"{cell.task}/{cell.law}")
-def test_every_law_fits_every_task_in_which_it_runs(cell: BenchCell) -> None:
+def test_every_law_fits_each_of_its_tasks(cell: BenchCell) -> None:
     found = cell.build(1)
     assert {site.control.__struct_config__.tag for site in found.scenario.sites.values()} == {
         cell.law
@@ -507,7 +511,7 @@ def test_every_link_fits_both_forms() -> None:
             )
 
 
-def test_gains_of_all_studies_are_there_and_within_their_ranges() -> None:
+def test_all_studies_have_gains_within_their_ranges() -> None:
     gains = read_gains()
     for study in STUDIES.values():
         for form, laws in study.laws.items():
@@ -523,7 +527,7 @@ def test_gains_of_all_studies_are_there_and_within_their_ranges() -> None:
 
 
 @pytest.mark.long
-def test_kept_gains_are_the_least_error_that_keeps_the_margin(tmp_path: Path) -> None:
+def test_kept_gains_minimise_error_at_the_margin(tmp_path: Path) -> None:
     found = tune_laws({"level": ["p_d"]}, 1, budget=4)
     assert [one.round_trip_ms for one in found] == list(TUNED_ROUND_TRIPS_MS)
     settings = format_settings(build_settings("level", "contact", "rtt272"))
@@ -558,7 +562,7 @@ def test_kept_gains_are_the_least_error_that_keeps_the_margin(tmp_path: Path) ->
     ],
 )
 def test_laws_with_another_promise_can_be_tuned(law: str, gains: dict[str, float]) -> None:
-    """Both end away from the pose of the hand, and are stable by what they promise."""
+    """Both laws end away from the pose of the hand, and are stable by their own promise."""
     base = bench_plan.load_tuning_task("three", law, 68)
     candidate = base.with_gains(SEARCH_SPACES[law], KNOWLEDGE, gains)
     score = measure_candidate(*candidate.texts)
@@ -567,8 +571,8 @@ def test_laws_with_another_promise_can_be_tuned(law: str, gains: dict[str, float
     assert score.pose_rad > 0.1
 
 
-def test_an_interrupted_tuning_goes_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Gains are stored one by one, and those that are up to date are not tuned again."""
+def test_an_interrupted_tuning_resumes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Gains are stored one by one, and gains that are up to date are not tuned again."""
     path, made = tmp_path / "gains.json", []
 
     def tune(form: str, law: str, round_trip_ms: int, *_: Any) -> TunedGains:
@@ -595,15 +599,15 @@ def test_an_interrupted_tuning_goes_on(monkeypatch: pytest.MonkeyPatch, tmp_path
 
 
 class Damped(BUILT_IN["p_d"]):
-    """P+d with twice the damping that it is given."""
+    """P+d with twice the configured damping."""
 
     @classmethod
     def write_control(cls, gains: Any, site: Any) -> dict[str, Any]:
         return super().write_control({**gains, "d": 2.0 * gains["d"]}, site)
 
 
-def test_gains_are_outdated_by_another_motion_alone() -> None:
-    """Neither texts nor names of a law's code matter, but how it moves the arms does."""
+def test_only_another_motion_makes_gains_outdated() -> None:
+    """Texts and names in a law's code do not matter; its motion of the arms does."""
     space = SEARCH_SPACES["p_d"]
     task = bench_plan.load_tuning_task("level", "p_d", 68)
     same = space._replace(kind=type("Renamed", (BUILT_IN["p_d"],), {}))
@@ -613,7 +617,7 @@ def test_gains_are_outdated_by_another_motion_alone() -> None:
 
 
 def list_shipped_gains() -> Iterator[Any]:
-    """Yields all gains that are shipped; every ninth is tried on a push."""
+    """Yields all shipped gains; every ninth is tested on a push."""
     for place, gains in enumerate(read_gains().values()):
         yield pytest.param(
             gains, id=str(gains), marks=() if place % 9 == 0 else pytest.mark.long
@@ -625,7 +629,7 @@ def test_shipped_gains_are_up_to_date(gains: TunedGains) -> None:
     assert find_stale([gains]) == []
 
 
-def test_gains_are_those_of_the_next_longer_round_trip() -> None:
+def test_gains_come_from_the_next_longer_round_trip() -> None:
     assert [choose_round_trip(ms) for ms in (0.0, 68.0, 69.0, 600.0, 5000.0)] == [
         68,
         68,
@@ -655,16 +659,14 @@ def test_gains_of_another_law_or_scenario_are_stale() -> None:
         ),
     ],
 )
-def test_what_cannot_be_asked_is_refused(more: dict[str, Any], words: str) -> None:
+def test_impossible_requests_are_refused(more: dict[str, Any], words: str) -> None:
     with pytest.raises(UsageError) as refused:
         asked(**more)
     assert words in str(refused.value)
 
 
 @pytest.mark.long
-def test_folder_takes_more_of_suite_and_nothing_from_elsewhere(
-    whole: BenchResults, tmp_path: Path
-) -> None:
+def test_a_folder_resumes_its_own_suite_only(whole: BenchResults, tmp_path: Path) -> None:
     first = run_bench(prepare_bench_folder(asked(links=["rtt8"]), tmp_path / "one"), jobs=1)
     made: list[int] = []
     more = run_bench(

@@ -1,4 +1,4 @@
-"""Results of sweeps that were never run, for tests of what is drawn of them."""
+"""Results of sweeps that were never run, for tests of drawings."""
 
 from collections.abc import Callable, Iterator
 from itertools import product
@@ -19,7 +19,7 @@ Judge = Callable[..., CellClass]
 
 
 def by_the_line(delay_ms: float, d: float, *_: Any) -> CellClass:
-    """What the condition of P+d says of K = 10 and three sites."""
+    """Returns the verdict of P+d's condition for K = 10 and three sites."""
     return CellClass.CONVERGED if d > 5e-3 * delay_ms else CellClass.BOUNDED
 
 
@@ -43,6 +43,6 @@ def rows(verdict: Judge = by_the_line, seeds: int = 1, **axes: Any) -> Iterator[
 
 
 def drawn(verdict: Judge = by_the_line, seeds: int = 1, **axes: Any) -> MapPlane:
-    """Returns the plane of such rows."""
+    """Returns the plane of these rows."""
     made = list(rows(verdict, seeds, **axes))
     return build_plane(made, [*KEYS, *(key.replace("__", ".") for key in axes)], P_D)

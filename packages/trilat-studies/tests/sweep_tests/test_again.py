@@ -1,4 +1,4 @@
-"""A cell as a log: the printed command makes the very run that was judged."""
+"""A cell as a log: the printed command repeats exactly the judged run."""
 
 import shlex
 from pathlib import Path
@@ -21,14 +21,14 @@ AT_REST_OR_LOST = ("limits.qd_limit_rad_s=6", "link.loss=0.1")
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> SweepResults:
-    """Cells that settle, that are extended, and that diverge."""
+    """Returns cells that settle, that are extended, and that diverge."""
     path = tmp_path_factory.mktemp("again")
     over = ["control.d=0.1,1,8", "link.delay_ms=0,400"]
     sweep = asked(path, "control.law=p_d", "control.K=40", *AT_REST_OR_LOST, over=over)
     return run_sweep(prepare_sweep_folder(sweep, path / "o"), 1).results
 
 
-def test_command_of_cell_makes_its_numbers_bit_for_bit(
+def test_command_of_cell_gives_its_numbers_bitwise(
     results: SweepResults, tmp_path: Path
 ) -> None:
     assert any(row["diverged_s"] is not None for row in results.rows)
@@ -54,9 +54,7 @@ def test_command_of_cell_makes_its_numbers_bit_for_bit(
         assert (note, row["command"]) == ("", command)
 
 
-def test_where_the_scenario_has_changed_the_rows_own_is_named(
-    results: SweepResults, tmp_path: Path
-) -> None:
+def test_a_changed_scenario_names_the_rows_own(results: SweepResults, tmp_path: Path) -> None:
     source = Path(results.plan.written.label)
     row = results.rows[-1]
     source.write_text(SHORT.replace("0.3, -0.2", "0.3, -0.3"))

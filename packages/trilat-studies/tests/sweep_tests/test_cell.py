@@ -1,4 +1,4 @@
-"""One run: what its command makes is what was judged, and its text is kept as what differs."""
+"""One run: its command repeats the judged run, and its text is kept as a difference."""
 
 import json
 import pickle
@@ -37,7 +37,7 @@ def test_an_entry_holds_the_text_that_was_judged(tmp_path: Path, judge: Judge) -
     assert not run_cell(CellItem(same, same.cell(5), 1)).random
 
 
-def test_command_of_cell_runs_its_scenario_for_so_long(tmp_path: Path, judge: Judge) -> None:
+def test_command_of_cell_runs_its_scenario_and_length(tmp_path: Path, judge: Judge) -> None:
     plan = asked(
         tmp_path, "link.loss=0.1", "duration_s=0.25", laws=["p_d"], over=["link.delay_ms=0,20"]
     )
@@ -51,7 +51,7 @@ def test_command_of_cell_runs_its_scenario_for_so_long(tmp_path: Path, judge: Ju
 
 
 @pytest.mark.usefixtures("judge")
-def test_a_task_makes_the_same_entry_in_another_process(tmp_path: Path) -> None:
+def test_a_task_makes_equal_entries_in_another_process(tmp_path: Path) -> None:
     plan = asked(tmp_path, laws=["adaptive", "p_d"], over=["link.delay_ms=0,20"])
     task = CellItem(plan, plan.cell(3), 1)
     sent = pickle.loads(pickle.dumps(task))
@@ -61,7 +61,7 @@ def test_a_task_makes_the_same_entry_in_another_process(tmp_path: Path) -> None:
     )
 
 
-def test_a_cell_that_is_no_scenario_is_named(tmp_path: Path) -> None:
+def test_a_cell_without_valid_scenario_is_named(tmp_path: Path) -> None:
     plan = asked(tmp_path)
     cell = plan.cell(7)._replace(overrides=("link.delay_ms=60", "control.Kd=-1"))
     with pytest.raises(
@@ -74,7 +74,7 @@ texts = st.text(alphabet="ab\n ", max_size=60) | st.text(max_size=40)
 
 
 @given(text=texts, base=texts)
-def test_a_text_is_found_again_whatever_it_was_compared_with(text: str, base: str) -> None:
+def test_a_text_is_restored_whatever_its_reference(text: str, base: str) -> None:
     parts = diff_lines(text, base)
     assert apply_diff(parts, base) == text
     assert apply_diff(json.loads(json.dumps(parts)), base) == text
@@ -83,7 +83,7 @@ def test_a_text_is_found_again_whatever_it_was_compared_with(text: str, base: st
 @given(
     text=texts, line=st.integers(0, 10), other=st.text(alphabet="xy", min_size=1, max_size=5)
 )
-def test_a_line_that_was_changed_is_all_that_differs(text: str, line: int, other: str) -> None:
+def test_only_the_changed_line_differs(text: str, line: int, other: str) -> None:
     lines = text.split("\n")
     lines[line % len(lines)] = other
     own = [part for part in diff_lines("\n".join(lines), text) if isinstance(part, str)]

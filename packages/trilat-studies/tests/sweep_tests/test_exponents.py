@@ -50,7 +50,7 @@ def chart(results: SweepResults) -> StabilityMap:
     return build_stability_map(results, (), 1)
 
 
-def test_an_exponent_is_the_real_part_of_the_rightmost_root(results: SweepResults) -> None:
+def test_exponents_are_real_parts_of_rightmost_roots(results: SweepResults) -> None:
     """Within 2 % or 2e-3 /s, whichever is larger; some grow and some do not."""
     for delay_ms in DELAYS_MS:
         column = [row for row in results.rows if row[KEYS[0]] == delay_ms]
@@ -65,7 +65,7 @@ def test_an_exponent_is_the_real_part_of_the_rightmost_root(results: SweepResult
             assert row["exponent_per_s"] == pytest.approx(root, rel=0.02, abs=2e-3)
 
 
-def test_the_zero_line_is_the_edge_of_the_linear_analysis(chart: StabilityMap) -> None:
+def test_zero_line_is_the_linear_analysis_edge(chart: StabilityMap) -> None:
     """Within 2 %, from cells that are 0.2 apart."""
     zero, *_, linear = chart.lines[0]
     assert (zero.rank, linear.rank) == (-1, 1)
@@ -74,7 +74,7 @@ def test_the_zero_line_is_the_edge_of_the_linear_analysis(chart: StabilityMap) -
         assert zero.crossings(n, chart.plane.y) == [pytest.approx(edge, rel=0.02)]
 
 
-def test_page_sets_zero_of_column_beside_verdicts_and_theory(chart: StabilityMap) -> None:
+def test_page_shows_exponents_zero_verdicts_and_theory(chart: StabilityMap) -> None:
     table = tabulate_edges(chart.plane, chart.plane.panels[0], chart.lines[0])
     assert table.headers[1:4] == ("edge of d (N m s/rad)", "stable is", "edge of the verdicts")
     assert [row[0] for row in table.rows] == ["200", "250"]
@@ -99,7 +99,7 @@ def test_a_cell_without_growth_or_decay_is_white() -> None:
     assert red[0] > red[2]
 
 
-def test_place_has_mean_of_its_seeds_and_none_without_exponent() -> None:
+def test_place_is_its_seeds_mean_without_missing_exponents() -> None:
     made = [row | {"exponent_per_s": float(row["seed"])} for row in rows(seeds=3)]
     made[0] |= {"exponent_per_s": None}
     exponents = build_plane(made, KEYS, P_D).panels[0].exponents_per_s
@@ -108,7 +108,7 @@ def test_place_has_mean_of_its_seeds_and_none_without_exponent() -> None:
     assert not build_plane(list(rows()), KEYS, P_D).judged_by_twins
 
 
-def test_verdicts_and_exponents_are_not_mixed_in_a_folder(tmp_path: Path) -> None:
+def test_a_folder_never_mixes_verdicts_and_exponents(tmp_path: Path) -> None:
     verdicts, twins = (asked(tmp_path, judge=judge) for judge in ("verdict", "twins"))
     assert "judge" not in verdicts.facts()
     assert plan_from_json(verdicts.facts()).judge == "verdict"

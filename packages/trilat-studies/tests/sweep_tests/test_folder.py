@@ -1,4 +1,4 @@
-"""The folder of a sweep goes on with its own alone; of its journal a torn line costs no other."""
+"""The folder of a sweep resumes its own sweep only; a torn line of its journal costs no other line."""
 
 import json
 import math
@@ -34,11 +34,11 @@ def refused(path: Path, *overrides: str, **settings: Any) -> str:
 
 @pytest.fixture
 def begun(tmp_path: Path) -> Path:
-    """The folder of a sweep that was begun."""
+    """Returns the folder of a sweep that was begun."""
     return prepare_sweep_folder(asked(tmp_path), tmp_path / "o").path
 
 
-def test_the_same_sweep_goes_on_in_its_folder(begun: Path) -> None:
+def test_the_same_sweep_resumes_in_its_folder(begun: Path) -> None:
     plan = (begun / PLAN_FILE).read_bytes()
     again = prepare_sweep_folder(asked(begun.parent), begun)
     assert open_sweep_folder(begun).facts == again.facts == json.loads(plan)
@@ -62,7 +62,7 @@ def test_the_same_sweep_goes_on_in_its_folder(begun: Path) -> None:
         ([], {"longest_s": 2.0}, ("another longest time", "4 s in the folder, 2 s now")),
     ],
 )
-def test_another_sweep_is_refused_with_what_differs(
+def test_another_sweep_is_refused_with_its_differences(
     begun: Path, overrides: list[str], settings: dict[str, Any], words: tuple[str, ...]
 ) -> None:
     problem = refused(begun, *overrides, **settings)
@@ -70,7 +70,7 @@ def test_another_sweep_is_refused_with_what_differs(
         assert word in problem
 
 
-def test_a_scenario_that_was_edited_since_is_refused(begun: Path) -> None:
+def test_an_edited_scenario_is_refused(begun: Path) -> None:
     (begun.parent / "trio.toml").write_text(
         SHORT.replace("delay_ms = 50.0", "delay_ms = 50.0 # ms")
     )
@@ -90,7 +90,7 @@ def test_another_arithmetic_or_program_is_refused(
         open_sweep_folder(begun)
 
 
-def test_a_folder_that_holds_something_else_is_left_alone(tmp_path: Path) -> None:
+def test_a_folder_with_other_contents_is_left_alone(tmp_path: Path) -> None:
     other = tmp_path / "o"
     other.mkdir()
     (other / "precious").write_text("precious")
@@ -162,7 +162,7 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "j"
 
 
-def test_what_is_written_is_read_number_for_number(path: Path) -> None:
+def test_written_numbers_are_read_back_exactly(path: Path) -> None:
     odd = msgspec.structs.replace(
         FIVE[0],
         cell=9,
@@ -173,7 +173,7 @@ def test_what_is_written_is_read_number_for_number(path: Path) -> None:
 
 
 @given(data=st.data())
-def test_file_cut_anywhere_keeps_every_whole_line_and_takes_more(
+def test_a_cut_file_keeps_whole_lines_and_grows(
     five: bytes, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
 ) -> None:
     cut = data.draw(st.integers(0, len(five)))
@@ -188,7 +188,7 @@ def test_file_cut_anywhere_keeps_every_whole_line_and_takes_more(
 
 
 @given(data=st.data())
-def test_a_byte_that_is_wrong_loses_its_line_alone(
+def test_a_wrong_byte_loses_only_its_line(
     five: bytes, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
 ) -> None:
     at = data.draw(st.integers(0, len(five) - 1))
@@ -204,7 +204,7 @@ def test_a_byte_that_is_wrong_loses_its_line_alone(
     assert all(one in FIVE for one in kept)
 
 
-def test_lines_of_another_sweep_count_for_nothing(path: Path) -> None:
+def test_lines_of_another_sweep_are_ignored(path: Path) -> None:
     written(path, FIVE, "another sweep")
     assert read(path) == []
     written(path, FIVE[:2])
@@ -212,8 +212,8 @@ def test_lines_of_another_sweep_count_for_nothing(path: Path) -> None:
     assert read(path, "another sweep") == FIVE
 
 
-def test_a_run_refused_by_a_full_disk_is_not_done(path: Path) -> None:
-    """`/dev/full` answers as a disk does that is full."""
+def test_a_run_refused_by_full_disk_is_pending(path: Path) -> None:
+    """`/dev/full` answers like a full disk."""
     with opened(path, "sweep") as journal:
         journal.add(FIVE[0])
         whole = journal._file

@@ -1,4 +1,4 @@
-"""A cell's word is the certificate's on a log of the same run, and extending is running longer."""
+"""A cell's verdict is the certificate's on a log of the same run, and extending equals running longer."""
 
 import io
 import math
@@ -41,7 +41,7 @@ def judged(scenario: Scenario, longest_s: float = 0.0) -> CellResult:
 
 
 @pytest.mark.parametrize("run", RUNS)
-def test_the_word_and_the_numbers_are_those_of_a_log(run: str) -> None:
+def test_verdict_and_numbers_are_those_of_a_log(run: str) -> None:
     name, changes = RUNS[run]
     scenario = load_scenario(name, changes)
     stream = io.BytesIO()
@@ -72,7 +72,7 @@ def test_the_word_and_the_numbers_are_those_of_a_log(run: str) -> None:
         ("contact", {"duration_s": 60.0, "sites.m.control.k_f": 0.2}, CellClass.CONVERGED),
     ],
 )
-def test_what_the_scenarios_are_known_to_do(
+def test_scenarios_have_their_published_behaviour(
     name: str, changes: dict[str, Any], verdict: CellClass
 ) -> None:
     """The figures of these scenarios, from an independent implementation, stand in their texts."""
@@ -80,16 +80,19 @@ def test_what_the_scenarios_are_known_to_do(
 
 
 @pytest.mark.long
-def test_law_in_python_is_judged_as_same_law_of_kernel() -> None:
-    """`tests.laws:Adaptive` is Eq. (13) and (15) by other code, with the gains of the scenario."""
+def test_python_law_is_judged_like_kernel_law() -> None:
+    """`tests.laws:Adaptive` is Eq.
+
+    (13) and (15) by other code, with the gains of the scenario.
+    """
     short = {"duration_s": 2.0, "link.delay_ms": 5.0}
     theirs = load_scenario("free", {**short, "control.law": "tests.laws:Adaptive"})
     assert judged(theirs) == judged(load_scenario("free", short))
 
 
 @pytest.mark.long
-def test_what_is_not_plain_goes_on_and_is_longer_run() -> None:
-    """Of a growth of 0.01/s nothing is to be seen in 4 s."""
+def test_an_undecided_run_continues_as_longer_run() -> None:
+    """A growth of 0.01/s is invisible in 4 s."""
     changes = {"control.d": 0.95, "duration_s": 4.0}
     scenario = load_scenario("p_d_margin", changes)
     assert not is_conclusive(judged(scenario))
@@ -106,7 +109,7 @@ def test_what_is_not_plain_goes_on_and_is_longer_run() -> None:
     )
 
 
-def test_slow_trend_of_run_with_chance_in_it_decides_nothing() -> None:
+def test_slow_trends_under_random_links_decide_nothing() -> None:
     """Arms 3.7 rad apart that swing at 7 rad/s; the certificate's word is kept beside the verdict."""
     found = judged(
         load_scenario("jitter", {"control.d": 0.08, "seed": 5, "duration_s": 20.0}),
@@ -116,7 +119,7 @@ def test_slow_trend_of_run_with_chance_in_it_decides_nothing() -> None:
     assert found.end_speed_rad_s > 5.0
 
 
-def test_it_is_never_extended_beyond_what_was_asked() -> None:
+def test_no_run_is_extended_beyond_its_limit() -> None:
     scenario = load_scenario("p_d_margin", {"control.d": 0.99, "duration_s": 4.0})
     found = judged(scenario, longest_s=10.0)
     assert (found.ran_s, found.extended) == (10.0, 2)
@@ -124,8 +127,11 @@ def test_it_is_never_extended_beyond_what_was_asked() -> None:
 
 
 @pytest.mark.parametrize("d", [0.95, 1.05])
-def test_few_per_cent_beside_edge_word_is_right(d: float) -> None:
-    """The edge is d = (K / 2) sin(w T) / w with w at the edge, 0.97 here: what 20 s cannot tell, 160 s do."""
+def test_few_per_cent_beside_edge_verdicts_are_right(d: float) -> None:
+    """The edge is d = (K / 2) sin(w T) / w with w at the edge, 0.97 here.
+
+    Runs of 160 s decide where runs of 20 s cannot.
+    """
     scenario = load_scenario("p_d_margin", {"control.d": d, "duration_s": 20.0})
     found = judged(scenario, longest_s=160.0)
     assert found.extended > 0
@@ -135,8 +141,8 @@ def test_few_per_cent_beside_edge_word_is_right(d: float) -> None:
 @pytest.mark.parametrize(
     ("d", "verdict"), [(0.93, CellClass.BOUNDED), (1.0, CellClass.CONVERGED)]
 )
-def test_roots_decide_about_arms_that_hardly_move(d: float, verdict: CellClass) -> None:
-    """Arms 1e-3 rad apart: by their speed they rest, and the rightmost root is +0.002 /s or -0.02 /s."""
+def test_roots_decide_for_arms_that_hardly_move(d: float, verdict: CellClass) -> None:
+    """Arms 1e-3 rad apart count as resting by their speed; the rightmost root is +0.002 /s or -0.02 /s."""
     starts = {
         f"sites.{name}.q0_rad": [-0.6, 1.8 + off]
         for name, off in (("m1", 1e-3), ("m2", 0), ("s", -1e-3))
@@ -157,8 +163,10 @@ def test_a_run_that_diverges_says_when() -> None:
     assert found.end_speed_rad_s > 5.0
 
 
-def test_a_trial_sees_no_roots_but_a_cell_and_a_certificate_do() -> None:
-    """Arms that start at one pose stay there, however unstable it is (docs/reference/stability.md)."""
+def test_trials_see_no_roots_but_certificates_do() -> None:
+    """Arms that start at one pose stay there, however unstable that pose is
+    (docs/reference/stability.md).
+    """
     together = {f"sites.{name}.q0_rad": [0.2, 0.3] for name in ("m1", "m2", "s")}
     scenario = load_scenario(
         "p_d_margin", {**together, "control.d": 0.5, "rate_hz": 100, "duration_s": 5.0}

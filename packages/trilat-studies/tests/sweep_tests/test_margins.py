@@ -1,4 +1,4 @@
-"""Margins: an edge encloses what is there; over a plane beside theory, as table, page and JSON."""
+"""Margins: an interval encloses each edge; over a plane beside theory, as table, page and JSON."""
 
 import json
 import math
@@ -37,7 +37,7 @@ def asked(*over: str, **settings: object) -> SweepPlan:
 
 @pytest.fixture
 def by_the_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A judge that goes by the condition of P+d, and remembers nothing."""
+    """Stands for the judge: follows the condition of P+d and remembers nothing."""
 
     def judge(text: str, _: float) -> CellResult:
         scenario = parse_scenario(text)
@@ -52,7 +52,7 @@ def by_the_line(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def without_roots(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No linear analysis, which takes seconds."""
+    """Leaves out the linear analysis, which takes seconds."""
     monkeypatch.setattr(margin_search, "find_root_crossings", lambda *_, **__: ((), ""))
 
 
@@ -68,7 +68,7 @@ def test_a_place_has_its_edge_beside_theory() -> None:
 
 
 @pytest.mark.usefixtures("by_the_line", "without_roots")
-def test_seeds_are_places_of_their_own_where_anything_is_random() -> None:
+def test_seeds_are_places_where_links_are_random() -> None:
     lossy = search_margins(asked("link.loss=0,0.1", seeds=2), WITHIN, 1)
     assert [(one.cell.values, one.seed) for one in lossy] == [
         ((0.0,), 1),
@@ -79,7 +79,7 @@ def test_seeds_are_places_of_their_own_where_anything_is_random() -> None:
 
 @pytest.mark.long
 def test_the_number_of_processes_changes_nothing() -> None:
-    """Runs of p_d at 100 Hz, 1 s: what they show is another question."""
+    """Runs of p_d at 100 Hz for 1 s; their verdicts do not matter."""
     brief = ["duration_s=1.0", "rate_hz=100"]
     within = WITHIN._replace(tolerance=0.2)
     wanted = plan_sweep(
@@ -92,8 +92,8 @@ def test_the_number_of_processes_changes_nothing() -> None:
 
 
 @pytest.mark.usefixtures("by_the_line", "without_roots")
-def test_a_key_of_whole_numbers_is_searched_in_them() -> None:
-    """The judge calls 300 Hz and 50 Hz alike: what counts is that no value between whole numbers is run."""
+def test_whole_number_keys_are_searched_in_integers() -> None:
+    """The judge gives 300 Hz and 50 Hz the same verdict; no value between whole numbers may be run."""
     within = SearchRange("rate_hz", 50.0, 300.0, 0.005)
     wanted = plan_sweep("p_d_margin", over=["link.delay_ms=100,200", format_range_axis(within)])
     assert [one.margin.stable for one in search_margins(wanted, within, 1)] == [True, True]
@@ -106,7 +106,7 @@ def found(*spans: StabilityEdge, stable: bool | None = None) -> GridPointMargin:
     )
 
 
-def test_table_tells_edges_islands_and_what_there_is_none_of() -> None:
+def test_table_shows_edges_islands_and_missing_edges() -> None:
     edges = (StabilityEdge(0.49, 0.492, False, True), StabilityEdge(1.8, 2.1, True, False))
     every = [found(*edges), found(stable=True), found(stable=False), found()]
     grid = SweepMargins(asked(), WITHIN, every).table()
@@ -145,12 +145,12 @@ def test_the_facts_are_json_and_name_the_command() -> None:
 @pytest.mark.parametrize(
     "text", ["control.d", "control.d=1:1", "=1:2", "control.d=a:b", "d=0:inf"]
 )
-def test_what_is_no_range_is_refused(text: str) -> None:
+def test_an_invalid_range_is_refused(text: str) -> None:
     with pytest.raises(UsageError, match=r"along must have the form KEY=FROM:TO"):
         parse_search_range(text)
 
 
-def test_a_range_is_read_as_it_is_written() -> None:
+def test_a_range_is_read_as_written() -> None:
     assert parse_search_range("control.d=0.2:3") == WITHIN
     assert format_range_axis(WITHIN) == "control.d=0.2,3"
     with pytest.raises(UsageError, match="fraction of the value at the edge"):
@@ -180,7 +180,7 @@ def test_an_edge_is_enclosed_to_the_tolerance(
 
 
 @given(st.floats(0.35, 2.8), st.floats(0.001, 0.1), st.booleans())
-def test_what_stays_undecided_is_the_interval_that_is_given(
+def test_an_undecided_part_is_the_reported_interval(
     edge: float, width: float, above: bool
 ) -> None:
     def stable(value: float) -> bool | None:
@@ -199,12 +199,12 @@ def test_what_stays_undecided_is_the_interval_that_is_given(
 
 
 @pytest.mark.parametrize("side", [True, False, None])
-def test_without_change_there_is_no_edge_and_side_is_told(side: bool | None) -> None:
+def test_without_change_only_the_side_is_reported(side: bool | None) -> None:
     found = search_key_margin(lambda _: side, 0.2, 3.0)
     assert (found.spans, found.stable, found.runs) == ((), side, SCAN_POINTS)
 
 
-def test_an_island_has_both_its_shores() -> None:
+def test_an_island_has_two_edges() -> None:
     found = search_key_margin(lambda value: not 1.0 < value < 1.9, 0.0, 4.0)
     first, second = found.spans
     assert first.low <= 1.0 <= first.high
@@ -225,7 +225,7 @@ def test_whole_numbers_are_narrowed_to_neighbours(edge: float) -> None:
     )
 
 
-def test_an_edge_near_nothing_ends_all_the_same() -> None:
+def test_searching_an_edge_near_zero_ends() -> None:
     """A tolerance relative to 0 is never met."""
     (span,) = search_key_margin(lambda value: value > 1e-300, 0.0, 1.0).spans
     assert span.low <= 1e-300 <= span.high

@@ -1,4 +1,6 @@
-"""Metrics of a sweep: asked for by the keys of docs/reference/metrics.md, they are those of a log of the same run."""
+"""Metrics of a sweep, requested by the keys of docs/reference/metrics.md, equal those of a log
+of the same run.
+"""
 
 from pathlib import Path
 
@@ -21,11 +23,11 @@ def swept(folder: Path, **more: object) -> SweepResults:
 
 
 def of_run(log: Log, key: str) -> float | None:
-    """What `compare` shows of a log."""
+    """Returns the metrics that `compare` shows of a log."""
     return trilat_net.compare(log, log).metrics.row(key).values[0]
 
 
-def test_metrics_of_a_cell_are_those_of_its_log(tmp_path: Path) -> None:
+def test_metrics_of_a_cell_equal_its_logs(tmp_path: Path) -> None:
     found = swept(tmp_path / "o", duration_s=0.5, longest_s=0.5)
     for row in found.rows:
         delay = row["link.delay_ms"]
@@ -33,7 +35,7 @@ def test_metrics_of_a_cell_are_those_of_its_log(tmp_path: Path) -> None:
         assert {key: row[key] for key in KEYS} == {key: of_run(log, key) for key in KEYS}
 
 
-def test_numbers_of_every_row_are_metrics_of_their_keys(tmp_path: Path) -> None:
+def test_every_row_holds_metrics_under_their_keys(tmp_path: Path) -> None:
     (row,) = trilat_net.sweep(
         "contact",
         ["link.delay_ms=20"],
@@ -48,7 +50,7 @@ def test_numbers_of_every_row_are_metrics_of_their_keys(tmp_path: Path) -> None:
     assert row["force_peak_n"] > 0.1
 
 
-def test_metrics_are_kept_with_results_of_a_resumed_sweep(tmp_path: Path) -> None:
+def test_a_resumed_sweep_keeps_its_metrics(tmp_path: Path) -> None:
     found = swept(tmp_path / "o")
     assert read_results(tmp_path / "o").to_rows() == found.to_rows()
     assert swept(tmp_path / "o").to_rows() == found.to_rows()
@@ -73,7 +75,7 @@ def test_seeds_give_a_metric_its_mean_and_interval(tmp_path: Path) -> None:
     assert places["spread_rms_rad_half"][1] > 0.0
 
 
-def test_a_metric_that_is_none_is_refused_with_the_nearest(tmp_path: Path) -> None:
+def test_unknown_metrics_are_refused_with_the_nearest(tmp_path: Path) -> None:
     done = trilat(
         "sweep",
         "two_sites",

@@ -1,4 +1,4 @@
-"""The page of a map, and its figure: colours are the verdicts, borders half way, lines on top."""
+"""The page of a map, and its figure: colours are the verdicts, borders lie half way, lines on top."""
 
 from pathlib import Path
 from typing import Any
@@ -42,9 +42,7 @@ def chart() -> StabilityMap:
     )
 
 
-def test_the_folder_has_a_picture_a_vector_and_a_page(
-    chart: StabilityMap, tmp_path: Path
-) -> None:
+def test_folder_has_a_picture_vector_and_page(chart: StabilityMap, tmp_path: Path) -> None:
     paths = write_map(chart, tmp_path)
     assert [path.name for path in paths] == ["map.png", "map.svg", "map.pdf", "map.md"]
     # 3.5 in, 300 pixels to the inch
@@ -53,14 +51,14 @@ def test_the_folder_has_a_picture_a_vector_and_a_page(
 
 
 @pytest.mark.long
-def test_the_same_results_give_the_same_bytes(chart: StabilityMap, tmp_path: Path) -> None:
+def test_equal_results_give_equal_bytes(chart: StabilityMap, tmp_path: Path) -> None:
     again = tmp_path / "again"
     again.mkdir()
     for one, other in zip(write_map(chart, tmp_path), write_map(chart, again), strict=True):
         assert one.read_bytes() == other.read_bytes()
 
 
-def test_the_page_tells_commands_lines_and_remarks(chart: StabilityMap) -> None:
+def test_the_page_shows_commands_lines_and_remarks(chart: StabilityMap) -> None:
     text = build_map_page(chart, "map.png")
     assert text.startswith("# P+d\n")
     assert "trilat sweep a\ntrilat map\n```" in text
@@ -75,7 +73,7 @@ def test_counts_are_of_all_runs() -> None:
     assert tabulate_classes(plane).rows == [("all", "25", "25", "25", "0")]
 
 
-def test_an_edge_stands_beside_each_line_with_its_difference() -> None:
+def test_an_edge_stands_beside_each_lines_difference() -> None:
     plane = drawn()
     table = tabulate_edges(plane, plane.panels[0], (EXACT, HALF))
     heads = [
@@ -98,7 +96,7 @@ def test_an_edge_stands_beside_each_line_with_its_difference() -> None:
         assert row[6] == expected
 
 
-def test_a_line_that_is_not_there_has_no_difference() -> None:
+def test_a_missing_line_has_no_difference() -> None:
     plane = drawn()
     table = tabulate_edges(
         plane, plane.panels[0], (EXACT._replace(excess=np.full((5, 5), np.nan)),)
@@ -143,8 +141,11 @@ def test_a_place_reaches_half_way_to_the_next() -> None:
     assert np.allclose(corners[:, 0, 1], [0, 0.45, 0.95, 1.45, 1.95, 2.45])
 
 
-def test_classes_are_apart_in_lightness() -> None:
-    """Grey print: luminance after Rec. 709; white stands for undecided, and is hatched besides."""
+def test_classes_differ_in_lightness() -> None:
+    """Grey print: luminance after Rec.
+
+    709; white stands for undecided, and is hatched besides.
+    """
     light = [
         float(np.dot(to_rgb(CLASS_COLOURS[v]), (0.2126, 0.7152, 0.0722))) for v in CELL_CLASSES
     ]
@@ -165,7 +166,7 @@ def test_lines_are_drawn_where_they_are_and_named() -> None:
     assert words == ["converged", "bounded oscillation", "$d$", "linear analysis"]
 
 
-def test_the_legend_has_only_what_occurs() -> None:
+def test_the_legend_has_only_occurring_classes() -> None:
     (legend,) = figure(drawn(lambda *_, **__: CellClass.UNDECIDED)).legends
     assert [text.get_text() for text in legend.get_texts()] == ["undecided"]
 
@@ -185,7 +186,7 @@ def test_several_runs_show_their_share_with_a_scale() -> None:
 
 
 @pytest.mark.parametrize(("panels", "width_in"), [(1, 3.5), (3, 3.5), (6, 7.0)])
-def test_every_panel_has_a_title_and_shares_one_label(panels: int, width_in: float) -> None:
+def test_panels_have_titles_and_share_one_label(panels: int, width_in: float) -> None:
     plane = drawn(rate_hz=tuple(float(n) for n in range(1, panels + 1)))
     made = figure(plane, width_in, (LINE,))
     assert made.get_figwidth() == width_in
@@ -196,13 +197,13 @@ def test_every_panel_has_a_title_and_shares_one_label(panels: int, width_in: flo
     assert [text for text in labels if text] == ["delay (ms)"]
 
 
-def test_nothing_of_matplotlib_is_left_changed() -> None:
+def test_settings_of_matplotlib_stay_unchanged() -> None:
     before = dict(mpl.rcParams)
     figure(drawn())
     assert dict(mpl.rcParams) == before
 
 
-def test_a_place_that_did_not_run_is_no_verdict() -> None:
+def test_a_place_without_run_is_no_verdict() -> None:
     from trilat_studies.sweep.stability_map import build_plane
 
     from .maps import KEYS, P_D

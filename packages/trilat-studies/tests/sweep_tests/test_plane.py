@@ -24,9 +24,7 @@ from .maps import DAMPINGS, DELAYS_MS, KEYS, P_D, by_the_line, drawn, rows
 
 
 @given(st.permutations(range(50)), st.integers(0, 2**16))
-def test_every_run_is_counted_once_in_whatever_order_they_come(
-    order: list[int], chance: int
-) -> None:
+def test_runs_in_any_order_are_counted_once(order: list[int], chance: int) -> None:
     random = np.random.default_rng(chance)
     made = list(rows(lambda *_, **__: CELL_CLASSES[random.integers(4)], seeds=2))
     found = build_plane([made[n] for n in order], KEYS, P_D)
@@ -51,7 +49,7 @@ def test_the_share_is_of_decided_runs() -> None:
     assert found.seeds == 4
 
 
-def test_nothing_decided_has_no_share() -> None:
+def test_undecided_places_have_no_share() -> None:
     assert np.isnan(drawn(lambda *_, **__: CellClass.UNDECIDED).panels[0].share).all()
 
 
@@ -97,7 +95,7 @@ def test_uneven_values_are_drawn_one_apart(values: tuple[float, ...], even: bool
     assert side.positions.tolist() == list(values if even else range(len(values)))
 
 
-def test_no_runs_no_numbers_and_too_many_panels_are_refused() -> None:
+def test_no_runs_numbers_or_panels_are_refused() -> None:
     with pytest.raises(UsageError, match="no cell has run"):
         build_plane([], KEYS, P_D)
     with pytest.raises(UsageError, match=r"needs a numeric axis, .* not numbers: link\.order"):
@@ -110,12 +108,12 @@ YES, NO, UNKNOWN = CellClass.CONVERGED, CellClass.DIVERGED, CellClass.UNDECIDED
 
 
 def up(column: tuple[CellClass, ...]) -> list[StabilityEdge]:
-    """The edges of the first column of a map in which all are like this one."""
+    """Returns the edges of the first column of a map whose columns are alike."""
     found = drawn(lambda _, d, *__: column[DAMPINGS.index(d)])
     return [edge for x, edge in find_map_edges(found, found.panels[0]) if x == DELAYS_MS[0]]
 
 
-def test_the_condition_lies_in_the_edges_that_it_makes() -> None:
+def test_the_condition_lies_in_its_own_edges() -> None:
     found = drawn()
     measured = find_map_edges(found, found.panels[0])
     assert [x for x, _ in measured] == [100, 200, 300, 400]
@@ -125,7 +123,7 @@ def test_the_condition_lies_in_the_edges_that_it_makes() -> None:
 
 
 @pytest.mark.parametrize("column", list(itertools.product((YES, NO, UNKNOWN), repeat=5))[::7])
-def test_edges_separate_all_that_was_decided(column: tuple[CellClass, ...]) -> None:
+def test_edges_separate_all_decided_places(column: tuple[CellClass, ...]) -> None:
     """From below, the side changes at every edge and nowhere else."""
     found = up(column)
     side = [verdict.stable for verdict in column]
@@ -138,13 +136,13 @@ def test_edges_separate_all_that_was_decided(column: tuple[CellClass, ...]) -> N
         assert edge.stable_below is (side[DAMPINGS.index(edge.low)])
 
 
-def test_what_is_undecided_widens_an_edge() -> None:
+def test_undecided_places_widen_an_edge() -> None:
     (edge,) = up((NO, UNKNOWN, UNKNOWN, YES, YES))
     assert (edge.low, edge.high, edge.middle) == (0.2, 1.7, pytest.approx(0.95))
 
 
-def test_of_several_runs_the_majority_decides_and_a_draw_nothing() -> None:
-    """Per place seeds 1 and 2 as the line says; below, seed 3 another way: a majority of two of three."""
+def test_majorities_of_runs_decide_and_draws_do_not() -> None:
+    """Per place seeds 1 and 2 follow the line, and seed 3 contradicts: a majority of two of three."""
     three = drawn(lambda x, y, seed: by_the_line(x, y) if seed < 3 else YES, seeds=3)
     assert find_map_edges(three, three.panels[0]) == find_map_edges(drawn(), drawn().panels[0])
     draw = drawn(lambda x, y, seed: by_the_line(x, y) if seed < 2 or y > 1.0 else YES, seeds=2)
@@ -171,11 +169,11 @@ def test_of_several_runs_the_majority_decides_and_a_draw_nothing() -> None:
         ("sites.s.q0_rad.1", "q0[1] of s (rad)"),
     ],
 )
-def test_a_key_is_told_in_its_words_and_its_unit(key: str, text: str) -> None:
+def test_keys_are_shown_in_words_with_units(key: str, text: str) -> None:
     assert label_axis(key) == text
 
 
-def test_what_a_number_means_is_told_by_the_scenario() -> None:
+def test_the_scenario_gives_a_numbers_meaning() -> None:
     key = "sites.s.environment.0.stiffness_n_m"
     assert label_axis(key, load_scenario("contact")) == "stiffness, wall of s (N/m)"
     assert (
@@ -184,7 +182,7 @@ def test_what_a_number_means_is_told_by_the_scenario() -> None:
     )
 
 
-def test_every_suffix_of_shipped_arm_and_its_limits_is_unit() -> None:
+def test_suffixes_of_shipped_arms_and_limits_are_units() -> None:
     """No label shows a piece of a unit as if it were a word."""
     spec = next(iter(load_scenario(list_shipped()[0]).sites.values()))
     for table in (spec.arm, spec.limits):
@@ -194,7 +192,7 @@ def test_every_suffix_of_shipped_arm_and_its_limits_is_unit() -> None:
                 assert label_axis(f"arm.{field}").endswith(")"), field
 
 
-def test_a_place_is_its_value_in_its_unit() -> None:
+def test_a_place_is_shown_in_its_unit() -> None:
     assert label_setting("link.playout_ms", 400.0) == "playout 400 ms"
     assert label_setting("link.loss", 0.25) == "loss 0.25"
     assert label_setting("link.order", "in_order") == "order in order"

@@ -1,4 +1,4 @@
-"""Runs of a sweep: the same results however they were made, nothing twice, every run counted."""
+"""Runs of a sweep: results do not depend on how they were made, and every run is made and counted once."""
 
 from collections import Counter
 from pathlib import Path
@@ -32,7 +32,7 @@ def judge(monkeypatch: pytest.MonkeyPatch) -> Judge:
 
 
 @pytest.mark.long
-def test_results_are_the_same_bytes_whatever_the_number_of_processes(tmp_path: Path) -> None:
+def test_the_number_of_processes_changes_no_byte(tmp_path: Path) -> None:
     """The judge of the package, in this process and in two others."""
     sweep = asked(tmp_path, "link.loss=0.2", seeds=2, over=[DELAYS])
     alone, others = (
@@ -75,7 +75,7 @@ def test_interrupted_work_is_not_done_again(tmp_path: Path, judge: Judge) -> Non
     assert 0 < swept.runs < 24
 
 
-def test_one_seed_is_run_where_nothing_is_random(tmp_path: Path, judge: Judge) -> None:
+def test_without_randomness_one_seed_is_run(tmp_path: Path, judge: Judge) -> None:
     told: list[tuple[int, int]] = []
     sweep = asked(tmp_path, over=["link.loss=0,0.1,1"], seeds=5)
     rows = run_sweep(
@@ -88,7 +88,7 @@ def test_one_seed_is_run_where_nothing_is_random(tmp_path: Path, judge: Judge) -
     assert len(judge.texts) == 7
 
 
-def test_the_runs_of_an_estimate_are_not_made_again(tmp_path: Path, judge: Judge) -> None:
+def test_runs_of_an_estimate_are_not_repeated(tmp_path: Path, judge: Judge) -> None:
     sweep = asked(tmp_path)
     expected = estimate_sweep(sweep, jobs=1)
     assert [entry.cell for entry in expected.entries] == [0, 1, 3, 5, 7, 9, 11]
@@ -100,15 +100,13 @@ def test_the_runs_of_an_estimate_are_not_made_again(tmp_path: Path, judge: Judge
     assert estimate_sweep(sweep, [(n, 1) for n in range(12)], 1) == DurationEstimate(0, 0.0, [])
 
 
-def test_an_estimate_counts_seeds_where_something_is_random(
-    tmp_path: Path, judge: Judge
-) -> None:
+def test_an_estimate_counts_seeds_of_random_links(tmp_path: Path, judge: Judge) -> None:
     assert estimate_sweep(asked(tmp_path, seeds=10), jobs=1).runs == 12
     assert estimate_sweep(asked(tmp_path, "link.loss=0.1", seeds=10), jobs=1).runs == 120
     assert judge.texts
 
 
-def test_enormous_sweep_is_refused_with_its_count_and_its_time(judge: Judge) -> None:
+def test_enormous_sweeps_are_refused_with_count_and_time(judge: Judge) -> None:
     over = ["link.delay_ms=0:9999:1", "control.d=0.1:20:0.1"]
     sweep = plan_sweep("p_d_margin", over=over)
     with pytest.raises(UsageError) as error:
@@ -131,7 +129,7 @@ def test_enormous_sweep_is_refused_with_its_count_and_its_time(judge: Judge) -> 
 
 
 def test_a_cell_that_cannot_run_is_named(tmp_path: Path, judge: Judge) -> None:
-    """The ends of both axes are fine alone and together; a pair between them is not."""
+    """The ends of both axes are valid alone and together; one pair between them is not."""
     sweep = asked(tmp_path, over=["link.loss=0.1,0.7,0.2", "link.loss_burst=5,1.5,6"])
     folder = prepare_sweep_folder(sweep, tmp_path / "o")
     with pytest.raises(

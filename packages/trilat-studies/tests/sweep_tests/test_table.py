@@ -1,4 +1,4 @@
-"""Results: what was run, number for number, in a file that other programs read; shares with intervals."""
+"""Results: every run, number for number, in a file that other programs read; shares with intervals."""
 
 import csv
 import json
@@ -32,7 +32,9 @@ ORDERS = "link.order=newest,in_order"
 
 @pytest.fixture(scope="module")
 def swept(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, SweepResults, Judge]:
-    """Numbers and words, two laws, two seeds where something is random; its folder, and who judged."""
+    """A sweep of numbers and words, two laws, and two seeds where links are random: its folder,
+    and its judge.
+    """
     path = tmp_path_factory.mktemp("swept")
     sweep = asked(path, over=["link.loss=0,0.1", ORDERS], laws=["adaptive", "p_d"], seeds=2)
     with pytest.MonkeyPatch.context() as patched:
@@ -40,7 +42,7 @@ def swept(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, SweepResults,
         return path / "o", run_sweep(prepare_sweep_folder(sweep, path / "o"), 1).results, judge
 
 
-def test_what_is_read_is_what_was_run(swept: tuple[Path, SweepResults, Judge]) -> None:
+def test_the_read_runs_are_the_written_ones(swept: tuple[Path, SweepResults, Judge]) -> None:
     path, results, judge = swept
     again = read_results(path)
     assert list(again.rows) == list(results.rows)
@@ -54,7 +56,7 @@ def test_what_is_read_is_what_was_run(swept: tuple[Path, SweepResults, Judge]) -
         )
 
 
-def test_rows_are_in_the_order_of_cells_and_seeds(
+def test_rows_are_ordered_by_cells_and_seeds(
     swept: tuple[Path, SweepResults, Judge],
 ) -> None:
     _, results, _ = swept
@@ -69,7 +71,7 @@ def test_rows_are_in_the_order_of_cells_and_seeds(
         results.of_cell(8)
 
 
-def test_bytes_do_not_depend_on_order_in_which_runs_ended(
+def test_the_order_of_finished_runs_changes_no_byte(
     swept: tuple[Path, SweepResults, Judge],
 ) -> None:
     path, results, _ = swept
@@ -165,7 +167,7 @@ def test_ten_thousand_scenarios_take_little_room(tmp_path: Path) -> None:
     assert read_results(tmp_path).rows[1234]["scenario"].count("delay_ms = 240.0") == 6
 
 
-def test_a_run_that_diverged_is_given_time_to_diverge_again(tmp_path: Path) -> None:
+def test_a_diverged_run_gets_time_to_diverge_again(tmp_path: Path) -> None:
     sweep = asked(tmp_path, over=[DELAYS])
     outcomes = [outcome_of(str(n)) for n in range(100)]
     for outcome in outcomes:
@@ -176,7 +178,7 @@ def test_a_run_that_diverged_is_given_time_to_diverge_again(tmp_path: Path) -> N
             assert lasts_s == min(4.0, 0.5 * 2.0**outcome.extended) > outcome.diverged_s
 
 
-def test_what_holds_no_results_is_refused(tmp_path: Path) -> None:
+def test_a_folder_without_results_is_refused(tmp_path: Path) -> None:
     def refused(path: Path, *words: str) -> None:
         with pytest.raises(UsageError) as error:
             read_results(path)
@@ -235,9 +237,7 @@ def test_every_run_is_counted_once(points: list[GridPoint]) -> None:
         assert place.interval == wilson_interval(converged, converged + bounded + diverged)
 
 
-def test_they_stand_in_a_file_where_there_are_seeds(
-    points: list[GridPoint], tmp_path: Path
-) -> None:
+def test_random_cells_have_rows_of_shares(points: list[GridPoint], tmp_path: Path) -> None:
     with (tmp_path / "o" / GRID_POINTS_FILE).open(newline="") as stream:
         lines = list(csv.DictReader(stream))
     for line, place in zip(lines, points, strict=True):
@@ -270,7 +270,7 @@ def test_intervals_are_those_of_a_published_table(
 
 
 @pytest.mark.parametrize("runs", [10, 20, 100])
-def test_the_interval_holds_the_truth_95_times_of_100(runs: int) -> None:
+def test_intervals_hold_the_truth_in_95_percent(runs: int) -> None:
     """Coverage by the binomial sums, over even shares: 0.95 within 0.01; nowhere below 0.83."""
     shares = np.linspace(0.0005, 0.9995, 1000)
     held = np.zeros(len(shares))
@@ -282,5 +282,5 @@ def test_the_interval_holds_the_truth_95_times_of_100(runs: int) -> None:
     assert held.min() > 0.83
 
 
-def test_without_runs_nothing_is_known() -> None:
+def test_without_runs_no_share_is_known() -> None:
     assert wilson_interval(0, 0) == (0.0, 1.0)

@@ -36,12 +36,12 @@ def trio(*overrides: str) -> Scenario:
 
 
 def asked(folder: Path, *overrides: str, text: str = TRIO, **settings: object) -> TuningPlan:
-    """A comparison in that scenario, as a file."""
+    """Returns a request for a comparison in the quick scenario, as a file."""
     path = folder / "trio.toml"
     path.write_text(text)
     return plan_tuning(path, overrides, **settings)  # type: ignore[arg-type]
 
 
 def dominates(a: ObjectivePoint, b: ObjectivePoint) -> bool:
-    """True where a is no worse than b in both, and better in one."""
+    """True if a is no worse than b in both objectives, and better in one."""
     return a[0] <= b[0] and a[1] <= b[1] and a != b

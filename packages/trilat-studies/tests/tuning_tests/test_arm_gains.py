@@ -1,4 +1,4 @@
-"""The largest gains that an arm bears: the edge by roots, the margins, and runs that confirm both."""
+"""The largest gains that an arm tolerates: the edge by roots, the margins, and runs that confirm both."""
 
 import json
 import math
@@ -37,7 +37,9 @@ DELAYS = ("0", "20ms", "100ms", "jitter")
 def write_jitter(
     path: Path, swing_ms: float = 15.0, jitter_ms: float = 3.0, every_s: float = 0.01
 ) -> Path:
-    """A trace of 2 s about 40 ms: a queue that fills and empties, and what is drawn anew in intervals."""
+    """Writes a trace of 2 s about 40 ms: a queue that fills and empties, and delays drawn anew
+    in intervals.
+    """
     chance = random.Random(3)
     rows = []
     for n in range(round(2.0 / every_s)):
@@ -52,7 +54,7 @@ def write_jitter(
 
 
 def tune(name: str, delay: str, folder: Path, **more: object) -> ArmGains:
-    """The gains of an arm of one's own, of a shipped one, or of a maker's."""
+    """Returns the gains of a user's own arm, of a shipped arm, or of a maker's arm."""
     arm, tip = Path(name), ""
     if name in ODD_ARMS:
         arm = folder / "odd.urdf"
@@ -66,14 +68,14 @@ def tune(name: str, delay: str, folder: Path, **more: object) -> ArmGains:
 
 
 def assert_confirmed(found: ArmGains) -> None:
-    """Below the edge the runs decay, beyond it they grow, and at the gains they decay."""
+    """Asserts that runs decay below the edge, grow beyond the edge, and decay at the chosen gains."""
     stable = {run["share"]: run["stable"] for run in found.runs}
     assert stable == {None: True, SHARES[0]: True, SHARES[1]: False}, found.summary()
     assert found.agree
 
 
 def assert_proven(found: ArmGains) -> None:
-    """At a margin of 2 P+d meets d > K T, which suffices whatever the masses."""
+    """Asserts that, at a margin of 2, P+d meets d > K T, which suffices whatever the masses."""
     assert (gains(found, "d") > gains(found, "K") * 1e-3 * found.age_ms).all()
 
 
@@ -95,19 +97,19 @@ def test_runs_confirm_the_edge_of_every_arm(name: str, delay: str, tmp_path: Pat
 
 
 def gains(found: ArmGains, name: str) -> np.ndarray:
-    """One gain of every joint."""
+    """Returns the same gain for every joint."""
     return np.array([joint[name] for joint in found.joints])
 
 
 @pytest.fixture
 def one_joint(tmp_path: Path) -> Path:
-    """An arm of one joint."""
+    """Returns an arm of one joint."""
     path = tmp_path / "one.urdf"
     path.write_text(write_arm([SHOULDER]), encoding="utf-8")
     return path
 
 
-def test_the_edge_of_one_joint_is_that_of_its_equation(one_joint: Path) -> None:
+def test_one_joint_has_the_edge_of_its_equation(one_joint: Path) -> None:
     """M w^2 = K (1 + cos w T) and d w = K sin w T, with d = 2 zeta sqrt(K M)."""
     found = tune_arm(one_joint, "60ms", poses=1, margin=2.0, damping=0.7)
     zeta = 0.7 / math.sqrt(2.0)
@@ -124,7 +126,7 @@ def test_the_edge_of_one_joint_is_that_of_its_equation(one_joint: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["slide", pytest.param("arm6.urdf", marks=pytest.mark.long)])
-def test_modes_begin_to_grow_where_the_edge_is(name: str, tmp_path: Path) -> None:
+def test_modes_begin_to_grow_at_the_edge(name: str, tmp_path: Path) -> None:
     found = tune(name, "20ms", tmp_path, poses=3, set={"arm.g_m_s2": 0})
     arm = str(tmp_path / "odd.urdf") if name in ODD_ARMS else name
     loop = {
@@ -145,7 +147,7 @@ def test_modes_begin_to_grow_where_the_edge_is(name: str, tmp_path: Path) -> Non
 
 @cache
 def tune_shoulder(share: float) -> ArmGains:
-    """The gains of an arm of one joint with so much of its mass."""
+    """Returns the gains of an arm of one joint with the given mass."""
     text = write_arm([SHOULDER._replace(mass=share * SHOULDER.mass)])
     return tune_arm("arm", "30ms", poses=1, set={"urdf": {"arm": text}})
 
@@ -163,7 +165,7 @@ def test_the_edge_falls_with_the_delay(one_joint: Path) -> None:
     assert k[0] > 3.0 * k[1] > 9.0 * k[2]
 
 
-def test_beyond_some_rate_the_delay_alone_counts(one_joint: Path) -> None:
+def test_at_high_rates_only_delay_limits_gains(one_joint: Path) -> None:
     slow, fast, faster = (
         tune_arm(one_joint, "50ms", poses=1, rate_hz=hz) for hz in (20, 500, 2000)
     )
@@ -205,7 +207,8 @@ def test_the_longest_delays_lower_the_gains(one_joint: Path, tmp_path: Path) -> 
 
 @pytest.mark.long
 def test_over_slow_jitter_growth_begins_more_than_once(one_joint: Path, tmp_path: Path) -> None:
-    """Delays that change every 50 ms swing the loop as a child does: it grows below the edge too.
+    """Delays that change every 50 ms pump the loop parametrically: the loop grows below the
+    edge too.
 
     The gains are those of the constant delay, which is the tighter bound, and they are stable.
     """
@@ -225,7 +228,7 @@ def test_delays_are_taken_from_a_log(one_joint: Path) -> None:
     assert found.runs[0]["stable"]
 
 
-def test_a_session_has_the_delay_of_its_slowest_link(
+def test_sessions_have_the_delay_of_their_slowest_link(
     one_joint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     report = ping_sites()  # of a party on the party's clock
@@ -250,7 +253,7 @@ def test_gains_of_several_joints_scale_with_all_masses() -> None:
         assert gains(found[1], name) == pytest.approx(7.0 * gains(found[0], name), rel=5e-3)
 
 
-def test_a_digital_controller_bears_less(one_joint: Path) -> None:
+def test_a_digital_controller_tolerates_less_gain(one_joint: Path) -> None:
     held = tune_arm(one_joint, "5ms", poses=1, set={"scheme": "digital"})
     assert_confirmed(held)
     assert held.edge["k_per_s2"] < tune_arm(one_joint, "5ms", poses=1).edge["k_per_s2"]
@@ -266,7 +269,7 @@ dominance = {{ m = {{ s = 1.0 }}, s = {{ m = 1.0 }} }}
 """
 
 
-def test_the_line_is_one_of_a_scenario(one_joint: Path, tmp_path: Path) -> None:
+def test_the_printed_line_fits_a_scenario(one_joint: Path, tmp_path: Path) -> None:
     words = ("tune", "--arm", one_joint.name, "--delay", "40ms", "--json")
     told = json.loads(trilat(*words, cwd=tmp_path).succeeds())
     (tmp_path / "mine.toml").write_text(SCENARIO.format(line=told["line"]), encoding="utf-8")
@@ -307,7 +310,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("kind", REFUSED)
-def test_bad_input_is_refused_with_what_is_right(
+def test_bad_input_is_refused_with_the_valid_choices(
     kind: str, one_joint: Path, tmp_path: Path
 ) -> None:
     more, fact = REFUSED[kind]

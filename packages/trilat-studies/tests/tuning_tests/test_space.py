@@ -1,4 +1,4 @@
-"""Where laws are searched, and what all of them are told."""
+"""The ranges in which laws are searched, and the knowledge that all laws share."""
 
 import numpy as np
 import pytest
@@ -33,7 +33,7 @@ HELD = ("tdpa", "tanks", "wave")
 
 @pytest.mark.parametrize("law", sorted(SEARCH_SPACES))
 @pytest.mark.parametrize("scenario", ["contact", "free"])
-def test_a_candidate_changes_its_law_at_every_site_alone(law: str, scenario: str) -> None:
+def test_candidates_change_their_law_at_every_site(law: str, scenario: str) -> None:
     if law == "p_f" and scenario == "free":
         return
     scheme = ["scheme=digital"] if law in HELD else []
@@ -56,7 +56,7 @@ def test_a_candidate_changes_its_law_at_every_site_alone(law: str, scenario: str
     assert len(with_same_control) == len(experiment.scenario.names)
 
 
-def test_sites_with_their_own_control_are_changed_one_by_one() -> None:
+def test_sites_with_own_control_are_changed_separately() -> None:
     found: TuningScenario = load_tuning_scenario("contact").with_gains(
         SEARCH_SPACES["p_d"], ModelInformation(), {"K": 31.2, "d": 7.1}
     )
@@ -73,7 +73,7 @@ def test_sites_with_their_own_control_are_changed_one_by_one() -> None:
     )
 
 
-def test_the_same_quantity_has_the_same_range_in_every_law() -> None:
+def test_equal_quantities_have_equal_ranges_in_laws() -> None:
     ranges: dict[str, set[tuple[str, float, float]]] = {}
     for space in SEARCH_SPACES.values():
         # of the place, in N s/m
@@ -86,7 +86,7 @@ def test_the_same_quantity_has_the_same_range_in_every_law() -> None:
 
 
 def six(state: ChainState, **overrides: object) -> TuningScenario:
-    """`six_joints` of two equal start poses."""
+    """Returns `six_joints` with two equal start poses."""
     start = {f"sites.{name}.q0_rad": state.q.tolist() for name in ("m1", "m2", "s")}
     given = {"arm.stops": False, **start, **overrides}
     return load_tuning_scenario(
@@ -94,7 +94,7 @@ def six(state: ChainState, **overrides: object) -> TuningScenario:
     )
 
 
-def test_joints_share_a_gain_by_the_inertia_of_pinocchio() -> None:
+def test_joints_share_gains_by_inertia_from_pinocchio() -> None:
     armature = np.array([0.2, 0.2, 0.2, 0.05, 0.05, 0.05])
     for state in chain_references()["arm6"].states:
         inertia = 1.0 / np.diag(np.linalg.inv(state.inertia + np.diag(armature)))
@@ -112,9 +112,7 @@ def test_joints_share_a_gain_by_the_inertia_of_pinocchio() -> None:
 
 @pytest.mark.parametrize("scheme", ["second_order", "digital"])
 @pytest.mark.parametrize("armature_kg_m2", [0.0, 0.001, 0.2])
-def test_every_choice_within_ranges_is_one_that_arms_can_take(
-    armature_kg_m2: float, scheme: str
-) -> None:
+def test_every_choice_within_ranges_is_a_valid_arm(armature_kg_m2: float, scheme: str) -> None:
     state, *_ = chain_references()["arm6"].states
     small = {"law": "p_d", "K": 1.0, "d": 1e-3}
     experiment = six(
@@ -147,13 +145,13 @@ def test_the_usual_laws_take_any_number_of_sites() -> None:
         ("own", ["no law 'own'"]),
     ],
 )
-def test_what_cannot_be_tuned_is_refused(law: str, facts: list[str]) -> None:
+def test_untunable_settings_are_refused(law: str, facts: list[str]) -> None:
     with pytest.raises(UsageError) as refused:
         select_search_spaces([law], trio())
     assert all(fact in str(refused.value) for fact in facts)
 
 
-def test_force_reflection_is_refused_for_three_sites_with_the_reason() -> None:
+def test_force_reflection_is_refused_for_three_sites() -> None:
     with pytest.raises(
         ScenarioError,
         match="between one master and one slave; this scenario has 3 sites, 2 of them",
@@ -168,8 +166,10 @@ SHARES = st.floats(50.0, 150.0)
 
 
 @given(percent=SHARES)
-def test_the_box_holds_the_truth_strictly_inside(percent: float) -> None:
-    """Otherwise V' <= 0 does not stand, and a law would be searched where it cannot work."""
+def test_ranges_hold_the_true_parameters_strictly_inside(percent: float) -> None:
+    """Otherwise V' <= 0 does not hold, and the search would include settings in which the law
+    cannot work.
+    """
     scenario, knowledge = trio(), build_model_information(percent)
     truth = scenario.arms["s"].theta
     low, high = knowledge.box_sides(scenario, "s")
@@ -178,7 +178,7 @@ def test_the_box_holds_the_truth_strictly_inside(percent: float) -> None:
 
 
 @given(percent=SHARES)
-def test_all_candidates_know_one_share_of_gravity_no_inertia(percent: float) -> None:
+def test_candidates_know_equal_gravity_and_no_inertia(percent: float) -> None:
     scenario = trio()
     prior = np.array(build_model_information(percent).prior(scenario, "m1"))
     # (m1 lc1 + m2 l1, m2 lc2) of point masses at the ends, Eq. (24)
@@ -188,6 +188,6 @@ def test_all_candidates_know_one_share_of_gravity_no_inertia(percent: float) -> 
 
 
 @pytest.mark.parametrize("percent", [0.0, 49.0, 151.0, float("nan"), float("inf")])
-def test_what_nobody_could_be_told_is_refused(percent: float) -> None:
+def test_impossible_knowledge_is_refused(percent: float) -> None:
     with pytest.raises(UsageError, match="gravity_percent must be from 50 to 150 %"):
         build_model_information(percent)

@@ -1,4 +1,4 @@
-"""The procedure as a whole: small budgets, short runs."""
+"""The whole procedure: small budgets, short runs."""
 
 import json
 import re
@@ -26,26 +26,24 @@ LAWS = ("adaptive", "p_d", "known")
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> TuningResult:
-    """Three laws, six candidates each."""
+    """The result for three laws with six candidates each."""
     return asked(tmp_path_factory.mktemp("tuned"), laws=LAWS, budget=6, seed=7).run(jobs=1)
 
 
 @pytest.mark.long
-def test_same_request_makes_same_result_whatever_number_of_processes(
-    found: TuningResult, tmp_path: Path
-) -> None:
+def test_the_number_of_processes_changes_no_result(found: TuningResult, tmp_path: Path) -> None:
     again = asked(tmp_path, laws=LAWS, budget=6, seed=7).run(jobs=2)
     assert [one.tried for one in again.found] == [one.tried for one in found.found]
     assert [one.scores for one in again.found] == [one.scores for one in found.found]
     assert [one.score for one in again.printed] == [one.score for one in found.printed]
 
 
-def test_every_law_has_its_budget_and_every_run_one_outcome(found: TuningResult) -> None:
+def test_laws_use_their_budget_and_runs_end_once(found: TuningResult) -> None:
     for one in found.found:
         assert len(one.tried) == len(one.scores) == sum(one.outcomes.values()) == 6
 
 
-def test_clamp_and_all_but_law_are_same_for_every_candidate(found: TuningResult) -> None:
+def test_candidates_differ_only_in_their_law(found: TuningResult) -> None:
     shared = set()
     for one in found.found:
         for place in range(len(one.tried)):
@@ -79,7 +77,7 @@ def test_a_front_is_dominated_by_no_law(found: TuningResult) -> None:
             assert (place in shared) == (not any(dominates(other, point) for other in every))
 
 
-def test_a_points_command_runs_what_was_measured(found: TuningResult) -> None:
+def test_the_command_of_a_point_repeats_its_run(found: TuningResult) -> None:
     for one in found.found:
         for place in one.front:
             words = shlex.split(found.candidate(one, place).command)
@@ -101,8 +99,8 @@ def test_printed_gains_are_measured_and_never_searched(found: TuningResult) -> N
     assert (1.0, 1.0, 3.0, 1.0) not in every
 
 
-def test_runs_that_failed_are_in_the_facts_and_counted(tmp_path: Path) -> None:
-    """A speed limit that nothing keeps: no front, and no silence about it."""
+def test_failed_runs_are_in_facts_and_counted(tmp_path: Path) -> None:
+    """No run keeps the speed limit: the front is empty, and the result says so."""
     found = asked(tmp_path, "limits.qd_limit_rad_s=0.001", laws=["p_d"], budget=4).run(jobs=1)
     law = found.to_dict()["laws"]["p_d"]
     assert law["outcomes"] == {
@@ -113,8 +111,8 @@ def test_runs_that_failed_are_in_the_facts_and_counted(tmp_path: Path) -> None:
     assert found.list_edge_gains(found.found[0]) == []
 
 
-def test_hanging_arms_are_on_no_front_of_a_real_search(tmp_path: Path) -> None:
-    """Gravity is told for half of what it is: no law that only knows it can stand, some that learn it can."""
+def test_hanging_arms_never_reach_a_real_front(tmp_path: Path) -> None:
+    """The laws are given half of gravity: a law that does not learn cannot stand, some that learn can."""
     settings = ("duration_s=10.0", "control.Kd=1")
     found = asked(
         tmp_path, *settings, laws=["adaptive", "pd_d"], budget=8, gravity_percent=50.0
@@ -141,7 +139,7 @@ def test_hanging_arms_are_on_no_front_of_a_real_search(tmp_path: Path) -> None:
         ({"laws": ["p_dd"]}, "no law 'p_dd' to tune; did you mean"),
     ],
 )
-def test_what_cannot_be_asked_is_refused(
+def test_impossible_requests_are_refused(
     tmp_path: Path, settings: dict[str, object], words: str
 ) -> None:
     with pytest.raises(UsageError) as refused:
@@ -156,7 +154,7 @@ def test_a_search_that_would_take_days_is_refused() -> None:
         plan_tuning("free", ["duration_s=86400"])
 
 
-def test_time_is_told_before_and_is_of_right_order(tmp_path: Path) -> None:
+def test_time_is_estimated_beforehand_in_right_order(tmp_path: Path) -> None:
     few = asked(tmp_path, laws=["p_d"], budget=8)
     assert 0.0 < few.estimate_s(1) < 600.0
     assert few.runs == 10
@@ -165,7 +163,7 @@ def test_time_is_told_before_and_is_of_right_order(tmp_path: Path) -> None:
 
 
 def with_front(law: str, gains: dict[str, float], points: int) -> CandidateSearch:
-    """A search of which so many candidates, all of the same gains, are on the front, the others on none."""
+    """A search with `count` candidates of equal gains on the front, and the others not."""
     search = CandidateSearch(SEARCH_SPACES[law], 6, 1, Objective.ERROR)
     outcomes = [CandidateClass.SETTLED] * points + [CandidateClass.OPEN] * (6 - points)
     scores = [
@@ -176,7 +174,7 @@ def with_front(law: str, gains: dict[str, float], points: int) -> CandidateSearc
     return search
 
 
-def test_tables_name_the_edge_of_what_was_searched(found: TuningResult) -> None:
+def test_tables_name_the_edge_of_the_searched_ranges(found: TuningResult) -> None:
     knob = SEARCH_SPACES["p_d"].knobs[0]
     assert found.list_edge_gains(with_front("p_d", {"K": knob.high, "d": 10.0}, 1)) == ["K"]
 
@@ -216,7 +214,7 @@ def test_the_figure_is_a_vector_one_column_wide(written: Path) -> None:
     assert int.from_bytes(header, "big") == 700
 
 
-def test_the_page_tells_procedure_search_and_commands(
+def test_the_page_shows_procedure_search_and_commands(
     found: TuningResult, written: Path
 ) -> None:
     text = (written / "front.md").read_text()
@@ -235,7 +233,7 @@ def test_the_table_of_laws_counts_every_run(found: TuningResult) -> None:
         assert sum(int(row[place]) for place in places) == int(row[1]) == 6
 
 
-def test_a_long_front_is_shortened_to_points_with_both_ends(found: TuningResult) -> None:
+def test_long_fronts_are_shortened_between_both_ends(found: TuningResult) -> None:
     one = with_front("adaptive", found.found[0].tried[0], 5)
     shown = [row[0].rstrip("*") for row in tabulate_front(found, one, 3).rows]
     assert shown == ["adaptive 1", "adaptive 3", "adaptive 5"]
