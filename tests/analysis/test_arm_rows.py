@@ -31,7 +31,7 @@ def _hangs(arm: ArmRows, pose: Sequence[float] | np.ndarray) -> bool:
 
 
 def chain_of(name: str, **drive: float) -> ChainArmRows:
-    """A reference's chain with gravity along its z axis."""
+    """Returns a reference's chain with gravity along its z axis."""
     chain = REFERENCES[name].chain
     joints = tuple(
         ChainJoint(one.kind == "prismatic", one.axis, one.rotation, one.origin_m, **drive)
@@ -46,7 +46,7 @@ def drawn(joints: int, rows: int = 5) -> list[Array]:
 
 
 @each
-def test_torque_inertia_gradient_and_end_effector_are_those_of_pinocchio(name: str) -> None:
+def test_torque_inertia_gradient_and_tip_equal_pinocchios(name: str) -> None:
     arm = chain_of(name)
     for state in REFERENCES[name].states:
         there = arm._replace(
@@ -78,8 +78,8 @@ def test_the_slope_of_the_potential_energy_is_gravity(name: str) -> None:
     np.testing.assert_allclose((up - down) / (2 * step), arm.gravity_torque(q)[0], atol=2e-8)
 
 
-def test_friction_and_stops_are_what_the_core_takes_and_gives() -> None:
-    """M qdd changes by them, and by nothing else."""
+def test_friction_and_stops_equal_the_cores() -> None:
+    """M qdd changes by friction and stops, and by nothing else."""
     drive = {"viscous": 0.4, "coulomb": 1.2}
     stop = {"lower": -0.5, "upper": 0.5, "stop_stiffness": 800.0, "stop_damping": 9.0}
     rough, smooth = chain_of("arm6", **drive, **stop), chain_of("arm6")
@@ -97,7 +97,7 @@ def test_friction_and_stops_are_what_the_core_takes_and_gives() -> None:
     np.testing.assert_allclose(found, forces[0] - forces[1], atol=1e-10)
 
 
-def test_the_planar_arm_is_the_same_as_a_chain() -> None:
+def test_the_planar_arm_equals_its_chain() -> None:
     written = Arm(
         l1_m=0.8, m1_kg=1.5, lc1_m=0.3, I1_kg_m2=0.05, l2_m=0.6, m2_kg=0.7, lc2_m=0.25
     )
@@ -130,7 +130,7 @@ def test_the_planar_arm_is_the_same_as_a_chain() -> None:
         assert _hangs(plane, pose) is _hangs(chain, pose) is hangs
 
 
-def test_arm_hangs_where_it_stores_hardly_more_energy_than_anywhere() -> None:
+def test_arms_hang_near_their_least_potential_energy() -> None:
     """The links of a UR5 point along -x of their frames: shoulder_lift at +90 degrees is straight down."""
     arm = chain_of("arm6")
     down = np.array([0.4, 0.5 * np.pi, 0.0, 0.0, 0.0, 1.0])
@@ -144,8 +144,8 @@ def test_arm_hangs_where_it_stores_hardly_more_energy_than_anywhere() -> None:
 
 
 @pytest.mark.parametrize(("name", "count"), [("random2", 10), ("arm6", 36), ("arm7", 43)])
-def test_base_parameters_are_as_many_as_regressors_have_rank(name: str, count: int) -> None:
-    """36 of a UR5 is what Pinocchio's regressors give; the rank by SVD of other states agrees."""
+def test_base_parameters_count_the_regressors_rank(name: str, count: int) -> None:
+    """36 of a UR5 is the number by Pinocchio's regressors; the rank by SVD of other states agrees."""
     arm = chain_of(name)
     base = find_base_parameters(arm, np.ones(len(arm.theta), dtype=np.bool_))
     assert len(base.kept) == count == np.linalg.matrix_rank(stack_regressors(arm, 77), tol=1e-7)
@@ -153,7 +153,7 @@ def test_base_parameters_are_as_many_as_regressors_have_rank(name: str, count: i
 
 
 @each
-def test_base_parameters_leave_out_only_what_makes_no_torque(name: str) -> None:
+def test_base_parameters_omit_only_torque_free_combinations(name: str) -> None:
     """Pinocchio's Y'r has no part that is orthogonal to the rows of the combination."""
     arm = chain_of(name)
     B = find_base_parameters(arm, np.ones(len(arm.theta), dtype=np.bool_)).combination
@@ -170,7 +170,7 @@ def test_base_parameters_leave_out_only_what_makes_no_torque(name: str) -> None:
     assert np.abs(arm.law_torque(null[np.newaxis], q, qd, v, a)).max() <= 1e-8
 
 
-def test_parameters_that_are_not_learnt_join_no_combination() -> None:
+def test_fixed_parameters_join_no_combination() -> None:
     arm = chain_of("arm6")
     learnt = np.arange(60) % 10 < 4
     base = find_base_parameters(arm, learnt)
@@ -179,7 +179,7 @@ def test_parameters_that_are_not_learnt_join_no_combination() -> None:
 
 
 def body(places: Array, masses: Array) -> Array:
-    """Ten parameters of point masses."""
+    """Returns ten parameters of point masses."""
     m, mc = masses.sum(), masses @ places
     inertia = np.sum(
         [
@@ -192,7 +192,7 @@ def body(places: Array, masses: Array) -> Array:
     return np.array([m, *mc, xx, xy, yy, xz, yz, zz])
 
 
-def test_a_body_with_a_negative_mass_is_not_consistent() -> None:
+def test_a_negative_mass_is_inconsistent() -> None:
     random = np.random.default_rng(4)
     places, masses = random.normal(size=(6, 3)), random.uniform(0.5, 2.0, 6)
     sound = body(places, masses)

@@ -8,7 +8,7 @@ from trilat_net.net.messages import State
 
 
 @pytest.mark.parametrize("ticks", [1, 7, 40])
-def test_times_at_the_torque_limit_are_counted_by_site(ticks: int) -> None:
+def test_ticks_at_the_torque_limit_are_counted(ticks: int) -> None:
     log = logs.simulated("paper")  # 200 Hz
     limits_nm = {site: log.scenario.sites[site].limits.tau_limit_nm for site in log.sites}
 
@@ -23,7 +23,7 @@ def test_times_at_the_torque_limit_are_counted_by_site(ticks: int) -> None:
 
 
 @pytest.mark.parametrize("share", [0.9, 1.1])
-def test_pushes_above_half_of_the_limit_are_named(share: float) -> None:
+def test_pushes_above_half_the_limit_are_named(share: float) -> None:
     log = logs.simulated("paper")
     limit_nm = log.scenario.sites["m2"].limits.tau_limit_nm
     push_nm = share * LARGE_PUSH_SHARE * limit_nm

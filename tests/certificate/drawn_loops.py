@@ -1,8 +1,9 @@
 """Experiments that are drawn from a seed, many of them near an edge of stability.
 
-Seeds below `WIDE_FROM` draw loops of a few kinds at rest poses well apart; from there on everything that a
-scenario may have is drawn: all laws, starts from 1e-10 to 1 rad apart, delays that swing, drift or were
-recorded, several tick rates, chains, task space, walls, hands that hold or let go.
+Seeds below `WIDE_FROM` draw loops of a few kinds at rest poses well apart. Larger seeds draw
+every feature of a scenario: all laws, starts from 1e-10 to 1 rad apart, delays that swing,
+drift or were recorded, several tick rates, chains, task space, walls, hands that hold or let
+go.
 """
 
 import json
@@ -23,7 +24,9 @@ SAMPLED = "sites.s.environment.0.sampled"
 
 
 def _toml(value: Any) -> str:
-    """A value in TOML; nine digits, since further ones of a sine or an eigenvalue depend on the machine."""
+    """Returns a value in TOML with nine digits, since further digits of a sine or an eigenvalue
+    depend on the machine.
+    """
     if isinstance(value, float):
         return json.dumps(float(f"{value:.9g}"))
     if isinstance(value, Mapping):
@@ -38,7 +41,7 @@ def _toml(value: Any) -> str:
 
 
 def experiment(name: str, **tables: Any) -> Scenario:
-    """The scenario of some tables."""
+    """Returns the scenario of some tables."""
     given = {
         "name": name,
         "rate_hz": 100,
@@ -50,7 +53,7 @@ def experiment(name: str, **tables: Any) -> Scenario:
 
 
 def swinging(peaks: Iterable[tuple[float, float]], hertz: float = 1.0) -> dict[str, Any]:
-    """A hand whose torque swings on joint 1 and 2, its size linear between (time s, N m)."""
+    """Returns a hand whose torque swings on joint 1 and 2, its size linear between (time s, N m)."""
     times, sizes = np.array(list(peaks)).T
     t_s = np.arange(times[0], times[-1] + 1e-9, 0.02)
     torque = np.interp(t_s, times, sizes) * np.sin(2 * np.pi * hertz * t_s)
@@ -61,12 +64,14 @@ def swinging(peaks: Iterable[tuple[float, float]], hertz: float = 1.0) -> dict[s
 
 
 def p_d(d: Any, **more: Any) -> dict[str, Any]:
-    """P+d with 10 N m/rad."""
+    """Returns P+d with 10 N m/rad."""
     return {"law": "p_d", "K": 10.0, "d": d, **more}
 
 
 class Drawn(NamedTuple):
-    """An experiment that was drawn: its kind, its scenario, the key that may be near an edge, what it has."""
+    """An experiment that was drawn: its kind, its scenario, the key that may be near an edge,
+    and its features.
+    """
 
     kind: str
     scenario: Scenario
@@ -75,12 +80,12 @@ class Drawn(NamedTuple):
 
     @property
     def wide(self) -> bool:
-        """True if everything was drawn."""
+        """True if every feature was drawn."""
         return bool(self.has)
 
 
 def _sites(rng: np.random.Generator, names: str, spread_rad: float) -> dict[str, Any]:
-    """Arms of several masses, about one pose."""
+    """Draws arms of several masses, about one pose."""
     pose = rng.uniform(-0.8, 0.8, 2)
     return {
         name: {
@@ -97,7 +102,7 @@ def _sites(rng: np.random.Generator, names: str, spread_rad: float) -> dict[str,
 
 
 def _shares(rng: np.random.Generator, names: str) -> dict[str, dict[str, float]]:
-    """Shares of every site, of all of its peers or of one."""
+    """Draws shares of every site, of all of its peers or of one."""
     rows = {}
     for name in names:
         peers = [peer for peer in names if peer != name]
@@ -110,7 +115,7 @@ def _shares(rng: np.random.Generator, names: str) -> dict[str, dict[str, float]]
 
 
 def _loop(rng: np.random.Generator, names: str, **more: Any) -> dict[str, Any]:
-    """A network of P+d or PD+d whose damping is about the edge of stability."""
+    """Draws a network of P+d or PD+d whose damping is about the edge of stability."""
     shares, T_ms, K = (
         _shares(rng, names),
         float(rng.uniform(80.0, 400.0)),
@@ -152,7 +157,7 @@ def _draw_noisy(rng: np.random.Generator) -> Drawn:
 
 
 def _draw_groups(rng: np.random.Generator) -> Drawn:
-    """Two closed groups: what one does hides the other."""
+    """Draws two closed groups, one of which hides the motion of the other."""
     made, T = _loop(rng, "abce"), 0.001 * float(rng.uniform(50.0, 300.0))
     d = 10.0 * T * rng.uniform([1.2, 0.7], [2.5, 1.3])
     sites = _sites(rng, "abce", 0.5)
@@ -166,7 +171,7 @@ def _draw_groups(rng: np.random.Generator) -> Drawn:
 
 
 def _draw_adaptive(rng: np.random.Generator) -> Drawn:
-    """The paper's law at rates at which sampling may feed it."""
+    """Draws the paper's law at rates at which sampling may feed it."""
     names = "abc"[: rng.integers(2, 4)]
     late = rng.random() < 0.6
     made = _loop(
@@ -183,7 +188,7 @@ def _draw_adaptive(rng: np.random.Generator) -> Drawn:
 
 
 def _draw_delay(rng: np.random.Generator) -> Drawn:
-    """A delay that swings about twice as fast as the loop does."""
+    """Draws a delay that swings about twice as fast as the loop does."""
     T = float(rng.uniform(100.0, 250.0))
     link = {
         "model": "sine",
@@ -213,7 +218,7 @@ def _draw_wall(rng: np.random.Generator) -> Drawn:
 
 
 def _draw_operator(rng: np.random.Generator) -> Drawn:
-    """A hand that swings to the end, or lets go long before it."""
+    """Draws a hand that swings to the end, or lets go long before the end."""
     made = _loop(rng, "abc")
     made["control"] = p_d(float(rng.uniform(2.0, 6.0)))
     until_s = DRAWN_S - 0.02 if rng.random() < 0.5 else 0.3 * DRAWN_S
@@ -263,12 +268,12 @@ _TYPICAL: Mapping[str, Mapping[str, float]] = {
 
 
 def _about(rng: np.random.Generator, value: float, factor: float = 2.0) -> float:
-    """A number within a factor of another."""
+    """Draws a number within a factor of another."""
     return float(f"{value * factor ** rng.uniform(-1.0, 1.0):.4g}")
 
 
 def _draw_law(rng: np.random.Generator, law: str, names: str) -> list[dict[str, Any]]:
-    """A law with its gains, of every site."""
+    """Draws a law with its gains, for every site."""
     gains: dict[str, Any] = {"law": law} | {
         key: _about(rng, x) for key, x in _TYPICAL[law].items()
     }
@@ -298,7 +303,7 @@ def _draw_law(rng: np.random.Generator, law: str, names: str) -> list[dict[str, 
 
 
 def _draw_link(rng: np.random.Generator) -> tuple[str, dict[str, Any]]:
-    """A link's name and its keys: constant, swinging, drifting, or as it was recorded."""
+    """Draws a link's name and its keys: constant, swinging, drifting, or recorded."""
     T_ms, kind = (
         round(float(rng.uniform(20.0, 250.0)), 1),
         str(rng.choice(["constant", "sine", "ar1", "trace"])),
@@ -332,7 +337,7 @@ def _draw_link(rng: np.random.Generator) -> tuple[str, dict[str, Any]]:
 
 
 def _draw_touch(rng: np.random.Generator, sites: dict[str, Any]) -> str:
-    """Lets a hand hold, let go or push, or an environment resist; what it is."""
+    """Draws a hand that holds, lets go or pushes, or an environment that resists, and returns its kind."""
     names, to = list(sites), [float(x) for x in rng.uniform(-0.8, 1.2, 2).round(3)]
     spring = {"kind": "spring", "to_rad": to, "stiffness_nm_rad": _about(rng, 30.0, 3.0)}
     spring |= {
@@ -371,7 +376,7 @@ _TOUCHES = (0.4, 0.12, 0.12, 0.08, 0.1, 0.1, 0.08)
 
 
 def _draw_wide(rng: np.random.Generator) -> Drawn:
-    """Anything that a scenario may have; what contradicts itself is drawn again."""
+    """Draws every feature of a scenario; contradictory draws are repeated."""
     while True:
         try:
             return _draw_anything(rng)
@@ -425,7 +430,7 @@ def _draw_anything(rng: np.random.Generator) -> Drawn:
 
 
 def draw_experiment(seed: int) -> Drawn:
-    """The experiment of a seed."""
+    """Returns the experiment of a seed."""
     rng = np.random.default_rng(seed)
     if seed >= WIDE_FROM:
         return _draw_wide(rng)

@@ -1,4 +1,4 @@
-"""Six commands say the same about a run, because one function decides for all of them."""
+"""Six commands agree about every run, because one function decides for all of them."""
 
 import csv
 import json
@@ -247,7 +247,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.push
 def test_commands_themselves_agree(folder: Path) -> None:
-    """The commands print what the functions above say, as far as JSON and tables have it."""
+    """The commands print the statements of the functions above, as far as JSON and tables contain them."""
     with (folder / "sweep" / "results.csv").open(encoding="utf-8") as stream:
         cells = list(csv.DictReader(stream))
     compared = read_statement(folder, "compare", *(f"{d}.mcap" for d in DAMPING))
@@ -278,7 +278,7 @@ def test_commands_themselves_agree(folder: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_report_says_what_a_certificate_says(folder: Path) -> None:
+def test_a_report_agrees_with_its_certificate(folder: Path) -> None:
     name = f"{DAMPING[0]}.mcap"
     certified = read_statement(folder, "certify", name)
     verdict = read_statement(folder, "report", name)["verdict"]
@@ -287,8 +287,8 @@ def test_a_report_says_what_a_certificate_says(folder: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_run_of_the_suite_says_what_a_certificate_says() -> None:
-    """The run may have been made longer, which its certificate follows."""
+def test_a_suite_run_agrees_with_its_certificate() -> None:
+    """The run may have been made longer, and its certificate follows that length."""
     plan = plan_bench(
         laws=["p_d"], study="round-trips", tasks=["free"], links=["rtt8"], seeds=1
     )

@@ -1,4 +1,4 @@
-"""A simulated run is recorded for its energies only where these may change the judgement."""
+"""A simulated run is recorded for its energies only if these may change the judgement."""
 
 from typing import Any
 

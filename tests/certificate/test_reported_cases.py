@@ -285,7 +285,7 @@ def test_looped_trace_is_judged_over_its_period(case: Case) -> None:
 
 
 @pytest.mark.parametrize(("loop_case", "share"), [(0, 0.5), (1, 0.4), (3, 0.5)])
-def test_run_before_the_first_burst_is_judged_with_it(loop_case: int, share: float) -> None:
+def test_runs_before_their_first_burst_count_it(loop_case: int, share: float) -> None:
     """All delays of the run are equal; those of the period are not."""
     case = LOOPED_TRACES[loop_case]
     short = case._replace(duration_s=share * case.duration_s)
@@ -360,7 +360,7 @@ def test_command_without_effect_leaves_the_roots(case: CommandedCase) -> None:
     assert tn.certify(tn.simulate(scenario)).decision == found.decision
 
 
-def test_command_with_effect_decides_by_the_roots_after_it() -> None:
+def test_effective_commands_decide_by_later_roots() -> None:
     stable = SATURATED._replace(d=3.626)
     later = stable._replace(delays={(0, 1): constant(250.0), (1, 0): constant(300.0)})
     rate_per_s = later.compute_rates(1)[0]
@@ -536,7 +536,7 @@ SLOW_GROWTH = [
 
 
 @pytest.mark.parametrize("case", [*SLOW_MOTIONS, *SLOW_GROWTH])
-def test_motion_near_the_edge_is_judged_by_its_roots(case: Case) -> None:
+def test_roots_judge_motion_near_the_edge(case: Case) -> None:
     assert case.loop.compute_rates(1)[0] == pytest.approx(case.rate_per_s, abs=1e-5)
     found = certify_case(case)
     assert found.end.stability is Stability.NOT_STABLE

@@ -132,7 +132,7 @@ def test_theorem_covers_prismatic_joints(loop: SampledLoop) -> None:
     assert "the theorem, all of whose premises hold" in found.decision.rests_on
 
 
-def test_theorem_does_not_cover_prismatic_joints_over_a_delay_that_varies() -> None:
+def test_theorem_excludes_prismatic_joints_over_varying_delay() -> None:
     swinging = SLIDING[0]._replace(delays=sine(80.0, 60.0, 1.5))
     found = tn.certify(tn.simulate(write_sliding(swinging, 20.0)))
     assert "the theorem" not in found.decision.rests_on
@@ -178,7 +178,7 @@ def measure_start(loop: SampledLoop, ticks: int) -> Any:
 
 
 @pytest.mark.parametrize("loop", PUSHED_LOOPS)
-def test_push_at_zero_keeps_the_history_of_the_run(loop: SampledLoop) -> None:
+def test_push_at_zero_keeps_the_runs_history(loop: SampledLoop) -> None:
     """The peers of a twin see the old pose for one delay, those of another start never do."""
     still = np.zeros((len(loop.names), len(loop.inertia)))
     pushed = still.copy()
@@ -191,7 +191,7 @@ def test_push_at_zero_keeps_the_history_of_the_run(loop: SampledLoop) -> None:
     np.testing.assert_allclose(measure_start(loop, last), start, rtol=1e-3, atol=1e-11)
 
 
-def test_push_at_zero_is_nearly_another_start_without_a_delay() -> None:
+def test_push_without_delay_nearly_equals_another_start() -> None:
     """The peers see the old pose for one tick only."""
     loop = SampledLoop(PAIR, constant(0.0), 10.0, 2.6, (), 1000)
     twin = measure_twin(loop, 0.5)

@@ -1,4 +1,6 @@
-"""Code from a log: none is imported unless somebody names its file (docs/sessions/code-that-runs.md)."""
+"""Code from a log: no module is imported unless the user names its file
+(docs/sessions/code-that-runs.md).
+"""
 
 import hashlib
 import json
@@ -115,7 +117,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def place(logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """The folder of a log, in which commands run; nothing is allowed, and nothing remembered."""
+    """The folder of a log in which commands run; no code is allowed or remembered."""
     shutil.copy(logs / "run.mcap", tmp_path)
     monkeypatch.setenv("WITNESS", str(tmp_path / "witness"))
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "settings"))
@@ -147,7 +149,7 @@ def _marks(words: list[str], law: str) -> tuple[Any, ...]:
         for case in CASES
     ],
 )
-def test_no_command_imports_what_a_log_names(
+def test_no_command_imports_modules_named_in_logs(
     words: list[str], code: int, law: str, logs: Path, place: Path
 ) -> None:
     for name, text in FILES[law].items():
@@ -176,7 +178,7 @@ def test_no_command_imports_what_a_log_names(
         ),
     ],
 )
-def test_looking_for_a_module_runs_nothing_either(code: str, place: Path) -> None:
+def test_looking_for_a_module_runs_no_code(code: str, place: Path) -> None:
     """Python's finder of distutils imports the setuptools that is nearest."""
     for name in ("setuptools/__init__.py", "distutils/__init__.py", "a/b/c.py"):
         (place / name).parent.mkdir(parents=True)
@@ -192,7 +194,7 @@ def test_looking_for_a_module_runs_nothing_either(code: str, place: Path) -> Non
     assert "Traceback" not in done.stderr
 
 
-def test_verify_says_what_was_not_executed_and_how_to_permit_it(
+def test_verify_names_skipped_code_and_its_permission(
     tmp_path: Path,
 ) -> None:
     # The other tests need to be the first that import mylaws.
@@ -211,13 +213,13 @@ def test_verify_says_what_was_not_executed_and_how_to_permit_it(
     assert "150/150 records identical" in allowed.out
 
 
-def test_the_table_has_all_that_was_asked_for() -> None:
+def test_the_table_covers_every_requested_case() -> None:
     assert len(CASES) >= 26
     assert {law for _, _, law in CASES} == set(FILES)
 
 
 def list_commands(command: Any, *words: str) -> Iterator[str]:
-    """Every command of the program, by its words."""
+    """Returns every command of the program, by its words."""
     if not hasattr(command, "commands"):
         yield " ".join(words)
         return
@@ -248,7 +250,9 @@ RUN_NONE = {
 
 @pytest.mark.push
 def test_the_page_lists_every_command() -> None:
-    """A row of `docs/sessions/code-that-runs.md` says of each command whose code it runs; the others run none."""
+    """A row of `docs/sessions/code-that-runs.md` says of each command whose code it runs;
+    commands without row run none.
+    """
     page = Path(__file__).parents[2] / "docs" / "sessions" / "code-that-runs.md"
     rows = [
         line
@@ -284,7 +288,7 @@ ONLY_NAMING_OWN: dict[str, list[str]] = {
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", [*RUNNING_OWN, *ONLY_NAMING_OWN])
-def test_command_runs_own_code_as_the_page_says(name: str, place: Path) -> None:
+def test_commands_run_own_code_as_documented(name: str, place: Path) -> None:
     (place / "mylaws.py").write_text(LAW)
     setting = ("--set", "sites.s.control.law=mylaws:Spring", "--set", "duration_s=0.5")
     shown = trilat("scenario", "show", "paper", *setting, cwd=place).succeeds()
@@ -306,7 +310,7 @@ def imports(place: Path) -> list[str]:
     return witness.read_text().split(";")[:-1] if witness.exists() else []
 
 
-def test_the_named_file_runs_and_no_other_of_its_name(place: Path) -> None:
+def test_only_the_named_file_runs(place: Path) -> None:
     (place / "mylaws.py").write_text(FILES["foreign"]["mylaws.py"])
     (place / "kept").mkdir()
     file = place / "kept" / "spring-v1.py"
@@ -319,7 +323,7 @@ def test_the_named_file_runs_and_no_other_of_its_name(place: Path) -> None:
     assert not list(file.parent.glob("__pycache__"))
 
 
-def test_what_is_cached_beside_a_law_is_not_run(place: Path) -> None:
+def test_caches_beside_a_law_never_run(place: Path) -> None:
     import importlib.util
     import py_compile
 
@@ -359,7 +363,7 @@ def test_what_is_cached_beside_a_law_is_not_run(place: Path) -> None:
         (None, "mylaws.py", ScenarioError, "cannot be read"),
     ],
 )
-def test_a_file_that_differs_is_refused_before_it_runs(
+def test_a_different_file_is_refused_before_running(
     text: str | None, name: str, error: type[Exception], fact: str, place: Path
 ) -> None:
     if text is not None:
@@ -372,7 +376,7 @@ def test_a_file_that_differs_is_refused_before_it_runs(
     assert not imports(place)
 
 
-def test_file_that_changes_after_it_was_allowed_does_not_run(place: Path) -> None:
+def test_files_changed_after_permission_do_not_run(place: Path) -> None:
     file = place / "mylaws.py"
     file.write_text(LAW)
     log = tn.open_log("run.mcap", law=file)
@@ -383,7 +387,7 @@ def test_file_that_changes_after_it_was_allowed_does_not_run(place: Path) -> Non
     assert not imports(place)
 
 
-def test_a_remembered_file_runs_for_its_hash_alone(place: Path) -> None:
+def test_a_remembered_file_runs_for_its_hash(place: Path) -> None:
     file = place / "kept.py"
     file.write_text(LAW)
     trilat("verify", "run.mcap", "--remember", cwd=place).refuses("give --law FILE too")
@@ -424,7 +428,7 @@ def save_log_of_reader(
 
 @pytest.fixture
 def reader(place: Path) -> Path:
-    """A law that reads a file, a log of its user, and logs of strangers with the same hash."""
+    """Writes a law that reads a file, a log of its user, and logs of strangers with the same hash."""
     (place / "mylaws.py").write_text(READER)
     for name in ("gains.csv", "secret.txt"):
         (place / name).write_text("1")
@@ -455,7 +459,7 @@ def test_remembered_file_runs_with_remembered_settings_alone(reader: Path) -> No
 
 
 def test_law_of_own_run_allows_no_strangers_settings(reader: Path) -> None:
-    """A notebook in which somebody ran a law opens a stranger's log of the same law."""
+    """A notebook that has run a law opens a stranger's log of the same law."""
     tn.simulate(
         "two_sites", {"control.law": "mylaws:Spring", "control.K": 50.0}, duration_s=0.05
     )
@@ -474,7 +478,7 @@ def test_law_of_own_run_allows_no_strangers_settings(reader: Path) -> None:
     assert not imports(reader)
 
 
-def test_figures_run_the_laws_that_a_user_permitted_and_no_others(reader: Path) -> None:
+def test_figures_run_only_permitted_laws(reader: Path) -> None:
     stranger = tn.open_log("stranger.mcap")
     tn.figure(stranger, "overview")
     assert "twins" not in list_drawable_figures(stranger)
@@ -490,7 +494,7 @@ def test_figures_run_the_laws_that_a_user_permitted_and_no_others(reader: Path) 
 
 
 @pytest.mark.usefixtures("reader")
-def test_settings_that_a_person_changes_may_run() -> None:
+def test_settings_changed_by_a_person_may_run() -> None:
     log = tn.open_log("own.mcap", law="mylaws.py")
     again = tn.rerun(log, ["s"], {"sites.s.control.K": 60.0})
     assert again.sites["s"].executed == 50
@@ -533,7 +537,7 @@ def test_code_with_other_settings_is_withheld(keys: dict[str, Any]) -> None:
         import_class(CodeKey.of(other), "sites.s", named.method)
 
 
-def test_a_law_of_this_process_own_run_needs_nothing(place: Path) -> None:
+def test_laws_of_this_process_need_no_permission(place: Path) -> None:
     (place / "ownlaw.py").write_text(LAW)
     log = tn.simulate("two_sites", {"control.law": "ownlaw:Spring"}, duration_s=0.05)
     log.save("own.mcap")
@@ -549,7 +553,7 @@ def test_a_law_of_this_process_own_run_needs_nothing(place: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_compiled_law_runs_from_the_file_that_was_named(place: Path) -> None:
+def test_a_compiled_law_runs_from_the_named_file(place: Path) -> None:
     folder = place / "laws"
     folder.mkdir()
     (place / "gains.py").write_text(WITNESS)  # of the working directory

@@ -1,4 +1,4 @@
-"""`trilat experiment`: from a protocol to its table, and what is wrong in a sentence."""
+"""`trilat experiment`: from a protocol to its table, and refusals in a sentence."""
 
 import json
 import re
@@ -32,7 +32,7 @@ def test_a_protocol_becomes_a_table(tmp_path: Path) -> None:
     assert "is missing" in trilat("experiment", "status", folder, cwd=tmp_path).err
 
 
-def test_what_is_wrong_is_said_in_a_sentence(tmp_path: Path) -> None:
+def test_errors_are_one_sentence(tmp_path: Path) -> None:
     trilat("experiment", "new", "reaching.toml", cwd=tmp_path).succeeds()
     file = tmp_path / "reaching.toml"
     text = file.read_text(encoding="utf-8")
@@ -49,7 +49,7 @@ def test_what_is_wrong_is_said_in_a_sentence(tmp_path: Path) -> None:
     )
 
 
-def test_protocol_of_two_people_runs_as_it_is_written(tmp_path: Path) -> None:
+def test_two_person_protocols_run_as_written(tmp_path: Path) -> None:
     trilat("experiment", "new", "two-people.toml", "--pair", cwd=tmp_path).succeeds()
     told = trilat("experiment", "check", "two-people.toml", cwd=tmp_path).succeeds()
     assert "3 conditions of 1 + 10 trials: 33 trials" in told

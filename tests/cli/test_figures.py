@@ -32,7 +32,7 @@ def test_figures_are_written_by_name(folder: Path) -> None:
 
 
 @pytest.mark.long
-def test_the_default_is_pdf_and_png_beside_the_log(folder: Path) -> None:
+def test_the_default_is_pdf_and_png(folder: Path) -> None:
     done = trilat("figure", "run.mcap", "control_torques", "--width", "7", "--json", cwd=folder)
     paths = json.loads(done.succeeds())
     assert paths == [f"run-figures/control_torques.{kind}" for kind in ("pdf", "png")]
@@ -42,7 +42,7 @@ def test_the_default_is_pdf_and_png_beside_the_log(folder: Path) -> None:
     )
 
 
-def test_the_list_says_what_a_log_has_nothing_for(folder: Path) -> None:
+def test_the_list_names_impossible_figures(folder: Path) -> None:
     printed = trilat("figure", "run.mcap", "--list", cwd=folder).succeeds()
     assert "settling times" in printed
     assert "no site has a wall" in printed
@@ -61,7 +61,7 @@ def test_the_list_says_what_a_log_has_nothing_for(folder: Path) -> None:
         (["phase", "--out", "run.mcap"], ["run.mcap"]),
     ],
 )
-def test_what_cannot_be_drawn_is_refused(
+def test_impossible_figures_are_refused(
     folder: Path, words: list[str], facts: list[str]
 ) -> None:
     trilat("figure", "run.mcap", *words, cwd=folder).refuses(*facts)

@@ -45,7 +45,7 @@ def printed(*arguments: str) -> str:
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
-def test_every_command_has_help_with_example_and_explains_its_options(
+def test_commands_have_help_examples_and_explained_options(
     command: list[str],
 ) -> None:
     text = printed(*command, "-h")
@@ -67,7 +67,7 @@ def test_every_command_has_help_with_example_and_explains_its_options(
         assert "--set" in text
 
 
-def test_the_main_help_names_what_to_begin_with() -> None:
+def test_the_main_help_names_first_steps() -> None:
     assert "trilat demo paper" in printed("--help")
 
 
@@ -86,7 +86,7 @@ def test_the_main_help_has_six_panels() -> None:
 
 
 @pytest.mark.parametrize("name", sorted({name.split()[0] for name in NAMES}))
-def test_a_purpose_fits_on_one_line_of_the_main_help(name: str) -> None:
+def test_purposes_fit_one_line_of_main_help(name: str) -> None:
     (line,) = re.findall(rf"^│ {name} +(.+?) +│$", printed("--help"), re.MULTILINE)
     assert len(line) <= 64
     assert re.fullmatch(r"[A-Z].*[.?]", line)
@@ -94,7 +94,7 @@ def test_a_purpose_fits_on_one_line_of_the_main_help(name: str) -> None:
 
 
 @pytest.mark.parametrize("command", [*map(" ".join, COMMANDS), *GROUPS])
-def test_a_help_ends_with_an_example_and_a_page(command: str) -> None:
+def test_help_ends_with_an_example_and_page(command: str) -> None:
     *_, example, page = (
         line for line in printed(*command.split(), "-h").splitlines() if line.strip()
     )
@@ -105,7 +105,7 @@ def test_a_help_ends_with_an_example_and_a_page(command: str) -> None:
 
 
 @pytest.mark.parametrize("command", [*map(" ".join, COMMANDS), *GROUPS])
-def test_a_help_starts_with_one_sentence(command: str) -> None:
+def test_help_starts_with_one_sentence(command: str) -> None:
     found: Any = typer.main.get_command(app)
     for word in command.split():
         found = found.commands[word]
@@ -114,15 +114,15 @@ def test_a_help_starts_with_one_sentence(command: str) -> None:
     assert not re.search(r"[.?] [A-Z]", purpose)
 
 
-def test_help_lists_all_laws_that_can_be_tuned() -> None:
+def test_help_lists_all_tunable_laws() -> None:
     listed = {*list_laws(), "known"}
     assert listed == set(SEARCH_SPACES)
     words = " ".join(re.sub("[│|]", " ", printed("compare", "--help")).split())
     assert all(re.search(rf"\b{law}\b", words) for law in listed)
 
 
-def test_only_commands_that_accept_folders_of_logs_offer_them(tmp_path: Path) -> None:
-    """The others name the logs in the folder."""
+def test_only_folder_commands_offer_folders_of_logs(tmp_path: Path) -> None:
+    """The other commands name the logs in the folder."""
     simulated(tmp_path, "paper", seconds="0.05")
     (tmp_path / "logs").mkdir()
     (tmp_path / "run.mcap").rename(tmp_path / "logs" / "one.mcap")

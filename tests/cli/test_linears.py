@@ -11,7 +11,7 @@ from .running import trilat
 AT = ("--pose", "0.07,0.23")
 
 
-def test_it_prints_rest_roots_verdict_and_margin(tmp_path: Path) -> None:
+def test_output_has_rest_roots_verdict_and_margin(tmp_path: Path) -> None:
     printed = trilat(
         "linear", "p_d_margin", "--set", "control.d=0.9", *AT, cwd=tmp_path
     ).succeeds()
@@ -28,7 +28,7 @@ def test_it_prints_rest_roots_verdict_and_margin(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_it_says_where_stability_changes_over_a_key(tmp_path: Path) -> None:
+def test_output_says_where_stability_changes_over_keys(tmp_path: Path) -> None:
     over = ("--over", "control.d=0.1:3", "--over", "link.delay_ms=1:50")
     printed = trilat(
         "linear", "p_d_margin", "--no-ports", "--pose=-0.1,0.3", *over, cwd=tmp_path
@@ -39,7 +39,7 @@ def test_it_says_where_stability_changes_over_a_key(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_json_has_all(tmp_path: Path) -> None:
+def test_json_has_all_results(tmp_path: Path) -> None:
     over = ("--over", "control.d=0.5:2")
     told = json.loads(
         trilat("linear", "p_d_margin", *AT, *over, "--json", cwd=tmp_path).succeeds()
@@ -50,7 +50,7 @@ def test_json_has_all(tmp_path: Path) -> None:
     assert edge["stable_above"] is True
 
 
-def test_a_figure_is_the_same_file_every_time(tmp_path: Path) -> None:
+def test_figures_are_reproducible_files(tmp_path: Path) -> None:
     for name in ("one.svg", "two.svg"):
         trilat(
             "linear", "p_d_margin", "--no-ports", *AT, "--figure", name, cwd=tmp_path
@@ -77,13 +77,13 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("kind", REFUSED)
-def test_bad_input_is_one_line_and_exit_code_2(kind: str, tmp_path: Path) -> None:
+def test_bad_input_exits_2_with_one_line(kind: str, tmp_path: Path) -> None:
     arguments, facts = REFUSED[kind]
     trilat("linear", *arguments, cwd=tmp_path).refuses(*facts)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_figure_that_exists_is_kept(tmp_path: Path) -> None:
+def test_an_existing_figure_is_kept(tmp_path: Path) -> None:
     (tmp_path / "map.png").write_text("precious")
     trilat("linear", "free", *AT, "--figure", "map.png", cwd=tmp_path).refuses(
         "map.png", "exists", "--force"
@@ -91,8 +91,8 @@ def test_a_figure_that_exists_is_kept(tmp_path: Path) -> None:
     assert (tmp_path / "map.png").read_text() == "precious"
 
 
-def test_a_hand_that_was_identified_holds_the_ports(tmp_path: Path) -> None:
-    """As docs/studies/measured-hands.md has it, with the sines of its page."""
+def test_an_identified_hand_holds_the_ports(tmp_path: Path) -> None:
+    """As documented in docs/studies/measured-hands.md, with the sines of that page."""
     (sines,) = (
         block.text
         for block in find_blocks("docs/studies/measured-hands.md")

@@ -29,7 +29,7 @@ def test_json_is_for_programs(tmp_path: Path) -> None:
     assert "exceeds" in found["unknown"]["sites.m1.settle_s"]
 
 
-def test_who_felt_what_is_told(tmp_path: Path) -> None:
+def test_felt_torques_are_reported(tmp_path: Path) -> None:
     file = simulated(tmp_path, "force_sharing", "rate_hz=100", seconds="15")
     printed = trilat("metrics", file, "--all", cwd=tmp_path).succeeds()
     (line,) = (line for line in printed.splitlines() if line.startswith("14.0 - 15.0 s"))

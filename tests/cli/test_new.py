@@ -36,7 +36,7 @@ def test_the_skeleton_is_a_law_and_replaces_nothing(
     trilat("new", "law", "my-law.py", cwd=tmp_path).refuses("such as mylaw.py or my_law.py")
 
 
-def test_a_law_that_is_compiled_anew_needs_no_notice(tmp_path: Path) -> None:
+def test_laws_compiled_anew_need_no_notice(tmp_path: Path) -> None:
     """The core is in the cache after the first run; the law is compiled by every process."""
     trilat("new", "law", "swift.py", cwd=tmp_path)
     words = ["sim", "two_sites", "--duration", "0.1", "--set", "control.law=swift:Swift"]
@@ -62,7 +62,7 @@ def test_the_test_of_the_skeleton_passes(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_report_judges_a_permitted_law_as_certify_does(tmp_path: Path) -> None:
+def test_reports_judge_permitted_laws_like_certify(tmp_path: Path) -> None:
     made = trilat("new", "law", "mine.py", cwd=tmp_path)
     assert "trilat certify mine.mcap --law mine.py" in made.out
     run = ["sim", "free", "--set", "control.law=mine:Mine", "--duration", "8"]

@@ -1,4 +1,4 @@
-"""A command, and the study behind it, are one file: the program knows one that was put beside the others."""
+"""A command and its study are one file: the program finds a command that was put beside the others."""
 
 from pathlib import Path
 
@@ -71,7 +71,7 @@ print(json.dumps({
 """
 
 
-def test_file_beside_others_is_command_and_its_study(tmp_path: Path) -> None:
+def test_an_added_file_is_command_and_study(tmp_path: Path) -> None:
     put_beside(tmp_path, "app/cli", "lag.py", STUDY)
     found = look(LOOK, tmp_path)
     assert "Measures how far the slave lags, seed by seed." in found["listed"]

@@ -1,4 +1,4 @@
-"""No command writes through a symbolic link that somebody has planted in place of its outputs."""
+"""No command writes through a symbolic link that somebody planted in place of its outputs."""
 
 import shutil
 from pathlib import Path
@@ -94,7 +94,7 @@ def list_content(folder: Path) -> dict[Path, bytes | None]:
         for words in CASES
     ],
 )
-def test_planted_links_lead_no_command_elsewhere(
+def test_planted_links_redirect_no_command(
     words: list[str], inputs: Path, tmp_path: Path
 ) -> None:
     """Runs the command, puts links in place of each of its outputs, and runs it again."""

@@ -1,6 +1,7 @@
-"""Keys that do not fit: every row is a command with a folder of keys, and the reason for which it refuses.
+"""Unsuitable keys: every row is a command with a folder of keys, and the reason for the
+refusal.
 
-Nothing is reached: what is refused is refused before a connection is opened.
+Each refusal comes before a connection is opened.
 """
 
 import json
@@ -34,7 +35,9 @@ Change = Callable[[Path], object]
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Keys of a session, and as `old`, `early` and `others` such as have ended, begin later, are foreign."""
+    """Makes keys of a session, and as `old`, `early` and `others` keys that have ended, begin
+    later, or are foreign.
+    """
     folder = tmp_path_factory.mktemp("keys")
     create_keys(folder / "k", MEMBERS_MADE)
     create_keys(folder / "others", MEMBERS_MADE)
@@ -76,7 +79,7 @@ OF_ANOTHER = [
 @pytest.mark.parametrize(
     ("words", "whose", "due"), OF_ANOTHER, ids=lambda value: str(value)[:40]
 )
-def test_a_command_takes_the_keys_of_who_it_is(
+def test_commands_take_the_keys_of_their_member(
     words: Sequence[str], whose: str, due: str, made: Path, tmp_path: Path
 ) -> None:
     place = words.index("link") if "link" in words else len(words)
@@ -104,7 +107,9 @@ FROM_PYTHON = [
 
 
 @pytest.mark.parametrize(("act", "whose", "due"), FROM_PYTHON)
-def test_python_takes_the_keys_of_who_it_is(act: Any, whose: str, due: str, made: Path) -> None:
+def test_python_takes_the_keys_of_its_member(
+    act: Any, whose: str, due: str, made: Path
+) -> None:
     with pytest.raises(UsageError, match=TWO_NAMES.removeprefix("--").format(whose, due)):
         act(made / "k" / whose)
 
@@ -126,7 +131,7 @@ ENDPOINTS = [
 
 
 @pytest.mark.parametrize(("option", "place", "reason"), ENDPOINTS)
-def test_an_endpoint_with_keys_is_encrypted_as_they_say(
+def test_endpoints_with_keys_are_encrypted_as_stated(
     option: str, place: str, reason: str, made: Path, tmp_path: Path
 ) -> None:
     trilat(*SITE, made / "k" / "m1", option, place, cwd=tmp_path).refuses(place, reason)
@@ -150,7 +155,7 @@ ZENOH_FILES = [
 
 
 @pytest.mark.parametrize(("text", "reason"), ZENOH_FILES)
-def test_ones_own_zenoh_settings_do_not_loosen_keys(
+def test_a_users_zenoh_settings_cannot_loosen_keys(
     text: str, reason: str, made: Path, tmp_path: Path
 ) -> None:
     file = tmp_path / "own.json5"
@@ -226,7 +231,7 @@ SPOILT: list[tuple[Change, str]] = [
 @pytest.mark.parametrize(
     ("change", "reason"), SPOILT, ids=[reason[:40] for _, reason in SPOILT]
 )
-def test_keys_that_are_spoilt_are_refused(change: Change, reason: str, keys: Path) -> None:
+def test_spoilt_keys_are_refused(change: Change, reason: str, keys: Path) -> None:
     read_member_keys(keys / "m1")
     change(keys)
     done = trilat(*SITE, keys / "m1", cwd=keys)
@@ -234,20 +239,20 @@ def test_keys_that_are_spoilt_are_refused(change: Change, reason: str, keys: Pat
     assert "secret" not in done.err
 
 
-def test_the_keys_of_all_are_no_members(made: Path, tmp_path: Path) -> None:
+def test_the_folder_of_all_keys_is_no_member(made: Path, tmp_path: Path) -> None:
     trilat(*RECORD, made / "k", cwd=tmp_path).refuses(
         "has the keys of all members; name the folder of one member"
     )
 
 
-def test_a_folder_shared_with_the_sticky_bit_will_do(keys: Path) -> None:
-    """As the volumes of containers are: sticky."""
+def test_folders_with_the_sticky_bit_are_accepted(keys: Path) -> None:
+    """The volumes of containers are such folders."""
     (keys / "m1").chmod(0o1777)
     assert read_member_keys(keys / "m1").member == "m1"
 
 
 def test_files_of_another_user_are_refused(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whoever may write the folder above puts a folder of his own there."""
+    """Whoever may write the folder above could replace the folder of keys."""
     own = (made / "k" / "m1" / MEMBERS).stat()
     theirs = os.stat_result((own.st_mode, *own[1:4], 65533, *own[5:10]))
     monkeypatch.setattr(os, "geteuid", lambda: 65534)
@@ -273,7 +278,7 @@ NEW = [
 
 
 @pytest.mark.parametrize(("words", "reason"), NEW, ids=lambda value: str(value)[:40])
-def test_no_keys_are_made_for_many_and_nothing_is_left(
+def test_invalid_requests_for_keys_leave_no_files(
     words: list[str], reason: str, tmp_path: Path
 ) -> None:
     trilat("keys", "new", "k", *words, cwd=tmp_path).refuses(reason)
@@ -295,10 +300,10 @@ def test_python_makes_keys_for_so_many_days(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("failing", range(1, 11))
-def test_keys_are_made_whole_or_not_at_all(
+def test_keys_are_complete_or_absent(
     failing: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The disk refuses the n-th file, or Ctrl-C comes there: what was made before goes too."""
+    """The disk refuses the n-th file, or Ctrl-C comes there: earlier files are removed too."""
     put, written = member_keys._write_new_file, list[Path]()
 
     def refuse(error: BaseException) -> Callable[[Path, bytes], None]:
@@ -338,8 +343,8 @@ def test_keys_are_private_whatever_the_umask(tmp_path: Path) -> None:
     assert read_member_keys(tmp_path / "k" / "m1").ends > datetime.now(UTC) + timedelta(days=29)
 
 
-def test_the_right_keys_are_taken(made: Path, tmp_path: Path) -> None:
-    """By a process of its own, which listens over TLS where it would over TCP, and waits for the others."""
+def test_valid_keys_are_accepted(made: Path, tmp_path: Path) -> None:
+    """By a process of its own, which listens over TLS instead of TCP, and waits for the others."""
     words = [*COMMAND, *SITE, str(made / "k" / "m1"), "--join-timeout", "0"]
     done = subprocess.run(
         words,
@@ -353,11 +358,11 @@ def test_the_right_keys_are_taken(made: Path, tmp_path: Path) -> None:
     assert done.returncode == 2
 
 
-def test_the_table_has_its_forty_rows() -> None:
+def test_the_table_has_forty_rows() -> None:
     assert sum(map(len, (OF_ANOTHER, FROM_PYTHON, ENDPOINTS, ZENOH_FILES, SPOILT, NEW))) >= 40
 
 
-def test_what_is_printed_of_keys_agrees_with_their_rules(tmp_path: Path) -> None:
+def test_printed_settings_agree_with_key_rules(tmp_path: Path) -> None:
     """A few lines for a person, the settings of Zenoh on request, and the same in JSON."""
     create_keys(tmp_path / "k", MEMBERS_MADE, ["192.0.2.7"])
     for member in MEMBERS_MADE:

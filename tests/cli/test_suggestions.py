@@ -1,4 +1,4 @@
-"""What a user meant instead: commands by their synonyms, and keys by the table that has them."""
+"""Suggestions for mistaken input: commands for their synonyms, and keys with their table."""
 
 import re
 import shutil
@@ -42,7 +42,7 @@ def test_an_unknown_command_suggests_one(
     assert f"did you mean {suggestion}" in in_one_line(done.err)
 
 
-def test_subjects_without_command_lead_to_existing_pages(tmp_path: Path) -> None:
+def test_subjects_without_command_lead_to_pages(tmp_path: Path) -> None:
     text = in_one_line(trilat("lerobot", cwd=tmp_path).err)
     assert "trilat log export FILE --to lerobot" in text
     commands = whole_command().commands
@@ -53,7 +53,7 @@ def test_subjects_without_command_lead_to_existing_pages(tmp_path: Path) -> None
         assert all((ROOT / page).is_file() for page in pages)
 
 
-def test_a_word_like_no_command_lists_all(tmp_path: Path) -> None:
+def test_an_unrelated_word_lists_all_commands(tmp_path: Path) -> None:
     text = in_one_line(trilat("log", "zzzzzz", cwd=tmp_path).err)
     assert "trilat log has the commands info" in text
 
@@ -107,7 +107,7 @@ def test_an_unknown_key_suggests_the_whole_path(
     ],
 )
 @pytest.mark.parametrize("command", ["sim", "linear"])
-def test_a_setting_that_the_shell_splits_is_to_be_quoted(
+def test_a_setting_split_by_the_shell_needs_quotes(
     setting: str, command: str, tmp_path: Path
 ) -> None:
     bash = shutil.which("bash")
@@ -133,7 +133,7 @@ def test_a_setting_that_the_shell_splits_is_to_be_quoted(
         ["--set", "no form"],
     ],
 )
-def test_whole_settings_are_left_alone(words: list[str]) -> None:
+def test_whole_settings_stay_unchanged(words: list[str]) -> None:
     assert find_split_setting(words) == ""
 
 
@@ -142,7 +142,7 @@ def test_the_case_of_a_gain_is_corrected(tmp_path: Path) -> None:
     trilat("scenario", "check", "paper", *words, cwd=tmp_path).refuses("did you mean 'd'?")
 
 
-def test_a_faint_similarity_elsewhere_suggests_nothing() -> None:
+def test_faint_similarity_suggests_nothing() -> None:
     assert suggest_nearest("foo", ["name", "seed"], ["control.follows"]) == ""
     assert find_nearest("x" * 81, ["x" * 81]) == ""
 
@@ -158,9 +158,7 @@ class Torques:
 
 
 @pytest.mark.parametrize("written", ["torques.py", "torques"])
-def test_a_file_in_place_of_a_law_is_answered_with_its_class(
-    written: str, tmp_path: Path
-) -> None:
+def test_a_file_as_law_suggests_its_class(written: str, tmp_path: Path) -> None:
     (tmp_path / "torques.py").write_text(SUM_OF_NOTHING, "utf-8")
     words = ("sim", "two_sites", "--set", f"control.law={written}")
     trilat(*words, cwd=tmp_path).refuses("write torques:Torques")

@@ -1,4 +1,4 @@
-"""What holds for every command: results as JSON, outputs by one option, completion, a version."""
+"""Rules for every command: results as JSON, outputs by one option, completion, a version."""
 
 import json
 import subprocess
@@ -35,11 +35,11 @@ NO_RESULT = {
 """Commands that print what they do, and find nothing."""
 
 
-def test_every_command_that_finds_something_prints_it_as_json() -> None:
+def test_every_command_with_results_prints_json() -> None:
     assert {name for name in COMMANDS if "--json" not in OPTIONS[name]} == NO_RESULT
 
 
-def test_every_output_is_named_alike() -> None:
+def test_outputs_have_one_option_name() -> None:
     for name, names in OPTIONS.items():
         given = {"-o", "--out", "--output"} & set(names)
         assert not given or given >= {"-o", "--out"}, name
@@ -63,7 +63,7 @@ def test_the_version_is_that_of_the_package() -> None:
         pytest.param(f"twin {GOLDEN_LOG} --push m", {"m1", "m2"}, marks=pytest.mark.long),
     ],
 )
-def test_a_shell_completes(words: str, found: set[str]) -> None:
+def test_shells_complete_commands(words: str, found: set[str]) -> None:
     asked = {"_TRILAT_COMPLETE": "complete_fish", "_TYPER_COMPLETE_FISH_ACTION": "get-args"}
     code = "from trilat_net.app.cli import app; app(prog_name='trilat')"
     done = subprocess.run(
@@ -76,7 +76,7 @@ def test_a_shell_completes(words: str, found: set[str]) -> None:
 
 
 @pytest.mark.long
-def test_what_was_made_is_named_as_json(tmp_path: Path) -> None:
+def test_created_files_are_named_in_json(tmp_path: Path) -> None:
     made = json.loads(
         trilat("sim", "two_sites", "--duration", "0.1", "--json", cwd=tmp_path).succeeds()
     )
@@ -97,7 +97,7 @@ def test_what_was_made_is_named_as_json(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_sweep_is_json_while_its_lines_go_aside(tmp_path: Path) -> None:
+def test_a_sweeps_json_keeps_progress_lines_aside(tmp_path: Path) -> None:
     over = ("--over", "control.d=0.3,3", "--duration", "2", "--jobs", "1", "-o", "grid")
     first = trilat("sweep", "p_d_margin", *over, "--json", cwd=tmp_path)
     again = trilat("sweep", "grid", "--json", cwd=tmp_path)

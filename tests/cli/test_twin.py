@@ -24,7 +24,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_push_is_told_in_words_and_drawn(folder: Path) -> None:
+def test_pushes_are_described_and_drawn(folder: Path) -> None:
     asked = (
         "twin",
         "run.mcap",
@@ -48,13 +48,13 @@ def test_a_push_is_told_in_words_and_drawn(folder: Path) -> None:
     assert (folder / "twin.png").read_bytes() == first
 
 
-def test_one_joint_is_pushed_by_two_sizes(folder: Path) -> None:
+def test_two_sizes_push_one_joint(folder: Path) -> None:
     asked = ("twin", "run.mcap", "--push", "m.q1=1e-6", "--push", "m.q1=-1e-3")
     words = trilat(*asked, cwd=folder).succeeds().splitlines()
     assert [line.split()[3] for line in words] == ["1e-06", "-0.001"]
 
 
-def test_sizes_are_told_apart_from_what_is_linear(folder: Path) -> None:
+def test_sizes_are_separated_from_linear_growth(folder: Path) -> None:
     found = json.loads(
         trilat("twin", "run.mcap", "--delta", "1e-9:1e-3", "--json", cwd=folder).succeeds()
     )
@@ -95,13 +95,13 @@ def test_two_logs_are_refused(folder: Path, tmp_path: Path) -> None:
     trilat("twin", "run.mcap", other, cwd=folder).refuses("not a part of the session")
 
 
-def test_a_law_that_may_not_run_has_no_twin(folder: Path) -> None:
+def test_a_forbidden_law_has_no_twin(folder: Path) -> None:
     done = trilat("twin", OWN_LAW, cwd=folder)
     assert done.code == 4
     assert done.err.splitlines()[-1].startswith("error: ")
 
 
-def test_what_cannot_be_executed_again_has_no_twin() -> None:
+def test_unexecutable_logs_have_no_twin() -> None:
     lost, log = without_records({"m1": [7]}), tn.simulate("two_sites", duration_s=0.2)
     with pytest.raises(NotRepeatable, match="records of m1 are missing"):
         tn.twin(lost)
@@ -116,7 +116,7 @@ def test_what_cannot_be_executed_again_has_no_twin() -> None:
 
 
 @pytest.mark.parametrize("command", ["certify", "twin"])
-def test_help_tells_of_twins(command: str, folder: Path) -> None:
+def test_help_mentions_twins(command: str, folder: Path) -> None:
     assert "twin" in trilat(command, "--help", cwd=folder).succeeds()
 
 

@@ -59,7 +59,7 @@ def test_a_saturated_pull_ends_at_its_limit() -> None:
     assert -linear["tau_x"][0, 0] == pytest.approx(9.677, abs=5e-4)
 
 
-def test_saturation_turns_the_weighted_mean_into_a_vote() -> None:
+def test_saturation_makes_the_weighted_mean_a_vote() -> None:
     sites = {"m1": {"hands": [hand(0.3)]}, "m2": {"hands": [hand(-0.3)]}}
     vote = last_rows(three(SATURATED, (0.9, 0.1), sites), 40.0)[0]
     assert vote["q"][:, 0] == pytest.approx([0.2444, -0.2, 0.2389], abs=5e-5)
@@ -67,7 +67,7 @@ def test_saturation_turns_the_weighted_mean_into_a_vote() -> None:
     assert mean["q"][:, 0] == pytest.approx([0.135, -0.015, 0.120], abs=5e-4)
 
 
-def test_lee_and_spong_feel_clamp_and_drag_common_motion() -> None:
+def test_lee_and_spong_drag_common_motion() -> None:
     """The drag of both arms at one speed is 2 d + 2 K T = 4 K T at the bound."""
     law = {"law": "lee_spong", "K": 100.0, "Kd": 3.0, "T_max_ms": 200.0}
     clamped = last_rows(two(law, clamped=True), 30.0)[0]
@@ -86,7 +86,7 @@ def test_lee_and_spong_feel_clamp_and_drag_common_motion() -> None:
         ("digital", 0.0, 0.09, False),
     ],
 )
-def test_bound_of_lee_and_spong_is_met_at_edge(
+def test_lee_and_spong_bound_holds_at_edge(
     scheme: str, more_ms: float, P_e: float, holds: bool
 ) -> None:
     """As published, and with K h more for torques that are held."""
@@ -101,7 +101,7 @@ def test_bound_of_lee_and_spong_is_met_at_edge(
 
 @pytest.mark.long
 def test_users_share_authority_and_feel_no_environment() -> None:
-    """Hands that end at +-0.3 under the guidance that they feel, K (1 - a_i) 0.6."""
+    """Hands end at +-0.3 under the guidance that they feel, K (1 - a_i) 0.6."""
     stiff: dict[str, Any] = {
         "kind": "spring",
         "stiffness_nm_rad": 1e5,
@@ -138,7 +138,7 @@ def test_a_single_user_closes_no_loop() -> None:
 
 
 @pytest.mark.long
-def test_impedances_give_way_as_they_are_set() -> None:
+def test_impedances_yield_as_configured() -> None:
     push = {"kind": "recorded", "points": [[0.0, 0.0, 0.0], [1.0, 3.0, 3.0], [100.0, 3.0, 3.0]]}
     law = {"law": "impedance", "K": 50.0}
     sites: dict[str, Any] = {"m1": {"hands": [push]}, "s": {"control": {"follows": True}}}
@@ -159,7 +159,7 @@ PULSE = {"kind": "pulse", "start_s": 0.5, "end_s": 0.8, "peak_nm": [1.0, 0.5]}
 
 
 def spring(stiffness: float) -> dict[str, Any]:
-    """A hand or a wall without damping at the start pose."""
+    """Returns a hand or a wall without damping at the start pose."""
     return {**CLAMP, "stiffness_nm_rad": stiffness}
 
 
@@ -184,7 +184,7 @@ def impedances(
 
 
 def peak_motion(scenario: Scenario, first_s: float, last_s: float) -> float:
-    """The largest motion of the slave over a time, at steps of 20 ms."""
+    """Returns the largest motion of the slave over a time, at steps of 20 ms."""
     rows = last_rows(scenario, *np.arange(first_s, last_s, 0.02))
     return max(float(np.abs(row["q"][1]).max()) for row in rows)
 
@@ -215,7 +215,7 @@ HELD_LOOPS = {
 
 
 def largest_loop_gain(loop: dict[str, float], hand: float) -> float:
-    """The largest gain over all frequencies, with a spring hand at the master."""
+    """Returns the largest gain over all frequencies, with a spring hand at the master."""
     M, B, K, K_s, K_e, _ = loop.values()
     s = 1j * np.geomspace(0.1, 100.0, 20001)
     slave = K_e * (K_s + B * s) / (M * s**2 + B * s + K_s + K_e)
@@ -223,7 +223,8 @@ def largest_loop_gain(loop: dict[str, float], hand: float) -> float:
 
 
 def rightmost_root(loop: dict[str, float], delay_ms: float, near: complex) -> complex:
-    """Root of (M s^2 + B s + K_s + K_e) (M s^2 + B s + K + k) + K_e (K_s + B s) e^(-s T) by Newton.
+    """Returns the root of (M s^2 + B s + K_s + K_e) (M s^2 + B s + K + k) + K_e (K_s + B s)
+    e^(-s T) by Newton.
 
     T is the delay of both ways.
     """
@@ -247,7 +248,7 @@ def rightmost_root(loop: dict[str, float], delay_ms: float, near: complex) -> co
         *(pytest.param(name, marks=pytest.mark.long) for name in [*HELD_LOOPS][1:]),
     ],
 )
-def test_a_spring_hand_at_a_master_voids_the_small_gain_of_free_masters(name: str) -> None:
+def test_a_masters_spring_hand_voids_small_gain(name: str) -> None:
     loop, delay_ms, growth_per_s = HELD_LOOPS[name]
     M, _, K, _, _, k = loop.values()
     root = rightmost_root(loop, delay_ms, 0.3 + 1j * np.sqrt((K + k) / M))
@@ -262,7 +263,7 @@ def test_a_spring_hand_at_a_master_voids_the_small_gain_of_free_masters(name: st
 
 
 @pytest.mark.parametrize("name", HELD_LOOPS)
-def test_condition_states_the_gain_with_the_hands_at_the_masters(name: str) -> None:
+def test_the_condition_includes_the_masters_hands(name: str) -> None:
     """A weak hand leaves the gain below one, and the strongest hand does not."""
     loop, delay_ms, _ = HELD_LOOPS[name]
     for held, verdict in ((0.0, "holds"), (3.0, "holds"), (loop["hand"], "does not hold")):
@@ -274,12 +275,12 @@ def test_condition_states_the_gain_with_the_hands_at_the_masters(name: str) -> N
         assert stated == pytest.approx(gain, rel=5e-3)
 
 
-def test_condition_of_a_free_slave_states_the_stiffest_wall() -> None:
+def test_free_slave_condition_names_the_stiffest_wall() -> None:
     untouched = impedances(LOOP, constant(20.0), 12.0, hand=LOOP["hand"], wall=False)
     assert "up to 6.123 N m/rad at the slave" in describe_law_conditions(untouched)[0]
 
 
-def test_hands_that_are_no_springs_leave_the_small_gain_undecided() -> None:
+def test_other_hands_leave_small_gain_undecided() -> None:
     point = {"kind": "tip_spring", "to_m": [1.0, 0.5], "stiffness_n_m": [50.0, 50.0]}
     law = {"law": "impedance"}
     for hand_ in (point, {**spring(5.0), "sampled": True}):
@@ -303,7 +304,7 @@ SWINGS = (
 """Mean, amplitude, in ms, and period, in s, of a delay, and the rate of the growth, in 1/s."""
 
 
-def test_a_gain_below_one_is_undecided_where_delays_vary() -> None:
+def test_gains_below_one_need_constant_delays() -> None:
     told = describe_law_conditions(impedances(SWINGING, SWING, 10.0))[0]
     assert "is undecided: known for constant delays" in told
     told = describe_law_conditions(impedances(SWINGING, constant(440.0), 10.0))[0]
@@ -317,10 +318,10 @@ def test_a_gain_below_one_is_undecided_where_delays_vary() -> None:
     ("delay_ms", "amplitude_ms", "period_s", "growth_per_s"),
     SWINGS,
 )
-def test_a_delay_that_varies_makes_a_small_gain_grow(
+def test_a_varying_delay_makes_small_gains_grow(
     delay_ms: float, amplitude_ms: float, period_s: float, growth_per_s: float
 ) -> None:
-    """Constant delays of the range of a delay that swings decay."""
+    """Constant delays within the range of the swinging delay decay."""
     swing = {
         "model": "sine",
         "delay_ms": delay_ms,
@@ -356,17 +357,17 @@ def test_a_prediction_removes_the_delay_from_the_loop() -> None:
 
 
 @pytest.mark.long
-def test_a_prediction_that_lacks_the_contact_is_unstable_there() -> None:
+def test_predictions_that_lack_contact_are_unstable_there() -> None:
     rows = last_rows(two(SMITH, clamped=True, control={"predicts": True}), 20.0)[0]
     assert abs(rows["qd"]).max() > 1.0
 
 
-def test_a_law_that_compares_joints_is_refused_in_task_space() -> None:
+def test_joint_space_laws_are_refused_in_task_space() -> None:
     with pytest.raises(ScenarioError, match="saturated_pd compares arms joint by joint"):
         load_scenario("unlike_arms", {"control": SATURATED})
 
 
-def test_saturated_pull_and_gravity_must_fit_below_torque_limit() -> None:
+def test_saturated_pull_and_gravity_stay_below_limits() -> None:
     """The largest gravity over all poses of the textbook's arm."""
     changes = {"control.law": "saturated_pd", "control.P": 5.0, "control.d": 4.0}
     scenario = load_scenario("paper", changes)

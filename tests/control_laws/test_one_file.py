@@ -1,4 +1,4 @@
-"""A control law is one file: whoever knows laws knows one that was put beside the others."""
+"""A control law is one file: the program finds a law that was put beside the others."""
 
 from pathlib import Path
 
@@ -55,7 +55,7 @@ print(json.dumps({
 """
 
 
-def test_a_file_beside_the_others_is_a_law_everywhere(tmp_path: Path) -> None:
+def test_an_added_file_is_a_law_everywhere(tmp_path: Path) -> None:
     (tmp_path / "soft_spring.py").write_text(LAW)
     found = look(LOOK, tmp_path)
     assert found["control"] == [9.0, 9.0]

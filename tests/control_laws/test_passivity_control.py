@@ -1,4 +1,4 @@
-"""Time-domain passivity control on the unit arm: numbers of independent simulations, and what it is for."""
+"""Time-domain passivity control on the unit arm: numbers of independent simulations, and its purpose."""
 
 from typing import Any
 
@@ -28,7 +28,7 @@ def run(
 
 
 def watching(delay_ms: float, *, clamped: bool, duration_s: float = 30.0) -> Any:
-    """Without controllers, which is no choice of a scenario; hands as they are sampled."""
+    """Returns a run without controllers, which no scenario can choose; hands are sampled."""
     law = {
         "law": "trilat_net.laws.tdpa:Tdpa",
         **PUBLISHED,
@@ -93,14 +93,16 @@ def test_contact_stays_bounded() -> None:
 
 
 def mean_felt(result: Any) -> float:
-    """Over the last half of a run, N m/rad: as it is published it chatters."""
+    """Returns the mean over the last half of a run, N m/rad, because the published law chatters."""
     half = len(result["m"].q) // 2
     return float(abs(result["m"].tau_x[half:, 0]).mean() / result["m"].q[half:, 0].mean())
 
 
 @pytest.mark.long
-def test_books_of_steps_cost_no_stiffness_unlike_an_acceleration_margin() -> None:
-    """34.9 N m/rad as it is published, 71.8 by spring and clamp alone; the margin costs two thirds."""
+def test_books_of_steps_keep_their_stiffness() -> None:
+    """34.9 N m/rad as published, 71.8 by spring and clamp alone; the acceleration margin costs
+    two thirds.
+    """
     assert mean_felt(run_contact(120.0, **PUBLISHED)) == pytest.approx(34.9, rel=1e-2)
     by_step = run_contact(120.0)
     assert mean_felt(by_step) == pytest.approx(43.9, rel=1e-2)
@@ -129,8 +131,10 @@ TURNED = {
 
 
 @pytest.mark.long
-def test_change_of_dominance_is_paid_by_motion_that_follows() -> None:
-    """The weighted pose jumps, the goal does not; while masters rest, nothing pays for what is left."""
+def test_later_motion_pays_for_dominance_changes() -> None:
+    """The weighted pose jumps, the goal does not; while masters rest, nothing pays for the
+    remaining distance.
+    """
     sites = {
         "m1": {"hands": [hand(0.3, 100.0, 15.0)]},
         "m2": {"hands": [hand(-0.3, 100.0, 15.0)]},
@@ -153,8 +157,8 @@ def test_change_of_dominance_is_paid_by_motion_that_follows() -> None:
         assert run["s"].q[-1, 0] > 0.1 * m1 + 0.9 * m2 + 0.05
 
 
-def test_every_site_follows_unless_told_otherwise() -> None:
-    """An arm that nobody holds comes to rest with the others, where a leader's alone would coast."""
+def test_every_site_follows_by_default() -> None:
+    """An arm that nobody holds comes to rest with the others; with a leader alone it would coast."""
     sites = {
         "m": {
             "hands": [{"kind": "pulse", "start_s": 0.1, "end_s": 0.4, "peak_nm": [2.0, 1.0]}]
@@ -175,8 +179,10 @@ def test_every_site_follows_unless_told_otherwise() -> None:
 
 
 @pytest.mark.parametrize("clamped", [False, True])
-def test_energy_is_what_the_arm_gets(clamped: bool) -> None:
-    """The leader's account, told again from torque and step; books of velocity are off by tau qdd h^2 / 2."""
+def test_booked_energy_is_the_arms(clamped: bool) -> None:
+    """The leader's account, recomputed from torque and step; books of velocity are off by tau
+    qdd h^2 / 2.
+    """
     known = {"energy": "step", "reserve_J": 1e-3}
     result = run(50.0, clamped=clamped, duration_s=6.0, every=1, **known)
     m, s = result["m"], result["s"]
@@ -189,7 +195,7 @@ def test_energy_is_what_the_arm_gets(clamped: bool) -> None:
 
 
 @pytest.mark.long
-def test_a_mesh_of_three_observes_no_energy_of_its_own() -> None:
+def test_a_mesh_observes_no_energy_of_its_own() -> None:
     shares = {
         "m1": {"m2": 0.1, "s": 0.9},
         "m2": {"m1": 0.4, "s": 0.6},
@@ -202,6 +208,6 @@ def test_a_mesh_of_three_observes_no_energy_of_its_own() -> None:
         assert least_energy(ticked(scenario, every=7)) >= -1e-12
 
 
-def test_books_of_torque_that_is_held_are_for_digital_alone() -> None:
+def test_held_torque_books_need_the_digital_scheme() -> None:
     with pytest.raises(ScenarioError, match="choose 'digital'"):
         pair_of({"law": "tdpa"}, clamped=False, duration_s=1.0, scheme="second_order")

@@ -1,4 +1,4 @@
-"""Whatever was run, a certificate comes of it: in words, in finite numbers, and accusing nobody."""
+"""Every run has a certificate, in words and in finite numbers, that accuses nobody."""
 
 import json
 from typing import Any
@@ -50,7 +50,9 @@ changes = st.dictionaries(st.sampled_from(sorted(CHANGES)), st.integers(0, 2), m
 
 @settings(max_examples=25)
 @given(st.sampled_from(SCENARIOS), changes, st.sampled_from([0.02, 0.5, 1.5]))
-def test_every_run_is_certified(name: str, picks: dict[str, int], duration_s: float) -> None:
+def test_every_run_has_a_certificate(
+    name: str, picks: dict[str, int], duration_s: float
+) -> None:
     overrides = {key: CHANGES[key][pick % len(CHANGES[key])] for key, pick in picks.items()}
     try:
         scenario = load_scenario(name, {"rate_hz": 100, "duration_s": duration_s, **overrides})

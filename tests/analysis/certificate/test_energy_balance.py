@@ -1,8 +1,8 @@
-"""The energy balance closes, to the order of what made the log, and only with every term as it is.
+"""The energy balance closes, to the order of the integrator, and only with every term as
+derived.
 
-The energy balance of arms of n joints closes, with friction, stops, walls in space and limits too.
-
-The energy balance of sites that follow with their end effectors closes, and needs every term.
+The balance of arms of n joints closes with friction, stops, walls in space and limits. The
+balance of sites that follow with their end effectors closes, and needs every term.
 """
 
 import dataclasses
@@ -56,24 +56,24 @@ def order(name: str, fine_hz: int = 1000, **overrides: object) -> float:
 @pytest.mark.parametrize(
     "name", ["paper", pytest.param("free", marks=pytest.mark.long), "asymmetric"]
 )
-def test_the_balance_closes_to_2e_5_with_order_two(name: str) -> None:
+def test_balance_closes_to_2e_5_with_second_order(name: str) -> None:
     assert of_largest_v(runs.run(name, {"duration_s": 2.0, "rate_hz": 1000}).balance) <= 2e-5
     assert order(name, duration_s=2.0) == pytest.approx(2.0, abs=0.1)
 
 
-def test_it_closes_until_both_hands_have_let_go() -> None:
+def test_balance_closes_until_both_hands_let_go() -> None:
     """At a tenth of the rate a hundred times the error is allowed."""
     assert of_largest_v(runs.run("paper", {"duration_s": 11.5, "rate_hz": 100}).balance) <= 2e-3
 
 
-def test_digital_closes_to_some_percent_with_order_one() -> None:
+def test_digital_closes_to_some_percent_with_first_order() -> None:
     b = runs.run("paper", {"duration_s": 3.0, "scheme": "digital", "rate_hz": 500}).balance
     assert of_largest_v(b) == pytest.approx(3.2e-2, rel=0.2)
     assert order("paper", 500, duration_s=3.0, scheme="digital") == pytest.approx(1.0, abs=0.1)
     assert np.abs(b.unexplained).max() <= 4e-5 * b.scale
 
 
-def test_jitter_closes_to_1e_4_with_its_jumps_booked() -> None:
+def test_jitter_closes_to_1e_4_with_booked_jumps() -> None:
     b = runs.run("free", runs.JITTER).balance
     links = np.sum([x for name, x in b.work.items() if "->" in name], axis=0)
     assert of_largest_v(b) <= 1e-4
@@ -82,14 +82,16 @@ def test_jitter_closes_to_1e_4_with_its_jumps_booked() -> None:
 
 
 def test_jitter_is_of_order_one_at_least() -> None:
-    """Of some seeds together: which jumps a run has is a matter of its draws; errors cancel to order 1.5."""
+    """Over some seeds together: the jumps of a run depend on its draws, and errors cancel to order 1.5."""
     seeds = [{**runs.JITTER, "duration_s": 1.5, "seed": seed} for seed in (1, 2)]
     orders = [order("free", 500, **overrides) for overrides in seeds]
     assert 1.0 <= np.mean(orders) <= 2.0
 
 
-def test_what_sampling_leaves_is_of_order_two_across_a_jump() -> None:
-    """Arms that brake: e and its derivative jump at once, and the torque that is held is that of before."""
+def test_sampling_error_across_jumps_is_second_order() -> None:
+    """Arms that brake: e and its derivative jump at once, while the held torque is the torque
+    before the jump.
+    """
     cut = {"link.loss": 1.0, "on_stale.action": "brake", "duration_s": 1.0}
     rest = [
         float(np.abs(runs.run("free", {**cut, "rate_hz": hz}).balance.unexplained).max())
@@ -102,7 +104,7 @@ def test_what_sampling_leaves_is_of_order_two_across_a_jump() -> None:
     ("key", "limit", "term"),
     [("tau_rate_limit_nm_s", 100.0, "torque limit"), ("qd_des_limit_rad_s", 0.5, "rule")],
 )
-def test_what_limit_of_torque_rate_or_reference_takes_is_booked(
+def test_limits_of_torque_rate_and_reference_are_booked(
     key: str, limit: float, term: str
 ) -> None:
     b = runs.run("paper", {"duration_s": 2.0, "rate_hz": 1000, f"limits.{key}": limit}).balance
@@ -110,21 +112,21 @@ def test_what_limit_of_torque_rate_or_reference_takes_is_booked(
     assert np.abs(b.unexplained).max() <= 5e-6 * b.scale
 
 
-def test_a_site_that_stops_and_goes_on_is_booked() -> None:
-    """Its torque is not that of the law, and its estimates stand still."""
+def test_a_stop_and_restart_is_booked() -> None:
+    """The torque of a stopped site is not that of the law, and the site's estimates stand still."""
     b = compute_energy_balance(compute_site_energies(stopped_log(adaptive_text(), 3000)))
     assert np.abs(b.work["torque limit"]).max() > 0.01 * b.V.max()
     assert np.abs(b.work["estimates"]).max() > 1e-3 * b.V.max()
     assert np.abs(b.unexplained).max() <= 5e-4 * b.scale
 
 
-def test_a_wall_that_gives_energy_closes_to_1e_4() -> None:
+def test_sampled_walls_energy_closes_to_1e_4() -> None:
     b = runs.run("wall").balance
     assert b.work["walls"].max() > 1e-3
     assert of_largest_v(b) <= 1e-4
 
 
-def test_everything_at_once_closes_to_1e_4_at_500_hz() -> None:
+def test_all_effects_together_close_to_1e_4() -> None:
     b = runs.run("rich").balance
     assert of_largest_v(b) <= 1e-4
     assert all(
@@ -149,7 +151,7 @@ TERMS = [
 
 @pytest.mark.parametrize("factor", [-1.0, 0.0, 2.0])
 @pytest.mark.parametrize(("name", "group", "term"), TERMS, ids=lambda value: str(value))
-def test_any_one_term_with_another_sign_or_factor_is_caught(
+def test_a_wrong_sign_or_factor_is_detected(
     name: str, group: str, term: str, factor: float
 ) -> None:
     b = runs.run(name, runs.JITTER if name == "free" else None).balance
@@ -157,8 +159,11 @@ def test_any_one_term_with_another_sign_or_factor_is_caught(
     assert runs.relative(replace(b, **{group: terms})) > CAUGHT > 5 * runs.relative(b)
 
 
-def test_ones_for_beta_is_caught_and_named() -> None:
-    """The paper sets beta = (1, 1, 1) after Eq. (20): the right null vector of Upsilon, not the left one."""
+def test_beta_of_ones_is_detected_and_named() -> None:
+    """The paper sets beta = (1, 1, 1) after Eq.
+
+    (20), which is the right null vector of Upsilon, not the left one.
+    """
     ones = compute_energy_balance(
         runs.run("asymmetric", {"duration_s": 2.0, "rate_hz": 1000}).energies,
         paper_weights=True,
@@ -167,7 +172,7 @@ def test_ones_for_beta_is_caught_and_named() -> None:
     assert np.abs(ones.residual + ones.transfer).max() <= 2e-5 * ones.V.max()
 
 
-def test_v_with_the_papers_weights_rises_the_corrected_one_never() -> None:
+def test_v_rises_with_the_papers_weights_only() -> None:
     books = runs.run("free", runs.LYAPUNOV).energies
     ones, right = (
         compute_energy_balance(books, paper_weights=True),
@@ -180,8 +185,10 @@ def test_v_with_the_papers_weights_rises_the_corrected_one_never() -> None:
 
 
 @pytest.mark.parametrize("name", [pytest.param("paper", marks=pytest.mark.long), "asymmetric"])
-def test_it_is_what_another_book_of_the_same_run_says(name: str) -> None:
-    """`tests/theory/energy.py` knows one constant delay per link and nothing else; there both must agree."""
+def test_balance_equals_an_independent_book(name: str) -> None:
+    """`tests/theory/energy.py` allows one constant delay per link and nothing else; for such
+    runs both must agree.
+    """
     overrides = {"duration_s": 2.5, "rate_hz": 500}
     made = run(name, overrides)
     theirs, ours = (
@@ -194,8 +201,10 @@ def test_it_is_what_another_book_of_the_same_run_says(name: str) -> None:
     assert sum(ours.work.values()) == pytest.approx(theirs.given, **close)
 
 
-def test_it_converges_to_the_functional_along_the_exact_solution() -> None:
-    """V, dissipation and work of the continuous equations: DOP853 and Gauss-Legendre, nothing of ours."""
+def test_v_converges_to_the_exact_functional() -> None:
+    """V, dissipation and work of the continuous equations: DOP853 and Gauss-Legendre, no code
+    of the program.
+    """
     scenario = load_scenario("paper", {"duration_s": 2.0})
     exact = equations(scenario).solve(2.0)
     ours = runs.run("paper", {"duration_s": 2.0, "rate_hz": 1000}).balance
@@ -213,7 +222,7 @@ def test_it_converges_to_the_functional_along_the_exact_solution() -> None:
 
 
 def _gauss(f, a: float, b: float, edges: list[float]) -> float:
-    """Integral of a function of times, with no panel across an edge."""
+    """Returns the integral of a function of time, with no panel across an edge."""
     x, w = np.polynomial.legendre.leggauss(12)
     cuts = sorted({a, b, *(float(e) for e in edges if a < e < b)})
     total = 0.0
@@ -261,7 +270,7 @@ def _exact_integrals(exact: DelayEquations, t: float) -> tuple[float, float]:
     return tuple(_gauss(lambda s, n=n: powers(s)[n], 0.0, t, PANELS) for n in (0, 1))  # type: ignore[return-value]
 
 
-def test_a_closed_group_is_balanced_by_itself() -> None:
+def test_a_closed_group_balances_alone() -> None:
     """m1 and m2 follow each other alone; s follows both and has no part in their balance."""
     pair = {
         "dominance.m1.m2": 1.0,
@@ -285,7 +294,7 @@ def unexplained(balance: EnergyBalance) -> float:
 
 
 def check_six(duration_s: float) -> LogMetrics:
-    """The certificate of a run of six joints, and its metrics."""
+    """Checks the certificate of a run of six joints, and its metrics."""
     log = trilat_net.simulate(parse_scenario(six_joints(duration_s, 200.0)))
     found, metrics = certify(log), compute_log_metrics(log)
     assert found.verdict.finding is StabilityFinding.COVERED, found.verdict.text
@@ -302,7 +311,7 @@ def check_six(duration_s: float) -> LogMetrics:
     return metrics
 
 
-def test_energy_of_six_joints_closes_with_the_base_parameters() -> None:
+def test_six_joints_close_with_the_base_parameters() -> None:
     metrics = check_six(2.0)
     estimates = metrics.estimates["s"].base
     assert estimates is not None
@@ -361,7 +370,7 @@ def test_every_term_of_a_rough_arm_is_needed() -> None:
         assert np.abs(lame.unexplained).max() > 50 * np.abs(energy.unexplained).max(), name
 
 
-def test_friction_and_stops_stand_in_the_energies_of_an_arm() -> None:
+def test_friction_and_stops_stand_in_arm_energies() -> None:
     found = compute_log_metrics(rough_log())
     for own in found.sites.values():
         assert own["friction_j"].value > 1.0
@@ -384,14 +393,14 @@ def share(found: Certificate, name: str = "residual") -> float:
     return float(np.abs(getattr(found.balance, name)).max() / found.balance.V.max())
 
 
-def test_it_closes_with_order_two() -> None:
+def test_the_balance_closes_with_order_two() -> None:
     found = {rate_hz: judge(rate_hz) for rate_hz in (500, 1000)}
     assert all(one.verdict.finding is StabilityFinding.COVERED for one in found.values())
     assert share(found[1000]) <= BAR
     assert share(found[500]) / share(found[1000]) == pytest.approx(4.0, rel=0.1)
 
 
-def test_it_closes_with_links_that_jitter_box_and_torque_limit() -> None:
+def test_it_closes_under_jitter_box_and_limit() -> None:
     jitter = judge(**{"link.model": "uniform", "link.delay_ms": 60, "link.half_width_ms": 30})
     box = judge(
         **{"control.law": "adaptive_box", "control.theta_low": -0.3, "control.theta_high": 1.2}
@@ -416,8 +425,10 @@ def test_damping_near_a_singular_pose_fails_a_premise() -> None:
 
 
 @pytest.mark.long
-def test_an_axis_that_only_one_follows_dissipates() -> None:
-    """The arm of seven joints begins beside the plane of its masters, which cannot leave it."""
+def test_the_axis_of_one_arm_dissipates() -> None:
+    """The arm of seven joints starts beside the plane of its masters, and the masters cannot
+    leave that plane.
+    """
     q0 = [0.3, -0.3, 0.0, -1.6, 0.0, 1.4, 0.0]
     log = trilat_net.simulate(
         load_scenario("unlike_arms", {"duration_s": 1.0, "sites.s.q0_rad": q0})
@@ -436,14 +447,14 @@ def test_an_axis_that_only_one_follows_dissipates() -> None:
             assert np.abs(lame.residual).max() > 10 * np.abs(energy.residual).max()
 
 
-def test_following_an_axis_that_peers_leave_free_fails() -> None:
+def test_following_an_axis_free_at_peers_fails() -> None:
     found = judge(**{"sites.m.task.axes": ["x"]})
     premise = next(one for one in found.premises if one.name == "axes")
     assert premise.holds is False
     assert "s follows m" in premise.text
 
 
-def test_orientations_have_no_v_and_it_says_why() -> None:
+def test_orientations_have_no_v_for_a_reason() -> None:
     text = (
         planar_task(duration_s=0.1)
         .replace("position", "pose")

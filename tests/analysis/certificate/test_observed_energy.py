@@ -1,6 +1,7 @@
-"""Energies that laws declare: lines, stores and what is taken for good, judged from the records.
+"""Energies that laws declare (lines, stores and losses), judged from the records.
 
-Energies of the built-in laws that keep account of it, as the certificate books them from records alone.
+Energies of the built-in laws that account for them, as the certificate books them from records
+alone.
 """
 
 from functools import cache
@@ -60,13 +61,15 @@ damping_nm_s_rad = 10.0
 
 @cache
 def clamped(**changes: Any) -> Log:
-    """A master that a hand moves, a line, and a slave that is held."""
+    """A run of a master that a hand moves, a line, and a clamped slave."""
     overrides = {key.replace("__", "."): value for key, value in changes.items()}
     return simulate_scenario(load_scenario(load_scenario(PAIR), overrides))
 
 
-def test_a_line_at_rest_is_the_spring_that_theory_says() -> None:
-    """b / T between the hand and what holds the slave: its energy is half its force squared times T / b."""
+def test_a_line_at_rest_is_a_spring() -> None:
+    """The spring b / T lies between the hand and the clamp of the slave: its energy is half its
+    force squared times T / b.
+    """
     log = clamped()
     found = observe_energies(log, own_laws=True)
     assert found.finding is ObservedFinding.PASSIVE
@@ -81,10 +84,11 @@ def test_a_line_at_rest_is_the_spring_that_theory_says() -> None:
     assert stored == pytest.approx(force**2 * DELAY_S / B, rel=5e-3)
 
 
-def test_wave_that_is_held_over_outage_is_energy_from_nowhere() -> None:
-    """What is missing must be zero (Niemeyer and Slotine 2004); this law uses the last wave again and again.
+def test_waves_held_over_an_outage_add_energy() -> None:
+    """The wave of a missing sample must be zero (Niemeyer and Slotine 2004); this law uses the
+    last wave again and again.
 
-    The hand lets go in the outage, so that the master sends less than what the slave goes on using.
+    The hand lets go in the outage, so that the master sends less than the slave goes on using.
     """
     outage = {"links__m->s__outages_s": [[1.8, 3.0]], "sites__m__hands__0__end_s": 2.0}
     log = clamped.__wrapped__(**outage, duration_s=3.2)
@@ -102,7 +106,7 @@ def test_wave_that_is_held_over_outage_is_energy_from_nowhere() -> None:
     assert found.stability is not Stability.STABLE
 
 
-def test_books_find_a_law_that_sends_more_than_it_got() -> None:
+def test_books_detect_a_law_sending_too_much() -> None:
     found = observe_energies(clamped(control__boost=1.01, duration_s=2.0), own_laws=True)
     assert found.finding is ObservedFinding.BROKEN
     assert found.residual_j > 1e-4
@@ -116,7 +120,7 @@ def test_code_from_outside_runs_only_on_request() -> None:
     assert observe_energies(mixed, own_laws=True).text.endswith("the law of s declares none")
 
 
-def test_the_certificate_says_it_in_words_and_in_json() -> None:
+def test_the_certificate_reports_it_in_text_and_json() -> None:
     found = certify(clamped(), own_laws=True)
     lines = {line.text: line.mark for line in describe_certificate(found)}
     assert lines[found.observed.text] == "ok"
@@ -128,13 +132,13 @@ def test_the_certificate_says_it_in_words_and_in_json() -> None:
 
 @cache
 def run(law: str) -> Log:
-    """A clamped slave, 200 ms each way."""
+    """A run with a clamped slave, 200 ms each way."""
     return simulate_scenario(pair(LAWS[law], clamped=True, duration_s=3.0))
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("law", LAWS)
-def test_energy_of_lines_observers_and_tanks_is_never_below_zero(law: str) -> None:
+def test_energies_of_lines_observers_and_tanks_stay_nonnegative(law: str) -> None:
     log = run(law)
     found = observe_energies(log)
     assert found.finding is ObservedFinding.PASSIVE
@@ -153,7 +157,7 @@ def test_energy_of_lines_observers_and_tanks_is_never_below_zero(law: str) -> No
 
 
 @pytest.mark.long
-def test_a_figure_shows_them_over_time() -> None:
+def test_a_figure_shows_energies_over_time() -> None:
     drawn = figure(run("wave"), "observed_energy")
     lines, known, stored, given = drawn.axes
     assert len(lines.lines) == len(known.lines) == len(stored.lines) == 2
@@ -161,8 +165,8 @@ def test_a_figure_shows_them_over_time() -> None:
 
 
 @pytest.mark.long
-def test_jolt_beyond_reserve_leaves_observer_negative_and_certificate_says_so() -> None:
-    """Sites that start apart; the reserve of a scenario that names none covers that."""
+def test_jolts_beyond_reserve_make_the_observer_negative() -> None:
+    """Sites that start apart; the reserve of a scenario that names none covers such a jolt."""
     changes = {
         "control.law": "tdpa",
         "scheme": "digital",
@@ -183,8 +187,8 @@ def test_jolt_beyond_reserve_leaves_observer_negative_and_certificate_says_so() 
 
 
 @pytest.mark.long
-def test_the_leaders_velocity_makes_energy_at_a_slower_follower() -> None:
-    """As it is published: the follower's damper acts on a velocity at which it is not moved."""
+def test_leaders_velocity_makes_energy_at_slower_followers() -> None:
+    """As published: the follower's damper uses a velocity with which the follower is not moved."""
     law = {**LAWS["tdpa"], "energy": "velocity", "reserve_J": 0.0, "acceleration_rad_s2": 0.0}
     log = simulate_scenario(pair(law, clamped=False, duration_s=4.0))
     found = observe_energies(log)
@@ -195,7 +199,7 @@ def test_the_leaders_velocity_makes_energy_at_a_slower_follower() -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("law", LAWS)
-def test_torque_that_the_limit_cuts_is_booked_as_cut(law: str) -> None:
+def test_torque_cut_by_the_limit_is_booked(law: str) -> None:
     """The hand holds the master where its spring gives 1.5 N m."""
     limits = {"tau_limit_nm": 1.5, "qd_limit_rad_s": 1e3}
     log = simulate_scenario(pair(LAWS[law], clamped=True, duration_s=6.0, limits=limits))
@@ -216,7 +220,7 @@ def test_torque_that_the_limit_cuts_is_booked_as_cut(law: str) -> None:
         pytest.param(JITTER, id="jitter"),
     ],
 )
-def test_torques_with_weights_keep_the_weighted_energy(law: str, link: dict[str, Any]) -> None:
+def test_weighted_torques_keep_the_weighted_energy(law: str, link: dict[str, Any]) -> None:
     shares = {
         "m1": {"m2": 0.1, "s": 0.9},
         "m2": {"m1": 0.4, "s": 0.6},
@@ -233,7 +237,7 @@ def test_torques_with_weights_keep_the_weighted_energy(law: str, link: dict[str,
 
 
 @pytest.mark.parametrize("mem", [[], [0.0] * 4])
-def test_a_record_without_the_laws_memory_is_told(mem: list[float]) -> None:
+def test_missing_law_memory_in_records_is_reported(mem: list[float]) -> None:
     data = recorded(
         "two_sites", {"control.law": "tanks", "duration_s": 0.1, "scheme": "digital"}
     )
@@ -245,7 +249,7 @@ def test_a_record_without_the_laws_memory_is_told(mem: list[float]) -> None:
         observe_energies(opened(broken))
 
 
-def test_three_places_explain_a_negative_energy_in_the_same_words() -> None:
+def test_three_texts_explain_negative_energy_alike() -> None:
     """The certificate, `compare --tune` and the page of the laws."""
     page = find_page("laws-tdpa.md").read_text(encoding="utf-8")
     assert NEGATIVE_ENERGY_MEANING in " ".join(page.split())

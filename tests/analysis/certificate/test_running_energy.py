@@ -1,4 +1,4 @@
-"""V of a running session is that of `certify`, however the records come in."""
+"""V of a running session equals that of `certify`, in whatever blocks the records arrive."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,9 @@ BLOCK = 60
 def courses(
     log: Log, *, late: int = 0, without: frozenset[int] = frozenset()
 ) -> list[EnergyCourse]:
-    """V of a log whose records come block by block, at its last site later; that lacks some."""
+    """Returns V of a log whose records arrive block by block, those of its last site later;
+    some are missing.
+    """
     windows = {site: RecordWindow(log.scenario, site, kept_s=4.0) for site in log.sites}
     running = RunningEnergy(log.scenario, windows)
     found = []
@@ -42,7 +44,7 @@ def joined(found: list[EnergyCourse]) -> EnergyCourse:
 
 
 @pytest.mark.parametrize("late", [0, 7])
-def test_v_and_work_while_running_are_those_of_the_log(late: int) -> None:
+def test_v_while_running_equals_that_of_log(late: int) -> None:
     """With ramps and steps of shares, jitter, loss, an outage, a held stale peer, limits and a wall."""
     whole = runs.run("rich").balance
     course = joined(courses(runs.run("rich").log, late=late))
@@ -53,8 +55,8 @@ def test_v_and_work_while_running_are_those_of_the_log(late: int) -> None:
     assert np.abs(course.supplied - whole.external_work[rows]).max() < 1e-10 * most
 
 
-def test_v_without_some_records_is_that_of_an_incomplete_log() -> None:
-    """Records that cannot be had are passed over as `certify` passes over them."""
+def test_v_without_some_records_is_the_incomplete_logs() -> None:
+    """Unavailable records are passed over as `certify` passes over them."""
     log = runs.run("rich").log
     gap = frozenset(range(700, 760))
     whole = runs.run("rich").balance
@@ -82,7 +84,7 @@ def test_v_begins_late_in_a_session_joined_late() -> None:
     assert np.abs(course.V - whole.V[rows]).max() < 1e-12 * np.abs(whole.V).max()
 
 
-def test_a_law_without_such_a_v_says_so() -> None:
+def test_a_law_without_v_is_reported() -> None:
     log = runs.run("jitter", {"duration_s": 0.3}).log
     windows = {site: RecordWindow(log.scenario, site) for site in log.sites}
     running = RunningEnergy(log.scenario, windows)

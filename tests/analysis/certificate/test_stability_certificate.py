@@ -36,7 +36,7 @@ def test_every_released_version_is_certified(path: Path) -> None:
     ("d", "motion", "passed"),
     [(0.2, EndBehaviour.DIVERGED, False), (3.0, EndBehaviour.DECAYS, True)],
 )
-def test_a_law_without_a_functional_is_judged_by_growth_alone(
+def test_growth_alone_judges_laws_without_functional(
     d: float, motion: EndBehaviour, passed: bool
 ) -> None:
     law = {
@@ -54,7 +54,7 @@ def test_a_law_without_a_functional_is_judged_by_growth_alone(
 
 
 def outside(log: Log, *, known: bool) -> Log:
-    """The same records, of a slave that is outside of the program."""
+    """Returns the same records, of a slave with an external arm."""
     spec = log.scenario.sites["s"]
     arm = msgspec.structs.replace(spec.arm, known=known)
     sites = {
@@ -71,7 +71,7 @@ def still_free() -> Log:
     )
 
 
-def test_an_arm_whose_theta_nobody_knows_has_no_v() -> None:
+def test_an_arm_with_unknown_theta_has_no_v() -> None:
     found = certify(outside(still_free(), known=False))
     assert found.verdict.finding is StabilityFinding.NOT_JUDGED
     assert (
@@ -80,7 +80,7 @@ def test_an_arm_whose_theta_nobody_knows_has_no_v() -> None:
     )
 
 
-def test_an_external_arm_is_judged_where_theta_explains_its_motion() -> None:
+def test_external_arms_are_judged_with_identified_theta() -> None:
     as_told = certify(outside(still_free(), known=True))
     assert as_told.verdict.finding is StabilityFinding.COVERED
     assert "no record says who pushes the arm of s" in as_told.verdict.text
@@ -90,13 +90,13 @@ def test_an_external_arm_is_judged_where_theta_explains_its_motion() -> None:
     assert "the external arm of s does not move as its theta says" in found.verdict.text
 
 
-def test_records_with_none_beside_them_are_no_period() -> None:
+def test_a_record_without_neighbours_is_no_period() -> None:
     found = certify(logs.rewritten(still_free(), lambda state: state.tick % 2 == 0))
     assert found.verdict.text == f"V cannot be judged: {NO_PERIOD}"
 
 
-def test_a_period_too_long_for_the_gains_is_not_judged() -> None:
-    """M of 1 g at the end of link 2, Kp = 1: its time constant is 1 ms, the period 3."""
+def test_a_period_too_long_is_not_judged() -> None:
+    """M of 1 g at the end of link 2, Kp = 1: its time constant is 1 ms, the period 3 ms."""
     light = {
         "arm.m2_kg": 0.001,
         "rate_hz": 333,
@@ -108,7 +108,7 @@ def test_a_period_too_long_for_the_gains_is_not_judged() -> None:
     assert "the period is too long for these gains" in found.verdict.text
 
 
-def test_gaps_are_left_out_and_told_of() -> None:
+def test_gaps_are_left_out_and_reported() -> None:
     whole = runs.run("free", {"duration_s": 4.0, "rate_hz": 200, "link.delay_ms": 150.0}).log
     log = logs.rewritten(
         whole, lambda state: not (state.site == "m1" and 200 <= state.tick < 240)
@@ -127,8 +127,8 @@ def test_gaps_are_left_out_and_told_of() -> None:
     assert find_unjudged_spans(found.balance) == [pytest.approx((0.995, 1.35))]
 
 
-def test_a_gap_that_hides_what_happened_is_no_broken_balance() -> None:
-    """Whatever was lost, nobody is accused for what lies in the gap."""
+def test_a_gap_does_not_break_the_balance() -> None:
+    """Events within a gap are nobody's fault."""
     whole = runs.run("free", {"duration_s": 4.0, "rate_hz": 100}).log
     for site in whole.sites:
         found = certify(
@@ -139,7 +139,7 @@ def test_a_gap_that_hides_what_happened_is_no_broken_balance() -> None:
         assert found.verdict.finding is not StabilityFinding.BROKEN
 
 
-def test_an_unfinished_log_is_judged_as_far_as_it_goes() -> None:
+def test_an_unfinished_log_is_judged_to_its_end() -> None:
     whole = runs.run("free", {"duration_s": 4.0, "rate_hz": 200}).log
     found = certify(logs.rewritten(whole, lambda state: 200 < state.tick < 700, finished=False))
     assert found.balance is not None
@@ -150,7 +150,7 @@ def test_an_unfinished_log_is_judged_as_far_as_it_goes() -> None:
 
 
 @pytest.mark.parametrize("ticks", [0, 1])
-def test_logs_with_next_to_nothing_say_so(ticks: int) -> None:
+def test_nearly_empty_logs_are_reported(ticks: int) -> None:
     found = certify(logs.rewritten(logs.simulated("paper"), lambda state: state.tick < ticks))
     assert found.verdict.text == f"V cannot be judged: {NO_COMMON_TIME}"
     assert found.end.behaviour is EndBehaviour.UNDECIDED
@@ -163,8 +163,8 @@ def test_two_records_are_a_period() -> None:
     assert len(found.balance.t_s) == 2
 
 
-def test_nobody_moves_and_there_is_no_energy() -> None:
-    """theta_hat(0) = theta and equal starts: V(0) = 0, and nothing divides by it."""
+def test_arms_at_rest_have_no_energy() -> None:
+    """theta_hat(0) = theta and equal starts: V(0) = 0, and nothing divides by V(0)."""
     rest = {"control.theta_hat0": [3.0, 1.0, 1.0, 2.0, 1.0], "duration_s": 1.0, "rate_hz": 200}
     found = runs.run("paper", rest).certificate
     assert found.balance is not None
@@ -182,14 +182,14 @@ def test_sites_of_different_rates_are_booked_together() -> None:
     assert found.verdict.finding in (StabilityFinding.DID_NOT_RISE, StabilityFinding.ROSE)
 
 
-def test_a_command_is_a_change_like_a_scripted_one() -> None:
+def test_a_command_is_booked_like_scripted_changes() -> None:
     found = certify(logs.busy().log)
     assert found.balance is not None
     assert runs.relative(found.balance) <= 5e-3
     assert found.verdict.finding is not StabilityFinding.BROKEN
 
 
-def test_a_change_that_is_none_is_the_files_fault() -> None:
+def test_an_unreadable_change_is_a_log_error() -> None:
     change = lambda s: logs.replaced(s, cmd=["{}"] if s.tick == 5 else [])  # noqa: E731
     with pytest.raises(LogError, match="a command that cannot be read"):
         certify(logs.rewritten(logs.simulated("paper"), change=change))

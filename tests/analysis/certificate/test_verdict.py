@@ -1,6 +1,7 @@
-"""The verdict: covered, outside and yet not risen, risen and by whom, and logs that do not add up.
+"""The verdict: covered, outside the theorem without a rise, a rise with its cause, and logs
+whose balance is broken.
 
-What a certificate rests on: records that are missing, changed, or no site's own.
+The evidence of a certificate: records that are missing, changed, or from no site.
 """
 
 from collections.abc import Callable
@@ -47,7 +48,7 @@ def test_free_motion_is_covered() -> None:
     assert not found.passed
 
 
-def test_hands_are_told_of_and_excused() -> None:
+def test_hands_are_named_and_excused() -> None:
     found = runs.run("paper", {"duration_s": 12.5, "rate_hz": 100}).certificate
     assert found.verdict.finding is StabilityFinding.COVERED
     assert (
@@ -56,7 +57,7 @@ def test_hands_are_told_of_and_excused() -> None:
     )
 
 
-def test_outside_and_yet_not_risen() -> None:
+def test_outside_the_theorem_without_a_rise() -> None:
     found = runs.run("wall").certificate
     assert found.verdict.finding is StabilityFinding.DID_NOT_RISE
     assert found.verdict.text.startswith(
@@ -65,7 +66,7 @@ def test_outside_and_yet_not_risen() -> None:
     assert found.bounded_by_v
 
 
-def test_a_rise_is_named_with_time_amount_and_giver() -> None:
+def test_a_rise_names_time_amount_and_cause() -> None:
     found = runs.run("free", runs.JITTER).certificate
     rise = found.verdict.rise
     assert found.verdict.finding is StabilityFinding.ROSE
@@ -90,8 +91,8 @@ def test_kd_of_different_shape_makes_v_rise() -> None:
     assert list(found.verdict.rise.causes) == ["what beta does not cancel"]
 
 
-def test_a_slow_digital_loop_is_fed_by_sampling() -> None:
-    """T = 0 at 80 Hz: `digital` keeps swinging, and it is the hold that keeps it up."""
+def test_sampling_feeds_a_slow_digital_loop() -> None:
+    """T = 0 at 80 Hz: `digital` keeps swinging, because torques are held over a tick."""
     found = certify(made(rate_hz=80, scheme="digital", link__delay_ms=0.0, duration_s=20.0))
     assert found.verdict.finding is StabilityFinding.ROSE
     assert found.verdict.rise is not None
@@ -104,7 +105,7 @@ def tampered(change: Callable[[State], State]) -> Certificate:
 
 
 @pytest.mark.parametrize("field", ["q", "qd", "q_des", "theta_hat"])
-def test_record_that_was_changed_breaks_balance_of_its_site(field: str) -> None:
+def test_a_changed_record_breaks_its_sites_balance(field: str) -> None:
     def change(state: State) -> State:
         late = state.site == "m2" and state.tick >= 375
         values = [1.05 * x for x in getattr(state, field)]
@@ -116,7 +117,7 @@ def test_record_that_was_changed_breaks_balance_of_its_site(field: str) -> None:
     assert "were not made by the equations that the log claims" in found.verdict.text
 
 
-def test_record_that_was_changed_breaks_it_where_delays_vary_too() -> None:
+def test_changed_records_break_balances_under_varying_delay() -> None:
     log = runs.run("free", {**runs.JITTER, "duration_s": 2.0, "rate_hz": 500}).log
     late = lambda s: s.site == "m2" and s.tick >= 500  # noqa: E731
     found = certify(
@@ -127,7 +128,7 @@ def test_record_that_was_changed_breaks_it_where_delays_vary_too() -> None:
     assert found.verdict.finding is StabilityFinding.BROKEN
 
 
-def test_hands_that_were_erased_break_the_balance() -> None:
+def test_erased_hands_break_the_balance() -> None:
     log = runs.run("paper", {"duration_s": 11.5, "rate_hz": 100}).log
     found = certify(
         logs.rewritten(log, change=lambda s: msgspec.structs.replace(s, tau_x=[0.0, 0.0]))
@@ -168,7 +169,7 @@ def test_two_closed_groups_are_refused_and_named() -> None:
     assert found.balance is None
 
 
-def test_groups_that_only_a_change_makes_are_refused_too() -> None:
+def test_groups_made_by_a_change_are_refused() -> None:
     joined = FOUR.replace("c = { d = 1.0 }", "c = { d = 0.5, a = 0.5 }")
     step = '[[timeline]]\nat_s = 1.0\ndominance = "c"\nto = { d = 1.0 }\nramp_s = 0.5\n'
     assert certify(trilat_net.simulate(parse_scenario(joined))).balance is not None
@@ -176,15 +177,15 @@ def test_groups_that_only_a_change_makes_are_refused_too() -> None:
     assert found.verdict.finding is StabilityFinding.NOT_JUDGED
 
 
-def test_a_site_without_weight_converges_after_those_that_it_follows() -> None:
-    """V tells nothing of m2; where the shares alone fail its peers' motion bounds it."""
+def test_a_site_without_weight_converges_after_peers() -> None:
+    """V does not contain m2; if only the shares fail, the motion of its peers bounds m2."""
     found = runs.run("free", {**SHORT, **runs.EXPERT, "duration_s": 1.0}).certificate
     assert found.verdict.finding is StabilityFinding.DID_NOT_RISE
     assert found.end.stability is Stability.OPEN
     assert found.bounded_by_v
 
 
-def test_site_without_weight_is_left_to_growth_where_more_fails() -> None:
+def test_weightless_sites_with_other_failures_need_growth() -> None:
     hand = {
         "sites.m2.hands": [
             {"kind": "pulse", "start_s": 0.2, "end_s": 5.0, "peak_nm": [1.0, 1.0]}
@@ -197,17 +198,17 @@ def test_site_without_weight_is_left_to_growth_where_more_fails() -> None:
 
 
 def still() -> Certificate:
-    """The paper's law at rest: nothing leaves it open."""
+    """Returns a certificate of the paper's law at rest, which nothing leaves open."""
     return runs.run("free", {"duration_s": 30.0, "rate_hz": 100}).certificate
 
 
-def test_run_that_comes_to_rest_with_v_falling_is_stable() -> None:
+def test_rest_with_falling_v_is_stable() -> None:
     assert still().stability is Stability.STABLE
     assert still().passed
     assert still().reasons == ()
 
 
-def test_growth_fails_a_run_whatever_v_did() -> None:
+def test_growth_fails_a_run_despite_v() -> None:
     grown = replace(still(), end=still().end._replace(behaviour=EndBehaviour.GROWS))
     assert grown.stability is Stability.NOT_STABLE
     assert not grown.accepts(("bounded", "open"))
@@ -223,7 +224,7 @@ def test_growth_fails_a_run_whatever_v_did() -> None:
         (EndBehaviour.DRIFTS, ("bounded", "open"), False),
     ],
 )
-def test_only_what_is_accepted_passes_besides_a_stable_run(
+def test_only_accepted_outcomes_pass_besides_stable(
     behaviour: EndBehaviour, accepted: tuple[str, ...], passes: bool
 ) -> None:
     found = replace(still(), end=still().end._replace(behaviour=behaviour))
@@ -274,7 +275,7 @@ def found(data: bytes, **options: float) -> Certificate:
     return certify(opened(data), **options)
 
 
-def test_whole_log_is_stable_and_says_what_it_rests_on() -> None:
+def test_a_whole_log_is_stable_with_reasons() -> None:
     certificate = found(recorded("free", RUN))
     assert certificate.stability is Stability.STABLE
     facts = certificate.to_dict()["evidence"]
@@ -289,8 +290,8 @@ def test_whole_log_is_stable_and_says_what_it_rests_on() -> None:
 
 
 @pytest.mark.parametrize("cut", [range(1490, 1525), range(2965, 3000), range(35)])
-def test_seven_tenths_of_a_second_less_leave_a_run_open(cut: range) -> None:
-    """At its end, its beginning or in between, of one site."""
+def test_missing_700_ms_leave_a_run_open(cut: range) -> None:
+    """At the end, the beginning or in between, of one site."""
     taken = taken_apart(recorded("free", RUN)).without_chain()
     topics, accounts = taken.topics(), taken.metadata("trilat.accounts")
     own = "/trilat/free/s/state"
@@ -311,7 +312,7 @@ def test_seven_tenths_of_a_second_less_leave_a_run_open(cut: range) -> None:
     assert found(taken.bytes(), min_coverage=0.9).passed
 
 
-def test_of_v_the_periods_count_that_rest_on_records() -> None:
+def test_only_recorded_periods_count_for_v() -> None:
     """Single records of one site: few are missing, and each leaves several periods of V unjudged."""
     data = edited(recorded("free", RUN), record=without("s", set(range(100, 3000, 1000))))
     certificate = found(data)
@@ -321,7 +322,7 @@ def test_of_v_the_periods_count_that_rest_on_records() -> None:
     assert any(why.startswith("V is judged over 99.") for why in certificate.reasons)
 
 
-def test_a_changed_log_is_accepted_by_no_word() -> None:
+def test_no_option_accepts_a_changed_log() -> None:
     taken = taken_apart(recorded("free", RUN))
     taken.metadata("trilat.session")["seed"] += "0"
     certificate = found(taken.bytes())
@@ -330,7 +331,7 @@ def test_a_changed_log_is_accepted_by_no_word() -> None:
 
 
 @pytest.mark.parametrize("law", ["adaptive", "adaptive_box"])
-def test_torques_that_the_law_did_not_give_break_the_balance(law: str) -> None:
+def test_torques_foreign_to_the_law_break_the_balance(law: str) -> None:
     def scaled(r: dict) -> dict:
         own = r["site"] == "m1" and r["tick"] >= 40
         return {**r, "tau": [x * (1 + 1e-5) for x in r["tau"]]} if own else r
@@ -344,7 +345,7 @@ def test_torques_that_the_law_did_not_give_break_the_balance(law: str) -> None:
         assert not certificate.accepts(("open",))
 
 
-def test_sites_that_did_not_react_leave_a_run_open() -> None:
+def test_sites_that_did_not_react_stay_open() -> None:
     claims = {"driver": "rerun", "rerun_executed": "s"}
     certificate = found(edited(recorded("free", RUN), session=claims))
     assert any("m1 and m2, as recorded, did not react" in why for why in certificate.reasons)

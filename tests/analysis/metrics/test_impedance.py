@@ -1,4 +1,4 @@
-"""Ratios over frequency: decided where they are driven, undecided elsewhere, never the hand's own."""
+"""Ratios over frequency: decided at driven frequencies, undecided elsewhere, never the hand's own."""
 
 import math
 
@@ -32,7 +32,7 @@ def strongest(
     return estimate_responses(drive, x, y, usable, rate_hz, least)[0]
 
 
-def test_a_filter_is_found_again() -> None:
+def test_a_known_filter_is_identified() -> None:
     """Gain and phase of a known system, by SciPy's freqz."""
     b, a = signal.butter(1, 3.0, fs=RATE_HZ)
     x = noise(1)
@@ -43,7 +43,7 @@ def test_a_filter_is_found_again() -> None:
     assert found.coherence > 0.95
 
 
-def test_what_does_not_belong_together_is_undecided() -> None:
+def test_unrelated_signals_are_undecided() -> None:
     x = noise(1)
     found = strongest(x, x, noise(2), EVERYTHING, RATE_HZ, 1e-3)
     assert found.gain is None
@@ -58,7 +58,7 @@ def test_one_push_is_not_enough() -> None:
     assert "stretches of 4 s" in found.why
 
 
-def test_what_nobody_drives_and_what_was_not_recorded_are_named() -> None:
+def test_weak_drives_and_missing_records_are_named() -> None:
     x = noise(1)
     assert (
         strongest(0.0 * x, x, x, EVERYTHING, RATE_HZ, 1e-3).why
@@ -69,11 +69,12 @@ def test_what_nobody_drives_and_what_was_not_recorded_are_named() -> None:
     assert "no stretch of 4 s" in strongest(x, x, x, gaps, RATE_HZ, 1e-3).why
 
 
-def test_in_a_closed_loop_the_driver_decides_whose_impedance() -> None:
-    """A spring k held against a damper b that others shake: torque / speed is b + noise's, not -k/s.
+def test_closed_loop_impedance_depends_on_the_driver() -> None:
+    """A spring k held against a damper b that others shake: torque / speed is b + noise's, not
+    -k/s.
 
-    The hand's torque is k (x - q), speed qd = (torque + push) / b. By the hand's own script x the ratio is b;
-    the plain ratio of the two, without the drive, is far off.
+    The hand's torque is k (x - q), speed qd = (torque + push) / b. By the hand's own script x
+    the ratio is b; the plain ratio of the two, without the drive, is far off.
     """
     k, b, h = 5.0, 2.0, 1.0 / RATE_HZ
     x, torque, speed = noise(3), np.zeros(len(EVERYTHING)), np.zeros(len(EVERYTHING))
@@ -111,7 +112,7 @@ def shaken() -> dict[str, object]:
     }
 
 
-def test_the_impedance_of_a_linear_pair_is_its_closed_form() -> None:
+def test_linear_pair_has_its_closed_form_impedance() -> None:
     """Both arms at one pose, small motions: M s^2 + d s + K, coupled by K exp(-s T), driven at joint 1."""
     log = simulated("two_sites", shaken())
     (found,) = (
@@ -131,7 +132,7 @@ def test_the_impedance_of_a_linear_pair_is_its_closed_form() -> None:
     assert found.ratio.phase_rad == pytest.approx(float(np.angle(Z)), abs=0.03)
 
 
-def test_a_hand_that_stands_still_tells_nothing_of_its_site() -> None:
+def test_a_still_hand_says_nothing_of_its_site() -> None:
     """`contact`: from 3 s on the wall shakes the arm against a still hand of 30 N m/rad."""
     found = compute_log_metrics(simulated("contact", {"rate_hz": 200})).responses
     for one in found:
@@ -140,7 +141,9 @@ def test_a_hand_that_stands_still_tells_nothing_of_its_site() -> None:
 
 
 def closed_form_impedance(frequency_hz: float, c2: float) -> complex:
-    """Of joint 1 of a pair M s^2 + d s + K, coupled by K exp(-s T), gains as in `shaken`."""
+    """Returns the impedance of joint 1 of a pair M s^2 + d s + K, coupled by K exp(-s T), gains
+    as in `shaken`.
+    """
     s = 2j * math.pi * frequency_hz
     M = np.array([[3.0 + 2.0 * c2, 1.0 + c2], [1.0 + c2, 1.0]])
     own = M * s**2 + np.eye(2) * (10.0 * s + 20.0)

@@ -1,14 +1,7 @@
-"""Logs of every kind: what can be said is said, and what cannot has its reason.
+"""Logs of every kind: every metric has a number or a reason.
 
-Runs side by side.
-
-Effort and saturation in closed form.
-
-The stiffness that a hand feels at rest.
-
-Force sharing at rest: sum_i (pi_i / K_i) tau_i = 0.
-
-How near estimates came to the truth.
+Runs side by side. Effort and saturation in closed form. The stiffness that a hand feels at
+rest. Force sharing at rest: sum_i (pi_i / K_i) tau_i = 0. Errors of the estimates.
 """
 
 import csv
@@ -36,7 +29,7 @@ GOLDEN = sorted((Path(__file__).parents[2] / "golden").glob("v*.mcap"))
 
 
 def told(log: Log) -> dict[str, Any]:
-    """The facts of a log, checked for what holds of all."""
+    """Returns the facts of a log after checking the rules that all facts obey."""
     measured = compute_log_metrics(log)
     found: dict[str, Any] = json.loads(json.dumps(measured.to_dict(), allow_nan=False))
     assert set(found["sites"]) == set(log.sites)
@@ -71,7 +64,7 @@ def test_busy_and_uneven_sites_are_measured() -> None:
     told(logs.simulated("four"))
 
 
-def test_gap_and_late_begin_leave_numbers_and_are_counted() -> None:
+def test_gaps_and_late_starts_are_counted() -> None:
     log = simulated("free", {"duration_s": 3.0, "rate_hz": 200})
     torn = logs.rewritten(
         log, lambda s: not (s.site == "m1" and 200 <= s.tick < 240), finished=False
@@ -85,7 +78,7 @@ def test_gap_and_late_begin_leave_numbers_and_are_counted() -> None:
     assert late["run"]["spread_max_rad"] > 0.0
 
 
-def test_site_without_any_record_takes_only_its_own_figures_away() -> None:
+def test_a_missing_site_lacks_only_its_figures() -> None:
     log = simulated("free", {"duration_s": 1.0, "rate_hz": 100})
     found = told(logs.rewritten(log, lambda state: state.site != "m1"))
     assert found["sites"]["m2"]["controller_j"] is not None
@@ -98,20 +91,20 @@ def test_site_without_any_record_takes_only_its_own_figures_away() -> None:
 
 
 @pytest.mark.parametrize("ticks", [0, 1, 2, 3])
-def test_next_to_nothing_is_no_error(ticks: int) -> None:
+def test_nearly_empty_logs_are_no_error(ticks: int) -> None:
     log = simulated("contact", {"duration_s": 1.0, "rate_hz": 100})
     found = told(logs.rewritten(log, lambda state: state.tick < ticks))
     assert (found["sites"]["m"]["controller_j"] is None) == (ticks < 2)
     assert (found["walls"]["s/1"]["force_peak_n"] is None) == (ticks < 1)
 
 
-def test_a_run_that_diverged_is_measured_up_to_there() -> None:
+def test_a_diverged_run_is_measured_until_divergence() -> None:
     found = told(logs.diverged())
     assert found["sites"]["m1"]["unaccounted_j"] < 1e-2
 
 
 @pytest.mark.parametrize("size", [1e200, 1e308])
-def test_numbers_beyond_all_physics_are_no_numbers_and_no_error(size: float) -> None:
+def test_unphysical_numbers_are_missing_without_error(size: float) -> None:
     log = simulated("contact", {"duration_s": 5.0, "rate_hz": 100})
     grown = logs.rewritten(
         log,
@@ -126,7 +119,7 @@ def test_numbers_beyond_all_physics_are_no_numbers_and_no_error(size: float) -> 
     assert told(grown)["sites"]["m"]["mechanical_j"] is None
 
 
-def test_loops_are_told_of_where_a_clock_was_read() -> None:
+def test_loops_are_reported_if_clocks_were_read() -> None:
     """Every loop late by its tick in us, every tick 7 us of work."""
     log = logs.timed(simulated("free", {"duration_s": 1.0, "rate_hz": 200}))
     found = told(log)["sites"]["m1"]
@@ -148,7 +141,7 @@ def test_the_docs_have_a_line_for_every_quantity() -> None:
     assert sorted(keys) == sorted(quantity.key for quantity in quantities())
 
 
-def test_row_is_largest_of_places_or_their_sum() -> None:
+def test_a_row_is_the_largest_or_the_sum() -> None:
     log = pair(
         lambda site, _: {
             "tau": [3.0 if site == "m" else 4.0, 0.0],
@@ -163,8 +156,8 @@ def test_row_is_largest_of_places_or_their_sum() -> None:
     assert found.row("max_error_rad").values == (0.1, 0.1)
 
 
-def test_what_one_site_lacks_the_whole_run_lacks() -> None:
-    """A largest value of some sites is none of the run; a site that cannot have one takes nothing away."""
+def test_runs_lack_figures_missing_at_a_site() -> None:
+    """A largest value of some sites is none of the run; sites that cannot have the figure do not count."""
     log = simulated("free", {"duration_s": 1.0, "rate_hz": 100})
     torn = rewritten(log, lambda state: state.site != "m2")
     row = compare_metrics([log, torn]).row("max_error_rad")
@@ -173,7 +166,7 @@ def test_what_one_site_lacks_the_whole_run_lacks() -> None:
     assert row.entries[1].why == "m2: no records of m2"
 
 
-def test_rows_that_no_run_could_have_are_left_out() -> None:
+def test_rows_without_any_value_are_left_out() -> None:
     free = simulated("free", {"duration_s": 1.0, "rate_hz": 100})
     wall = simulated("contact", {"duration_s": 1.0, "rate_hz": 100})
     keys = [row.quantity.key for row in compare_metrics([free]).rows]
@@ -185,7 +178,7 @@ def test_rows_that_no_run_could_have_are_left_out() -> None:
         compare_metrics([free]).row("force_peak_n")
 
 
-def test_json_has_a_value_and_a_reason_per_column() -> None:
+def test_json_has_value_and_reason_per_column() -> None:
     free = simulated("free", {"duration_s": 1.0, "rate_hz": 100})
     found = json.loads(json.dumps(comparison_to_json(compare_metrics([free])), allow_nan=False))
     assert found["columns"] == ["log"]
@@ -204,8 +197,8 @@ def test_effort_of_a_constant_and_of_a_sinusoid() -> None:
     assert found["saturated_share"].value == 0.0
 
 
-def test_the_share_of_ticks_at_the_limit() -> None:
-    """200 N m is the limit of a scenario that names none; -200 is at it as well."""
+def test_saturation_is_the_share_of_limited_ticks() -> None:
+    """200 N m is the limit of a scenario that names none; -200 counts as well."""
     log = pair(lambda _, t_s: {"tau": [0.0, -200.0 if t_s < 1.0 else 199.9]})
     assert compute_log_metrics(log).sites["s"]["saturated_share"].value == pytest.approx(0.25)
 
@@ -231,7 +224,7 @@ ANCHORED = {
 }
 
 
-def test_learning_gravity_is_spring_that_ties_arms_to_pose() -> None:
+def test_learnt_gravity_is_a_spring_to_pose() -> None:
     """Gamma g^2 cos^2 (1 + Lambda T) = 115.5 N m/rad a robot; the hand moves all three."""
     found = compute_log_metrics(simulated("paper", ANCHORED))
     assert [one.site for one in found.stiffness] == ["m1", "m1"]
@@ -244,8 +237,10 @@ def test_learning_gravity_is_spring_that_ties_arms_to_pose() -> None:
     assert first is None or abs(first) > 10.0 * second.stiffness_nm_rad
 
 
-def test_where_something_else_moves_arm_ratio_would_be_hands_own() -> None:
-    """`training`: the shares change, the hands do not; nothing is said, and surely not their 200 N m/rad."""
+def test_no_stiffness_is_given_under_changing_shares() -> None:
+    """In `training` the shares change and the hands do not: no stiffness is stated, in
+    particular not their 200 N m/rad.
+    """
     found = compute_log_metrics(simulated("training", {"rate_hz": 50}))
     assert found.static_windows.value == 2.0
     assert found.stiffness == []
@@ -254,7 +249,7 @@ def test_where_something_else_moves_arm_ratio_would_be_hands_own() -> None:
 SLOW = {"rate_hz": 50}
 
 
-def test_a_hand_feels_what_the_shares_say() -> None:
+def test_the_felt_stiffness_follows_the_shares() -> None:
     """5 N m on the slave: 4.79 N m at the expert, 16.4 N m at the trainee, 5.00 with equal shares."""
     found = compute_log_metrics(simulated("force_sharing", SLOW))
     assert [pair.pushed + pair.holds for pair in found.sharing_ratios] == ["sm1", "sm2", "sm2"]
@@ -281,7 +276,7 @@ def test_three_loaded_sites_balance() -> None:
     assert found.joint_loads[0].imbalance.value <= 0.01
 
 
-def test_where_gravity_is_learnt_nothing_is_expected() -> None:
+def test_with_learnt_gravity_no_sharing_is_expected() -> None:
     found = compute_log_metrics(simulated("windup", {"duration_s": 40.0, "rate_hz": 50}))
     assert found.sharing_ratios
     for one in found.sharing_ratios:
@@ -293,7 +288,7 @@ def test_where_gravity_is_learnt_nothing_is_expected() -> None:
         assert one.off is None
 
 
-def test_arms_that_move_share_nothing() -> None:
+def test_moving_arms_have_no_force_sharing() -> None:
     found = compute_log_metrics(simulated("contact", {"duration_s": 1.0, "rate_hz": 100}))
     assert found.static_windows.value is None
     assert (
@@ -306,8 +301,8 @@ LEARNS = 'control = { law = "adaptive", Gamma = [1.0, 1.0, 2.0, 0.0, 0.0] }'
 THETA = [3.0, 1.0, 1.0, 2.0, 1.0]
 
 
-def test_distance_energy_and_slope_of_estimates_that_move_straight() -> None:
-    """Learnt are the first three; off by (3, 4, 12) at t = 0, and by that less rate times time later."""
+def test_straight_estimates_have_distance_energy_and_slope() -> None:
+    """The first three are learnt; off by (3, 4, 12) at t = 0, and later by that less rate times time."""
     rate = [0.1, 0.2, -0.2]
 
     def motion(_: str, t_s: float) -> dict[str, list[float]]:
@@ -330,14 +325,14 @@ def test_distance_energy_and_slope_of_estimates_that_move_straight() -> None:
     assert learnt.theta == THETA
 
 
-def test_a_law_that_learns_nothing_says_so() -> None:
+def test_a_law_without_estimates_is_reported() -> None:
     found = compute_log_metrics(pair(lambda _, __: {})).sites["m"]["theta_error_last"]
     assert found.value is None
     assert found.why == "nothing is learnt"
     assert not found.applies
 
 
-def test_without_a_truth_estimates_are_given_and_not_judged() -> None:
+def test_without_truth_estimates_have_no_error() -> None:
     log = simulated("free", {"duration_s": 1.0, "rate_hz": 100})
     changes = {
         "sites.s.plant": "external",

@@ -1,4 +1,6 @@
-"""A metric is one file: whoever shows, compares or expects metrics knows one put beside the others."""
+"""A metric is one file: reports, comparisons and expectations find a metric that was put beside
+the others.
+"""
 
 from pathlib import Path
 
@@ -41,7 +43,7 @@ print(json.dumps({
 """
 
 
-def test_a_file_beside_the_others_is_a_metric_everywhere(tmp_path: Path) -> None:
+def test_an_added_file_is_a_metric_everywhere(tmp_path: Path) -> None:
     (tmp_path / "haste.py").write_text(METRIC)
     found = look(LOOK, tmp_path)
     assert 0.0 < found["json"] < found["compared"][0] == found["compared"][1]
@@ -51,7 +53,7 @@ def test_a_file_beside_the_others_is_a_metric_everywhere(tmp_path: Path) -> None
     assert ["metrics.haste_rad_s", True] in found["expected"]
 
 
-def test_a_key_with_two_definitions_is_refused_with_both_homes() -> None:
+def test_duplicate_keys_are_refused_with_both_files() -> None:
     def measure_again(_view: RunView, _site: str) -> dict[str, object]:
         return {}
 
@@ -62,7 +64,7 @@ def test_a_key_with_two_definitions_is_refused_with_both_homes() -> None:
 
 
 @pytest.mark.parametrize("name", ["free", "contact"])
-def test_a_measure_gives_the_quantities_that_it_declares(name: str) -> None:
+def test_a_measure_gives_its_declared_quantities(name: str) -> None:
     view = RunView(trilat_net.simulate(name, {"duration_s": 0.2}))
     for one in list_measures():
         for place in view.list_subjects(one.of):

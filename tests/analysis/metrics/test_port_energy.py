@@ -1,4 +1,4 @@
-"""Energies: what the ports gave is in the arm, to the order of the scheme.
+"""Energies: the energy through the ports is in the arm, to the order of the scheme.
 
 The energy that a delay gives.
 """
@@ -17,7 +17,7 @@ from trilat_net.scenario.arms import build_arm
 from .written import pair, simulated, under
 
 
-def test_work_of_spring_is_exact_and_independent_of_way() -> None:
+def test_work_of_springs_is_exact_path_independent() -> None:
     """int -K q dq = K (q_0^2 - q_1^2) / 2."""
     q = np.cumsum(np.random.default_rng(1).normal(size=(50, 2)), axis=0)
     K = np.array([3.0, 7.0])
@@ -26,14 +26,14 @@ def test_work_of_spring_is_exact_and_independent_of_way() -> None:
     )
 
 
-def test_work_of_torque_that_is_held_is_torque_times_way() -> None:
+def test_held_torques_work_is_torque_times_path() -> None:
     q = np.array([[0.0, 1.0], [0.5, 1.0], [0.25, 3.0]])
     assert held_work(np.array([[2.0, 9.0], [4.0, 1.0]]), q).tolist() == [1.0, 1.0]
 
 
 @pytest.mark.parametrize("scheme", ["second_order", "digital"])
-def test_ports_make_up_the_mechanical_energy_to_second_order(scheme: str) -> None:
-    """1/2 qd'M qd + U grows by what controller and hands give; the held torque's work is exact."""
+def test_ports_balance_mechanical_energy_to_second_order(scheme: str) -> None:
+    """1/2 qd'M qd + U grows by the energy of controller and hands; the held torque's work is exact."""
     rests = []
     for rate_hz in (100, 200):
         log = simulated("paper", {"duration_s": 3.0, "rate_hz": rate_hz, "scheme": scheme})
@@ -56,7 +56,7 @@ def _mechanical(log, site: str):
     return kinetic + spec.arm.g_m_s2 * (theta[3] * np.sin(q1) + theta[4] * np.sin(q12))
 
 
-def test_a_lossless_wall_gives_back_no_more_than_it_took() -> None:
+def test_lossless_walls_return_at_most_their_energy() -> None:
     found = compute_log_metrics(
         simulated("contact", {"duration_s": 6.0, "link.delay_ms": 20.0, "rate_hz": 250})
     ).sites["s"]
@@ -66,7 +66,7 @@ def test_a_lossless_wall_gives_back_no_more_than_it_took() -> None:
     assert found["walls_j"].value == pytest.approx(-(3.3**2) / 4000.0, rel=0.1)
 
 
-def test_a_damper_takes_what_the_formula_says() -> None:
+def test_a_damper_dissipates_by_the_formula() -> None:
     """int B (A w cos w t)^2 dt = B A^2 w^2 / 2 times the time, to second order of the period."""
     A, w, B = 0.2, 2.0 * math.pi, 4.0
 
@@ -99,7 +99,7 @@ def test_periods_without_both_records_are_left_out() -> None:
 
 
 def test_an_unknown_arm_has_no_mechanical_energy() -> None:
-    """What the ports gave is known all the same; an arm outside of the program was told tau."""
+    """The energy through the ports is known all the same; an external arm was given tau."""
     log = simulated("free", {"duration_s": 1.0, "rate_hz": 100})
     outside = under(log, {"sites.s.plant": "external", "sites.s.arm.known": False})
     found, before = (compute_log_metrics(one).sites["s"] for one in (outside, log))
@@ -136,7 +136,7 @@ def test_the_energy_of_a_delay_between_sinusoids(apart: float) -> None:
 
 
 @pytest.mark.parametrize("law", ["pd_d", "adaptive", "p_d"])
-def test_delays_are_what_port_has_beyond_law_without_them(law: str) -> None:
+def test_delay_energy_is_the_ports_excess(law: str) -> None:
     """The controller's energy less that of all delays is that of the same law fed with present peers."""
     log = simulated("asymmetric", {"duration_s": 2.0, "rate_hz": 250, "control.law": law})
     found, largest = compute_log_metrics(log), 0.0
@@ -181,15 +181,15 @@ def _regressed(spec, part, v, a, theta):
 LAWS = {"pd_d": _pd, "p_d": _pd, "adaptive": _adaptive}
 
 
-def test_direct_force_reflection_counts_the_force_that_comes_late() -> None:
-    """Where the slave meets no wall, no force is late, and the master's law sees nothing of its peer."""
+def test_force_reflection_counts_only_late_force() -> None:
+    """If the slave meets no wall, no force is late, and the master's law sees nothing of its peer."""
     calm = simulated("contact", {"duration_s": 3.0, "rate_hz": 200, "sites.s.environment": []})
     assert compute_log_metrics(calm).links["s->m"]["delay_j"].value == 0.0
     pushed = simulated("contact", {"duration_s": 3.0, "rate_hz": 200})
     assert compute_log_metrics(pushed).links["s->m"]["delay_most_j"].value > 0.0
 
 
-def test_a_law_of_somebodys_own_is_not_judged() -> None:
+def test_a_users_own_law_is_not_judged() -> None:
     log = simulated(
         "free", {"duration_s": 0.2, "rate_hz": 100, "control.law": "tests.laws:Adaptive"}
     )

@@ -1,4 +1,4 @@
-"""Errors, spread and following, of motions whose figures are known in closed form."""
+"""Errors, spread and following, for motions whose figures are known in closed form."""
 
 import math
 
@@ -36,15 +36,15 @@ def test_settling_is_the_last_time_above_the_limit() -> None:
     assert found["max_error_end_rad"].value == pytest.approx(math.exp(-5.0), rel=2.0 / RATE_HZ)
 
 
-def test_what_has_not_settled_says_so() -> None:
+def test_an_unsettled_run_is_reported() -> None:
     found = compute_log_metrics(pair(lambda _, __: {"q": [0.5, 0.0], "q_des": [0.0, 0.0]}))
     settled = found.sites["m"]["settle_s"]
     assert settled.value is None
     assert "exceeds 0.01 rad" in settled.why
 
 
-def test_following_looks_back_and_the_spread_does_not() -> None:
-    """A slave that is exactly its master's past: nothing is left of q_m(t - T) - q_s, v T of the spread."""
+def test_following_allows_for_delay_unlike_spread() -> None:
+    """A slave that is exactly its master's past: q_m(t - T) - q_s is zero, and the spread is v T."""
     speed, delay_s = 0.4, 0.05
 
     def motion(site: str, t_s: float) -> dict[str, list[float]]:
@@ -59,8 +59,8 @@ def test_following_looks_back_and_the_spread_does_not() -> None:
     assert not found.links["s->m"]["following_max_rad"].applies
 
 
-def test_the_delay_of_following_is_the_one_in_use() -> None:
-    """Where older samples are in use than the link says, the master's angles are those of their stamps."""
+def test_following_uses_the_delay_in_use() -> None:
+    """If older samples are in use than the link states, the master's angles are those of their stamps."""
 
     def motion(site: str, t_s: float) -> dict[str, object]:
         tick = round(t_s * RATE_HZ)
@@ -83,7 +83,7 @@ def test_instants_with_a_missing_record_do_not_count() -> None:
     assert compute_log_metrics(torn).run["spread_max_rad"].value == 0.25
 
 
-def test_the_latest_record_is_of_the_tick_that_was() -> None:
+def test_the_latest_record_is_the_last_tick() -> None:
     track = align_records(pair(lambda _, __: {}))["m"]
     row, there = find_latest_rows(track, np.array([0.0, 0.0049, 0.005, 3.995, 4.0, -0.1]))
     assert row.tolist() == [0, 0, 1, 799, 799, 0]

@@ -1,4 +1,4 @@
-"""Metrics of users who share a slave, on records that are prescribed, against numbers worked out by hand."""
+"""Metrics of users who share a slave, on prescribed records, against numbers worked out by hand."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -46,7 +46,7 @@ PUSHES = {"m1": [3.0, 2.0], "m2": [-1.0, 1.0], "m3": [2.0, -3.0], "s": [0.0, 0.0
 
 
 def pushed(log: Log, steps: Mapping[int, float] | None = None) -> Log:
-    """The log with these pushes; references move by 1 mrad a tick, by other steps where they are given."""
+    """Returns the log with these pushes; references move by 1 mrad a tick, or by the given steps."""
     step = np.full(400, 1e-3)
     for tick, size in (steps or {}).items():
         step[tick] = size
@@ -76,7 +76,7 @@ def test_effort_of_a_hand_counts_by_its_share() -> None:
     assert not found.sites["s"]["authority_effort_nm2_s"].applies
 
 
-def test_what_cancels_is_the_smaller_of_opposed_torques() -> None:
+def test_the_smaller_of_opposed_torques_cancels() -> None:
     """Joint 1 has 3 against -1, joint 2 has 2 and 1: 1 N m of joint 1 cancels on both sides, of 7 in all."""
     found = compute_log_metrics(prescribed()).run
     assert found["internal_rms_nm"].value == pytest.approx(1.0)
@@ -84,7 +84,7 @@ def test_what_cancels_is_the_smaller_of_opposed_torques() -> None:
     assert not found["internal_rms_n"].applies
 
 
-def test_three_users_cancel_up_to_the_torque_that_remains() -> None:
+def test_three_users_cancel_except_the_remaining_torque() -> None:
     """Of 3, -1 and 2 N m at joint 1 and 2, 1 and -3 at joint 2 the sums are 4 and 0: 1 and 3 N m cancel."""
     text = TRIO.replace("[sites.s]", '[sites.m3]\nrole = "master"\n[sites.s]').replace(
         "RAMP", "0.5"
@@ -105,8 +105,8 @@ def test_a_takeover_lasts_until_the_larger_share() -> None:
     }
 
 
-def test_the_program_is_the_user_that_the_log_names() -> None:
-    """m1 leads for ticks 0 to 249, and for tick 250, at equal shares, if it is the program."""
+def test_the_log_names_the_program_as_user() -> None:
+    """m1 leads for ticks 0 to 249, and at tick 250, with equal shares, if m1 is the program."""
     event = Event(member="m1", boot=1, kind="hand", text="m1: policy takes hold at t = 0.000 s")
     log = rewritten(prescribed(), others=[event])
     found = measure_run(log, ["intervention_share"])["intervention_share"]
@@ -157,15 +157,15 @@ def test_shares_are_identified_from_motion() -> None:
     assert not found.sites["s"]["motion_share"].applies
 
 
-def test_users_who_move_alike_are_not_told_apart() -> None:
+def test_users_moving_alike_are_not_separated() -> None:
     log = rewritten(
         prescribed(), change=lambda state: msgspec.structs.replace(state, qd=[1.0, 0.5])
     )
     assert "not independent" in compute_log_metrics(log).sites["m1"]["motion_share"].why
 
 
-def test_slave_that_moves_otherwise_has_no_shares() -> None:
-    """It follows one user in one half of the run, and does the opposite in the other."""
+def test_contradictory_motion_of_the_slave_has_no_shares() -> None:
+    """The slave follows one user in one half of the run, and does the opposite in the other."""
 
     def change(state: Any) -> Any:
         sign = 1.0 if state.tick < 200 else -1.0

@@ -1,4 +1,4 @@
-"""Walls: what they are met with, in closed form and as a scenario's figures say."""
+"""Contact with walls, in closed form and against the figures in a scenario's text."""
 
 import math
 
@@ -53,7 +53,7 @@ def test_force_depth_and_hits_of_a_swing() -> None:
     )
 
 
-def test_who_touches_from_the_first_record_on_has_not_hit() -> None:
+def test_contact_from_the_first_record_is_no_hit() -> None:
     found = compute_log_metrics(
         pair(lambda _, __: {"q": [0.0] * JOINTS, "qd": [0.0] * JOINTS}, more=WALL)
     ).walls["s/1"]
@@ -62,8 +62,8 @@ def test_who_touches_from_the_first_record_on_has_not_hit() -> None:
     assert found["end_force_mean_n"].value == pytest.approx(100.0)
 
 
-def test_a_contact_that_began_in_a_gap_is_no_hit() -> None:
-    """Nobody knows since when it touches; and no number comes from records that are not there."""
+def test_contact_that_began_in_gaps_is_no_hit() -> None:
+    """Its beginning is unknown; and missing records give no numbers."""
     whole = pair(swinging, more=WALL)
     torn = rewritten(
         whole, lambda state: not (state.site == "s" and 120 <= state.tick % 200 < 140)
@@ -74,7 +74,7 @@ def test_a_contact_that_began_in_a_gap_is_no_hit() -> None:
     assert (before, after) == (8.0, 4.0)
 
 
-def test_contact_as_scenarios_tell_of_it() -> None:
+def test_contact_matches_the_scenario_text() -> None:
     """20 ms: one hit, then 3.3 N."""
     found = compute_log_metrics(
         simulated("contact", {"link.delay_ms": 20.0, "duration_s": 11.0, "rate_hz": 200})
