@@ -1,4 +1,4 @@
-"""The equations of `resting` over the rows of a log, written once more."""
+"""The equations of `resting` over the rows of a log, written again."""
 
 import numpy as np
 
@@ -9,13 +9,14 @@ from trilat_net.log.site_log import SiteLog
 
 
 def gravity_of(theta: Array, q: Array) -> Array:
-    """G of the planar arm, rows of q, by the paper's Eq. (2)."""
+    """Returns G of the planar arm, rows of q, by the paper's Eq. (2)."""
     outer = theta[4] * np.cos(q[:, 0] + q[:, 1])
     return 9.81 * np.stack([theta[3] * np.cos(q[:, 0]) + outer, outer], axis=1)
 
 
 def reference(gains: RestGains, part: SiteLog, first: int, rows: int) -> tuple[Array, Array]:
-    """q_ref and qd_ref of an arm that comes to rest from its record `first` on, with no torque at its limit.
+    """Returns q_ref and qd_ref of an arm that comes to rest from record `first` on, with no
+    torque at its limit.
 
     Eq. (1) of docs/theory/coming-to-rest.md, joint by joint; q_ref is the integral of qd_ref.
     """
@@ -37,9 +38,10 @@ def reference(gains: RestGains, part: SiteLog, first: int, rows: int) -> tuple[A
 def rest_torque(
     gains: RestGains, part: SiteLog, law: Array, first: int, limit: Array
 ) -> tuple[Array, Array]:
-    """Law + w - B s from a record on, and w, of a slow arm whose law does not learn.
+    """Returns law + w - B s from a record on, and w, of a slow arm whose law does not learn.
 
-    Eq. (2) to (4) of docs/theory/coming-to-rest.md, for rows of its law's torque; w is that with which a tick begins.
+    Eq. (2) to (4) of docs/theory/coming-to-rest.md, for rows of its law's torque; w is the
+    value at the start of a tick.
     """
     rows = slice(first, first + len(law))
     q_ref, qd_ref = reference(gains, part, first, len(law))
@@ -59,7 +61,7 @@ def rest_torque(
 
 
 def integrals(part: SiteLog, rows: slice) -> Array:
-    """w of the records after some: what their `mem` has of the torque at rest."""
+    """Returns w of the records after a given one, read from the torque at rest in `mem`."""
     first = 2 * (part.layout.shared + 1) + len(part.peers)
     return np.array(
         [

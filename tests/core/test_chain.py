@@ -82,7 +82,7 @@ def test_place_and_jacobian_are_those_of_pinocchio(name: str) -> None:
 
 
 def test_friction_and_drives_enter_both_dynamics_alike() -> None:
-    """What inverse dynamics asks for a motion makes that motion, with armature and friction too."""
+    """The torque of inverse dynamics for a motion makes that motion, with armature and friction too."""
     arm = build("arm7", armature_kg_m2=0.1, viscous=0.5, coulomb=1.5)
     state, qdd = REFERENCES["arm7"].states[0], np.zeros(7)
     moving(arm, state, state.qd)
@@ -92,7 +92,7 @@ def test_friction_and_drives_enter_both_dynamics_alike() -> None:
 
 
 def stop_torque(q: list[float], qd: list[float]) -> Array:
-    """The generalised force of the stops of two joints, N m: what they change of M qdd."""
+    """Returns the generalised force of the stops of two joints, N m: their change of M qdd."""
     arms = (
         build("random2", lower=-0.5, upper=0.5, stop_stiffness=1e3, stop_damping=10.0),
         build("random2"),

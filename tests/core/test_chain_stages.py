@@ -1,4 +1,4 @@
-"""The torque of a tick of a chain, joint by joint, by the dynamics that Pinocchio computed for it."""
+"""The torque of a tick of a chain, joint by joint, by the dynamics of Pinocchio."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ LAMBDA = 2.0
 
 
 def build(name: str, state: ChainState, **gains: object) -> SiteArrays:
-    """A site with the chain, in a state; its reference is such that v and a are those of the state."""
+    """Returns a site with the chain in a state; with its reference, v and a are those of the state."""
     chain = REFERENCES[name].chain
     joints = tuple(
         ChainJoint(one.kind == "prismatic", one.axis, one.rotation, one.origin_m)
@@ -53,7 +53,7 @@ def build(name: str, state: ChainState, **gains: object) -> SiteArrays:
 
 
 def find_torque(arrays: SiteArrays) -> Array:
-    """What the site's law asks in its tick, N m."""
+    """Returns the torque of the site's law in its tick, N m."""
     site, chain = arrays.site[0], arrays.chain
     place_chain(site, chain)
     update_errors(site, chain)
@@ -62,7 +62,7 @@ def find_torque(arrays: SiteArrays) -> Array:
 
 
 @each
-def test_adaptive_torque_is_that_of_pinocchio_less_its_feedback(name: str) -> None:
+def test_adaptive_torque_equals_pinocchios_less_feedback(name: str) -> None:
     """Eq. (13): Y theta - Kp r - Kd ed, and Y' r of Eq. (15)."""
     for state in REFERENCES[name].states:
         arrays = build(name, state, law=Law.ADAPTIVE, Kp=(3.0,), Kd=(5.0,))
@@ -74,7 +74,7 @@ def test_adaptive_torque_is_that_of_pinocchio_less_its_feedback(name: str) -> No
 
 @each
 def test_law_that_knows_gravity_adds_springs_and_dampers(name: str) -> None:
-    """G - K e - d qd - Kd ed, where G is what the inverse dynamics ask of the arm at rest."""
+    """G - K e - d qd - Kd ed, where G is the torque of inverse dynamics for the arm at rest."""
     for state in REFERENCES[name].states:
         arrays = build(name, state, law=Law.KNOWN, K=(7.0,), d=(2.0,), Kd=(5.0,))
         found = find_torque(arrays)

@@ -1,4 +1,4 @@
-"""A live hand: who holds the arm, where its target is, and that nothing of it jumps."""
+"""A live hand: its holder, its target, and continuity of its force and target."""
 
 import math
 from collections.abc import Sequence
@@ -36,7 +36,7 @@ ARM = (1.0, 0.5)
 def run(
     messages: dict[int, Sequence[HandCommand]], ticks: int, rules: HandRules = RULES
 ) -> list[HandStep]:
-    """Returns what a hand does in each tick, with the messages that come in before some of them."""
+    """Returns the hand's state in each tick, with the given messages before some ticks."""
     memory, steps = HandMemory(), []
     for k in range(ticks):
         step = advance_hand(
@@ -48,7 +48,7 @@ def run(
 
 
 def hands(steps: list[HandStep]) -> list[HandInForce]:
-    """Returns what is in force in each tick."""
+    """Returns the message in force in each tick."""
     return [HandInForce.read(step.vector) for step in steps]
 
 
@@ -66,7 +66,7 @@ def at(
     return {k: [HandCommand(**{**one, **fields})]}
 
 
-def test_it_begins_at_arm_without_force_and_its_grip_grows() -> None:
+def test_holds_begin_without_force_and_grow() -> None:
     steps = run(at(10, (1.2, 0.5)), 150)
     before, first, *rest = hands(steps)[9:]
     assert before == HandInForce.read(empty_hand_vector(2))
@@ -78,8 +78,10 @@ def test_it_begins_at_arm_without_force_and_its_grip_grows() -> None:
     assert grips[-1] == 1.0
 
 
-def test_between_two_messages_the_target_glides_in_a_straight_line() -> None:
-    """Sixty messages a second of a hand that moves at 0.6 m/s: the target moves at 0.6 m/s, and no step."""
+def test_the_target_glides_linearly_between_messages() -> None:
+    """Sixty messages a second of a hand that moves at 0.6 m/s: the target moves at 0.6 m/s
+    without steps.
+    """
     messages: dict[int, Any] = {}
     for n in range(60):
         k = round(n * 1000 / 60)
@@ -110,7 +112,7 @@ def test_a_silent_hand_lets_go_and_fades() -> None:
     assert {hand.rate for hand in fading} == {(0.0, 0.0)}
 
 
-def test_who_lets_go_is_followed_by_whoever_takes_hold_next() -> None:
+def test_the_next_holder_follows_a_release() -> None:
     release = at(50, (), n=50, grip=False)
     second = {
         40: [HandCommand(9, 0, True, (2.0, 2.0), 0)],
@@ -127,9 +129,7 @@ def test_who_lets_go_is_followed_by_whoever_takes_hold_next() -> None:
 
 @pytest.mark.parametrize("source", [7, 9], ids=["the same", "another"])
 @pytest.mark.parametrize("starts_at_arm", [True, False], ids=["a target", "a force"])
-def test_who_takes_hold_of_fading_grip_goes_on_from_it(
-    source: int, starts_at_arm: bool
-) -> None:
+def test_a_new_holder_continues_a_fading_grip(source: int, starts_at_arm: bool) -> None:
     """After 20 ms of fading the grip was 0.79, and fell to 0 in one tick."""
     rules = RULES._replace(starts_at_arm=starts_at_arm)
     again = {220: [HandCommand(source, 220, True, (1.0, 0.6), 0)]}
@@ -148,8 +148,8 @@ def test_who_takes_hold_of_fading_grip_goes_on_from_it(
     assert grips[-1] == 1.0
 
 
-def test_a_message_that_was_overtaken_changes_nothing() -> None:
-    """Also one that comes after the same hand has let go: it does not take hold again."""
+def test_an_overtaken_message_changes_nothing() -> None:
+    """A message that comes after the same hand has let go does not take hold again either."""
     late = {
         30: [HandCommand(7, 5, True, (9.0, 9.0), 0)],
         70: [HandCommand(7, 49, True, (9.0, 9.0), 0)],
@@ -159,7 +159,7 @@ def test_a_message_that_was_overtaken_changes_nothing() -> None:
     assert steps[-1].vector == empty_hand_vector(2)
 
 
-def test_hand_that_wakes_up_takes_hold_again_with_same_goal() -> None:
+def test_a_silent_hand_resumes_its_goal() -> None:
     steps = run(at(0, (1.1, 0.5)) | at(400, (1.1, 0.5), n=0), 402)
     assert [change for step in steps for _, change in step.changes] == [TAKEN, SILENT, TAKEN]
 
@@ -183,7 +183,7 @@ COMMANDS = st.builds(
 
 @settings(max_examples=60, deadline=None)
 @given(st.dictionaries(st.integers(0, 400), st.lists(COMMANDS, max_size=4), max_size=40))
-def test_a_grip_never_jumps_and_its_target_keeps_its_limit(messages: Any) -> None:
+def test_grips_are_continuous_and_targets_limited(messages: Any) -> None:
     steps = hands(run(messages, 500))
     most = 1e6 / GRIP_NS + 1e-12
     for before, now in pairwise(steps):
@@ -209,10 +209,13 @@ H_S = 1e-3
     acceleration=st.floats(0.1, 100.0),
     h_s=st.sampled_from([1e-4, 1e-3, 5e-3]),
 )
-def test_the_way_from_the_stopping_speed_is_the_distance(
+def test_stopping_distance_matches_stopping_speed(
     speed: float, acceleration: float, h_s: float
 ) -> None:
-    """Eq. (L1): the ways of ticks at v, v - a h, ... add up to the distance whose stopping speed v is."""
+    """Eq.
+
+    (L1): the ways of ticks at v, v - a h, ... add up to the distance whose stopping speed v is.
+    """
     step = acceleration * h_s
     ways = [h_s * (speed - n * step) for n in range(int(speed / step) + 1)]
     assert find_stopping_speed(sum(ways), acceleration, h_s) == pytest.approx(speed, rel=1e-9)
@@ -221,7 +224,7 @@ def test_the_way_from_the_stopping_speed_is_the_distance(
 @settings(max_examples=30, deadline=None)
 @given(st.dictionaries(st.integers(0, 400), st.lists(COMMANDS, max_size=4), max_size=40))
 def test_target_keeps_both_limits_whatever_messages_come(messages: Any) -> None:
-    """Also where one lets go, is silent, or takes hold of a grip that fades."""
+    """Also for messages that let go, fall silent, or take over a fading grip."""
     steps = hands(run(messages, 600, LIMITED))
     assert all(math.hypot(*now.rate) <= 1.5 + 1e-9 for now in steps)
     for before, now in pairwise(steps):
@@ -233,7 +236,7 @@ def test_target_keeps_both_limits_whatever_messages_come(messages: Any) -> None:
 
 @settings(max_examples=12, deadline=None)
 @given(goal=st.tuples(st.floats(-1.0, 3.0), st.floats(-1.0, 2.0)), limit=st.floats(5.0, 200.0))
-def test_target_comes_to_rest_at_still_goal_without_overshoot(
+def test_targets_reach_still_goals_without_overshoot(
     goal: tuple[float, float], limit: float
 ) -> None:
     rules = RULES._replace(acceleration_limit=limit)
@@ -251,7 +254,7 @@ def test_target_comes_to_rest_at_still_goal_without_overshoot(
     assert math.hypot(*steps[-1].rate) < 1e-9
 
 
-def test_target_passes_a_goal_that_comes_back_by_its_stopping_way() -> None:
+def test_targets_overshoot_returning_goals_by_stopping_distance() -> None:
     messages = at(0, (4.0, 0.5)) | at(199, (4.0, 0.5), n=0) | at(200, (1.1, 0.5))
     messages |= {k: at(k, (1.1, 0.5), n=200)[k] for k in range(250, 2000, 50)}
     steps = hands(run(messages, 2000, LIMITED))
@@ -262,7 +265,7 @@ def test_target_passes_a_goal_that_comes_back_by_its_stopping_way() -> None:
 
 
 @pytest.mark.parametrize("gap", [10, 25, 60, 150])
-def test_uneven_messages_of_a_device_never_jerk_its_force(gap: int) -> None:
+def test_bursty_messages_never_jerk_the_force(gap: int) -> None:
     """A hand at 0.3 m/s whose states come in bursts: its spring and damper change by 0.85 N in a tick."""
     stiffness_n_m, damping_n_s_m = 300.0, 20.0
     messages: dict[int, Any] = {}
@@ -284,7 +287,7 @@ def test_uneven_messages_of_a_device_never_jerk_its_force(gap: int) -> None:
 # The reach of an arm
 
 
-def test_goals_beyond_reach_move_to_its_nearest_place() -> None:
+def test_goals_beyond_reach_move_inside() -> None:
     ring = HandReach((0.0, 0.0), 0.5, 2.0)
     assert ring.find_nearest((3.0, 4.0)) == pytest.approx((1.2, 1.6))
     assert ring.find_nearest((0.0, 0.1)) == pytest.approx((0.0, 0.5))
@@ -297,7 +300,7 @@ def test_goals_beyond_reach_move_to_its_nearest_place() -> None:
 
 @settings(max_examples=15, deadline=None)
 @given(st.dictionaries(st.integers(0, 400), st.lists(COMMANDS, max_size=2), max_size=30))
-def test_target_never_leaves_the_reach_by_more_than_it_takes_to_stop(messages: Any) -> None:
+def test_targets_leave_reach_by_stopping_distance_only(messages: Any) -> None:
     rules = LIMITED._replace(reach=HandReach((0.0, 0.0), 0.0, 2.0))
     steps = hands(run(messages, 500, rules))
     stopping_m = 1.5**2 / (2.0 * LIMIT_M_S2) + 1.5 * H_S / 2.0

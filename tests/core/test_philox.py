@@ -48,7 +48,7 @@ def test_any_counter_and_key_as_defined(counter: tuple[int, ...], key: tuple[int
     purpose=words,
     attempt=st.integers(0, 63),
 )
-def test_uniforms_are_words_of_their_own_place(
+def test_uniforms_follow_from_their_place(
     key: int, sample: int, purpose: int, attempt: int
 ) -> None:
     a, b, c, d = philox_in_integers(

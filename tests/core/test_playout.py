@@ -1,4 +1,4 @@
-"""A play-out buffer turns jitter below its budget into a constant delay, bit for bit; whole runs."""
+"""A play-out buffer makes jitter below its budget a constant delay, bit for bit; whole runs."""
 
 from typing import Any
 
@@ -38,7 +38,7 @@ def same_bits(a: Run, b: Run) -> bool:
 
 
 @pytest.mark.parametrize("name", BELOW)
-def test_jitter_below_budget_is_constant_delay_bit_for_bit(name: str) -> None:
+def test_jitter_below_budget_is_constant_bit_for_bit(name: str) -> None:
     over = {"duration_s": 2.0}
     constant = run("free", {**over, "link.delay_ms": BUDGET_MS})
     made = trajectory("free", {**over, "link": {**BELOW[name], "playout_ms": BUDGET_MS}})
@@ -56,7 +56,7 @@ def test_it_holds_to_the_end_of_the_paper() -> None:
     assert same_bits(trajectory("paper", {"link": link}), run("paper"))
 
 
-def test_jitter_above_the_budget_is_not() -> None:
+def test_jitter_above_budget_varies() -> None:
     link = {
         "model": "uniform",
         "delay_ms": 150.0,
@@ -78,7 +78,7 @@ def outputs(overrides: dict[str, Any]) -> list[TickRecord]:
     ]
 
 
-def test_even_the_arrivals_checksums_agree() -> None:
-    """All that a record of virtual time holds, not the numbers of the trajectory alone."""
+def test_arrival_checksums_agree() -> None:
+    """The whole records of virtual time agree, beyond the numbers of the trajectory."""
     held = outputs({"link": {**BELOW["uniform"], "playout_ms": BUDGET_MS}})
     assert held == outputs({"link.delay_ms": BUDGET_MS})

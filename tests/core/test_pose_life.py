@@ -32,10 +32,11 @@ PEERS = Rotation.from_rotvec([-0.2, 0.5, 1.4])
 def drive(
     spin: tuple[float, float, float], heard: list[tuple[int, int]], ticks: int
 ) -> dict[str, Array]:
-    """The reference of a site whose peers turn with this angular velocity, and are heard in some ticks.
+    """Returns the reference of a site whose peers turn with this angular velocity, and are
+    heard in some ticks.
 
-    While they are not, their reference stays where it was, as a sample in use does. The arm is where its
-    reference is, and comes to rest within 0.1 s.
+    In other ticks their reference stays constant, as a sample in use does. The arm stands at
+    its reference, and comes to rest within 0.1 s.
     """
     arrays = build(POSE)
     s: Row = arrays.site[0]
@@ -79,13 +80,13 @@ def drive(
 
 
 def steps(turns: Array) -> Array:
-    """The turn from each orientation to the next."""
+    """Returns the turn from each orientation to the next."""
     found = Rotation.from_rotvec(turns.copy())
     return np.asarray((found[1:] * found[:-1].inv()).as_rotvec())
 
 
 @pytest.mark.long
-def test_the_way_to_peers_is_the_shortest_allowed_turn() -> None:
+def test_arms_take_the_shortest_allowed_turn() -> None:
     run = drive((0.0, 0.0, 0.0), [(50, 5000)], 4000)
     aligning = np.flatnonzero(run["mode"] == Mode.RETURN)
     way = (OWN * PEERS.inv()).magnitude()
@@ -99,8 +100,8 @@ def test_the_way_to_peers_is_the_shortest_allowed_turn() -> None:
 
 
 @pytest.mark.long
-def test_neither_orientation_nor_velocity_jumps_while_peers_fall_silent() -> None:
-    """Waits, aligns, follows, holds, and is back over a long way: to the third order of the tick."""
+def test_silent_peers_never_make_orientations_jump() -> None:
+    """Waits, aligns, follows, holds, and returns over a long way: to the third order of the tick."""
     spin = (0.7, -1.1, 0.6)
     run = drive(spin, [(50, 3500), (4600, 9000), (9100, 12000)], 12000)
     modes = run["mode"].astype(int)
@@ -127,7 +128,7 @@ def test_neither_orientation_nor_velocity_jumps_while_peers_fall_silent() -> Non
 
 
 @pytest.mark.long
-def test_farther_than_limit_is_not_gone_to_by_whole_turn() -> None:
+def test_limits_on_turns_are_never_bypassed() -> None:
     """1.8 rad about an axis askew, of which no coordinate is above 1.1 rad."""
     arrays = build(POSE)
     s: Row = arrays.site[0]
@@ -157,7 +158,7 @@ outages_s = [[2.0, 4.0]]"""
 
 @functools.cache
 def posed() -> Log:
-    """Three arms that agree on a pose, none of which hears another from 2.04 to 4.04 s."""
+    """Returns three arms that agree on a pose; no site hears another from 2.04 to 4.04 s."""
     text = posed_arms(5.0).replace("[link]", GLIDES)
     far = "posture_rad = [1.2, -0.3, -0.9, -1.6, -0.3, 1.4, 0.25] }"
     text = text.replace(
@@ -167,10 +168,11 @@ def posed() -> Log:
 
 
 @pytest.mark.long
-def test_arms_that_hold_pose_hold_their_joints_and_follow_again() -> None:
-    """The elbow of the slave is on its way to a posture on the other side as the links are cut.
+def test_arms_hold_joints_and_follow_again() -> None:
+    """The elbow of the slave is on its way to a posture on the other side when the links are
+    cut.
 
-    What is left is gravity that is not learnt yet.
+    The remaining motion comes from gravity that is not learnt yet.
     """
     log = posed()
     for site in log.sites:
@@ -187,8 +189,10 @@ def test_arms_that_hold_pose_hold_their_joints_and_follow_again() -> None:
 
 
 @pytest.mark.long
-def test_a_held_arm_returns_when_pushed_in_its_free_motion() -> None:
-    """By the motion in which its end effector stays; it goes back by 3/s, less what its law damps."""
+def test_held_arms_return_from_free_motion() -> None:
+    """In the motion in which its end effector stays, the arm returns at 3/s, less the damping
+    of its law.
+    """
     text = posed_arms(6.5).replace("[link]", GLIDES.replace("4.0", "6.0"))
     text = text.replace('"adaptive"\nLambda = 1.5\nKp = 10.0', '"pd_d"\nd = 10.0\nK = 60.0')
     text = text.replace("Gamma = 1.0\n", "").replace(
@@ -209,8 +213,8 @@ def test_a_held_arm_returns_when_pushed_in_its_free_motion() -> None:
 
 
 @pytest.mark.long
-def test_references_of_poses_in_session_are_integrals_of_their_velocities() -> None:
-    """Where the reference is that of peers alone it is so only once these agree, see `task_space`."""
+def test_references_integrate_their_velocities() -> None:
+    """If the reference follows peers alone, it does so only once these agree; see `task_space`."""
     log = posed()
     for site in log.sites:
         part = log[site]
@@ -225,8 +229,10 @@ def test_references_of_poses_in_session_are_integrals_of_their_velocities() -> N
 
 
 @pytest.mark.long
-def test_energies_close_over_a_hold_in_task_space() -> None:
-    """Seven joints, four of them to spare, on their way to a posture 0.4 rad off: r has their pose in it."""
+def test_energies_close_over_a_task_space_hold() -> None:
+    """Seven joints, four of them redundant, on their way to a posture 0.4 rad off: r contains
+    their pose.
+    """
     rule = {"action": "glide", "align_speed_rad_s": 1.0, "align_limit_rad": 2.0}
     log = trilat_net.simulate(
         "unlike_arms",
@@ -248,7 +254,7 @@ def test_energies_close_over_a_hold_in_task_space() -> None:
 
 
 @pytest.mark.long
-def test_arms_of_one_pose_stop_and_return_without_a_step() -> None:
+def test_equal_arms_stop_and_return_smoothly() -> None:
     text = posed_arms(6.0).replace("[link]", GLIDES.replace("4.0", "2.5"))
     scenario = parse_scenario(text, "", {"limits.tau_rate_limit_nm_s": 500.0})
     orders = {"m2": {1200: "stop", 1500: "enable"}, "s": {3200: "arm_lost", 3600: "reset"}}

@@ -29,7 +29,7 @@ tasks = pytest.mark.parametrize("task", [PLACE, POSE], ids=["place", "pose"])
 
 
 def place(arrays: SiteArrays, q: Array, qd: Array) -> Row:
-    """The site's row with its end effector placed in a state."""
+    """Returns the site's row with its end effector placed in a state."""
     s: Row = arrays.site[0]
     s.q, s.qd = q, qd
     place_joints(arrays.chain, s.q)
@@ -59,7 +59,7 @@ def test_rotations_are_those_of_scipy(vector: tuple[float, float, float]) -> Non
 
 @given(vector=vectors, rate=vectors, shorter=st.sampled_from([1.0, 1e-2, 3e-3, 1e-3, 1e-6]))
 @example(vector=(0.6, -0.5, 0.4), rate=(0.3, 0.9, -0.7), shorter=1e-2)
-def test_velocity_of_turn_is_limit_of_differences_and_is_undone(
+def test_turn_velocities_are_limits_of_differences(
     vector: tuple[float, float, float], rate: tuple[float, float, float], shorter: float
 ) -> None:
     turn = (shorter * vector[0], shorter * vector[1], shorter * vector[2])
@@ -79,7 +79,7 @@ def test_the_arc_tangent_is_that_of_numpy(x: float) -> None:
 
 
 @given(seed=seeds)
-def test_velocities_and_rate_of_jacobian_are_limits_of_differences(seed: int) -> None:
+def test_velocities_and_jacobian_rates_are_limits(seed: int) -> None:
     arrays, q, qd = draw(seed)
     h, m = 1e-6, arrays.site[0].shared
     before, after = (np.array(place(arrays, q + sign * h * qd, qd).J) for sign in (-1.0, 1.0))
@@ -94,8 +94,8 @@ def test_velocities_and_rate_of_jacobian_are_limits_of_differences(seed: int) ->
 
 
 @given(seed=seeds)
-def test_r_is_what_the_task_asks_whatever_the_posture(seed: int) -> None:
-    """J r = x' + Lambda e wherever nothing is damped."""
+def test_r_follows_the_task_in_any_posture(seed: int) -> None:
+    """J r = x' + Lambda e wherever no axis is damped."""
     arrays, q, qd = draw(seed)
     s = place(arrays, q, qd)
     s.q_des = np.array(s.x) + 0.01
@@ -105,10 +105,10 @@ def test_r_is_what_the_task_asks_whatever_the_posture(seed: int) -> None:
 
 
 @tasks
-def test_the_reference_acceleration_is_the_derivative_of_the_reference_velocity(
+def test_reference_acceleration_differentiates_reference_velocity(
     task: TaskSetup,
 ) -> None:
-    """Along a motion whose reference stands: v at a little before and after, and a between them."""
+    """Along a motion whose reference stands still: v shortly before and after, and a between them."""
     arrays = build(task)
     q, h = np.array(arrays.site[0].q), 1e-6
     qd = np.linspace(-0.3, 0.4, 7)
@@ -127,7 +127,7 @@ def test_the_reference_acceleration_is_the_derivative_of_the_reference_velocity(
         assert np.abs(rate - found[1][1]).max() <= 1e-5
 
 
-def test_damping_begins_below_its_singular_value_and_not_above() -> None:
+def test_damping_begins_below_its_singular_value() -> None:
     arrays = build(PLACE._replace(singular_value=1e-6))
     straight = build(PLACE._replace(singular_value=0.5))
     q, qd = np.array(arrays.site[0].q), np.zeros(7)
@@ -140,7 +140,7 @@ def test_damping_begins_below_its_singular_value_and_not_above() -> None:
 
 
 @given(seed=seeds)
-def test_the_wrench_is_the_force_at_the_end_effector(seed: int) -> None:
+def test_the_wrench_is_the_end_effectors_force(seed: int) -> None:
     arrays, q, qd = draw(seed)
     s = place(arrays, q, qd)
     s.q_des = s.x
@@ -151,7 +151,7 @@ def test_the_wrench_is_the_force_at_the_end_effector(seed: int) -> None:
     assert s.wrench == pytest.approx(force, rel=1e-6)
 
 
-def test_an_axis_that_is_not_followed_asks_nothing() -> None:
+def test_free_axes_get_no_torque() -> None:
     arrays = build(PLACE._replace(axes=(1.0, 0.0, 1.0)))
     s = place(arrays, np.array(arrays.site[0].q), np.zeros(7))
     s.q_des = np.array(s.x) + np.array([0.0, 0.3, 0.0])

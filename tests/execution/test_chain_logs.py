@@ -1,4 +1,4 @@
-"""Logs of arms of six joints: every record, executed again and in virtual time, has the same bits."""
+"""Logs of arms of six joints: every record has the same bits when executed again and in virtual time."""
 
 import io
 import math
@@ -22,14 +22,14 @@ N, TICKS = 6, 80
 
 @cache
 def made() -> bytes:
-    """A run of which 20 ms are the delay of every link."""
+    """Returns a run in which every link delays by 20 ms."""
     stream = io.BytesIO()
     write_virtual_log(parse_scenario(six_joints(TICKS / 1000)), stream)
     return stream.getvalue()
 
 
 def changed(field: str, numbers: int) -> Log:
-    """The log whose slave has that many numbers in a vector of one record."""
+    """Returns the log whose slave has that many numbers in a vector of one record."""
 
     def change(record: Record) -> Record:
         if (record["site"], record["tick"]) == ("s", 40):
@@ -39,7 +39,7 @@ def changed(field: str, numbers: int) -> Log:
     return opened(edited(made(), record=change))
 
 
-def test_six_joints_executed_again_are_virtual_time() -> None:
+def test_six_joints_executed_again_equal_virtual_time() -> None:
     log = opened(made())
     verdict, twins = verify(log), compare_with_virtual(log)
     assert verdict.passed, str(verdict.first)
@@ -51,7 +51,7 @@ def test_six_joints_executed_again_are_virtual_time() -> None:
     assert (log["s"].q[-1] != log["s"].q[0]).all()
 
 
-def test_a_gap_of_six_joints_is_resumed_from_two_records() -> None:
+def test_two_records_resume_six_joints() -> None:
     log = opened(
         edited(
             made(), record=lambda r: None if r["site"] == "m2" and 30 <= r["tick"] < 33 else r
@@ -65,7 +65,7 @@ def test_a_gap_of_six_joints_is_resumed_from_two_records() -> None:
 @pytest.mark.parametrize(
     ("field", "numbers"), [("q", 5), ("q", 7), ("tau", 2), ("theta_hat", 5)]
 )
-def test_a_record_with_another_number_of_joints_is_refused(field: str, numbers: int) -> None:
+def test_records_with_other_joints_are_refused(field: str, numbers: int) -> None:
     log = changed(field, numbers)
     with pytest.raises(
         LogError, match=f"a record of s cannot be read: .*{field} has {numbers} numbers, not"
@@ -103,8 +103,10 @@ PLANAR |= {"l2_m": 0.9, "m2_kg": 0.8, "lc2_m": 0.3, "I2_kg_m2": 0.07}
 
 
 @pytest.mark.long
-def test_planar_arm_written_as_chain_makes_same_run() -> None:
-    """Unrolled and recursive leaves: every angle, speed and torque of both laws, with operators that push."""
+def test_a_planar_arm_equals_its_chain() -> None:
+    """Unrolled and recursive leaves: every angle, speed and torque of both laws, with operators
+    that push.
+    """
     for law in ({"law": "adaptive", "Gamma": 0.0}, {"law": "p_d", "K": 30.0, "d": 4.0}):
         logs = []
         for arm in (PLANAR, {"urdf": "two.urdf", "down": [0.0, -1.0, 0.0]}):

@@ -106,7 +106,7 @@ def test_every_shipped_scenario_has_the_same_bits(name: str) -> None:
     rates=st.tuples(*[st.sampled_from([7, 100, 333, 1000])] * 3),
     seed=st.integers(0, 9),
 )
-def test_whatever_the_links_the_rates_and_the_scheme(
+def test_any_links_rates_and_schemes_agree(
     name: str, scheme: str, link: Mapping[str, Any], rates: tuple[int, ...], seed: int
 ) -> None:
     changes = {
@@ -117,7 +117,7 @@ def test_whatever_the_links_the_rates_and_the_scheme(
     agree(load_scenario(load_scenario(name), {**changes, **run, **link}))
 
 
-def test_run_that_diverges_ends_with_ticks_of_that_instant() -> None:
+def test_diverging_runs_end_with_that_tick() -> None:
     scenario = load_scenario("free", {"limits.qd_limit_rad_s": 1.5, "duration_s": 3.0})
     agree(scenario)
     fused = FusedRun(scenario)
@@ -130,7 +130,7 @@ def test_run_that_diverges_ends_with_ticks_of_that_instant() -> None:
 
 @settings(max_examples=10, deadline=None)
 @given(stops=st.lists(st.floats(0.01, 1.0), min_size=1, max_size=5))
-def test_a_run_in_parts_is_the_run_in_one(stops: list[float]) -> None:
+def test_a_split_run_equals_the_whole_run(stops: list[float]) -> None:
     scenario = load_scenario("paper", {"duration_s": 1.0, "link.delay_ms": 35.0})
     whole, parts = FusedRun(scenario), FusedRun(scenario)
     whole.advance_to(1.0)
@@ -185,7 +185,7 @@ def test_totals_are_those_of_the_log(name: str, changes: dict[str, Any]) -> None
 
 
 @pytest.mark.long
-def test_it_settles_when_the_last_error_falls_below_the_limit() -> None:
+def test_settling_is_the_last_error_limit_crossing() -> None:
     scenario = load_scenario("free", {"duration_s": 13.0})
     fused = FusedRun(scenario, settled_rad=0.01)
     fused.advance_to(13.0)
@@ -234,7 +234,7 @@ def test_what_the_compiled_loop_cannot_run_is_refused() -> None:
 
 
 @pytest.mark.parametrize("law", ["Line", "CompiledLine"])
-def test_plugged_laws_have_the_bits_of_the_per_tick_driver(law: str) -> None:
+def test_plugged_laws_have_per_tick_bits(law: str) -> None:
     """One law among those of the kernel, which send nothing; and all sites, at two rates."""
     plugged = {"link.delay_ms": 5.0, "duration_s": 0.2}
     line = f"tests.plugged_laws:{law}"
@@ -254,7 +254,7 @@ def test_plugged_laws_have_the_bits_of_the_per_tick_driver(law: str) -> None:
 
 
 @pytest.mark.parametrize("law", ["Line", "CompiledLine"])
-def test_a_law_that_fails_in_a_fused_run_is_named(law: str) -> None:
+def test_failing_laws_in_fused_runs_are_named(law: str) -> None:
     control = {"law": f"tests.plugged_laws:{law}", "fail_at": 42}
     run = FusedRun(
         load_scenario("asymmetric", {"link.delay_ms": 5.0, "sites.m2.control": control})

@@ -1,4 +1,4 @@
-"""What may be asked of a log, and what is refused, with the reason."""
+"""Requests for reruns: valid changes, and refusals with their reason."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -26,7 +26,7 @@ def asked(
     )
 
 
-def test_nothing_changed_is_the_experiment_of_the_log() -> None:
+def test_an_unchanged_request_is_the_logs_experiment() -> None:
     for name in ("paper", "handover", "outage"):
         log = opened(recorded(name, {"duration_s": 0.3}))
         for replace in (log.sites[:1], log.sites):
@@ -63,13 +63,13 @@ def test_nothing_changed_is_the_experiment_of_the_log() -> None:
     ],
     ids=str,
 )
-def test_differences_are_told_in_lines_of_the_executed_scenario(
+def test_differences_are_lines_of_the_executed_scenario(
     overrides: list[str], words: list[str]
 ) -> None:
     assert describe_rerun_changes(asked(["s"], overrides)) == words
 
 
-def test_what_stands_as_recorded_keeps_its_own() -> None:
+def test_copied_sites_keep_their_settings() -> None:
     found = asked(["s"], {"control.Kd": 5, "link.delay_ms": 30.0, "arm.m2_kg": 2.0})
     original = opened(recorded("paper")).scenario
     for name in ("m1", "m2"):
@@ -82,7 +82,7 @@ def test_what_stands_as_recorded_keeps_its_own() -> None:
     }
 
 
-def test_a_timeline_is_each_sites_own() -> None:
+def test_each_site_has_its_own_timeline() -> None:
     timeline = [
         {"at_s": 0.01, "link": "m1->s", "to": {"delay_ms": 5.0}},
         {"at_s": 0.02, "link": "s->m1", "to": {"delay_ms": 6.0}},
@@ -96,7 +96,7 @@ def test_a_timeline_is_each_sites_own() -> None:
     assert len(asked([], {"timeline": timeline}, closed_loop=True).scenario.timeline) == 3
 
 
-def test_every_site_is_a_closed_loop() -> None:
+def test_all_sites_make_a_closed_loop() -> None:
     assert asked(SITES).mode == asked([], closed_loop=True).mode == "closed loop"
     assert asked(["s", "m1", "s"]).replaced == ("m1", "s")
     assert asked(["s", "m1"]).mode == "open loop"
@@ -109,7 +109,7 @@ def test_every_site_is_a_closed_loop() -> None:
         (["s"], True, ["replace", "closed_loop=True"]),
     ],
 )
-def test_it_must_be_said_which_sites_once(
+def test_sites_must_be_named_once(
     replace: list[str], closed_loop: bool, facts: list[str]
 ) -> None:
     with pytest.raises(UsageError) as caught:
@@ -134,9 +134,7 @@ def test_it_must_be_said_which_sites_once(
     ],
     ids=str,
 )
-def test_what_cannot_be_otherwise_is_refused_with_the_reason(
-    overrides: list[str], facts: list[str]
-) -> None:
+def test_fixed_settings_are_refused_with_reason(overrides: list[str], facts: list[str]) -> None:
     with pytest.raises(ScenarioError) as caught:
         asked(["s"], overrides)
     assert all(fact in str(caught.value) for fact in facts), caught.value
@@ -148,6 +146,6 @@ def test_an_unknown_site_is_refused_with_the_nearest() -> None:
 
 
 @pytest.mark.parametrize("other", [{"x": {"role": "slave"}}, {"s": {"rate_hz": 5}}])
-def test_a_whole_table_cannot_bring_other_sites_or_rates_in(other: dict[str, Any]) -> None:
+def test_whole_tables_cannot_change_sites_or_rates(other: dict[str, Any]) -> None:
     with pytest.raises(ScenarioError):
         asked(["s"], {"sites": {"m1": {"role": "slave"}, "m2": {"role": "slave"}, **other}})

@@ -65,7 +65,7 @@ def judge_seed(seed: int, *, again: bool = True, timetable: Timetable = WHOLE) -
 
 
 def time_seed(seed: int) -> tuple[Judged, float]:
-    """Judges the faults of a seed, run twice; with what that took of a processor, s."""
+    """Judges the faults of a seed, run twice; also returns the processor time, s."""
     find_undisturbed_step()
     began_s = time.process_time()
     return judge_seed(seed), time.process_time() - began_s
@@ -122,14 +122,14 @@ def collector_at_rest() -> Iterator[None]:
 
 @cache
 def find_undisturbed_step(timetable: Timetable = WHOLE) -> float:
-    """The largest step of a torque in the session without faults, after its first 0.1 s, N m."""
+    """Returns the largest step of a torque in the session without faults, after its first 0.1 s, N m."""
     with tempfile.TemporaryDirectory() as folder:
         undisturbed = run_faults((), Path(folder), timetable=timetable)
         return max(largest_steps(undisturbed.published, START_TICKS).values())
 
 
 def digest_session(session: FaultSession) -> str:
-    """SHA-256 of all that was published, and of the log as far as it came."""
+    """Returns the SHA-256 of all published messages, and of the log as far as it was written."""
     digest = hashlib.sha256()
     for payload in session.payloads():
         digest.update(payload)
