@@ -195,7 +195,7 @@ ROWS = (
         "refused before they are read",
         ("stranger",),
         (),
-        (NET + "test_zenoh_bus.py::test_a_message_of_no_member_is_not_taken_in",),
+        (NET + "test_zenoh_bus.py::test_messages_without_member_are_refused",),
     ),
     Row(
         "F20",
@@ -275,10 +275,7 @@ ROWS = (
         "it is made again by itself",
         (),
         (),
-        (
-            NET
-            + "test_zenoh_bus.py::test_members_meet_again_through_a_router_that_was_started_again",
-        ),
+        (NET + "test_zenoh_bus.py::test_members_meet_again_through_restarted_routers",),
         "UDP, on which it was seen: it is refused",
     ),
     Row(

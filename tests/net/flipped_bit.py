@@ -21,7 +21,7 @@ from .waiting import drained, until
 
 
 class Flipping:
-    """A wire to a place that turns over a bit of what passes there, if asked."""
+    """A wire to a place that turns over one bit of its traffic on request."""
 
     def __init__(self, to: str) -> None:
         self._to = ("127.0.0.1", int(to.rpartition(":")[2]))

@@ -24,7 +24,7 @@ CLOCK = ManualClock().identity()
 
 
 def told(name: str, boot: int, **facts: object) -> Info:
-    """What a member answers when asked who it is; `facts` override."""
+    """Returns a member's answer about its identity; `facts` override."""
     recorder = name == topics.RECORDER
     own = {
         "scenario_sha256": "" if recorder else HASH,
@@ -35,7 +35,7 @@ def told(name: str, boot: int, **facts: object) -> Info:
 
 
 class Elsewhere(ManualClock):
-    """The clock of another machine: both of its readings are other ones than here."""
+    """The clock of another machine: both of its readings differ from those here."""
 
     def __init__(self, start_ns: int, unix_ns: int, name: str) -> None:
         super().__init__(start_ns, unix_ns)
@@ -54,7 +54,7 @@ class Member:
         self.joining = SessionJoin(bus, clock, SESSION, self.publisher, sites)
 
     def poll(self) -> None:
-        """One round of what a process does: join, and once it has the epoch, answer."""
+        """Polls once as a process does: joins, and answers once it has the epoch."""
         if self.epoch is None:
             self.epoch = self.joining.poll()
             if self.epoch is not None:
@@ -70,7 +70,7 @@ class Member:
 
 
 class Party:
-    """A session's network, its clock, its present members, and all events that were said."""
+    """A session's network, its clock, its present members, and all events so far."""
 
     def __init__(self, sites: Sequence[str]) -> None:
         self.sites = tuple(sites)
@@ -84,7 +84,7 @@ class Party:
         self._boot = 100
 
     def elsewhere(self, ahead_ns: int, unix_ns: int = 0, name: str = "elsewhere") -> Elsewhere:
-        """The clock of another machine, which goes on as the one here does."""
+        """Returns the clock of another machine, which advances like the one here."""
         made = Elsewhere(self.clock.monotonic_ns() + ahead_ns, unix_ns, name)
         self._clocks.append(made)
         return made
@@ -126,7 +126,7 @@ class Party:
             self.round()
 
     def agreed(self, within_s: float = 5.0) -> Epoch:
-        """Lets all poll until each has its epoch; returns the one that they agree on."""
+        """Lets all members poll until each has its epoch; returns the epoch on which all agree."""
         for _ in range(int(within_s * 1e9) // STEP_NS):
             if all(member.epoch for member in self.members.values()):
                 break

@@ -1,7 +1,8 @@
-"""Keys of members, and what a member with a valid certificate cannot do all the same.
+"""Keys of members, and the limits of a member with a valid certificate.
 
-The attacker is a member, `s`, that holds itself to no rules; what it may say comes after what it may not on
-the same link, so that the first has been refused once the second is there.
+The attacker is a member, `s`, that enforces no rules. Its permitted messages follow its
+forbidden ones on the same link, so that a forbidden one has been refused once a permitted one
+arrives.
 """
 
 import json
@@ -67,12 +68,12 @@ def foreign(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def lawless(keys: MemberKeys) -> dict[str, Any]:
-    """The settings of a member that holds nobody to any rules, itself neither."""
+    """Returns the settings of a member that enforces no rules, not even on itself."""
     return {"transport": keys.settings["transport"]}
 
 
 class Meeting:
-    """m1 and m2 with their keys, and whoever joins them, as peers of one another or through a router."""
+    """m1 and m2 with their keys, and a third member, as peers of one another or through a router."""
 
     def __init__(self, folder: Path, *, routed: bool) -> None:
         self.folder, self.members = folder, list[Bus]()
@@ -125,7 +126,7 @@ def heard(say: Any, inbox: Any) -> list[tuple[str, bytes]]:
     return came
 
 
-def test_a_member_speaks_under_its_own_name_alone(meeting: Meeting, folder: Path) -> None:
+def test_members_speak_under_their_own_name_only(meeting: Meeting, folder: Path) -> None:
     attacker = meeting.join(lawless(read_member_keys(folder / "s")))
     inbox, alive = (
         meeting.m1.inbox(key("*", topics.EVENT)),
@@ -147,7 +148,7 @@ def test_a_member_speaks_under_its_own_name_alone(meeting: Meeting, folder: Path
     assert drained(alive) == []
 
 
-def test_nobody_answers_for_another(meeting: Meeting, folder: Path) -> None:
+def test_no_member_answers_for_another(meeting: Meeting, folder: Path) -> None:
     attacker = meeting.join(lawless(read_member_keys(folder / "s")))
     attacker.respond(key("m2", topics.INFO), lambda _: b"forged")
     attacker.respond(key("s", topics.INFO), lambda _: b"true")
@@ -176,8 +177,8 @@ def test_orders_and_hands_are_the_operators(meeting: Meeting, folder: Path) -> N
         assert {payload for _, payload in heard(say, inbox)} == {b"true"}
 
 
-def test_a_bridge_is_hand_and_arm_and_holds_no_switch(meeting: Meeting, folder: Path) -> None:
-    """It gives orders as well; it speaks in the name of no site, and hears no more than it shows."""
+def test_bridges_are_hand_and_arm_without_switch(meeting: Meeting, folder: Path) -> None:
+    """A bridge gives orders as well; it speaks in the name of no site, and hears no more than it shows."""
     bridge, operator = (
         meeting.join(read_member_keys(folder / name).settings) for name in (BRIDGE, OPERATOR)
     )
@@ -210,9 +211,7 @@ def test_a_bridge_is_hand_and_arm_and_holds_no_switch(meeting: Meeting, folder: 
     assert drained(samples) == []
 
 
-def test_every_member_may_ask_site_to_stop_and_nothing_else(
-    meeting: Meeting, folder: Path
-) -> None:
+def test_every_member_may_stop_but_no_more(meeting: Meeting, folder: Path) -> None:
     for channel in (topics.STOP, topics.SET):
         meeting.m1.respond(key("m1", channel), lambda payload: payload)
     members = [
@@ -228,10 +227,10 @@ def test_every_member_may_ask_site_to_stop_and_nothing_else(
     ]
 
 
-def test_a_member_whose_name_was_taken_out_is_denied_everything(
-    folder: Path, tmp_path: Path
-) -> None:
-    """By the list in the folder of the one that it speaks to; its certificate is still good."""
+def test_removed_members_are_denied_everything(folder: Path, tmp_path: Path) -> None:
+    """By the list in the folder of the member that the removed one speaks to; its certificate
+    is still valid.
+    """
     for file in (folder / "m1").iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
     (tmp_path / PRIVATE_KEY).chmod(0o600)
@@ -259,7 +258,7 @@ def test_a_member_whose_name_was_taken_out_is_denied_everything(
             bus.close()
 
 
-def test_an_oversized_message_is_dropped_and_others_go_on(meeting: Meeting) -> None:
+def test_oversized_messages_are_dropped_alone(meeting: Meeting) -> None:
     inbox, publish = (
         meeting.m1.inbox(key("m2", topics.STATE)),
         meeting.m2.publisher(key("m2", topics.STATE)),
@@ -291,8 +290,8 @@ def test_strangers_cannot_connect(meeting: Meeting, foreign: Path) -> None:
     assert {payload for _, payload in came} == {b"true"}
 
 
-def test_a_flipped_bit_ends_the_connection_which_is_made_again(folder: Path) -> None:
-    """TLS finds it: no payload comes otherwise than it was sent, not even if Zenoh dies of it."""
+def test_flipped_bits_end_connections_which_return(folder: Path) -> None:
+    """TLS finds the bit: no payload arrives changed, even if Zenoh dies of the error."""
     words = [sys.executable, "-m", "tests.net.flipped_bit", str(folder)]
     done = subprocess.run(words, capture_output=True, text=True, timeout=120)
     assert set(done.stdout.split()) <= {"true", "again"}
@@ -306,7 +305,7 @@ def test_a_flipped_bit_ends_the_connection_which_is_made_again(folder: Path) -> 
     assert "true" in after
 
 
-def test_keys_are_whole_or_refused(folder: Path, tmp_path: Path) -> None:
+def test_incomplete_keys_are_refused(folder: Path, tmp_path: Path) -> None:
     keys = read_member_keys(folder / "m1")
     assert (keys.member, keys.members) == ("m1", ALL)
     with pytest.raises(UsageError, match="folder of one member"):
@@ -330,7 +329,7 @@ def test_keys_are_whole_or_refused(folder: Path, tmp_path: Path) -> None:
         ("authority.pem", "", "has not signed"),
     ],
 )
-def test_keys_of_several_do_not_mix(
+def test_keys_of_several_sets_do_not_mix(
     take: str, from_: str, words: str, folder: Path, foreign: Path, tmp_path: Path
 ) -> None:
     for file in (folder / "m1").iterdir():
@@ -342,7 +341,7 @@ def test_keys_of_several_do_not_mix(
         read_member_keys(tmp_path)
 
 
-def test_a_key_that_others_can_read_is_refused(folder: Path, tmp_path: Path) -> None:
+def test_keys_readable_by_others_are_refused(folder: Path, tmp_path: Path) -> None:
     for file in (folder / "m1").iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
     (tmp_path / PRIVATE_KEY).chmod(0o644)
@@ -363,7 +362,7 @@ def test_a_key_that_others_can_read_is_refused(folder: Path, tmp_path: Path) -> 
         ("unixsock-stream//tmp/x", False),
     ],
 )
-def test_without_keys_nobody_listens_at_a_network(listen: str, open_: bool) -> None:
+def test_without_keys_nobody_listens_on_a_network(listen: str, open_: bool) -> None:
     connection = Connection([listen])
     assert secure_connection(connection, None, insecure=True) == connection
     if open_:
@@ -373,7 +372,7 @@ def test_without_keys_nobody_listens_at_a_network(listen: str, open_: bool) -> N
         assert secure_connection(connection, None, insecure=False) == connection
 
 
-def test_ones_own_mutual_tls_is_as_good_as_keys() -> None:
+def test_own_mutual_tls_equals_keys() -> None:
     own = {"transport": {"link": {"tls": {"enable_mtls": True}}}}
     safe = Connection(["tls/192.0.2.1:7447"], settings=own)
     assert secure_connection(safe, None, insecure=False) == safe
@@ -406,7 +405,7 @@ def test_with_keys_links_are_encrypted(folder: Path) -> None:
         )
 
 
-def test_every_rule_names_its_member_or_everybody_and_denies_rest() -> None:
+def test_every_rule_names_members_and_denies_others() -> None:
     rules = make_access_rules(ALL)["access_control"]
     assert rules["enabled"] is True
     assert rules["default_permission"] == "deny"
@@ -456,7 +455,7 @@ def test_names_of_ascii_letters_are_taken(tmp_path: Path) -> None:
 def make_ending_keys(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Callable[[timedelta], Path]:
-    """Makes keys that have ended, whose certificates hold for a while yet."""
+    """Makes keys that have ended, whose certificates are valid for a while yet."""
 
     def make(holds: timedelta) -> Path:
         monkeypatch.setattr(member_keys, "STOPPING_TIME", holds)
@@ -468,7 +467,7 @@ def make_ending_keys(
 
 @contextmanager
 def two_members(folder: Path, *, stops: bool = False) -> Iterator[tuple[ZenohBus, ZenohBus]]:
-    """The site m1, which listens, and s, which is connected to it."""
+    """Connects the sites m1, which listens, and s."""
     (place,) = (endpoint.replace("tcp", "tls") for endpoint in find_free_endpoints(1))
     own = {
         member: read_member_keys(folder / member, stops=stops).settings
@@ -482,7 +481,7 @@ def two_members(folder: Path, *, stops: bool = False) -> Iterator[tuple[ZenohBus
 
 
 @pytest.mark.long
-def test_open_link_outlives_its_certificate(
+def test_open_links_outlive_certificates(
     make_ending_keys: Callable[[timedelta], Path],
 ) -> None:
     """Zenoh closes no link at the end of a certificate, so that no date ends a session."""
@@ -498,7 +497,7 @@ def test_open_link_outlives_its_certificate(
         assert heard(say, inbox)
 
 
-def test_ended_keys_stop_arms_and_nothing_else(
+def test_ended_keys_may_only_stop_arms(
     make_ending_keys: Callable[[timedelta], Path],
 ) -> None:
     folder = make_ending_keys(timedelta(days=1))
@@ -516,7 +515,7 @@ def test_ended_keys_stop_arms_and_nothing_else(
         until(is_asked)
 
 
-def test_renewed_keys_meet_those_that_are_not_renewed(tmp_path: Path) -> None:
+def test_renewed_keys_meet_older_ones(tmp_path: Path) -> None:
     """Members are renewed one after the other; hosts, names and private keys stay."""
     folder = tmp_path / "keys"
     create_keys(folder, ALL, ["192.0.2.1"], 5)
@@ -545,7 +544,7 @@ def read_files(folder: Path) -> dict[str, bytes]:
     }
 
 
-def test_an_added_member_meets_the_others_whose_keys_stay(tmp_path: Path) -> None:
+def test_added_members_meet_the_others(tmp_path: Path) -> None:
     folder = tmp_path / "keys"
     create_keys(folder, ["m1", "m2"], ["192.0.2.1"], 5)
     before = read_files(folder)
@@ -572,7 +571,7 @@ def test_an_added_member_meets_the_others_whose_keys_stay(tmp_path: Path) -> Non
     assert {path.name for path in renew_keys(folder)} == {"m1", "m2", "s"}
 
 
-def test_members_that_cannot_be_added_change_nothing(
+def test_impossible_members_change_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = tmp_path / "keys"
@@ -611,7 +610,7 @@ def test_members_that_cannot_be_added_change_nothing(
         add_keys(folder, ["s2"])
 
 
-def test_keys_that_cannot_be_renewed_are_refused(tmp_path: Path) -> None:
+def test_unrenewable_keys_are_refused(tmp_path: Path) -> None:
     for name in ("keys", "others"):
         create_keys(tmp_path / name, SITES)
     with pytest.raises(
@@ -637,8 +636,8 @@ def load_certificate(folder: Path) -> x509.Certificate:
     return x509.load_pem_x509_certificate((folder / CERTIFICATE).read_bytes())
 
 
-def test_keys_that_end_before_session_are_refused(tmp_path: Path) -> None:
-    """The end is known when a site begins, and again when the session begins for which it has waited."""
+def test_keys_ending_before_sessions_are_refused(tmp_path: Path) -> None:
+    """The end is checked when a site begins, and again when the awaited session begins."""
     create_keys(tmp_path / "keys", ["m", "s"], days=1)
     for member, words in (("m", "two_sites"), ("s", "two_sites")):
         long = ("--set", "duration_s=86400")

@@ -1,4 +1,4 @@
-"""Waiting in tests: for a condition, at most for a time, by a clock."""
+"""Waiting in tests: for a condition, with a time limit, by a clock."""
 
 from collections.abc import Callable
 from typing import TypeVar
