@@ -1,4 +1,4 @@
-"""The words of a figure: where they are drawn, and which are cut off or lie on each other."""
+"""The words of a figure: their places, and words that are cut off or overlap."""
 
 from itertools import combinations
 
@@ -12,7 +12,9 @@ SLACK_PT = 1.0
 
 
 def words(figure: Figure) -> list[tuple[str, Bbox]]:
-    """Every text that is drawn and its box, pt; numbers of an axis that lie outside of it are not drawn."""
+    """Returns every text that is drawn and its box, pt; numbers of an axis that lie outside the
+    axis are not drawn.
+    """
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     renderer = canvas.get_renderer()
@@ -35,7 +37,7 @@ def words(figure: Figure) -> list[tuple[str, Bbox]]:
 
 
 def misplaced(figure: Figure) -> list[str]:
-    """Words that are not wholly in the figure, and pairs of words that lie on each other."""
+    """Returns words that are not wholly in the figure, and pairs of words that overlap."""
     width, height = figure.get_size_inches() * 72.0
     found = words(figure)
     cut_off = [

@@ -1,4 +1,4 @@
-"""What the report, a terminal and a program are told of a certificate."""
+"""The text of a certificate in the report, on a terminal and in JSON."""
 
 import json
 import re
@@ -36,7 +36,7 @@ LOGS = {
 
 
 @pytest.mark.parametrize("name", LOGS)
-def test_facts_are_json_without_nan_and_say_what_verdict_says(name: str) -> None:
+def test_facts_are_json_without_nan(name: str) -> None:
     found = certify(LOGS[name]())
     read = json.loads(json.dumps(found.to_dict(), allow_nan=False))
     assert read["text"] == found.verdict.text
@@ -47,7 +47,7 @@ def test_facts_are_json_without_nan_and_say_what_verdict_says(name: str) -> None
 
 
 def test_the_numbers_add_up() -> None:
-    """V at the end is V at the start, less what was taken, plus what was given, to the residual."""
+    """V at the end is V at the start, less the dissipation, plus the work, to the residual."""
     f = certify(LOGS["jitter"]()).to_dict()["functional"]
     end = f["v_first_j"] - sum(f["taken_j"].values()) + sum(f["given_j"].values())
     assert end == pytest.approx(f["v_last_j"], abs=f["residual_max_j"])
@@ -55,7 +55,7 @@ def test_the_numbers_add_up() -> None:
 
 
 @pytest.mark.parametrize("name", LOGS)
-def test_a_figure_is_a_function_of_the_log(name: str) -> None:
+def test_figures_are_a_function_of_the_log(name: str) -> None:
     log = LOGS[name]()
     found = certify(log)
     figure = draw_functional(log, found)
@@ -81,9 +81,7 @@ def test_a_figure_is_a_function_of_the_log(name: str) -> None:
         ("diverged", "FAIL ok ok ok"),
     ],
 )
-def test_lines_give_the_judgement_and_then_verdict_end_and_balance(
-    name: str, marks: str
-) -> None:
+def test_lines_give_judgement_verdict_end_and_balance(name: str, marks: str) -> None:
     found = certify(LOGS[name]())
     said = describe_certificate(found)
     assert [line.mark for line in said] == marks.split()
@@ -97,7 +95,7 @@ def test_lines_give_the_judgement_and_then_verdict_end_and_balance(
 @pytest.mark.parametrize("behaviour", EndBehaviour)
 @pytest.mark.parametrize("name", LOGS)
 @pytest.mark.parametrize("root_per_s", [-0.25, 0.25])
-def test_the_first_line_repeats_no_word_and_agrees_with_its_judgement(
+def test_the_first_line_agrees_with_its_judgement(
     name: str, behaviour: EndBehaviour, root_per_s: float
 ) -> None:
     found = certify(LOGS[name]())
@@ -115,7 +113,7 @@ def test_the_first_line_repeats_no_word_and_agrees_with_its_judgement(
         assert "FAIL" in [line.mark for line in lines[1:]]
 
 
-def test_divergence_is_said_once_with_its_joint() -> None:
+def test_divergence_is_stated_once_with_its_joint() -> None:
     log = logs.diverged()
     found = certify(log)
     cause = log.describe_divergence()
@@ -131,7 +129,7 @@ def test_divergence_is_said_once_with_its_joint() -> None:
 
 
 def test_sentences_about_a_record_fit_its_length() -> None:
-    """This run diverged after milliseconds: there is neither a last second nor a push to follow."""
+    """This run diverged after milliseconds, so that there is neither a last second nor a push to follow."""
     short = {"duration_s": 2.0, "rate_hz": 1000, "limits.qd_limit_rad_s": 0.02}
     log = runs.run("free", short).log
     found = certify_run(log)
@@ -146,7 +144,7 @@ def test_sentences_about_a_record_fit_its_length() -> None:
     )
 
 
-def test_a_short_run_says_so_once_and_for_how_long() -> None:
+def test_short_runs_state_their_length_once() -> None:
     slow = LoopRoots("stable", -0.25, True, "this rest: stable, -0.25 /s")
     found = runs.run("free", {"duration_s": 4.0, "rate_hz": 200}).certificate
     end = found.end._replace(behaviour=EndBehaviour.UNDECIDED, reasons=())
@@ -160,7 +158,7 @@ def test_a_short_run_says_so_once_and_for_how_long() -> None:
     assert end.text not in describe_judgement(long)  # the line of the end has it
 
 
-def test_pace_is_that_of_the_slowest_root() -> None:
+def test_pace_follows_the_slowest_root() -> None:
     found = runs.run("free", {"duration_s": 4.0, "rate_hz": 200}).certificate
     for rate_per_s, verb in ((-0.5, "halves"), (0.5, "doubles")):
         verdict = "stable" if rate_per_s < 0.0 else "unstable"
@@ -178,7 +176,7 @@ def test_many_links_are_one_entry() -> None:
     assert [name for name in names if "->" in name or "links" in name] == ["supplied: 19 links"]
 
 
-def test_the_papers_weights_are_told_where_they_are_wrong() -> None:
+def test_wrong_weights_of_the_paper_are_named() -> None:
     told = describe_certificate(runs.run("free", runs.LYAPUNOV).certificate)[-1]
     assert told.mark == "note"
     assert told.text.startswith(
@@ -190,7 +188,7 @@ def test_the_papers_weights_are_told_where_they_are_wrong() -> None:
 
 
 @pytest.mark.parametrize("name", ["jitter", "rich", "busy"])
-def test_listed_energies_add_up_to_v_at_the_end(name: str) -> None:
+def test_listed_energies_sum_to_v(name: str) -> None:
     found = certify(LOGS[name]())
     assert found.balance is not None
     (_, first), *between, (_, last) = list_energies(found.balance)
@@ -199,7 +197,7 @@ def test_listed_energies_add_up_to_v_at_the_end(name: str) -> None:
     )
 
 
-def test_no_energy_is_said() -> None:
+def test_missing_energies_are_reported() -> None:
     rest = {"control.theta_hat0": [3.0, 1.0, 1.0, 2.0, 1.0], "duration_s": 0.5, "rate_hz": 200}
     found = certify(runs.run("paper", rest).log)
     assert "energy balance: there is no energy in this run" in [

@@ -1,4 +1,4 @@
-"""What other programs read of an export is the log, bit for bit."""
+"""Exports contain the log bit for bit, as other programs read them."""
 
 import csv
 import json
@@ -25,7 +25,7 @@ from trilat_net.scenario import parse_scenario
 
 @cache
 def log() -> Log:
-    """A log with everything in it: links of all kinds, modes, changes, events, statistics."""
+    """Returns a log with all features: links of all kinds, modes, changes, events, statistics."""
     text = 'says "no",\nand 1.5 °C'
     awkward = Event(
         member="a", boot=2**64 - 1, kind="refused", text=text, t_ns=-1, clocks={"a": "x"}, n=0
@@ -43,7 +43,7 @@ def log() -> Log:
 
 @cache
 def expected() -> dict[str, dict[str, list[Any]]]:
-    """Per table the values of every column, as Python's own; None where there is none."""
+    """Returns the values of every column per table, as Python's own; None without a value."""
     wanted = {
         table.label: {column.name: column.rows(0, len(table)) for column in table.columns}
         for table in log().tables()
@@ -68,7 +68,7 @@ def bits(value: float) -> bytes:
 
 
 def same(value: Any, wanted: Any) -> bool:
-    """Equal as numbers, and a float bit for bit."""
+    """True if two values are equal as numbers, and floats bit for bit."""
     if isinstance(wanted, float):
         return isinstance(value, float) and bits(value) == bits(wanted)
     return type(value) is type(wanted) and value == wanted
@@ -155,7 +155,7 @@ def test_mat_read_by_scipy(tmp_path: Path) -> None:
             assert (units if isinstance(units, str) else "") == said["unit"]
 
 
-def test_stamps_of_a_live_log_are_exact_in_matlab(tmp_path: Path) -> None:
+def test_live_stamps_are_exact_in_matlab(tmp_path: Path) -> None:
     """1.7e18 ns are no exact double."""
     sites = scipy.io.loadmat(exported("mat", tmp_path), simplify_cells=True)
     assert sites["a"]["publish_time_ns"].dtype == np.int64
@@ -189,7 +189,7 @@ def test_ros2_read_by_mcap_ros2(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("form", ["csv", "parquet"])
-def test_a_folder_says_what_is_in_it(form: str, tmp_path: Path) -> None:
+def test_a_folder_describes_its_files(form: str, tmp_path: Path) -> None:
     folder = exported(form, tmp_path)
     about = json.loads((folder / "about.json").read_text())
     assert set(about["tables"]) == {path.name for path in folder.iterdir()} - {
@@ -209,8 +209,8 @@ def test_a_folder_says_what_is_in_it(form: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("form", ["ros2", "csv", "parquet", "npz", "mat"])
-def test_an_export_has_no_stamp_of_its_own(form: str, tmp_path: Path) -> None:
-    """The same log gives the same bytes, but where a format stamps its file."""
+def test_exports_have_no_stamp_of_their_own(form: str, tmp_path: Path) -> None:
+    """The same log gives the same bytes, except in formats that stamp their files."""
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
         exported(form, tmp_path / name)

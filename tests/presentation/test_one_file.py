@@ -1,4 +1,6 @@
-"""A figure and a format of exports are one file each: whoever knows them knows one put beside the others."""
+"""A figure and an export format are one file each: the program finds a file that was put beside
+the others.
+"""
 
 from pathlib import Path
 
@@ -68,7 +70,7 @@ print(json.dumps({
 
 
 @pytest.mark.long
-def test_files_beside_the_others_are_figures_and_formats_everywhere(tmp_path: Path) -> None:
+def test_added_files_are_figures_and_formats(tmp_path: Path) -> None:
     for name, text in {"figures/haste.py": FIGURE, "exports/counts.py": FORMAT}.items():
         (tmp_path / name).parent.mkdir()
         (tmp_path / name).write_text(text)
@@ -81,7 +83,7 @@ def test_files_beside_the_others_are_figures_and_formats_everywhere(tmp_path: Pa
     assert "counts" in found["help"]
 
 
-def test_a_figure_with_two_definitions_is_refused_with_both_homes() -> None:
+def test_duplicate_figures_are_refused_with_both_files() -> None:
     with pytest.raises(
         ValueError, match=r"figure arms has two definitions, in .*arm_poses and .*run_overview"
     ):

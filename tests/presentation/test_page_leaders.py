@@ -1,4 +1,4 @@
-"""Who leads the slave, as the first screen of a report shows it."""
+"""The leaders of the slave on the first screen of a report."""
 
 import json
 import re
@@ -67,7 +67,7 @@ def test_one_master_leads_alone() -> None:
 
 
 @pytest.mark.parametrize("name", ["four", "busy"])
-def test_every_slave_that_follows_somebody_is_shown(name: str) -> None:
+def test_every_following_slave_is_shown(name: str) -> None:
     log = logs.busy().log if name == "busy" else logs.simulated(name)
     followers = {
         site

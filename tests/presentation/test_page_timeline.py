@@ -1,4 +1,4 @@
-"""What happened in a run, as sentences in the order of time."""
+"""The events of a run, as sentences in the order of time."""
 
 from tests.analysis import logs
 from tests.core.guarded_runs import stopped_log
@@ -21,7 +21,7 @@ def test_plain_run_begins_pushes_and_ends() -> None:
     assert told[-1].endswith("The record ends.")
 
 
-def test_changes_and_modes_are_told_with_their_origin() -> None:
+def test_changes_and_modes_have_their_origin() -> None:
     log = logs.busy().log
     told = sentences(log)
     assert "2.200 b braked until 3.053 s." in told
@@ -42,6 +42,6 @@ def test_sites_that_act_together_share_a_sentence() -> None:
     assert stop in told
 
 
-def test_divergence_is_told() -> None:
+def test_divergence_is_reported() -> None:
     log = logs.diverged()
     assert any(f"diverged: {log.describe_divergence()}." in line for line in sentences(log))

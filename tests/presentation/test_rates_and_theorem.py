@@ -14,7 +14,7 @@ from trilat_net.presentation.certificate_text import describe_certificate, descr
     ("factor", "remarks"), [(1.0, 0), (1.0 + 1e-6, 0), (1.1, 1), (0.5, 1), (-1, 1)]
 )
 @pytest.mark.parametrize("exact", [True, False])
-def test_rates_that_print_differently_are_explained(
+def test_rates_printing_differently_are_explained(
     factor: float, remarks: int, *, exact: bool
 ) -> None:
     found = certify_run(runs.run("paper", {"duration_s": 16.0, "rate_hz": 100}).log)
@@ -29,7 +29,7 @@ def test_rates_that_print_differently_are_explained(
     assert all(accuracy in line.text and "is measured" in line.text for line in told)
 
 
-def test_a_theorem_that_does_not_apply_has_not_passed() -> None:
+def test_inapplicable_theorems_have_not_passed() -> None:
     found = runs.run("wall").certificate
     (line,) = [line for line in describe_certificate(found) if line.text == found.verdict.text]
     assert line.mark == "note"
@@ -41,6 +41,6 @@ def test_a_theorem_that_does_not_apply_has_not_passed() -> None:
     ]
 
 
-def test_a_law_without_v_has_no_line_about_the_theorem() -> None:
+def test_laws_without_v_have_no_theorem() -> None:
     settings = {"control.law": "p_d", "duration_s": 1.0, "rate_hz": 200}
     assert describe_theorem(runs.run("free", settings).certificate) == []

@@ -1,4 +1,7 @@
-"""Figures for papers: sizes, fonts, words, files. What they show is tested beside what draws them."""
+"""Figures for papers: sizes, fonts, words, files.
+
+Their content is tested beside the functions that draw them.
+"""
 
 import re
 from functools import cache
@@ -35,7 +38,7 @@ def walled():
 
 @cache
 def example(name):
-    """A log that has something to show in a figure: changes and marks where it may."""
+    """Returns a log that has data for a figure: changes and marks if possible."""
     if name in ("operation", "operator_torques", "hands_moved"):
         return logs.simulated("paper")
     if name == "observed_energy":
@@ -62,7 +65,7 @@ def drawn(name, width_in):
         ("certificate", PAGE_IN),
     ],
 )
-def test_words_do_not_overlap_type_is_8_pt(name, width_in):
+def test_words_have_8_pt_without_overlap(name, width_in):
     made = drawn(name, width_in)
     assert made.get_figwidth() == width_in
     assert misplaced(made) == []
@@ -79,8 +82,8 @@ def test_words_do_not_overlap_type_is_8_pt(name, width_in):
 
 
 @pytest.mark.parametrize("name", ["parameter_estimates", "contact"])
-def test_a_pdf_is_one_page_with_fonts_and_no_date(name, tmp_path):
-    """252 pt are 3.5 in; Type 42 is TrueType, which journals take where they refuse Type 3."""
+def test_pdf_figures_embed_fonts_without_date(name, tmp_path):
+    """252 pt are 3.5 in; Type 42 is TrueType, which journals accept, unlike Type 3."""
     before = dict(mpl.rcParams)
     path = tmp_path / f"{name}.pdf"
     write_figure(drawn(name, COLUMN_IN), path, make_print_size(COLUMN_IN).dpi)
@@ -107,7 +110,7 @@ def test_the_same_log_gives_the_same_bytes(kind, tmp_path):
         assert int.from_bytes(first.read_bytes()[16:20], "big") == 2100  # 600 dots per inch
 
 
-def test_a_log_has_the_figures_that_it_has_something_for():
+def test_logs_have_the_figures_they_support():
     have = set(list_drawable_figures(walled()))
     assert {"contact", "operation", "positions"} <= have
     assert (
@@ -128,8 +131,10 @@ def test_a_log_has_the_figures_that_it_has_something_for():
     assert {"authority", "delay_distributions"} <= set(list_drawable_figures(logs.busy().log))
 
 
-def test_force_of_wall_is_what_record_says_of_arm():
-    """J'F of the drawn force along the normal is the recorded torque ON the arm: the wall is all there is."""
+def test_wall_force_equals_the_recorded_torque():
+    """J'F of the drawn force along the normal is the recorded torque ON the arm, because no
+    other force acts.
+    """
     log = walled()
     part, wall = log["s"], log.scenario.sites["s"].environment[0]
     above = joint_motion.draw_contact(log).axes[0]
@@ -154,7 +159,7 @@ def test_force_of_wall_is_what_record_says_of_arm():
         (["contact"], {"formats": ["eps"]}, "pdf, png, svg"),
     ],
 )
-def test_what_cannot_be_drawn_is_refused_before_anything_is(names, options, said, tmp_path):
+def test_impossible_figures_are_refused_beforehand(names, options, said, tmp_path):
     with pytest.raises(UsageError, match=said):
         write_figures(walled(), tmp_path / "new", ["positions", *names], **options)
     assert not (tmp_path / "new").exists()

@@ -1,6 +1,6 @@
-"""Exports of sites that follow with their end effectors, as other people's programs read them.
+"""Exports of sites that follow with their end effectors, as other programs read them.
 
-The export as a bag: in order of arrival, as long as the log, refused where the log is broken.
+The export as a bag: in order of arrival, as long as the log, refused if the log is broken.
 """
 
 import csv
@@ -80,7 +80,7 @@ def test_mat_read_by_scipy_and_frames_by_polars(tmp_path: Path) -> None:
 
 
 def list_numbers(message: Any) -> list[float]:
-    """The place, velocity or force of a stamped message."""
+    """Returns the place, velocity or force of a stamped message."""
     if hasattr(message, "pose"):
         vector = message.pose.position
     else:
@@ -151,7 +151,7 @@ def test_messages_are_in_order_of_arrival(
     )
 
 
-def test_records_that_came_late_stand_where_they_came(tmp_path: Path) -> None:
+def test_late_records_stand_where_they_came(tmp_path: Path) -> None:
     """A gap in the log is a gap in the bag."""
     log = opened(
         edited(recorded("paper"), record=lambda r: None if 20 <= r["tick"] < 40 else r)
@@ -163,7 +163,7 @@ def test_records_that_came_late_stand_where_they_came(tmp_path: Path) -> None:
     assert len(states) == 100
 
 
-def test_a_record_that_cannot_be_read_is_told(tmp_path: Path) -> None:
+def test_unreadable_records_are_reported(tmp_path: Path) -> None:
     log = opened(
         edited(
             recorded("paper"), record=lambda r: {**r, "q": r["q"][:1]} if r["tick"] == 7 else r

@@ -1,4 +1,4 @@
-"""A recording into memory, on a clock that the test moves, and sites that remember what they sent."""
+"""A recording into memory, on a clock that the test moves, and sites that remember their messages."""
 
 import io
 from collections.abc import Callable, Iterator, Sequence
@@ -148,7 +148,7 @@ class Desk:
         self.recording.write(self.tap, self.clock.monotonic_ns())
 
     def rounds(self, count: int, *sites: Memory, step_ns: int = 10 * MS) -> None:
-        """Time goes on, while the recorder works and these sites answer."""
+        """Lets time pass, while the recorder works and the given sites answer."""
         for _ in range(count):
             self.wait(step_ns)
             self.write()

@@ -1,4 +1,4 @@
-"""What a recorder says of its own work: true, once a second, bounded, and in its log."""
+"""A recorder's report on its own work: true, once a second, bounded, and in its log."""
 
 from recorder.session_recording import REPORT_EVERY_NS
 from trilat_net.net import topics
@@ -13,7 +13,7 @@ def heard(desk: Desk) -> list[RecorderStats]:
     return [decode(message[1], RecorderStats) for message in iter(desk.reports.poll, None)]
 
 
-def test_it_says_what_is_there_and_what_is_missing() -> None:
+def test_reports_give_stored_and_missing_records() -> None:
     desk = Desk()
     records = states("m")
     desk.take("m", topics.STATE, *records[:10], *records[13:30], records[29], records[12])
@@ -40,7 +40,7 @@ def test_it_says_what_is_there_and_what_is_missing() -> None:
     assert heard(desk)[0].flush_max_us == 0
 
 
-def test_it_says_so_once_a_second_and_writes_it() -> None:
+def test_reports_come_once_a_second_in_logs() -> None:
     desk = Desk()
     for _ in range(350):
         desk.wait(10 * MS)
@@ -55,7 +55,7 @@ def test_it_says_so_once_a_second_and_writes_it() -> None:
     assert desk.written()["recorder/stats"] == [encode(stats) for stats in said]
 
 
-def test_a_recorder_that_slept_does_not_make_up_for_it() -> None:
+def test_sleeping_recorders_skip_reports() -> None:
     desk = Desk()
     desk.wait(10 * S + 300 * MS)
     for _ in range(160):
@@ -64,7 +64,7 @@ def test_a_recorder_that_slept_does_not_make_up_for_it() -> None:
     assert [stats.t_ns // MS for stats in heard(desk)] == [10_300, 11_300]
 
 
-def test_it_fits_a_message_however_much_is_missing() -> None:
+def test_reports_always_fit_a_message() -> None:
     desk = Desk(load_scenario("two_sites"))
     for key in desk.recording.accounts:
         for number in range(0, 10_000, 2):

@@ -10,7 +10,7 @@ SENT_NS = (22211105, 1022856655, 2022029432, 3022256680, 4022643932)
 
 
 def trip(number: int, lost: str = "false") -> dict[str, Any]:
-    """An entry of the file; `lost` is what irtt says of that."""
+    """Returns an entry of the file; `lost` is irtt's word for the loss."""
     times = {"client": {"send": {"wall": 1707277440772833721, "monotonic": SENT_NS[number]}}}
     delay = (
         {}

@@ -1,4 +1,4 @@
-"""The canonical text of a scenario, over everything that a scenario may have."""
+"""The canonical text of a scenario, over every feature of a scenario."""
 
 from typing import Any
 
@@ -103,7 +103,7 @@ def test_the_canonical_text_loads_to_the_same_scenario(changed: dict[str, Any]) 
 
 
 @pytest.mark.parametrize("name", list_shipped())
-def test_what_nobody_asked_for_is_not_in_the_text(name: str) -> None:
+def test_unrequested_features_are_not_in_the_text(name: str) -> None:
     """So the hash of an experiment does not change when another feature comes."""
     text = load_scenario("paper", {"expect": {}}).text
     assert not any(

@@ -29,7 +29,7 @@ def refusal(kind: Any, **settings: Any) -> str:
     return str(refused.value)
 
 
-def test_an_unknown_argument_is_named_with_the_file_and_those_there_are() -> None:
+def test_unknown_arguments_are_named_with_known_ones() -> None:
     text = refusal(tests.own_laws.PD, k=3)
     assert "mine:Kind" in text
     assert "own_laws.py" in text
@@ -66,7 +66,7 @@ def test_right_arguments_reach_the_class(kind: Any, settings: Any) -> None:
     assert made.settings[1] == 1
 
 
-def test_a_failure_inside_the_class_keeps_its_text() -> None:
+def test_failures_inside_the_class_keep_their_text() -> None:
     class Broken:
         def __init__(self, _facts: object) -> None:
             raise RuntimeError("no motor")

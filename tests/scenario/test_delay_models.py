@@ -1,4 +1,4 @@
-"""Links as people write them: what each model states, and what cannot be is refused with its key."""
+"""Links as people write them: the statements of each model, and refusals with their key."""
 
 import math
 from typing import Any
@@ -30,7 +30,7 @@ def refused(keys: dict[str, Any]) -> ScenarioError:
 
 
 @given(keys=links())
-def test_whatever_loads_has_moments_words_and_fates(keys: dict[str, Any]) -> None:
+def test_every_valid_link_has_moments_and_fates(keys: dict[str, Any]) -> None:
     made = link(keys)
     mean_ms, deviation_ms = made.moments()
     if not made.measured and not math.isnan(mean_ms):
@@ -63,7 +63,7 @@ def test_the_chain_of_losses_is_one(keys: dict[str, Any]) -> None:
         )
 
 
-def test_it_says_in_a_few_words_what_a_link_does() -> None:
+def test_links_are_described_in_few_words() -> None:
     keys = {
         "loss": 0.05,
         "loss_burst": 8,
@@ -108,7 +108,7 @@ def test_a_table_with_a_model_begins_anew() -> None:
         ({"model": "uniform", "delay_ms": 5, "half_width_ms": 1}, True, False),
     ],
 )
-def test_whether_anything_is_drawn_and_whether_the_network_decides(
+def test_randomness_and_network_dependence_are_known(
     keys: dict[str, Any], random: bool, measured: bool
 ) -> None:
     scenario = load_scenario("paper", {"link": keys})
@@ -150,7 +150,7 @@ def test_whether_anything_is_drawn_and_whether_the_network_decides(
         ({"model": "hyperexponential", "floor_ms": 5}, "fast_ms", "is missing"),
     ],
 )
-def test_what_a_link_does_not_know(keys: dict[str, Any], path: str, words: str) -> None:
+def test_links_do_not_accept_other_keys(keys: dict[str, Any], path: str, words: str) -> None:
     error = refused(keys)
     assert path in error.path
     assert words in error.problem
@@ -192,14 +192,14 @@ def test_what_a_link_does_not_know(keys: dict[str, Any], path: str, words: str) 
         ({"delay_ms": 5, "loss": 0.5, "loss_bad": 0.5, "loss_burst": 1.5}, "loss"),
     ],
 )
-def test_a_value_that_cannot_be_is_refused_with_its_key(keys: dict[str, Any], key: str) -> None:
+def test_invalid_values_are_refused_with_their_key(keys: dict[str, Any], key: str) -> None:
     error = refused(keys)
     assert error.path.endswith(key)
     assert error.path.startswith("link")
     assert error.problem
 
 
-def test_choices_are_named_where_one_is_wrong() -> None:
+def test_wrong_choices_name_the_valid_ones() -> None:
     assert refused({"delay_ms": 5, "order": "in order"}).problem == (
         "is 'in order', but must be 'newest' or 'in_order'"
     )
@@ -221,7 +221,7 @@ def test_the_longest_burst_that_holes_allow_is_named() -> None:
 def test_extreme_numbers_are_refused_or_have_moments(
     model: str, delay_ms: float, deviation_ms: float
 ) -> None:
-    """Nothing overflows, divides by zero, or takes the root of a negative number."""
+    """No overflow, division by zero, or root of a negative number."""
     keys = {"delay_ms": delay_ms, "deviation_ms": deviation_ms}
     if model == "ar1":
         keys["correlation"] = 0.5
@@ -235,5 +235,5 @@ def test_extreme_numbers_are_refused_or_have_moments(
         assert due(channel([made.to_core_model()]), 3).min() >= 0
 
 
-def test_a_trace_may_reach_the_limit_whatever_its_deviation() -> None:
+def test_traces_may_reach_the_limit() -> None:
     assert link({"model": "trace", "trace": "0 0, 1 10000000"}).points is not None

@@ -1,4 +1,4 @@
-"""Traces from tables: what a person's file may look like, and what is no trace."""
+"""Traces from tables: accepted files, and refusals."""
 
 import math
 from pathlib import Path
@@ -37,7 +37,7 @@ TEXT = "0 41200, 1000 lost, 2500 0"
         "t_s,delay_ms\n17.000,41.2\n17.001,lost\n17.0025,0\n",  # times count from the first point
     ],
 )
-def test_tables_as_people_have_them(tmp_path: Path, content: str) -> None:
+def test_tables_from_people_are_read(tmp_path: Path, content: str) -> None:
     (tmp_path / "delays.csv").write_bytes(content.encode())
     text = read_trace(tmp_path / "delays.csv", "m1->s")
     assert text == TEXT
@@ -52,7 +52,7 @@ rows = st.lists(
 
 
 @given(rows=rows)
-def test_a_trace_keeps_its_points_to_the_microsecond(rows: list[tuple[int, int]]) -> None:
+def test_traces_keep_microseconds(rows: list[tuple[int, int]]) -> None:
     t_us = np.cumsum([gap for gap, _ in rows])
     delays = [delay for _, delay in rows]
     table = [
@@ -82,7 +82,7 @@ def test_a_trace_keeps_its_points_to_the_microsecond(rows: list[tuple[int, int]]
         ("O.0,41\n1,5\n", "line 1: must have the form"),  # a broken first line is no head
     ],
 )
-def test_what_is_no_trace_is_refused_where_it_is_wrong(
+def test_invalid_traces_are_refused_with_place(
     tmp_path: Path, content: str, words: str
 ) -> None:
     (tmp_path / "delays.csv").write_text(content, encoding="utf-8")
@@ -95,7 +95,7 @@ def test_what_is_no_trace_is_refused_where_it_is_wrong(
     assert "delays.csv" in error.value.problem
 
 
-def test_a_file_that_cannot_be_read_is_refused(tmp_path: Path) -> None:
+def test_unreadable_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / "latin.csv").write_bytes(b"t_s,delay_ms # \xe4\n0,5\n")
     (tmp_path / "long.csv").write_text("0," + "5" * 200_000, encoding="utf-8")
     for name, words in (
@@ -109,7 +109,7 @@ def test_a_file_that_cannot_be_read_is_refused(tmp_path: Path) -> None:
             read_trace(tmp_path / name, "m1->s")
 
 
-def test_a_trace_that_is_too_long_is_refused() -> None:
+def test_overlong_traces_are_refused() -> None:
     with pytest.raises(ValueError, match="has 200001 points, but at most 200000"):
         format_trace([(n / 1000, 5.0) for n in range(MAX_TRACE_POINTS + 1)])
 
@@ -130,7 +130,7 @@ def test_a_trace_that_is_too_long_is_refused() -> None:
         "0 5, ",
     ],
 )
-def test_a_text_that_is_none_of_ours_is_refused(text: str) -> None:
+def test_foreign_texts_are_refused(text: str) -> None:
     with pytest.raises(ScenarioError) as error:
         load_scenario("paper", {"link": {"model": "trace", "trace": text}})
     assert error.value.path.endswith(".trace")
@@ -144,7 +144,7 @@ def scenario(folder: Path, link: str) -> Any:
     return parse_scenario(text, "mine", folder=folder)
 
 
-def test_a_file_lies_beside_the_scenario_that_names_it(tmp_path: Path) -> None:
+def test_files_lie_beside_their_scenario(tmp_path: Path) -> None:
     (tmp_path / "delays.csv").write_text("0,41.2\n0.001,lost\n0.0025,0\n", encoding="utf-8")
     made = scenario(tmp_path, '[link]\nmodel = "trace"\nfile = "delays.csv"\nat_end = "loop"')
     assert {link.trace for link in made.links.values()} == {TEXT}
@@ -163,7 +163,7 @@ def test_a_file_lies_beside_the_scenario_that_names_it(tmp_path: Path) -> None:
     assert setup.traces[0].tolist() == POINTS
 
 
-def test_trace_written_out_replaces_file_and_file_trace(tmp_path: Path) -> None:
+def test_written_traces_replace_file_traces(tmp_path: Path) -> None:
     (tmp_path / "delays.csv").write_text("0,41.2\n", encoding="utf-8")
     file = 'file = "delays.csv"'
     made = scenario(
@@ -197,7 +197,7 @@ def test_trace_written_out_replaces_file_and_file_trace(tmp_path: Path) -> None:
         ('[link]\nmodel = "trace"\nfile = 5', "link.file", "No such file"),
     ],
 )
-def test_where_a_trace_comes_from_is_said_once(
+def test_a_traces_origin_is_named_once(
     tmp_path: Path, link: str, path: str, words: str
 ) -> None:
     with pytest.raises(ScenarioError) as error:

@@ -21,7 +21,7 @@ def told(*scenarios: tuple[str, list[str]]) -> dict[str, tuple[str, ...]]:
     }
 
 
-def test_one_experiment_differs_in_nothing_whatever_it_is_called() -> None:
+def test_renamed_experiments_do_not_differ() -> None:
     assert told(("free", []), ("free", ["name=other", "expect.stable=false"])) == {}
 
 
@@ -33,7 +33,7 @@ def test_a_gain_of_all_sites_is_one_line() -> None:
     assert found == {"control.Kd of s": ("3", "[5, 6]")}
 
 
-def test_another_law_is_told_as_a_whole() -> None:
+def test_another_law_is_shown_whole() -> None:
     found = told(("free", []), ("free", ["control.law=p_d"]))
     assert found == {
         "control of m1, m2, s": (
@@ -43,7 +43,7 @@ def test_another_law_is_told_as_a_whole() -> None:
     }
 
 
-def test_links_are_told_in_words() -> None:
+def test_links_are_described_in_words() -> None:
     found = told(
         ("free", []), ("free", ["link.delay_ms=50"]), ("free", ["links.m1->s.delay_ms=9"])
     )
@@ -61,7 +61,7 @@ def test_other_scenarios_other_sites_other_hands() -> None:
     assert found["duration_s"] == ("15", "30")
 
 
-def test_a_chain_is_told_joint_by_joint_with_notes() -> None:
+def test_chains_are_described_by_joint() -> None:
     unlimited = (
         (SHIPPED_FOLDER / "arm6.urdf")
         .read_text()
@@ -83,7 +83,7 @@ def test_a_chain_is_told_joint_by_joint_with_notes() -> None:
     assert "arm of" not in "\n".join(describe_scenario(load_scenario("free")))
 
 
-def test_limits_of_a_real_arm_are_said_first() -> None:
+def test_limits_of_real_arms_come_first() -> None:
     (line,) = [
         line for line in describe_scenario(EXAMPLES / "external_arm.toml")[:2] if "real" in line
     ]
@@ -98,7 +98,7 @@ def test_limits_of_a_real_arm_are_said_first() -> None:
     assert not [line for line in describe_scenario("free") if "real arm" in line]
 
 
-def test_it_says_how_often_a_site_will_hold() -> None:
+def test_checks_predict_holds_of_a_site() -> None:
     keys = {"on_stale.action": "glide", "link.model": "normal", "duration_s": 6.0, "seed": 3}
     link = {"link.delay_ms": 60.0, "link.deviation_ms": 25.0, "link.loss": 0.6}
     scenario = load_scenario("two_sites", {**keys, **link})
@@ -110,14 +110,16 @@ def test_it_says_how_often_a_site_will_hold() -> None:
     assert f"will hold {10 * entered:.3g} times a minute" in line
 
 
-def test_of_a_site_that_never_holds_it_says_nothing() -> None:
+def test_sites_that_never_hold_get_no_remark() -> None:
     glide = load_scenario("two_sites", {"on_stale.action": "glide", "duration_s": 2.0})
     assert not [line for line in describe_scenario(glide) if "times a minute" in line]
     assert describe_scenario("two_sites") == describe_scenario(load_scenario("two_sites"))
 
 
 def test_check_states_the_time_to_rest() -> None:
-    """Of every site under `glide`, and of an arm that is faster than its motors bear how fast joints get."""
+    """For every site under `glide`; and for an arm too fast for its motors, the speed that its
+    joints reach.
+    """
     scenario = load_scenario("free", {"on_stale.action": "glide"})
     bounds = find_rest_bounds(scenario, "s")
     lines = [line for line in describe_scenario(scenario) if line.startswith("arms of")]
@@ -135,7 +137,11 @@ def test_check_states_the_time_to_rest() -> None:
 
 @pytest.mark.parametrize("name", ["free", "paper_rods", "play", "six_joints", "unlike_arms"])
 def test_motors_bear_the_speeds_of_shipped_scenarios(name: str) -> None:
-    """Eq. (7) of docs/theory/coming-to-rest.md: the limits of torque hold gravity and Coriolis torques."""
+    """Eq.
+
+    (7) of docs/theory/coming-to-rest.md: the limits of torque hold gravity and Coriolis
+    torques.
+    """
     scenario = load_scenario(name, {"on_stale.action": "glide"})
     for site in scenario.names:
         bounds = find_rest_bounds(scenario, site)
@@ -175,7 +181,7 @@ RAMP = [{"at_s": 1.0, "dominance": "s", "to": {"m1": 0.1, "m2": 0.9}, "ramp_s": 
         ),
     ],
 )
-def test_a_check_says_which_shares_have_no_effect(
+def test_a_check_names_shares_without_effect(
     law: dict[str, object], more: dict[str, object], expected: list[str]
 ) -> None:
     scenario = unit_scenario(
@@ -189,7 +195,7 @@ def test_a_check_says_which_shares_have_no_effect(
     assert found == [f"dominance without effect at {line}" for line in expected]
 
 
-def test_lines_have_shares_of_their_sites_and_b_on_average() -> None:
+def test_lines_share_by_site_and_average_b() -> None:
     law = {"law": "wave", "b": [6.0, 3.0]}
     scenario = unit_scenario({"m1": {}, "m2": {}, "s": {}}, law, dominance=REVERSIBLE)
     total = np.zeros(2)

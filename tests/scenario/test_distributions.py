@@ -33,7 +33,7 @@ def drawn(seed: int) -> Scenario:
     return load_scenario("free", {**EXAMPLE, "seed": seed})
 
 
-def test_each_number_is_drawn_by_itself() -> None:
+def test_each_number_is_drawn_separately() -> None:
     """Joints, sites and seeds differ; the same seed gives the same."""
     one, other = drawn(1), drawn(2)
     assert one == drawn(1)
@@ -44,13 +44,13 @@ def test_each_number_is_drawn_by_itself() -> None:
     assert one.drawn["sites.m1.q0_rad.1"].value == one.sites["m1"].q0_rad[1]
 
 
-def test_another_number_that_is_drawn_changes_none() -> None:
+def test_further_drawn_numbers_change_none() -> None:
     more = load_scenario(drawn(1), {"sites.s.q0_rad": {"normal": [0.0, 1.0]}})
     assert more.sites["m1"] == drawn(1).sites["m1"]
     assert more.sites["s"].q0_rad != drawn(1).sites["s"].q0_rad
 
 
-def test_numbers_are_distributed_as_asked() -> None:
+def test_numbers_follow_their_distribution() -> None:
     """By the statistic of Kolmogorov and Smirnov, at 1e-4: a wrong mean or width of 10 % fails."""
     from scipy import stats
 
@@ -62,7 +62,7 @@ def test_numbers_are_distributed_as_asked() -> None:
     assert abs(np.corrcoef(normal[1:], normal[:-1])[0, 1]) < 0.08
 
 
-def test_the_text_is_canonical_and_holds_what_was_drawn() -> None:
+def test_canonical_text_holds_the_drawn_numbers() -> None:
     one = drawn(3)
     again = parse_scenario(one.text)
     assert again == one
@@ -70,7 +70,7 @@ def test_the_text_is_canonical_and_holds_what_was_drawn() -> None:
     assert "[drawn" not in load_scenario("free").text
 
 
-def test_another_seed_draws_again_wherever_the_scenario_came_from() -> None:
+def test_another_seed_draws_again_from_any_source() -> None:
     """From a scenario, and from the text of a log: hands that hold the start pose too."""
     for found in (
         reseed_scenario(drawn(1), 5),
@@ -102,10 +102,10 @@ ends = st.tuples(st.floats(0.5, 2.0), st.floats(2.0, 9.0)).map(list)
     drawn_there=st.dictionaries(st.sampled_from(PLACES), ends),
     seeds=st.tuples(*[st.integers(0, 2**63 - 1)] * 2),
 )
-def test_there_and_back_is_the_same_experiment(
+def test_changing_seeds_back_restores_the_experiment(
     drawn_there: dict[str, list[float]], seeds: tuple[int, int]
 ) -> None:
-    """Whatever is drawn: the text loads to itself, and the first seed again gives the first experiment."""
+    """For any draw: the text loads to itself, and the first seed again gives the first experiment."""
     ranges = {
         key: {"uniform": two}
         for key, two in drawn_there.items()
@@ -126,7 +126,7 @@ def test_there_and_back_is_the_same_experiment(
             assert one.uniform[0] - 1e-8 <= one.value <= one.uniform[1] + 1e-8, key
 
 
-def test_a_number_that_was_replaced_stays() -> None:
+def test_replaced_numbers_stay() -> None:
     fixed = load_scenario(drawn(1), {"sites.m1.q0_rad": [0.3, 0.0], "control.law": "p_d"})
     other = reseed_scenario(fixed, 2)
     assert other.sites["m1"].q0_rad == (0.3, 0.0)
@@ -134,7 +134,7 @@ def test_a_number_that_was_replaced_stays() -> None:
     assert not any(".control." in key for key in other.drawn)
 
 
-def test_an_experiment_without_operators_is_still_itself() -> None:
+def test_an_experiment_without_operators_stays_itself() -> None:
     alone = drawn(1).without_hands()
     assert parse_scenario(alone.text) == alone
 
@@ -158,7 +158,7 @@ def test_an_experiment_without_operators_is_still_itself() -> None:
         ("drawn", {"sites.m1.q0_rad.0": 1.0}, "drawn: "),
     ],
 )
-def test_what_is_no_distribution_is_refused_at_its_key(
+def test_invalid_distributions_are_refused_at_their_key(
     key: str, value: Any, problem: str
 ) -> None:
     with pytest.raises(ScenarioError) as refused:

@@ -1,4 +1,4 @@
-"""What `ping` prints on every system: each probe is an answer or a loss, and the text says where it ends."""
+"""The output of `ping` on every system: each probe is an answer or a loss, and the text states the end."""
 
 import math
 import zipfile
@@ -197,7 +197,7 @@ def test_other_forms_of_ping_are_read(tmp_path: Path, text: str, expected: list[
         ("Reply from 192.0.2.7: bytes=32 time<1ms TTL=53\n", False, [1.0]),
     ],
 )  # fmt: skip
-def test_unfinished_output_says_that_its_end_is_unknown(
+def test_unfinished_output_has_an_unknown_end(
     tmp_path: Path, text: str, begin_known: bool, expected: list[float]
 ) -> None:
     found = read(tmp_path, text)
@@ -223,9 +223,7 @@ def test_unfinished_output_says_that_its_end_is_unknown(
         ),
     ],
 )
-def test_output_that_contradicts_itself_is_refused(
-    tmp_path: Path, text: str, said: str
-) -> None:
+def test_contradictory_output_is_refused(tmp_path: Path, text: str, said: str) -> None:
     with pytest.raises(ScenarioError, match=said):
         read(tmp_path, text)
 
@@ -239,9 +237,7 @@ def test_output_that_contradicts_itself_is_refused(
         ("zip", "a.txt"),
     ],
 )
-def test_a_spreadsheet_is_named_as_one(
-    tmp_path: Path, form: str, ending: str, inside: str
-) -> None:
+def test_spreadsheets_are_named(tmp_path: Path, form: str, ending: str, inside: str) -> None:
     path = tmp_path / f"table.{ending}"
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("mimetype" if ending == "ods" else inside, inside)

@@ -1,4 +1,4 @@
-"""What the shipped scenarios say of themselves, beyond what their [expect] asks: the contrasts."""
+"""The shipped scenarios show their contrasts, beyond their [expect] tables."""
 
 from typing import Any
 
@@ -21,7 +21,7 @@ def ages(run: Run) -> np.ndarray:
 
 
 @pytest.mark.long
-def test_4g_looks_young_because_newer_samples_overtake() -> None:
+def test_newer_samples_overtake_on_4g() -> None:
     short = {"duration_s": 6.0}
     assert ages(ran("4g", short)).mean() == pytest.approx(21, abs=3)
     assert ages(ran("4g", {**short, "link.order": "in_order"})).mean() > 400
