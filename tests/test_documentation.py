@@ -1,4 +1,6 @@
-"""The blocks of the documentation: each runs and gives what stands beside it, or there is a reason."""
+"""The blocks of the documentation: each block runs and gives the output beside it, or has a
+stated reason.
+"""
 
 import re
 import shutil
@@ -37,14 +39,14 @@ SCENARIOS = resources.files("trilat_net") / "scenarios"
 OPTIONS = all_options()
 
 
-def test_every_exception_is_one_and_its_test_is_there() -> None:
+def test_every_exception_names_an_existing_test() -> None:
     for name, why in {**ELSEWHERE, **NOT_RUN}.items():
         assert sum(block.name.startswith(name) for block in BLOCKS) >= 1, name
         assert (ROOT / why).is_file() or why in NOT_RUN.values(), why
     assert not ELSEWHERE.keys() & NOT_RUN.keys()
 
 
-def test_every_block_is_run_or_there_is_a_reason() -> None:
+def test_every_block_runs_or_has_a_reason() -> None:
     runs = {"sh": COMMAND_PAGES, "python": PYTHON_PAGES, "toml": set(SCENARIO_OF)}
     known = [block for block in BLOCKS if block.language]
     assert len(known) > 60
@@ -54,7 +56,7 @@ def test_every_block_is_run_or_there_is_a_reason() -> None:
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_a_command_parses_as_it_is_written(page: str) -> None:
+def test_commands_parse_as_written(page: str) -> None:
     for block in find_blocks(page):
         for words, _ in read_commands(block.text) if block.language == "sh" else ():
             if words[0] == "trilat":
@@ -62,7 +64,7 @@ def test_a_command_parses_as_it_is_written(page: str) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_command_in_sentence_is_one_and_has_these_options(page: str) -> None:
+def test_commands_in_sentences_have_their_options(page: str) -> None:
     for text in re.findall(r"`(trilat [^`]*)`", (ROOT / page).read_text(encoding="utf-8")):
         words = re.findall(r"[^\s\[\]|,()]+", text)
         (name, *_) = [w for w in (" ".join(words[:n]) for n in (3, 2, 1)) if w in OPTIONS]
@@ -153,7 +155,7 @@ def test_settings_make_a_scenario(
 
 
 def write_own_arm(folder: Path, text: str) -> str:
-    """Puts an arm of the package in place of a robot's file that is not shipped; returns the scenario."""
+    """Replaces a robot's file that is not shipped by an arm of the package; returns the scenario."""
     shutil.copy(str(SCENARIOS / "arm6.urdf"), folder / "ur5_robot.urdf")
     return text.replace('"tool0"', '"flange"')
 
@@ -222,7 +224,7 @@ OF_RUNS = {
 
 
 def prepare(page: str, folder: Path) -> None:
-    """Makes the files that a page takes for granted."""
+    """Makes the files that a page assumes."""
     if page in OF_RUNS:
         trilat("sim", OF_RUNS[page], "-o", "run.mcap", cwd=folder).succeeds()
     if page == "docs/tutorials/first-hour.md":  # the log of the reader's session
@@ -239,7 +241,7 @@ def prepare(page: str, folder: Path) -> None:
 @pytest.mark.parametrize(
     "page", list_pages(COMMAND_PAGES - {"docs/tutorials/lab.md"}, PUSHED_COMMAND_PAGES)
 )
-def test_commands_of_page_run_and_print_what_stands_there(page: str, tmp_path: Path) -> None:
+def test_page_commands_print_their_shown_output(page: str, tmp_path: Path) -> None:
     prepare(page, tmp_path)
     for block in find_blocks(page):
         if block.language != "sh" or find_exception(block):
@@ -255,7 +257,7 @@ def test_commands_of_page_run_and_print_what_stands_there(page: str, tmp_path: P
 
 @pytest.mark.long
 @pytest.mark.live
-def test_code_of_hand_takes_hold_of_arm_and_lets_go(tmp_path: Path) -> None:
+def test_documented_hands_take_and_release_arms(tmp_path: Path) -> None:
     words = ("--scenario", "play", "--set", "duration_s=600")
     sites = [
         Process(name, ["site", name, *words], tmp_path)
@@ -303,7 +305,7 @@ AT_HAND = {
 
 
 def run_python(page: str, folder: Path, names: dict[str, Any] | None = None) -> str:
-    """Runs the code of a page in a folder, in one namespace; returns what it prints."""
+    """Runs the code of a page in a folder, in one namespace; returns its output."""
     space: dict[str, Any] = {"__name__": "page"} if names is None else names
     printed = StringIO()
     with redirect_stdout(printed), pytest.MonkeyPatch.context() as patch:
@@ -332,7 +334,7 @@ def check_linear_examples(printed: str, _: dict[str, Any]) -> None:
 
 
 def check_ports(_: str, names: dict[str, Any]) -> None:
-    """The lines of the command on docs/studies/ports.md are those of this page's function."""
+    """Compares the lines of the command on docs/studies/ports.md with those of this page's function."""
     (block,) = (one for one in find_blocks("docs/studies/ports.md") if one.language == "sh")
     ((_, shown),) = read_commands(block.text)
     made = names["describe_ports"](names["ports"]("p_d_margin_two", control__d=1.96))
@@ -340,7 +342,7 @@ def check_ports(_: str, names: dict[str, Any]) -> None:
 
 
 def check_energies(_: str, names: dict[str, Any]) -> None:
-    """A line that carries 2 N m for a second gave, and took, 2 J."""
+    """Asserts that a line that carries 2 N m for a second took, and gave, 2 J."""
     u = {"u": np.full((1000, 1), 2.0)}
     peers = [SimpleNamespace(sent=u, received=u)]
     found = names["energies"](None, SimpleNamespace(h_s=1e-3, peers=peers))
@@ -365,7 +367,7 @@ CHECKS: dict[str, Callable[[str, dict[str, Any]], None]] = {
 
 
 @pytest.mark.parametrize("page", list_pages(PYTHON_PAGES - OF_THEIR_OWN, PUSHED_PYTHON_PAGES))
-def test_code_of_page_runs_and_finds_what_stands_there(page: str, tmp_path: Path) -> None:
+def test_page_code_finds_its_stated_results(page: str, tmp_path: Path) -> None:
     prepare(page, tmp_path)
     names: dict[str, Any] = {"__name__": "page"}
     printed = run_python(page, tmp_path, names)
@@ -376,7 +378,7 @@ def test_code_of_page_runs_and_finds_what_stands_there(page: str, tmp_path: Path
 
 
 def list_shown(page: str) -> list[str]:
-    """Returns the lines that a page shows of what its code prints: the block right after the code."""
+    """Returns the output that a page shows: the block right after the code."""
     blocks = find_blocks(page)
     text = (ROOT / page).read_text(encoding="utf-8")
     shown: list[str] = []
@@ -392,7 +394,7 @@ def list_shown(page: str) -> list[str]:
 
 
 @pytest.mark.long
-def test_the_code_about_sweeps_reads_what_a_sweep_left(tmp_path: Path) -> None:
+def test_code_about_sweeps_reads_their_results(tmp_path: Path) -> None:
     over = [
         "--over",
         "link.delay_ms=0,100",
@@ -411,7 +413,7 @@ def test_the_code_about_sweeps_reads_what_a_sweep_left(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_what_certificate_says_first_is_what_stands_on_its_page(tmp_path: Path) -> None:
+def test_certificates_begin_as_shown_on_their_page(tmp_path: Path) -> None:
     trilat("sim", "paper", "-o", "run.mcap", cwd=tmp_path).succeeds()
     (shown,) = (
         b.text

@@ -75,7 +75,7 @@ def test_a_module_name_is_used_once() -> None:
 
 
 @pytest.mark.push
-def test_a_reader_walks_straight_from_certify_to_its_judgement() -> None:
+def test_readers_walk_straight_from_certify_to_judgement() -> None:
     """`python -m tests.reading_walk` prints the walk, and says how it is counted."""
     found = reading_walk.walk_to_judgement()
     # Of these, `stability_decision` has a third: it weighs the end, the twins and the proofs,
@@ -118,7 +118,7 @@ def test_no_test_imports_another() -> None:
 
 @pytest.mark.push
 def test_every_import_between_rooms_has_its_reason() -> None:
-    """The table that docs/develop/packages.md links to has each pair, and no pair that is not there."""
+    """The table that docs/develop/packages.md links to has exactly the existing pairs."""
     with IMPORTS.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     assert all(row["what for"] for row in rows)
@@ -129,7 +129,7 @@ def test_every_import_between_rooms_has_its_reason() -> None:
 
 @pytest.mark.push
 def test_no_string_names_a_layer_above() -> None:
-    """Import contracts do not see such a name; `hooks` does what it was for."""
+    """Import contracts do not see such a name; code uses `hooks` instead."""
     found = {str(path): house.names_from_above(path) for path in house.files()}
     assert {path: names for path, names in found.items() if names} == {}
 
@@ -143,7 +143,7 @@ def test_every_hook_that_is_looked_up_is_registered() -> None:
 
 
 @pytest.mark.push
-def test_no_modules_import_each_other_in_a_circle() -> None:
+def test_no_modules_import_each_other_in_circles() -> None:
     graph = grimp.build_graph(*house.TOPS, cache_dir=None, exclude_type_checking_imports=True)
     modules = sorted(graph.modules)
     indices = {module: n for n, module in enumerate(modules)}
@@ -158,7 +158,7 @@ def test_no_modules_import_each_other_in_a_circle() -> None:
     assert [names for names in members.values() if len(names) > 1] == []
 
 
-def test_the_tour_names_what_exists() -> None:
+def test_the_tour_names_existing_files() -> None:
     stops = re.findall(r"`([\w/]+\.py)`(?:: ((?:`[\w.]+`(?:, )?)+))?", TOUR)
     assert len(stops) > 25
     for file, names in stops:
@@ -186,7 +186,7 @@ def test_the_readme_is_short() -> None:
 
 
 def test_examples_import_the_interface_alone() -> None:
-    """Whoever reads one learns what a program of his own may use."""
+    """Readers of an example learn from it what their own program may use."""
     inside = re.compile(
         r"^\s*(?:from|import) (?:trilat_net\.(?!extension )|trilat_studies|trilat_ros2|sites|recorder|live)",
         re.MULTILINE,

@@ -1,4 +1,4 @@
-"""The changes that judge the tests: one token each, drawn by a seed."""
+"""The mutants that judge the tests: each changes one token and is drawn by a seed."""
 
 import ast
 import io

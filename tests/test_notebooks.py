@@ -1,4 +1,4 @@
-"""The notebooks of `examples/`: executed, and the facts that they state hold; kept without outputs."""
+"""The notebooks of `examples/` run, and their stated facts hold; they are stored without outputs."""
 
 import json
 from pathlib import Path
@@ -44,7 +44,7 @@ def test_every_notebook_has_facts_and_no_outputs() -> None:
 @pytest.mark.long
 @pytest.mark.filterwarnings("default")  # of its packages
 @pytest.mark.parametrize("name", FACTS)
-def test_a_notebook_runs_and_says_what_is_true(name: str, tmp_path: Path) -> None:
+def test_a_notebook_runs_and_its_facts_hold(name: str, tmp_path: Path) -> None:
     nbclient = pytest.importorskip("nbclient", reason="make test-long installs it")
     nbformat = pytest.importorskip("nbformat")
     pytest.importorskip("ipykernel")

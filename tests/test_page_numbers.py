@@ -1,8 +1,8 @@
-"""Numbers on the pages are what the program makes of the commands, runs and formulas beside them.
+"""Numbers on the pages equal the results of the commands, runs and formulas beside them.
 
-A row has a page's words with `{}` for each number, and what makes the numbers, in that order, or a text in which
-the same words stand. A number of the page must agree with the one that is made to six tenths of its last printed
-digit.
+A row has a page's words with `{}` for each number, and the source of the numbers in that order,
+or a text in which the same words stand. A number of the page must agree with its source to six
+tenths of its last printed digit.
 """
 
 import csv
@@ -91,7 +91,7 @@ def continuous(name: str, changes: Changes, pose: Pose | None = None) -> tuple[f
 def root(
     name: str, changes: Changes | None = None, pose: Pose | None = None
 ) -> tuple[float, float]:
-    """The rightmost root that decides, the upper one of a pair."""
+    """Returns the rightmost root that decides, the upper one of a pair."""
     found = analyse_linear_loop(
         load_scenario(name, changes or {}), pose=pose, roots=1
     ).decisive.rightmost
@@ -100,7 +100,7 @@ def root(
 
 
 def margin(name: str, changes: Changes | None = None) -> tuple[float, float]:
-    """The largest common delay, ms, and the frequency there, rad/s."""
+    """Returns the largest common delay, ms, and the frequency there, rad/s."""
     high = (
         analyse_linear_loop(load_scenario(name, changes or {}), roots=1)
         .margin.intervals[0]
@@ -126,7 +126,9 @@ def edge_of_p_d(name: str, share: float, delay_ms: float) -> float:
 
 
 def common_motion() -> tuple[float, float, float]:
-    """What the common motion asks of d, of K T: the largest -sin x / x; the mass there, two factors of it."""
+    """Returns the damping that the common motion needs, in K T: the largest -sin x / x; the
+    mass there, and two factors of it.
+    """
     x = brentq(lambda x: math.tan(x) - x, 4.4, 4.6)
     return -math.sin(x) / x, 1.0 - math.cos(x), x**2
 
@@ -191,7 +193,7 @@ def fused(name: str, duration_s: float | None = None, **changes: Any) -> FusedRu
 
 
 def rms_of_free(delay_ms: float) -> float:
-    """Of e over 20 s, of all joints and sites together, rad."""
+    """Returns the RMS of e over 20 s, of all joints and sites together, rad."""
     made = sampled(
         load_scenario("free", {"link.delay_ms": delay_ms}), np.arange(0.02, 20.01, 0.02)
     )
@@ -201,20 +203,20 @@ def rms_of_free(delay_ms: float) -> float:
 def seen(
     name: str, asked: str, *windows: tuple[float, float, str], **changes: Any
 ) -> list[float]:
-    """Quantities of windows of a run, window by window."""
+    """Returns quantities of windows of a run, window by window."""
     made = measured(name, keys(changes), *windows)
     return [value(made, key, n) for n in range(len(windows)) for key in asked.split()]
 
 
 def age(**changes: Any) -> float:
-    """Mean age of the samples in use in `jitter`, ms."""
+    """Returns the mean age of the samples in use in `jitter`, ms."""
     return float(
         np.mean([one.mean_ms for one in measured("jitter", keys(changes)).ages.values()])
     )
 
 
 def anchored(delay_s: float, duration_s: float) -> Numbers:
-    """The final angle of the first joint in `paper`: predicted, and of a run."""
+    """Returns the final angle of the first joint in `paper`: predicted, and of a run."""
     predicted = math.asin(-2.0 / (G * (1.0 + delay_s)))
     return predicted, fused("paper", duration_s, link__delay_ms=1e3 * delay_s).q[0, 0]
 
@@ -237,7 +239,7 @@ def rise(V: Any) -> Numbers:
 
 
 def energy_of_healing() -> Numbers:
-    """What the links give to the slave of `outage` as they heal, J."""
+    """Returns the energy that the links give to the slave of `outage` as they heal, J."""
     balance = runs.run("outage").balance
     healed = slice(*np.searchsorted(balance.t_s, (6.19, 6.21)))
     return (float(np.ptp(balance.work[f"{peer}->s"][healed])) for peer in ("m1", "m2"))
@@ -250,18 +252,20 @@ def certified(folder: Path) -> str:
 
 
 def uniform_age(order: Any, low_ms: float, high_ms: float) -> float:
-    """The mean age in use by the sums of docs/data/age-in-use.txt, at 1 kHz, ms."""
+    """Returns the mean age in use by the sums of docs/data/age-in-use.txt, at 1 kHz, ms."""
     return float(order(uniform(low_ms, high_ms - low_ms).cdf, 1.0)[0])
 
 
 def distances(scheme: str) -> list[float]:
-    """From the exact solution of `paper`, rad, at three rates, and the orders between them."""
+    """Returns distances from the exact solution of `paper`, rad, at three rates, and the orders
+    between them.
+    """
     far = [delay_equations.distance("paper", scheme, rate_hz) for rate_hz in (500, 1000, 2000)]
     return [*far, *delay_equations.order("paper", scheme)]
 
 
 def shipped_trials() -> list[Any]:
-    """What `trilat test --seeds 1..20` runs."""
+    """Returns the trials of `trilat test --seeds 1..20`."""
     return [trial for name in SHIPPED for trial in trilat_net.trials(name, seeds=range(1, 21))]
 
 
@@ -507,7 +511,7 @@ ROWS = [
 
 
 def numbers(words: str, text: str) -> list[str]:
-    """The numbers in the one place of a text that has these words."""
+    """Returns the numbers in the single place of a text that has these words."""
     pattern = NUMBER.join(map(re.escape, words.split("{}")))
     found = re.findall(pattern, " ".join(text.split()))
     assert len(found) == 1, f"{len(found)} places"
@@ -532,12 +536,12 @@ def check(page: str, words: str, made: Numbers | str) -> None:
 
 
 @pytest.mark.parametrize(("page", "words", "make"), ROWS)
-def test_a_number_on_a_page_is_what_is_made(page: str, words: str, make: Make) -> None:
+def test_page_numbers_equal_their_source(page: str, words: str, make: Make) -> None:
     check(page, words, make())
 
 
 @pytest.mark.long
-def test_the_example_of_a_certificate_is_what_is_printed(tmp_path: Path) -> None:
+def test_the_printed_certificate_is_the_example(tmp_path: Path) -> None:
     for words in CERTIFIED:
         check("docs/logs/certificate.md", words, certified(tmp_path))
 
@@ -571,8 +575,10 @@ def test_the_table_of_tuned_gains_has_every_range() -> None:
 
 
 @pytest.mark.parametrize("row", ENDS)
-def test_the_end_of_a_front_is_what_its_gains_make(row: int) -> None:
-    """Of the tables of docs/theory/fair-comparison-results.md with gains: four of the error, then four of settling."""
+def test_gains_repeat_the_ends_of_fronts(row: int) -> None:
+    """For the rows with gains in docs/theory/fair-comparison-results.md: four of the error,
+    then four of settling.
+    """
     assert len(TUNED) == 8
     law, reached, effort_nm, gains = TUNED[row]
     (space,) = select_search_spaces([law], load_scenario("free"))
@@ -594,7 +600,7 @@ def test_the_end_of_a_front_is_what_its_gains_make(row: int) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("told", AS_PRINTED)
-def test_the_gains_as_printed_make_what_the_page_says(told: str) -> None:
+def test_printed_gains_repeat_the_page(told: str) -> None:
     made = tuned(30.0, {"control.theta_hat0": AS_PRINTED[told]})
     check(
         "docs/theory/fair-comparison-results.md",
@@ -604,7 +610,7 @@ def test_the_gains_as_printed_make_what_the_page_says(told: str) -> None:
 
 
 def read_table(name: str) -> list[list[str]]:
-    """The rows of a table of docs/data, without its head."""
+    """Returns the rows of a table of docs/data, without its head."""
     with (ROOT / "docs" / "data" / name).open(newline="", encoding="utf-8") as stream:
         return list(csv.reader(stream))[1:]
 
@@ -619,8 +625,8 @@ def class_of(longest_s: float, **changes: Any) -> CellClass:
 
 @pytest.mark.long
 @pytest.mark.parametrize("row", range(19))
-def test_an_edge_of_p_d_lies_between_two_runs(row: int) -> None:
-    """Of the table of edges of docs/maps/README.md: unstable below, stable above."""
+def test_p_d_edges_lie_between_two_runs(row: int) -> None:
+    """The table of edges of docs/maps/README.md: unstable below, stable above."""
     assert len(EDGES) == 19
     stiffness, delay_ms, _, low, high = map(float, EDGES[row][:5])
     soft, longest_s = (SOFT, 640.0) if stiffness == SOFT["control.K"] else ({}, 320.0)
@@ -630,7 +636,7 @@ def test_an_edge_of_p_d_lies_between_two_runs(row: int) -> None:
 
 
 @pytest.mark.parametrize("row", range(len(LIVE_CELLS)))
-def test_a_cell_that_was_run_live_has_its_class(row: int) -> None:
+def test_live_cells_have_their_class(row: int) -> None:
     number, delay_ms, d, virtual, live = LIVE_CELLS[row]
     assert virtual == live
     # 40 values of d each
@@ -643,7 +649,7 @@ def test_a_cell_that_was_run_live_has_its_class(row: int) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize(("delay_ms", "d"), [(1560, 2.5), (1600, 2.7)])
-def test_a_mode_that_hardly_takes_part_is_not_passed_over(delay_ms: float, d: float) -> None:
+def test_hardly_excited_modes_are_not_ignored(delay_ms: float, d: float) -> None:
     """As docs/maps/README.md says: it grows at 0.01 to 0.03 /s, and the cell is not decided."""
     assert 0.005 < root("p_d_margin", {"link.delay_ms": delay_ms, "control.d": d})[0] < 0.035
     found = class_of(160.0, link__delay_ms=delay_ms, control__d=d, duration_s=20.0)

@@ -1,4 +1,4 @@
-"""A test run says in lines how far it is, and how long it will take."""
+"""A test run prints lines with its progress and its remaining time."""
 
 import os
 import re
@@ -21,7 +21,7 @@ def test_number(n):
 
 
 def run_tests(folder: Path, *options: str) -> str:
-    """Runs six tests, of which one fails; returns what is printed."""
+    """Runs six tests, of which one fails; returns the output."""
     (folder / "test_numbers.py").write_text(TESTS)
     (folder / "sitecustomize.py").write_text(
         "import tests.progress\ntests.progress.EVERY_S = 0.0\n"

@@ -1,4 +1,4 @@
-"""What a push leaves to the long tests: only what is dear, never a whole file, and nothing that is gone."""
+"""The tests that a push leaves to the long run: only dear ones, never a whole file, and no missing ones."""
 
 import re
 from pathlib import Path
@@ -18,7 +18,7 @@ def test_whatever_takes_too_long_is_left() -> None:
     assert choose_long_tests({dear: 1.01 * MOST_S, cheap: 0.5 * DEAR_S}) == [dear]
 
 
-def test_all_that_is_left_exists() -> None:
+def test_every_listed_test_exists() -> None:
     for name in read_long_tests():
         path, _, case = name.partition("::")
         text = Path(ROOT, path).read_text(encoding="utf-8")

@@ -17,7 +17,7 @@ from tests.readme_commands import (
 
 
 def list_commands() -> set[str]:
-    """All commands of the program, as in "log info"."""
+    """Returns all commands of the program, as in "log info"."""
     names = [name.removeprefix("trilat ") for name in all_options() if name != "trilat"]
     return {name for name in names if not any(other.startswith(f"{name} ") for other in names)}
 
@@ -32,7 +32,7 @@ def test_every_command_of_the_readme_is_run() -> None:
     assert list_unlike_commands() == []
 
 
-def test_the_readme_shows_the_judgement_of_its_first_run(tmp_path: Path) -> None:
+def test_the_readme_shows_its_first_judgement(tmp_path: Path) -> None:
     (shown,) = (block.text for block in find_blocks("README.md") if not block.language)
     trilat("sim", "two_people", "-o", "run.mcap", cwd=tmp_path).succeeds()
     printed = trilat("certify", "run.mcap", cwd=tmp_path).succeeds().splitlines()

@@ -1,4 +1,4 @@
-"""The release: one version, workflows whose steps are commands that exist, a wheel that installs and runs."""
+"""The release: one version, workflows whose steps are existing commands, a wheel that installs and runs."""
 
 import os
 import re
@@ -29,7 +29,7 @@ RELEASE: dict[Any, Any] = yaml.safe_load((ROOT / ".github/workflows/release.yml"
 
 
 @pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.name)
-def test_a_workflow_is_pinned_and_may_do_little(path: Path) -> None:
+def test_workflows_are_pinned_and_have_few_rights(path: Path) -> None:
     text = path.read_text(encoding="utf-8")
     used = re.findall(r"uses: (.+)$", text, re.MULTILINE)
     assert used
@@ -45,8 +45,8 @@ def test_a_workflow_is_pinned_and_may_do_little(path: Path) -> None:
     assert "secrets." not in text
 
 
-def test_workflows_install_by_hash_or_what_they_built() -> None:
-    """A package of somebody else could put its own files among those that are published."""
+def test_workflows_install_by_hash_or_own_builds() -> None:
+    """A foreign package could put its own files among the published ones."""
     installed = 0
     for path in WORKFLOWS:
         for line in re.findall(
@@ -68,7 +68,7 @@ def test_workflows_install_by_hash_or_what_they_built() -> None:
     assert installed >= 8
 
 
-def test_what_the_workflows_run_is_there() -> None:
+def test_commands_of_workflows_exist() -> None:
     for path in WORKFLOWS:
         for job in yaml.safe_load(path.read_text(encoding="utf-8"))["jobs"].values():
             for line in (step["run"] for step in job["steps"] if "run" in step):
@@ -86,7 +86,7 @@ def test_what_the_workflows_run_is_there() -> None:
                     ), line
 
 
-def test_a_release_is_built_once_and_published_without_a_secret() -> None:
+def test_releases_are_built_once_without_a_secret() -> None:
     jobs = RELEASE["jobs"]
     assert RELEASE[True] == {"push": {"tags": ["v*"]}}  # YAML reads `on` so
     needs = {"build": None, "compile": "build", "install": "compile", "studies": "build"}
@@ -115,8 +115,8 @@ def locked(name: str) -> set[str]:
     return set(re.findall(r"^([\w-]+)==", text, re.MULTILINE))
 
 
-def test_every_lock_has_what_is_stated_for_it() -> None:
-    """A lock that is made once and not again with a new dependency lacks it: `make lock`."""
+def test_locks_have_their_stated_contents() -> None:
+    """A lock that was not made again with a new dependency lacks that dependency: `make lock`."""
     groups = {key: names_of(stated) for key, stated in PROJECT["dependency-groups"].items()}
     needed, extras = (
         PROJECT["project"]["dependencies"],
@@ -139,7 +139,7 @@ def check_release(tag: str, folder: Path) -> "subprocess.CompletedProcess[str]":
     )
 
 
-def test_a_tag_that_is_not_the_version_is_refused(tmp_path: Path) -> None:
+def test_tags_must_equal_the_version(tmp_path: Path) -> None:
     for name in ("pyproject.toml", "CITATION.cff"):
         shutil.copy(ROOT / name, tmp_path)
     changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
@@ -167,7 +167,7 @@ def test_both_names_of_the_program_are_one() -> None:
 
 
 def run(*words: object, cwd: Path, **more: str) -> str:
-    """Runs a program outside of the checkout; returns what it printed."""
+    """Runs a program outside of the checkout; returns its output."""
     bare = {
         key: value
         for key, value in os.environ.items()
@@ -191,7 +191,7 @@ EXAMPLE = "trilat-lag"
 
 @pytest.fixture(scope="module")
 def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of what each distribution is built from."""
+    """Returns the folder from which each distribution is built."""
     folder = tmp_path_factory.mktemp("sources")
     run(sys.executable, ROOT / ".ci" / "distributions", folder / "made", cwd=folder)
     return folder / "made"
@@ -199,7 +199,7 @@ def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def built(sources: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Path]]:
-    """By distribution its sdist, and the wheel that is made of that sdist."""
+    """Returns, by distribution, the sdist and the wheel that is built from the sdist."""
     build = "from setuptools.build_meta import *; import sys; print(globals()[sys.argv[1]](sys.argv[2]))"
     made = {}
     shutil.copytree(ROOT / "examples" / "package", sources / EXAMPLE)
@@ -215,7 +215,7 @@ def built(sources: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
     return made
 
 
-def test_both_distributions_are_one_program_of_one_version(sources: Path) -> None:
+def test_both_distributions_are_one_program(sources: Path) -> None:
     """One has every file, the other the remaining libraries; nothing is installed twice."""
     core, whole = (
         tomllib.loads((sources / name / "pyproject.toml").read_text(encoding="utf-8"))[
@@ -242,7 +242,7 @@ def test_both_distributions_are_one_program_of_one_version(sources: Path) -> Non
 
 
 @pytest.mark.parametrize("name", PACKAGES)
-def test_a_package_has_the_version_and_bounds_of_the_program(name: str, sources: Path) -> None:
+def test_packages_have_the_programs_version_bounds(name: str, sources: Path) -> None:
     released = tomllib.loads((sources / name / "pyproject.toml").read_text(encoding="utf-8"))
     first, *libraries = released["project"]["dependencies"]
     assert (released["project"]["version"], first) == (VERSION, f"{CORE}=={VERSION}")
@@ -252,7 +252,7 @@ def test_a_package_has_the_version_and_bounds_of_the_program(name: str, sources:
 
 
 def needed(names: set[str]) -> dict[str, Distribution]:
-    """These distributions of this environment, and all that they need."""
+    """Returns these distributions of this environment, and all their dependencies."""
     found: dict[str, Distribution] = {}
     left = set(names)
     while left:
@@ -293,7 +293,9 @@ def install(clean: Path, wheel: Path, libraries: set[str]) -> Path:
 def test_a_robot_runs_trilat_net_core_alone(
     built: dict[str, list[Path]], tmp_path: Path
 ) -> None:
-    """Without a network: libraries are of this environment, the program is the wheel's; then both wheels'."""
+    """Without a network: libraries are of this environment, the program is the wheel's; then
+    both wheels'.
+    """
     with zipfile.ZipFile(built[CORE][1]) as archive:
         names = set(archive.namelist())
     packages = ("trilat_net", "sites", "recorder", "live")
@@ -360,10 +362,12 @@ print([name for name in sys.modules if name.startswith("trilat_studies")])
 
 
 @pytest.mark.long
-def test_packages_and_those_of_others_join_the_core(
+def test_own_and_foreign_packages_join_the_core(
     built: dict[str, list[Path]], tmp_path: Path
 ) -> None:
-    """The core imports none of them, and says what to install; with them it has their commands and functions."""
+    """The core imports none of them, and names the installation; with them it has their
+    commands and functions.
+    """
     clean = tmp_path / "clean"
     run(sys.executable, "-m", "venv", "--without-pip", clean, cwd=tmp_path)
     stated = names_of(PROJECT["project"]["dependencies"])
@@ -399,8 +403,10 @@ def test_the_packagers_find_nothing(built: dict[str, list[Path]]) -> None:
     run(tools["twine"], "check", "--strict", *built[CORE], *built[WHOLE], cwd=ROOT)
 
 
-def test_to_import_the_package_imports_none_of_what_takes_time() -> None:
-    """The bar is 30 ms: what it imports beyond an interpreter's start are a few modules of the library."""
+def test_importing_the_package_imports_nothing_slow() -> None:
+    """The bound is 30 ms: beyond an interpreter's start the import needs only a few modules of
+    the library.
+    """
     code = "import sys; before = set(sys.modules); import trilat_net; print(*(set(sys.modules) - before))"
     made = subprocess.run(
         [sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True, text=True

@@ -1,4 +1,6 @@
-"""The site of documentation: links and pictures hold, it has every name, and takes nothing from a network."""
+"""The site of documentation: links and pictures work, every name is present, and nothing is
+loaded from a network.
+"""
 
 import re
 import runpy
@@ -24,7 +26,7 @@ MAKE = SimpleNamespace(**runpy.run_path(str(ROOT / "docs" / "site" / "make_pages
 
 
 class Page(HTMLParser):
-    """What a page's parts are called, where it leads to, and what a browser loads for it."""
+    """The parts of a page, its links, and the files that a browser loads for the page."""
 
     def __init__(self, page: Path) -> None:
         super().__init__()
@@ -40,7 +42,7 @@ class Page(HTMLParser):
         self.loads |= {given[key] for key in ("src", "href") if tag != "a" and key in given}
 
 
-def test_every_picture_and_page_that_first_page_names_is_there() -> None:
+def test_the_first_pages_links_exist() -> None:
     overview = (ROOT / "docs" / "overview.md").read_text(encoding="utf-8")
     text = MAKE.read_beside_docs("README.md") + overview.replace("](../", "](")
     named = re.findall(r'(?:\]\(|src=")(?!https?:)([^)"#]+)', text)
@@ -49,7 +51,7 @@ def test_every_picture_and_page_that_first_page_names_is_there() -> None:
     assert [place for place in places if not place.is_file()] == []
 
 
-def test_the_menu_has_nine_entries_at_most_and_every_page_once() -> None:
+def test_the_menu_has_nine_entries_at_most() -> None:
     settings = tomllib.loads((ROOT / "docs/site/zensical.toml").read_text(encoding="utf-8"))
     entries = settings["project"]["nav"]
     assert len(entries) <= 9
@@ -62,7 +64,7 @@ def test_the_menu_has_nine_entries_at_most_and_every_page_once() -> None:
     assert pages | made == set(named)
 
 
-def test_a_page_is_found_by_its_name_and_lies_in_the_folder_of_its_menu() -> None:
+def test_pages_are_found_in_their_menus_folder() -> None:
     settings = tomllib.loads((ROOT / "docs/site/zensical.toml").read_text(encoding="utf-8"))
     names: list[str] = []
     for entry in settings["project"]["nav"]:
@@ -94,7 +96,9 @@ def test_the_list_of_scenarios_begins_with_the_paper() -> None:
 @pytest.mark.long
 @needs_browser
 def test_the_site_is_whole() -> None:
-    """Zensical refuses a Markdown link or an anchor that leads nowhere; pictures in HTML it does not see."""
+    """Zensical refuses a Markdown link or an anchor that leads nowhere, but does not check
+    pictures in HTML.
+    """
     subprocess.run(
         [sys.executable, "docs/site/make_pages.py", "--no-pictures"], cwd=ROOT, check=True
     )
@@ -125,7 +129,9 @@ def test_the_site_is_whole() -> None:
 
 
 def check_search() -> None:
-    """From a page in a folder, opened as a file: what is found leads to its place, and nothing is fetched."""
+    """Searches from a page in a folder, opened as a file: each result leads to its place, and
+    nothing is fetched.
+    """
     with browser_page("about:blank") as page:
         asked: list[str] = []
         page.on("request", lambda request: asked.append(request.url))

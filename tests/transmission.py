@@ -79,7 +79,7 @@ def balance(
 def transmitted(
     frequency_hz: float, alpha: NDArray[np.float64], at: int, **law: object
 ) -> float:
-    """|torque / velocity| that a torque on arm `at` meets, over |Z_e| of the wall at the last arm."""
+    """Returns |torque / velocity| for a torque on arm `at`, over |Z_e| of the wall at the last arm."""
     s = 2j * np.pi * frequency_hz
     free = [(0.0, 0.0)] * (len(alpha) - 1)
     A, b = balance(s, alpha, loads=[*free, WALL], **law)  # type: ignore[arg-type]
@@ -90,7 +90,9 @@ def transmitted(
 def rightmost_root(
     alpha: NDArray[np.float64], loads: Sequence[tuple[float, float]], **law: object
 ) -> float:
-    """The largest real part of the roots without delay, from det A(s), a polynomial of degree 2 n."""
+    """Returns the largest real part of the roots without delay, from det A(s), a polynomial of
+    degree 2 n.
+    """
     degree = 2 * len(alpha)
     points = 10.0 * np.exp(2j * np.pi * np.arange(degree + 1) / (degree + 1))
     values = [np.linalg.det(balance(s, alpha, loads=loads, **law)[0]) for s in points]  # type: ignore[arg-type]
@@ -99,5 +101,5 @@ def rightmost_root(
 
 
 def printed(value: float) -> Any:
-    """A printed number: within half of its last digit, of three."""
+    """Returns an approximation of a printed number of three digits, within half of the last digit."""
     return pytest.approx(value, rel=2e-3, abs=6e-4)

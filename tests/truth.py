@@ -23,7 +23,7 @@ Ints = NDArray[np.int64]
 
 @dataclass
 class Member:
-    """A member's clock: what it reads is start + offset + (true - start) (1 + drift)."""
+    """A member's clock, whose reading is start + offset + (true - start) (1 + drift)."""
 
     epoch_ns: int
     start_ns: int
@@ -36,17 +36,17 @@ class Member:
         return self.start_ns + round(passed_ns / self.rate)
 
     def reading_ns(self, true_ns: int) -> int:
-        """Returns what it reads at an instant of the clock underneath."""
+        """Returns the reading of the clock at an instant of the clock underneath."""
         return self.start_ns + self.offset_ns + round((true_ns - self.start_ns) * self.rate)
 
     def offset_to_ns(self, other: "Member", since_epoch_ns: int) -> int:
-        """Returns how far another clock is ahead of this one at a reading of this one since the epoch."""
+        """Returns the lead of another clock over this one at a reading of this one since the epoch."""
         true_ns = self.true_ns(since_epoch_ns)
         return other.reading_ns(true_ns) - self.reading_ns(true_ns)
 
 
 def members(log: Log) -> dict[str, Member]:
-    """The clocks of a log's members."""
+    """Returns the clocks of a log's members."""
     started = next(event for event in log.events if event.kind == "start")
     announced = next(
         e for e in log.events if e.kind == "epoch" and e.attempt == started.attempt
@@ -62,7 +62,7 @@ def members(log: Log) -> dict[str, Member]:
 
 
 def again(log: Log, name: str) -> Member:
-    """The clock of the last start of a member that joined the running session."""
+    """Returns the clock of the last start of a member that joined the running session."""
     event = [e for e in log.events if e.kind == "coming" and e.member == name][-1]
     skew = SKEWED.search(event.clock)
     offset_ns, drift_ppb, start_ns = map(int, skew.groups()) if skew else (0, 0, 0)
@@ -92,7 +92,7 @@ class Judged:
 
 
 class Bound:
-    """What a site's log says of the clock of one peer over time."""
+    """The logged bounds of a site on the clock of one peer over time."""
 
     def __init__(self, log: Log, site: str, peer: str) -> None:
         self.events: list[Event] = [
@@ -101,7 +101,7 @@ class Bound:
         self._ticks = [event.ticks for event in self.events]
 
     def at(self, tick: int, t_ns: int) -> float | None:
-        """The bound of an offset at a tick, us; None before the first that was logged."""
+        """Returns the bound of an offset at a tick, us; None before the first that was logged."""
         place = bisect_right(self._ticks, tick) - 1
         if place < 0:
             return None
@@ -111,7 +111,7 @@ class Bound:
 
 
 def judged(log: Log, site: str, peer: str) -> Judged:
-    """Every sample of a link that its receiver echoed, against the truth."""
+    """Returns every sample of a link that its receiver echoed, against the truth."""
     clocks = members(log)
     place = log.scenario.peers(site).index(peer)
     sent = {state.tick: state.sent_ns for state in log[peer].states}
@@ -132,7 +132,9 @@ def judged(log: Log, site: str, peer: str) -> Judged:
 
 
 def offset_errors(log: Log, site: str, peer: str) -> NDArray[np.float64]:
-    """Every logged estimate against the truth: t (s), error of the offset (us) and of the drift (ppm)."""
+    """Returns every logged estimate against the truth: t (s), error of the offset (us) and of
+    the drift (ppm).
+    """
     clocks = members(log)
     own, other = clocks[site], clocks[peer]
     drift_ppm = float(other.rate / own.rate - 1) * 1e6

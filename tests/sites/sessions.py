@@ -168,7 +168,7 @@ class Session:
         self.clocks[name].at(at_ns, lambda: setattr(interrupt, "number", number))
 
     def lose(self, by: str, lost: str, from_ns: int, to_ns: int) -> None:
-        """Loses what is published under a key between two times; `by` is a site that lives then."""
+        """Loses messages under a key between two times; `by` is a site that lives then."""
 
         def begin() -> None:
             for member in self.network.members:
@@ -200,7 +200,9 @@ class Session:
         )
 
     def play(self) -> None:
-        """Runs it in this process, which is left as it is: no real-time priority, no locked memory."""
+        """Runs the session in this process, which keeps its settings: no real-time priority, no
+        locked memory.
+        """
         obtained = dict.fromkeys(("scheduling", "memory"), "as it was")
         with mock.patch.object(realtime, "prepare", return_value=obtained):
             self.relay.run()

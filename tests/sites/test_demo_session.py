@@ -1,4 +1,4 @@
-"""Processes of a session: each is what a shell would have started, and none is left, whoever dies first."""
+"""Processes of a session start like those of a shell, and none survives, whichever dies first."""
 
 import os
 import signal
@@ -49,7 +49,7 @@ def parent(pid: int) -> int:
     return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
 
 
-def test_a_process_does_what_its_words_do(starter: ProcessStarter, tmp_path: Path) -> None:
+def test_processes_run_their_words(starter: ProcessStarter, tmp_path: Path) -> None:
     shown = ended(starter, starter.start("show", ["scenario", "show", "paper"]))
     refused = ended(starter, starter.start("site", ["site", "m9", "--scenario", "paper"]))
     assert (shown.code, shown.problem()) == (0, None)
@@ -59,7 +59,7 @@ def test_a_process_does_what_its_words_do(starter: ProcessStarter, tmp_path: Pat
     assert "m9" in str(refused.problem())
 
 
-def test_each_has_its_name_session_and_signals(starter: ProcessStarter) -> None:
+def test_processes_have_own_name_session_and_signals(starter: ProcessStarter) -> None:
     process = waiting(starter, "recorder")
     assert process.pid is not None
     assert (
@@ -79,14 +79,14 @@ def test_a_killed_process_is_named_with_its_signal(starter: ProcessStarter) -> N
     assert ended(starter, process).problem() == "m1 was killed by SIGKILL"
 
 
-def test_what_has_not_begun_is_ended_with_its_starter(tmp_path: Path) -> None:
+def test_unstarted_processes_end_with_their_starter(tmp_path: Path) -> None:
     with closing(started(tmp_path)) as starter:
         process = starter.start("m1", WAITS)
         process.end(signal.SIGINT)
         assert ended(starter, process).problem() is None
 
 
-def test_interrupted_starter_that_ends_with_any_code_is_no_problem(tmp_path: Path) -> None:
+def test_interrupted_starters_are_no_problem(tmp_path: Path) -> None:
     """An interpreter that a signal meets while it imports its first modules ends with code 1."""
     with closing(started(tmp_path)) as starter:
         process = SessionProcess(starter, "m1", tmp_path / "m1.txt")
@@ -99,7 +99,7 @@ def test_interrupted_starter_that_ends_with_any_code_is_no_problem(tmp_path: Pat
         assert process.problem() is None
 
 
-def test_signal_that_meets_a_copy_before_its_handler_ends_it(tmp_path: Path) -> None:
+def test_signals_before_the_handler_end_copies(tmp_path: Path) -> None:
     """The starter forks and signals at once: none of ten copies loses the signal."""
     with closing(started(tmp_path)) as starter:
         waiting(starter, "recorder")  # the starter serves orders
@@ -118,23 +118,23 @@ def test_processes_of_a_killed_starter_end(tmp_path: Path) -> None:
     until(lambda: not is_running(int(process.pid or 0)))
 
 
-def test_processes_end_with_whoever_asked_for_them(tmp_path: Path) -> None:
+def test_processes_end_with_their_requester(tmp_path: Path) -> None:
     starter = started(tmp_path)
     processes = [waiting(starter, name) for name in ("m1", "recorder")]
     starter.close()
     assert not any(is_running(int(one.pid or 0)) for one in processes)
 
 
-def test_a_starter_that_fails_says_why(tmp_path: Path) -> None:
+def test_failing_starters_give_their_reason(tmp_path: Path) -> None:
     with closing(ProcessStarter(tmp_path / "absent.toml", tmp_path)) as starter:
         process = ended(starter, starter.start("m1", WAITS))
     assert "absent.toml" in str(process.problem())
 
 
-def test_no_code_of_the_users_runs_in_the_starter(
+def test_no_user_code_runs_in_the_starter(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whose threads or devices no copy would have."""
+    """Copies would not have the threads or devices of such code."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv(
         "PYTHONPATH", os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])

@@ -1,4 +1,4 @@
-"""What the doctor finds: each trouble by itself, made here, against a machine without it."""
+"""The findings of the doctor: each trouble alone, made here, against a machine without trouble."""
 
 import json
 import os
@@ -31,7 +31,7 @@ from trilat_net.net.zenoh_bus import ZenohBus
 MEMBERS = ("m1", "s", "recorder")
 
 
-def test_a_measurement_that_fails_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failing_measurement_gives_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     failing = "raise MemoryError('no more pages')"
     monkeypatch.setattr(doctor, "_RATES_CODE", failing)
     monkeypatch.setattr(doctor, "_RIGHTS_CODE", failing)
@@ -67,14 +67,14 @@ def states(findings: Iterator[doctor.DoctorFinding]) -> list[str]:
     return [finding.state for finding in findings]
 
 
-def test_keys_that_are_well_are_well(folder: Path) -> None:
+def test_valid_keys_pass(folder: Path) -> None:
     (found,) = examine_keys(folder / "m1")
     assert found.state == "ok"
     assert "m1 of m1, s, recorder, until" in found.text
     assert states(examine_keys(None)) == ["ok"]
 
 
-def test_keys_that_end_soon_or_lie_open_are_told(tmp_path: Path) -> None:
+def test_keys_ending_soon_or_open_are_reported(tmp_path: Path) -> None:
     create_keys(tmp_path / "keys", MEMBERS, [], 3)
     (tmp_path / "keys" / "m1").chmod(0o755)
     found = list(examine_keys(tmp_path / "keys" / "m1"))
@@ -106,9 +106,7 @@ def member(folder: Path, place: str) -> Iterator[None]:
         bus.close()
 
 
-def test_member_with_keys_answers_one_with_keys_of_same_authority(
-    folder: Path, tmp_path: Path
-) -> None:
+def test_members_answer_keys_of_their_authority(folder: Path, tmp_path: Path) -> None:
     create_keys(tmp_path / "others", MEMBERS, [], 30)
     (place, nobody) = (one.replace("tcp", "tls") for one in find_free_endpoints(2))
     with member(folder / "m1", place):
@@ -120,7 +118,7 @@ def test_member_with_keys_answers_one_with_keys_of_same_authority(
 
 
 @pytest.mark.long
-def test_so_it_is_over_quic(folder: Path, tmp_path: Path) -> None:
+def test_members_answer_over_quic(folder: Path, tmp_path: Path) -> None:
     create_keys(tmp_path / "others", MEMBERS, [], 30)
     (place, nobody) = (one.replace("tcp", "quic") for one in find_free_endpoints(2))
     with member(folder / "m1", place):
@@ -132,7 +130,7 @@ def test_so_it_is_over_quic(folder: Path, tmp_path: Path) -> None:
     assert links(folder / "s", [nobody], []) == ["ok"]
 
 
-def test_endpoints_that_are_open_to_a_network_are_told() -> None:
+def test_endpoints_open_to_networks_are_reported() -> None:
     assert links(None, ["tcp/0.0.0.0:0"], []) == ["fail"]
     assert links(None, ["tcp/0.0.0.0:0"], [], insecure=True) == ["warn"]
     assert links(None, ["tcp/127.0.0.1:0"], []) == ["ok"]
@@ -142,7 +140,7 @@ def test_endpoints_that_are_open_to_a_network_are_told() -> None:
 
 
 class OddClock(ManualClock):
-    """A clock that goes on by itself, and does something odd once."""
+    """A clock that advances by itself, and does something odd once."""
 
     def __init__(self, odd_ns: int = 0, wall_step_ns: int = 0) -> None:
         super().__init__()
@@ -160,14 +158,14 @@ class OddClock(ManualClock):
 @pytest.mark.parametrize(
     ("clock", "state"), [((), "ok"), ((-5_000_000,), "fail"), ((0, 1 << 30), "warn")]
 )
-def test_a_clock_that_goes_back_or_steps_is_told(clock: tuple[int, ...], state: str) -> None:
+def test_clocks_that_go_back_are_reported(clock: tuple[int, ...], state: str) -> None:
     assert states(examine_clock(OddClock(*clock))) == [state]
 
 
 @pytest.mark.parametrize(
     ("free", "state"), [(50 << 20, "fail"), (1 << 30, "warn"), (1 << 40, "ok")]
 )
-def test_a_disk_that_is_nearly_full_is_told(
+def test_a_nearly_full_disk_is_reported(
     free: int, state: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=free))
@@ -175,7 +173,7 @@ def test_a_disk_that_is_nearly_full_is_told(
     assert [one.state for one in found] == [state]
 
 
-def test_rights_that_are_not_obtained_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_rights_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     obtained = {
         "scheduling": "normal (not permitted)",
         "memory": "locked",
@@ -199,9 +197,7 @@ def test_rights_that_are_not_obtained_are_told(monkeypatch: pytest.MonkeyPatch) 
         (2_000_000, 400, [True]),
     ],
 )
-def test_a_rate_is_held_if_ticks_begin_in_time(
-    late_ns: int, every: int, held: list[bool]
-) -> None:
+def test_rates_hold_if_ticks_begin_in_time(late_ns: int, every: int, held: list[bool]) -> None:
     """One tick in a hundred may begin in the second half of its period, or later."""
     found = doctor.rehearse_rates(UnpunctualClock(late_ns, every))
     assert [doctor.is_held(*one[:2]) for one in found] == held
@@ -221,7 +217,7 @@ def test_a_rate_is_held_if_ticks_begin_in_time(
         ([(100, 9000, 12000)], "fail", "holds not even 100 Hz"),
     ],
 )
-def test_the_rate_is_told_with_how_late_ticks_were(
+def test_rates_are_reported_with_their_lateness(
     rates: list[tuple[int, int, int]], state: str, text: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     done = SimpleNamespace(returncode=0, stdout=json.dumps(rates))
@@ -231,14 +227,14 @@ def test_the_rate_is_told_with_how_late_ticks_were(
     assert text in found.text
 
 
-def test_a_real_loop_is_measured_in_its_own_process() -> None:
+def test_real_loops_are_measured_in_own_processes() -> None:
     assert doctor.examine_rate().text.startswith("a site alone ")
 
 
 @pytest.mark.parametrize(
     ("kernel", "name"), [("Windows", "Windows"), ("Darwin", "macOS"), ("Linux", "")]
 )
-def test_what_is_promised_here_is_told(
+def test_promised_findings_are_reported(
     kernel: str, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(platform, "system", lambda: kernel)
@@ -250,7 +246,7 @@ def test_what_is_promised_here_is_told(
 def test_open_rights_are_no_finding_on_windows(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Windows lets a mode tell nothing but whether a file can be written."""
+    """On Windows a mode only says whether a file can be written."""
     (folder / "m1" / "private.key").chmod(0o666)
     try:
         monkeypatch.setattr("trilat_net.net.member_keys.sys", SimpleNamespace(platform="win32"))
@@ -260,7 +256,7 @@ def test_open_rights_are_no_finding_on_windows(
         (folder / "m1" / "private.key").chmod(0o600)
 
 
-def test_the_command_exits_with_1_if_something_fails(
+def test_the_command_exits_1_on_failures(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(doctor, "examine_rights", lambda: iter(()))
@@ -280,9 +276,7 @@ def test_the_command_exits_with_1_if_something_fails(
     assert "--insecure" in done.out
 
 
-def test_a_session_that_nobody_answers_for_fails(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_unanswering_session_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "CONNECT_S", 0.2)
     connection = Connection((), find_free_endpoints(1))
     found = list(

@@ -1,4 +1,4 @@
-"""An arm outside of the program: its measurements are the record, and without them nothing goes on."""
+"""An external arm: its measurements are the record, and without them the session stops."""
 
 import math
 import re
@@ -57,7 +57,7 @@ A_SECOND = 1_000_000_000
 
 
 class Pendulum:
-    """Joints that do not feel each other, with friction: no arm of ours."""
+    """Uncoupled joints with friction, as an external arm."""
 
     def __init__(self, q: Sequence[float]) -> None:
         self.q, self.qd = list(q), [0.0] * len(q)
@@ -80,7 +80,9 @@ def driving(
     senses: bool = False,
     poses: list[tuple[int, list[float]]] | None = None,
 ) -> Act:
-    """The program of an arm; with `poses`, which it notes with their times, one that has brakes."""
+    """The program of an arm; `poses` collects its times and poses, and a program with `poses`
+    has brakes.
+    """
     body = arm or Pendulum((0.3, -0.1))
 
     def drive(bus: Bus, clock: RelayClock) -> None:
@@ -114,7 +116,7 @@ def session_of(
     return session, session.ends
 
 
-def test_an_external_arms_measurement_is_the_record_and_drives_it(tmp_path: Path) -> None:
+def test_external_measurements_are_the_record_and_drive(tmp_path: Path) -> None:
     sent: list[list[float]] = []
     torques: list[tuple[float, ...]] = []
     session, ends = session_of(tmp_path, driving(sent, torques))
@@ -135,7 +137,7 @@ def test_an_external_arms_measurement_is_the_record_and_drives_it(tmp_path: Path
 
 
 def whole(log: Log) -> None:
-    """Executed again, and virtual time fed with it, bit for bit."""
+    """Asserts that the log is executed again, and equals virtual time fed with the log, bit for bit."""
     assert log.complete
     verdict = verify(log)
     assert verdict.whole_run
@@ -144,8 +146,10 @@ def whole(log: Log) -> None:
 
 
 @pytest.mark.long
-def test_arm_of_six_joints_sends_torque_that_it_measures(tmp_path: Path) -> None:
-    """Its tau_x is the record's to the bit, goes to the peers, and is what the log executes again."""
+def test_external_arms_may_send_measured_torques(tmp_path: Path) -> None:
+    """The measured tau_x is the record's to the bit, goes to the peers, and enters the repeated
+    execution.
+    """
     changes = {**ARM, "duration_s": 0.3}
     Site(six(**changes).setup("s")).step(TickInput(0))  # compiles, before anybody waits
     sent: list[list[float]] = []
@@ -162,7 +166,7 @@ def test_arm_of_six_joints_sends_torque_that_it_measures(tmp_path: Path) -> None
     whole(log)
 
 
-def test_an_arm_with_another_number_of_joints_is_told_so(tmp_path: Path) -> None:
+def test_arms_of_other_joint_numbers_are_refused(tmp_path: Path) -> None:
     scenario = six(**ARM)
     session = Session(scenario, tmp_path / "run.mcap")
     session.stranger(
@@ -184,7 +188,7 @@ def test_an_arm_with_another_number_of_joints_is_told_so(tmp_path: Path) -> None
     )
 
 
-def test_a_silent_arm_is_held_then_in_fault(tmp_path: Path) -> None:
+def test_silent_arms_are_held_then_in_fault(tmp_path: Path) -> None:
     session, ends = session_of(tmp_path, driving([], [], until_ns=A_SECOND + 1_300_000_000))
     log = session.run()
     assert ends == {"m": 0, "s": 0}
@@ -204,9 +208,7 @@ def test_a_silent_arm_is_held_then_in_fault(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "frozen_s", [0.3, *(pytest.param(s, marks=pytest.mark.long) for s in (1.0, 3.0, 10.0))]
 )
-def test_a_frozen_site_makes_up_for_nothing_its_arm_stays(
-    frozen_s: float, tmp_path: Path
-) -> None:
+def test_frozen_sites_catch_up_nothing(frozen_s: float, tmp_path: Path) -> None:
     poses: list[tuple[int, list[float]]] = []
     at_ns = 4 * A_SECOND
     scenario = load_scenario("two_sites", {**OUTSIDE, "duration_s": 3.5 + frozen_s})
@@ -237,7 +239,7 @@ def test_a_frozen_site_makes_up_for_nothing_its_arm_stays(
     whole(log)
 
 
-def test_an_arm_moves_only_while_its_switch_is_held(tmp_path: Path) -> None:
+def test_arms_move_only_with_held_switches(tmp_path: Path) -> None:
     """Held from 0.2 s to 0.5 s, then silent; again from 0.8 s, and let go at 1.1 s."""
     session, ends = session_of(
         tmp_path, driving([], []), **{"sites.s.arm.dead_man": True, "duration_s": 1.5}
@@ -285,7 +287,7 @@ def test_an_arm_moves_only_while_its_switch_is_held(tmp_path: Path) -> None:
     whole(log)
 
 
-def test_a_switch_is_for_an_arm_outside_alone() -> None:
+def test_switches_need_external_arms() -> None:
     with pytest.raises(
         ScenarioError, match=r"sites\.s\.arm\.dead_man: applies only to an external arm"
     ):
@@ -293,7 +295,7 @@ def test_a_switch_is_for_an_arm_outside_alone() -> None:
 
 
 class Switch:
-    """A switch, and programs that say whether they hold it."""
+    """A switch, and programs that report whether they hold the switch."""
 
     def __init__(self) -> None:
         self.clock, self.dropped = ManualClock(), Counter[str]()
@@ -303,14 +305,14 @@ class Switch:
     def hear(
         self, boot: int, n: int, site: str = "s", *, held: bool = True, after_ns: int = 0
     ) -> bool:
-        """Hears of one program; returns whether it is held then."""
+        """Processes a message of one program; returns whether the switch is held then."""
         self.clock.sleep_until(self.clock.monotonic_ns() + after_ns)
         self.ring.receive(encode(ArmEnable(site=site, boot=boot, n=n, held=held, sent_ns=0)))
         self.switch.poll()
         return self.switch.held
 
 
-def test_a_switch_is_held_until_let_go_or_silent() -> None:
+def test_switches_hold_until_released_or_silent() -> None:
     one = Switch()
     switch, clock, ring, hear = one.switch, one.clock, one.ring, one.hear
     assert switch.pop_order(Mode.RUN, LifeReason.START) == "released"
@@ -333,7 +335,7 @@ def test_a_switch_is_held_until_let_go_or_silent() -> None:
 
 
 @pytest.mark.parametrize("first", [1, 2])
-def test_of_two_that_hold_switch_whoever_lets_go_stops_arm(first: int) -> None:
+def test_of_two_holders_either_release_stops(first: int) -> None:
     """The other one has to let go and press anew: a hand-over goes by way of a stop."""
     one, other = Switch(), 3 - first
     assert one.hear(1, 0)
@@ -348,8 +350,10 @@ def test_of_two_that_hold_switch_whoever_lets_go_stops_arm(first: int) -> None:
     assert one.switch.pop_order(Mode.STOPPED, LifeReason.RELEASED) == "held"
 
 
-def test_of_two_that_hold_switch_silence_of_one_stops_arm() -> None:
-    """As its program crashed; nor does one go on that lets go and presses within a tick."""
+def test_of_two_holders_either_silence_stops() -> None:
+    """Silence means that its program crashed; a release and press within a tick does not
+    continue the hold either.
+    """
     one = Switch()
     assert one.hear(1, 0)
     for n in range(4):
@@ -365,7 +369,7 @@ def test_of_two_that_hold_switch_silence_of_one_stops_arm() -> None:
     assert one.switch.pop_order(Mode.STOPPED, LifeReason.RELEASED) == "held"
 
 
-def test_many_idle_switch_programs_forget_nobody_who_holds() -> None:
+def test_idle_switch_programs_displace_no_holder() -> None:
     one = Switch()
     assert one.hear(0, 0)
     for boot in range(1, 2 * STARTS_KEPT):
@@ -375,7 +379,7 @@ def test_many_idle_switch_programs_forget_nobody_who_holds() -> None:
 
 
 @pytest.mark.long
-def test_a_site_that_is_killed_comes_back_with_its_arm(tmp_path: Path) -> None:
+def test_killed_sites_return_with_their_arm(tmp_path: Path) -> None:
     """Both programs are started again by hand; meanwhile brakes hold the arm, and its peer holds."""
     glide = {"on_stale.action": "glide", "on_stale.align_limit_rad": 3.0}
     scenario = load_scenario(
@@ -406,7 +410,7 @@ def test_a_site_that_is_killed_comes_back_with_its_arm(tmp_path: Path) -> None:
     assert result.absences == [("s", *gone)]
 
 
-def test_without_an_arm_nothing_begins_and_that_is_said(tmp_path: Path) -> None:
+def test_without_an_arm_nothing_begins(tmp_path: Path) -> None:
     session = Session(load_scenario("two_sites", OUTSIDE), tmp_path / "run.mcap")
 
     def alone(clock: RelayClock) -> None:
@@ -419,7 +423,7 @@ def test_without_an_arm_nothing_begins_and_that_is_said(tmp_path: Path) -> None:
     session.play()
 
 
-def test_a_second_program_and_garbage_are_counted_and_change_nothing(tmp_path: Path) -> None:
+def test_second_programs_and_garbage_change_nothing(tmp_path: Path) -> None:
     session, ends = session_of(tmp_path, driving([], []))
 
     def shout(bus: Bus, clock: RelayClock) -> None:
@@ -485,7 +489,7 @@ class Heard:
         (measurement(site="m"), "stranger"),
     ],
 )
-def test_what_is_no_measurement_is_counted_and_dropped(payload: bytes, reason: str) -> None:
+def test_invalid_measurements_are_counted_and_dropped(payload: bytes, reason: str) -> None:
     heard = Heard()
     heard.hear(payload)
     assert heard.arm.newest is None
@@ -493,7 +497,7 @@ def test_what_is_no_measurement_is_counted_and_dropped(payload: bytes, reason: s
 
 
 @given(order=st.permutations(range(8)), bound=st.booleans())
-def test_the_newest_counts_in_whatever_order_they_come(order: list[int], bound: bool) -> None:
+def test_the_newest_measurement_counts_in_any_order(order: list[int], bound: bool) -> None:
     heard = Heard()
     heard.hear(measurement(n=0, q=[-0.001, 0.0]))
     if bound:
@@ -516,7 +520,7 @@ def test_a_flood_of_measurements_is_bounded_and_counted() -> None:
     assert heard.dropped["missing measurement"] == 8
 
 
-def test_program_that_is_started_anew_counts_until_session_begins() -> None:
+def test_restarted_programs_count_until_the_session_begins() -> None:
     heard = Heard()
     heard.hear(measurement(boot=1, n=900), measurement(boot=2, n=0, q=[2.0, 2.0]))
     assert heard.arm.newest.q == [2.0, 2.0]
@@ -526,7 +530,7 @@ def test_program_that_is_started_anew_counts_until_session_begins() -> None:
     assert heard.dropped == {"stranger": 1}
 
 
-def test_silence_is_what_the_site_itself_could_have_heard() -> None:
+def test_silence_counts_only_hearing_time() -> None:
     """A process that slept for a minute has heard nothing, and knows nothing of the arm."""
     heard = Heard()
     heard.hear(measurement())
@@ -548,7 +552,7 @@ def test_silence_is_what_the_site_itself_could_have_heard() -> None:
     assert heard.arm.newest.q == [0.5, 0.25]
 
 
-def test_a_short_silence_is_over_with_the_next_measurement() -> None:
+def test_short_silences_end_with_a_measurement() -> None:
     heard = Heard()
     heard.hear(measurement())
     heard.arm.bind((0.5, 0.25))
@@ -563,7 +567,7 @@ def test_a_short_silence_is_over_with_the_next_measurement() -> None:
     assert heard.arm.pop_order(Mode.RETURN) == ""
 
 
-def test_an_encoder_glitch_is_no_measurement_repeated_it_is_silence() -> None:
+def test_encoder_glitches_count_as_silence() -> None:
     """The arm of two_sites may move at 100 rad/s, 0.1 rad in a period."""
     heard = Heard()
     heard.hear(measurement(n=0))
@@ -580,7 +584,7 @@ def test_an_encoder_glitch_is_no_measurement_repeated_it_is_silence() -> None:
     assert heard.dropped["implausible measurement"] == 75
 
 
-def test_torque_counts_while_it_is_fresh_and_run_goes_on() -> None:
+def test_torque_counts_while_fresh_and_running() -> None:
     network, clock = LocalNetwork(), ManualClock()
     site = network.join()
     port = ArmClient(network.join(), clock, "t", "s")
@@ -637,7 +641,7 @@ def test_torque_counts_while_it_is_fresh_and_run_goes_on() -> None:
     assert port.over
 
 
-def test_a_site_that_is_gone_is_over() -> None:
+def test_a_missing_site_is_over() -> None:
     network = LocalNetwork()
     port = ArmClient(network.join(), ManualClock(), "t", "s")
     site = network.join()

@@ -1,4 +1,4 @@
-"""The benchmark of a network: what it measures over networks that are known, and what it makes of that."""
+"""The benchmark of a network: its measurements over known networks, and its conclusions."""
 
 import json
 import threading
@@ -29,7 +29,7 @@ MS = 1_000_000
 
 
 class SlowFarEnd:
-    """Sends back every sample but some, a time after it came."""
+    """Returns every sample but some, after a fixed time."""
 
     def __init__(
         self, relay: Relay, network: LocalNetwork, trip_ns: int, lost_every: int = 0
@@ -75,7 +75,7 @@ def test_round_trips_are_those_of_the_network(trip_ms: float) -> None:
     assert took_ns <= 700 * MS + 35 * MS
 
 
-def test_nobody_there_is_said() -> None:
+def test_an_absent_far_end_is_reported() -> None:
     relay, network = Relay(), LocalNetwork()
     relay.add("near", lambda clock: NearEnd(network.join(), clock, "near").wait_for_far_end())
     assert relay.run()["near"] is False
@@ -88,8 +88,8 @@ def row(needs, p99_ms: float, lost: int = 0) -> dict:
 
 
 @pytest.mark.long
-def test_a_network_is_judged_by_the_delay_margin_of_linear() -> None:
-    """P+d at 200 ms holds up to 229.8 ms, docs/studies/linear.md, and its links hide what is shorter than theirs."""
+def test_delay_margins_judge_a_network() -> None:
+    """P+d at 200 ms tolerates up to 229.8 ms, docs/studies/linear.md, and its links hide shorter delays."""
     needs = find_needs(tn.load_scenario("p_d_margin"))
     margin = tn.linear("p_d_margin", ports=False).to_dict()["margin"]["stable"]
     assert needs.stable_ms == [[1e3 * one["from_s"], 1e3 * one["to_s"]] for one in margin]
@@ -106,7 +106,7 @@ def test_a_network_is_judged_by_the_delay_margin_of_linear() -> None:
     assert not judge_network(needs, {**row(needs, 1.0, lost=1000), "one_way_us": None})["good"]
 
 
-def test_a_play_out_is_what_a_measured_link_adds() -> None:
+def test_measured_links_add_their_play_out() -> None:
     needs = find_needs(
         tn.load_scenario("p_d_margin", {"link.model": "measured", "link.playout_ms": 40})
     )
@@ -129,7 +129,7 @@ def test_a_play_out_is_what_a_measured_link_adds() -> None:
         (["--benchmark", "free", "--seconds", "0"], "--seconds"),
     ],
 )
-def test_what_has_no_meaning_is_refused(words: list[str], fact: str, tmp_path) -> None:
+def test_meaningless_settings_are_refused(words: list[str], fact: str, tmp_path) -> None:
     trilat("ping", *words, cwd=tmp_path).refuses(fact)
 
 
@@ -159,7 +159,7 @@ def check_result(found: Result, transports: list[str]) -> None:
         (("tcp/192.0.2.1:7447",), "the network from this machine to tcp/192.0.2.1:7447"),
     ],
 )
-def test_the_first_line_says_what_was_measured(connect: tuple[str, ...], line: str) -> None:
+def test_the_first_line_names_the_measurement(connect: tuple[str, ...], line: str) -> None:
     needs = find_needs(tn.load_scenario("free"))
     found = NetworkBenchmark("free", 1.0, needs, [], [], connect)
     assert found.summary().startswith(line)
@@ -167,7 +167,7 @@ def test_the_first_line_says_what_was_measured(connect: tuple[str, ...], line: s
 
 
 @pytest.mark.long
-def test_it_measures_loopback() -> None:
+def test_loopback_is_measured() -> None:
     ended = threading.Event()
     (endpoint,) = find_free_endpoints(1)
     far = threading.Thread(target=run_far_end, args=([endpoint], None, ended.is_set))

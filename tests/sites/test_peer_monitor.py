@@ -1,4 +1,4 @@
-"""Who else is there: starts of other sessions do not count, but a recorder may come at any time."""
+"""Presence of members: starts of other sessions do not count, but a recorder may come at any time."""
 
 from collections.abc import Sequence
 
@@ -16,7 +16,7 @@ BOOTS = {"m1": 1, "m2": 2, "s": 3, topics.RECORDER: 9}
 
 
 class Desk:
-    """The site m1, its company, and what it says of it."""
+    """The site m1, its peers, and its reports about them."""
 
     def __init__(self) -> None:
         self.network = LocalNetwork()
@@ -56,7 +56,7 @@ class Desk:
         (22, "diverged", [], ""),  # another start is nobody
     ],
 )
-def test_peer_that_goes_is_lost_unless_it_said_its_end(
+def test_departed_peers_are_lost_without_an_end(
     boot: int, event: str, news: list[tuple[str, str]], ended_by: str
 ) -> None:
     desk = Desk()
@@ -68,7 +68,7 @@ def test_peer_that_goes_is_lost_unless_it_said_its_end(
     assert (desk.told(), desk.company.ended_by) == (news, ended_by)
 
 
-def test_a_later_recorder_is_told_of_and_counted() -> None:
+def test_later_recorders_are_reported_and_counted() -> None:
     desk = Desk()
     first = desk.comes(topics.RECORDER, 9)
     assert desk.told() == []
@@ -81,7 +81,7 @@ def test_a_later_recorder_is_told_of_and_counted() -> None:
     assert desk.company.recorders == {"10"}
 
 
-def test_a_recorder_has_all_when_it_says_so() -> None:
+def test_recorders_report_themselves_complete() -> None:
     desk = Desk()
     desk.says(topics.RECORDER, 9, "stored", about="m1", ticks=4)
     desk.says(topics.RECORDER, 9, "stored", about="m2", ticks=5)

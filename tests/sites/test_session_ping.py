@@ -1,4 +1,4 @@
-"""A visitor sees who is there and where their clocks stand; nobody sees the visitor."""
+"""A visitor sees the members and their clock offsets; no member sees the visitor."""
 
 import pytest
 
@@ -14,7 +14,7 @@ from trilat_net.net.wire import encode
 from .visits import S, Visit, link_stats, ping_publishers, ping_sites
 
 
-def test_everybody_is_seen_and_nobody_waits_for_the_visitor() -> None:
+def test_members_are_seen_without_waiting() -> None:
     party = Party(("m", "s"))
     party.start("m", "recorder")
     found = Visit(party).look().report().members
@@ -29,7 +29,7 @@ def test_everybody_is_seen_and_nobody_waits_for_the_visitor() -> None:
     party.agreed()
 
 
-def test_a_clock_that_is_another_one_is_found() -> None:
+def test_another_clock_is_found() -> None:
     party = Party(("m", "s"))
     away = SkewedClock(party.clock, 3 * S, 50_000)
     party.start("m")
@@ -46,7 +46,7 @@ def test_a_clock_that_is_another_one_is_found() -> None:
     assert abs(truth - value) <= estimate.error_bound_ns(now_ns, value) + 2
 
 
-def test_who_answers_no_ping_is_shown_without_any() -> None:
+def test_members_without_answer_lack_their_clock() -> None:
     party = Party(("m", "s"))
     party.start("m")
     questions = party.stranger.query_inbox(topics.key(SESSION, "s", topics.INFO))
@@ -61,14 +61,14 @@ def test_who_answers_no_ping_is_shown_without_any() -> None:
     assert not {"rtt_us", "jitter_us", "offset_ns", "bound_us"} & facts.keys()
 
 
-def test_nobody_there_is_over_after_time_that_it_was_given() -> None:
+def test_absent_sessions_end_after_the_given_time() -> None:
     party = Party(("m", "s"))
     probe = Visit(party).look(2 * S)
     assert probe.report().members == []
     assert 0 <= party.clock.monotonic_ns() - 10**9 - 2 * S <= S // 10
 
 
-def test_sites_that_run_say_how_their_links_are() -> None:
+def test_running_sites_state_their_links() -> None:
     party = Party(("m", "s"))
     party.start("m")
     visit = Visit(party)
@@ -80,7 +80,7 @@ def test_sites_that_run_say_how_their_links_are() -> None:
     assert visit.look().links == {"m": stats}
 
 
-def test_it_waits_a_little_for_the_others() -> None:
+def test_pings_wait_briefly_for_others() -> None:
     party = Party(("m", "s"))
     party.start("m")
     visit = Visit(party, count=5)
@@ -96,11 +96,11 @@ def test_it_waits_a_little_for_the_others() -> None:
     assert {facts["member"] for facts in visit.probe.report().members} == {"m", "s"}
 
 
-def test_its_json_is_as_documented() -> None:
+def test_ping_json_is_as_documented() -> None:
     assert is_documented("ping", ping_sites().to_dict())
 
 
-def test_delays_of_topic_of_ros_is_that_of_every_publisher() -> None:
+def test_ros_topic_delays_are_per_publisher() -> None:
     found = ping_publishers()
     first, second = found.publishers
     assert first["messages"] == 201
@@ -114,7 +114,7 @@ def test_delays_of_topic_of_ros_is_that_of_every_publisher() -> None:
     assert is_documented("ping --ros2", found.to_dict())
 
 
-def test_a_topic_of_which_nothing_comes_is_said() -> None:
+def test_silent_topics_are_reported() -> None:
     class Silent:
         def tap(self, topic: str, take: object) -> None:
             del topic, take

@@ -1,4 +1,6 @@
-"""What a running session shows to programs: its newest states, what one site knows, marks and episodes."""
+"""States of a running session for programs: the newest states, the knowledge of one site, marks
+and episodes.
+"""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""Samples go to peers at every tick, records to recorders in blocks: the two say the same."""
+"""Samples go to peers at every tick, records to recorders in blocks, with equal contents."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -29,7 +29,7 @@ def taken(inbox: Inbox) -> list[bytes]:
 def heard(
     session: Session, sites: Sequence[str]
 ) -> tuple[dict[str, list[bytes]], dict[str, list[bytes]]]:
-    """What others hear of every site until the session is over: its samples, its blocks."""
+    """Returns the messages of every site until the session is over: samples and blocks."""
     samples: dict[str, list[bytes]] = {}
     blocks: dict[str, list[bytes]] = {}
 
@@ -53,9 +53,7 @@ def heard(
     ],
     ids=["two joints", "four ticks a millisecond", "six joints"],
 )
-def test_samples_are_records_and_blocks_hold_ten_milliseconds(
-    scenario: Scenario, tmp_path: Path
-) -> None:
+def test_samples_are_records_and_blocks_hold_10_ms(scenario: Scenario, tmp_path: Path) -> None:
     session = Session.whole(scenario, tmp_path)
     samples, blocks = heard(session, scenario.names)
     log = session.run()

@@ -1,4 +1,4 @@
-"""A visitor of a party: a ping of a session that is on its way or runs, on the party's clock."""
+"""A visitor of a party: a ping of a session that starts or runs, on the party's clock."""
 
 from collections.abc import Callable
 from functools import partial
@@ -70,7 +70,7 @@ class Publishers:
 
 
 def ping_publishers(lasts_s: float = 2.0) -> TopicDelays:
-    """What is measured of these publishers, a message every 10 ms."""
+    """Returns the measured delays of these publishers, a message every 10 ms."""
     graph, clock = Publishers(), ManualClock(0, 10**18)
     stopped = partial(graph.publish, clock)
     return ping_topic(graph, clock, "chatter", lasts_s, stopped)  # type: ignore[arg-type]

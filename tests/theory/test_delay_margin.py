@@ -22,7 +22,7 @@ from trilat_net.scenario import load_scenario
 
 @given(a=st.floats(0.2, 5.0))
 @settings(max_examples=25)
-def test_a_delayed_integrator_bears_a_quarter_turn(a: float) -> None:
+def test_a_delayed_integrator_tolerates_a_quarter_turn(a: float) -> None:
     """x' = -a x(t - T): stable up to a T = pi/2, crossing at a."""
     (span,) = find_delay_margin(loop(0.0, (1.0, -a))).intervals
     assert (span.low_s, span.low) == (0.0, None)
@@ -31,7 +31,7 @@ def test_a_delayed_integrator_bears_a_quarter_turn(a: float) -> None:
     assert span.high.omega_rad_s == pytest.approx(a, rel=1e-9)
 
 
-def test_what_damps_itself_enough_is_stable_for_every_delay() -> None:
+def test_sufficient_damping_is_stable_for_every_delay() -> None:
     """x' = -2 x + x(t - T)."""
     found = find_delay_margin(loop(-2.0, (1.0, 1.0)))
     assert found.description == "stable for every common delay up to 10 s"
@@ -41,7 +41,7 @@ def test_what_damps_itself_enough_is_stable_for_every_delay() -> None:
     )
 
 
-def test_an_oscillator_is_stable_between_delays_again_and_again() -> None:
+def test_oscillators_have_several_stable_delay_windows() -> None:
     """x'' + 0.1 x' + x = -0.4 x(t - T) with its windows; each end is a root on the axis."""
     system = loop([[0.0, 1.0], [-4.0, -0.1]], (1.0, [[0.0, 0.0], [-1.0, 0.0]]))
     found = find_delay_margin(system)
@@ -61,7 +61,7 @@ def test_an_oscillator_is_stable_between_delays_again_and_again() -> None:
 
 @given(seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=15)
-def test_the_verdict_over_delay_is_that_of_the_roots(seed: int) -> None:
+def test_verdicts_over_delay_are_the_roots(seed: int) -> None:
     rng = np.random.default_rng(seed)
     system = loop(rng.normal(size=(3, 3)) - np.eye(3), (1.0, 0.7 * rng.normal(size=(3, 3))))
     found = find_delay_margin(system)
@@ -84,7 +84,7 @@ def test_roots_at_zero_cross_nothing() -> None:
     assert found.description == "stable for every common delay up to 10 s"
 
 
-def test_force_reflection_in_contact_has_margin_between_calm_and_hammering() -> None:
+def test_force_reflection_in_contact_has_a_margin() -> None:
     """20 ms settles, 200 ms hammers."""
     scenario = load_scenario("contact", {"rate_hz": 500, "link.delay_ms": 20.0})
     found = find_delay_margin(

@@ -1,6 +1,7 @@
-"""What linear analysis says of a scenario, in Python, in words, and as facts.
+"""The linear analysis of a scenario, in Python, in words, and as facts.
 
-The loop where a recorded run ended: at several rates, over recorded samples, and of laws with waves.
+The loop at the end of a recorded run: at several rates, over recorded samples, and of laws with
+waves.
 """
 
 import json
@@ -37,7 +38,7 @@ def digital() -> LinearAnalysis:
     return analyse_linear_loop("paper", given, pose=POSE)
 
 
-def test_above_the_edge_it_is_stable_with_a_margin(calm: LinearAnalysis) -> None:
+def test_above_the_edge_a_margin_remains(calm: LinearAnalysis) -> None:
     assert calm.verdict == "stable"
     assert calm.continuous.zeros == 2  # a pose that all share, per joint
     assert calm.margin.intervals[0].high_s == pytest.approx(0.23, abs=0.01)
@@ -51,13 +52,13 @@ def test_less_damping_than_the_edge_is_unstable() -> None:
     )
 
 
-def test_verdict_is_that_of_loop_as_it_is_computed(digital: LinearAnalysis) -> None:
+def test_verdicts_follow_the_computed_loop(digital: LinearAnalysis) -> None:
     assert digital.continuous.verdict == "stable"
     assert digital.verdict == "unstable"
     assert any("the tick rate decides" in note for note in digital.notes)
 
 
-def test_sampled_roots_stand_beside_where_they_differ(
+def test_sampled_roots_stand_beside_differing_ones(
     calm: LinearAnalysis, digital: LinearAnalysis
 ) -> None:
     assert "re as computed" not in tabulate_roots(calm).headers
@@ -89,7 +90,7 @@ def test_the_map_has_every_root_and_its_conjugate(calm: LinearAnalysis) -> None:
     assert "zero by structure (2)" in lines
 
 
-def test_of_several_rates_the_roots_are_those_over_their_period() -> None:
+def test_several_rates_have_roots_over_periods() -> None:
     """Two sites at 40 and 30 Hz that the continuous loop, at the mean ages, calls stable."""
     given = ["scheme=digital", "sites.m.rate_hz=40", "sites.s.rate_hz=30", "link.delay_ms=0"]
     control = {"control": {"law": "p_d", "K": 50.0, "d": 2.0}}
@@ -107,7 +108,7 @@ def test_of_several_rates_the_roots_are_those_over_their_period() -> None:
     assert told["as_computed"]["deviation_per_s"] is told["continuous"]["span_s"] is None
 
 
-def test_drawn_delays_tell_how_well_their_roots_are_known() -> None:
+def test_drawn_delays_state_their_roots_accuracy() -> None:
     found = analyse_linear_loop("jitter", ["rate_hz=200"], pose=(0.07, 0.23), roots=2)
     assert found.sampled is not None
     assert found.sampled.deviation_per_s is not None
@@ -116,8 +117,8 @@ def test_drawn_delays_tell_how_well_their_roots_are_known() -> None:
     assert "mean delay in use on m2->m1" in "".join(describe_effective_delays(found))
 
 
-def test_what_keeps_its_speed_is_told_from_what_decays() -> None:
-    """Over wave lines with springs, the common speed of two joints; the others decay."""
+def test_lasting_motions_are_separated_from_decaying() -> None:
+    """Over wave lines with springs, the common speed of two joints lasts; the others decay."""
     control = {"law": "wave", "b": 60.0, "K": 50.0, "B": 5.0}
     found = analyse_linear_loop(
         "two_sites", {"scheme": "digital", "control": control}, pose=POSE
@@ -144,12 +145,12 @@ def test_a_line_without_losses_has_no_margin() -> None:
 
 
 @pytest.mark.parametrize("roots", [0, -1, 61])
-def test_a_number_of_roots_that_is_none_is_refused(roots: int) -> None:
+def test_invalid_numbers_of_roots_are_refused(roots: int) -> None:
     with pytest.raises(UsageError, match="roots is a number of roots, 1 to 60"):
         analyse_linear_loop("free", roots=roots)
 
 
-def test_of_several_rates_roots_are_exact_and_those_of_scenario() -> None:
+def test_several_rates_have_exact_scenario_roots() -> None:
     """Both sites end where they start, a millionth apart: folded, as they begin."""
     pair = {
         "sites.m.rate_hz": 40,
@@ -167,8 +168,10 @@ def test_of_several_rates_roots_are_exact_and_those_of_scenario() -> None:
     assert found.text.endswith("rad/s, over the period of 0.1 s")
 
 
-def test_drawn_delays_have_the_roots_of_samples_in_use() -> None:
-    """Its last quarter begins 15 s later than the draws of the linear analysis: they are others."""
+def test_drawn_delays_use_their_actual_samples() -> None:
+    """Its last quarter begins 15 s later than the draws of the linear analysis, so that the
+    draws differ.
+    """
     run = {"rate_hz": 200, "duration_s": 40.0}
     found, whole = (
         find_log_roots(tn.simulate("jitter", run)),
@@ -181,7 +184,7 @@ def test_drawn_delays_have_the_roots_of_samples_in_use() -> None:
     assert "over 10 s of the delays in use, +- 0.0" in found.text
 
 
-def test_waves_are_told_in_continuous_time() -> None:
+def test_waves_are_analysed_in_continuous_time() -> None:
     control = {"law": "wave", "b": 60.0, "K": 50.0, "B": 5.0}
     found = find_log_roots(
         tn.simulate("two_sites", {"scheme": "digital", "control": control, "duration_s": 2.0})

@@ -86,7 +86,7 @@ class Linear(NamedTuple):
 
 
 def six(law: str, off: Array | None = None, **overrides: Any) -> Linear:
-    """Sites that start at the pose, or off it by (2, 6) rad."""
+    """Returns sites that start at the pose, or off it by (2, 6) rad."""
     start = POSE + (np.zeros((2, 6)) if off is None else off)
     given = {
         "control": LAWS[law],
@@ -103,7 +103,7 @@ def six(law: str, off: Array | None = None, **overrides: Any) -> Linear:
 
 
 def follow(scenario: Scenario, ticks: int) -> Array:
-    """The angles of both sites at each tick, shape (ticks, 12)."""
+    """Returns the angles of both sites at each tick, shape (ticks, 12)."""
     run, rate_hz = FusedRun(scenario), scenario.sites["m"].rate_hz
     angles = []
     for k in range(1, ticks + 1):
@@ -113,7 +113,7 @@ def follow(scenario: Scenario, ticks: int) -> Array:
 
 
 def by_leaves(site: SiteSetup, x: Array, at: ArgumentLayout) -> Array:
-    """Accelerations and rates of the estimate as a tick computes them, by the compiled leaves."""
+    """Returns accelerations and rates of the estimate as a tick computes them, by the compiled leaves."""
     assert site.chain is not None
     gains, gravity, q, qd = site.gains, np.array(site.chain.gravity_m_s2), x[at.q], x[at.qd]
     rows = build_chain(site.chain.joints, MAX_JOINTS)
@@ -135,7 +135,7 @@ def by_leaves(site: SiteSetup, x: Array, at: ArgumentLayout) -> Array:
 
 
 @pytest.mark.long
-def test_rates_and_their_derivatives_are_those_of_the_compiled_leaves() -> None:
+def test_rates_and_derivatives_equal_compiled_leaves() -> None:
     """With hands on the joints and on the end effector, and walls of any direction, one of them touched."""
     rng = np.random.default_rng(14)
     normal = rng.normal(size=3)
@@ -187,7 +187,7 @@ def test_learnt_gravity_stands_for_all_estimates() -> None:
 
 @pytest.mark.long
 def test_no_root_at_zero_hides_the_rightmost_one() -> None:
-    """Of what is left out, each state counts as a root at zero; the shared pose is the others."""
+    """Each omitted state counts as a root at zero; the shared pose gives the others."""
     case = six("adaptive")
     loop = case.loop()
     found = compute_delay_spectrum(loop, 3)
@@ -208,7 +208,7 @@ OFF = np.array([[1.0, -0.7, 0.5, 0.8, -0.6, 0.9], [-0.8, 0.6, -0.9, 0.3, 0.7, -0
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_a_run_moves_as_the_delay_equation_says(law: str) -> None:
+def test_a_run_follows_the_delay_equation(law: str) -> None:
     """SciPy's DOP853 by the method of steps, from the same deviation; a run of 1 kHz."""
     small = 1e-6
     case = six(law, small * OFF)
@@ -239,8 +239,10 @@ def test_a_run_moves_as_the_delay_equation_says(law: str) -> None:
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_a_run_decays_as_its_rightmost_root_says(law: str) -> None:
-    """Late in a run of 200 Hz one mode is left: its root is fitted to joint 2, a recurrence of two steps."""
+def test_a_run_decays_at_its_rightmost_root(law: str) -> None:
+    """Late in a run of 200 Hz one mode remains: its root is fitted to joint 2, a recurrence of
+    two steps.
+    """
     pushed = {
         "sites.m.qd0_rad_s": (1e-3 * OFF[0]).tolist(),
         "sites.s.qd0_rad_s": (5e-4 * OFF[0]).tolist(),
@@ -259,7 +261,7 @@ def test_a_run_decays_as_its_rightmost_root_says(law: str) -> None:
     assert s.imag == pytest.approx(root.imag, rel=3e-4)
 
 
-def test_a_joint_answers_a_sinusoid_as_its_admittance_says() -> None:
+def test_joints_answer_sinusoids_by_their_admittance() -> None:
     """A torque on joint 3 of m in a run of P+d: the motion of all twelve joints."""
     w_rad_s, amplitude_nm, rate_hz, settled_s = 2.0 * np.pi, 0.05, 500, 14.0
     case = six("p_d", rate_hz=rate_hz)
@@ -281,8 +283,8 @@ def test_a_joint_answers_a_sinusoid_as_its_admittance_says() -> None:
     assert np.abs(found - Y).max() <= 0.01 * np.abs(Y).max()
 
 
-def test_the_law_is_passive_in_r_for_six_joints() -> None:
-    """Also where gravity is learnt, which is not passive in qd at the joints that it loads."""
+def test_six_joint_laws_are_passive_in_r() -> None:
+    """Also with learnt gravity, which is not passive in qd at the joints that it loads."""
     case = six("adaptive")
     ports = analyse_ports(case.scenario, case.rest, band_hz=(0.01, 20.0))
     assert ports.estimates_true
@@ -302,7 +304,7 @@ def test_a_pose_has_an_angle_for_each_joint() -> None:
 
 
 @pytest.mark.long
-def test_bound_of_p_d_holds_for_arms_of_six_joints() -> None:
+def test_the_p_d_bound_holds_for_chains() -> None:
     """4 d1 d2 = (T1 + T2)^2 K1 K2 whatever the arms weigh, if their drives weigh enough for the tick."""
 
     def damped(d: float, **overrides: Any) -> Linear:
@@ -324,8 +326,8 @@ def test_bound_of_p_d_holds_for_arms_of_six_joints() -> None:
 
 
 @pytest.mark.long
-def test_run_that_diverges_has_rest_that_its_start_predicts() -> None:
-    """Of alike arms with alike gains it is near the mean of the start poses."""
+def test_diverging_runs_keep_their_predicted_rest() -> None:
+    """Of alike arms with alike gains the rest is near the mean of the start poses."""
     case = six("adaptive", 0.3 * OFF)
     found = predict_equilibrium(case.scenario)
     assert found.residual <= 1e-10

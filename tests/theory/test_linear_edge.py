@@ -1,6 +1,6 @@
-"""Where stability changes over a key, against the lines of the theory and what they leave out.
+"""Edges of stability over a key, against the lines of the theory and their omissions.
 
-What linear analysis says of the places of a map: the same as it says of each by itself.
+The linear analysis of the places of a map equals that of each place alone.
 """
 
 import math
@@ -31,7 +31,8 @@ from trilat_net.scenario import Scenario, load_scenario
 
 
 def least_damping(scenario: Scenario, K: float, T: float, share: float) -> float:
-    """d where M w^2 = K (1 + share cos w T) and d w = share K sin w T, the largest over M's eigenvalues.
+    """Returns d where M w^2 = K (1 + share cos w T) and d w = share K sin w T, the largest over
+    M's eigenvalues.
 
     The equations of a mode v of M and of an eigenvalue -share of alpha on the imaginary axis.
     """
@@ -52,9 +53,7 @@ def least_damping(scenario: Scenario, K: float, T: float, share: float) -> float
 @pytest.mark.parametrize(
     "delay_ms", [200.0, *(pytest.param(ms, marks=pytest.mark.long) for ms in (20.0, 400.0))]
 )
-def test_p_d_turns_stable_where_its_mode_stands(
-    name: str, share: float, delay_ms: float
-) -> None:
+def test_p_d_turns_stable_with_its_mode(name: str, share: float, delay_ms: float) -> None:
     scenario = load_scenario(name, {"link.delay_ms": delay_ms})
     T = delay_ms / 1e3
     line = share * 10.0 * T
@@ -70,10 +69,9 @@ def test_p_d_turns_stable_where_its_mode_stands(
 def heavy_pair(
     seed: int, ratio: Callable[[float, float, float, float], float]
 ) -> tuple[Scenario, Array]:
-    """Two sites with random gains and delays whose arms are so heavy that K T^2 << M, and these.
-
-    These: K1, K2, T1 + T2, d1, d2. d2 is that of the line 4 d1 d2 = (T1 + T2)^2 K1 K2; `ratio` says how
-    much heavier the second arm is.
+    """Draws two sites with random gains and delays whose arms are so heavy that K T^2 << M;
+    also returns K1, K2, T1 + T2, d1, d2. d2 is that of the line 4 d1 d2 = (T1 + T2)^2 K1 K2;
+    `ratio` says how much heavier the second arm is.
     """
     rng = np.random.default_rng(seed)
     K1, K2 = (float(K) for K in rng.uniform(2.0, 10.0, 2))
@@ -113,7 +111,7 @@ def test_two_sites_turn_stable_at_4_d_d(seed: int) -> None:
 @pytest.mark.parametrize(
     "seed", [0, *(pytest.param(n, marks=pytest.mark.long) for n in (1, 2, 3))]
 )
-def test_two_like_arms_turn_stable_at_their_round_trip(seed: int) -> None:
+def test_two_like_arms_need_their_round_trip(seed: int) -> None:
     """d1/K2 + d2/K1 = T1 + T2: no more than 4 d1 d2 asks for, by two means of the terms."""
     scenario, (K1, K2, T, d1, d2) = heavy_pair(seed, lambda *_, **__: 1.0)
     exact = K1 * (T - d1 / K2)
@@ -127,7 +125,7 @@ def test_two_like_arms_turn_stable_at_their_round_trip(seed: int) -> None:
 
 
 @pytest.mark.long
-def test_digital_controller_has_least_rate_where_continuous_loop_has_none() -> None:
+def test_digital_controllers_have_a_least_rate() -> None:
     """No delay, gains of the paper: 100 Hz oscillates, 125 Hz does not."""
     scenario = load_scenario("paper", {"scheme": "digital", "link.delay_ms": 0.0})
     rest = find_equilibrium(scenario, (-0.1729, 0.0874))
@@ -145,7 +143,7 @@ def test_digital_controller_has_least_rate_where_continuous_loop_has_none() -> N
 
 
 @pytest.mark.long
-def test_every_edge_is_found_and_none_where_nothing_changes() -> None:
+def test_every_existing_edge_is_found() -> None:
     scenario = load_scenario("p_d_margin")
     assert next(iterate_linear_edges(scenario, "control.d", 1.2, 3.0, points=4), None) is None
     found = list(iterate_linear_edges(scenario, "link.delay_ms", 50, 3000, points=40))
@@ -157,14 +155,14 @@ def test_every_edge_is_found_and_none_where_nothing_changes() -> None:
 @pytest.mark.parametrize(
     ("low", "high"), [(2.0, 1.0), (1.0, 1.0), (float("nan"), 1.0), (0.0, float("inf"))]
 )
-def test_a_range_that_is_none_is_refused(low: float, high: float) -> None:
+def test_an_invalid_range_is_refused(low: float, high: float) -> None:
     with pytest.raises(
         UsageError, match=r"control\.d must be scanned from a lower to a higher value"
     ):
         next(iterate_linear_edges(load_scenario("p_d_margin"), "control.d", low, high), None)
 
 
-def test_a_key_that_is_none_is_refused_with_the_nearest() -> None:
+def test_invalid_keys_are_refused_with_the_nearest() -> None:
     with pytest.raises(ScenarioError, match="did you mean 'Kd'"):
         next(iterate_linear_edges(load_scenario("p_d_margin"), "control.Kdd", 1, 2), None)
 
@@ -202,7 +200,7 @@ def test_an_edge_is_where_the_sign_changes() -> None:
     assert found == pytest.approx(alone.value, rel=1e-6)
 
 
-def test_the_scheme_decides_which_loop_counts() -> None:
+def test_the_scheme_decides_the_loop() -> None:
     """Without delay the continuous loop of the paper's law is stable at any rate; as computed it is not."""
     slow: dict[str, Any] = {"link.delay_ms": 0.0, "rate_hz": 50}
     schemes = [
@@ -215,7 +213,7 @@ def test_the_scheme_decides_which_loop_counts() -> None:
     assert found[0].remarks == found[1].remarks == [ASSUMED_EQUILIBRIUM_REMARK]
 
 
-def test_what_has_no_linear_loop_is_told_and_not_known() -> None:
+def test_nonlinear_loops_are_reported_as_unknown() -> None:
     unknown = load_scenario("p_d_margin", {"link.model": "measured"})
     found, edges, remarks = compute_growth_column(
         [unknown, damped(3.0)], "control.d", (2.9, 3.0)

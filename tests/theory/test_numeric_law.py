@@ -1,4 +1,6 @@
-"""Laws of one's own, linearised by differences: their roots are those of built-in laws that they repeat."""
+"""Users' own laws, linearised by differences: their roots are those of the built-in laws that
+they repeat.
+"""
 
 from typing import Any
 
@@ -33,7 +35,7 @@ def roots(found: Spectrum) -> Array:
 
 @pytest.mark.parametrize("scheme", ["second_order", "digital"])
 @pytest.mark.parametrize("law", [PD, PeerPD])
-def test_p_d_of_ones_own_has_roots_of_p_d(law: type, scheme: str) -> None:
+def test_own_p_d_has_p_d_roots(law: type, scheme: str) -> None:
     ours, theirs = linear("p_d", scheme=scheme), linear(law, scheme=scheme)
     assert ours.sampled is not None
     assert theirs.sampled is not None
@@ -49,7 +51,7 @@ def test_p_d_of_ones_own_has_roots_of_p_d(law: type, scheme: str) -> None:
 
 
 def test_forces_are_those_of_the_four_channel_law() -> None:
-    """Of the peers, in sum and each by itself, and of its own arm: with an operator at a master."""
+    """Of the peers, as a sum and separately, and of its own arm: with an operator at a master."""
     hand = [{**CLAMP, "to_rad": list(POSE), "stiffness_nm_rad": 40.0, "damping_nm_s_rad": 5.0}]
     held: dict[str, Any] = {"sites.m1.hands": hand, "link.delay_ms": 30.0}
     ours = linear("four_channel", gains={"K": 100.0, "B": 20.0, "force_own": 0.5}, **held)
@@ -60,7 +62,7 @@ def test_forces_are_those_of_the_four_channel_law() -> None:
         )
 
 
-def test_the_tick_before_is_memory_like_any_other() -> None:
+def test_the_last_tick_is_memory() -> None:
     kept, remembered = linear(Backward), linear(Remembering)
     assert kept.sampled is not None
     assert remembered.sampled is not None
@@ -85,7 +87,7 @@ def test_memory_is_linearised_as_it_is_sampled(scheme: str) -> None:
     assert np.allclose(found[:3], known[:3], rtol=0.0, atol=1e-6 if same_bits else 2e-2)
 
 
-def test_what_is_not_linearised_is_refused() -> None:
+def test_unlinearised_features_are_refused() -> None:
     with pytest.raises(ScenarioError, match="sends vectors that the law defines"):
         linear(Line)
 
@@ -98,8 +100,8 @@ def test_a_certificate_runs_no_code_from_outside() -> None:
 
 
 @pytest.mark.long
-def test_a_run_decays_as_its_roots_say() -> None:
-    """From the poses of its sites to rest, and its edge lies where that of p_d does."""
+def test_a_run_decays_at_its_roots() -> None:
+    """From the poses of its sites to rest, and its edge lies at that of p_d."""
     own = tn.linear(
         "p_d_margin",
         {"control.law": CompiledPD, "control.d": 1.5},

@@ -23,7 +23,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 
 def drawn(seed: int, ports: int, count: int = 40) -> Complex:
-    """Networks about the edge of absolute stability, off-diagonal entries of very different size."""
+    """Draws networks about the edge of absolute stability, off-diagonal entries of very different size."""
     rng = np.random.default_rng(seed)
     Y = rng.normal(size=(count, ports, ports)) + 1j * rng.normal(size=(count, ports, ports))
     Y *= 10.0 ** rng.uniform(-1.0, 1.0, size=(count, 1, ports)) * rng.uniform(0.1, 0.6)
@@ -36,14 +36,14 @@ def drawn(seed: int, ports: int, count: int = 40) -> Complex:
 
 @settings(max_examples=20, deadline=None)
 @given(K=POSITIVE, B=POSITIVE, d=st.just(0.0) | POSITIVE)
-def test_springs_and_dampers_between_two_sites_hold_without_a_delay(
+def test_undelayed_springs_and_dampers_are_absolutely_stable(
     K: float, B: float, d: float
 ) -> None:
     assert not criterion(pair((K, K), (d, d), (0.0, 0.0), B)).below
 
 
 @pytest.mark.parametrize("d", [0.4, 1.0, 1.6])
-def test_with_a_delay_p_d_fails_below_its_sine(d: float) -> None:
+def test_delayed_p_d_fails_below_its_sine(d: float) -> None:
     """2 d^2 >= abs(z12 z21) + Re(z12 z21) = 2 K^2 sin^2(w T) / w^2."""
     edge_rad_s = brentq(lambda w: 10.0 * np.sin(0.2 * w) / w - d, 1e-6, np.pi / 0.2)
     (span,) = criterion(pair(d=(d, d))).below[:1]
@@ -53,7 +53,7 @@ def test_with_a_delay_p_d_fails_below_its_sine(d: float) -> None:
 
 
 @given(seed=SEEDS)
-def test_the_criterion_is_its_three_inequalities_in_both_forms(seed: int) -> None:
+def test_the_criterion_equals_its_three_inequalities(seed: int) -> None:
     Y = drawn(seed, 2)
     Y[::3, 0, 0] -= 0.4
     for parameters in (Y, np.linalg.inv(Y)):
@@ -68,14 +68,14 @@ def test_the_criterion_is_its_three_inequalities_in_both_forms(seed: int) -> Non
         np.testing.assert_array_equal((llewellyn_parameter(Y) >= 1.0)[clear], holds[clear])
 
 
-def test_the_parameter_is_minus_one_at_most_with_active_ports() -> None:
+def test_llewellyns_parameter_is_at_most_minus_one() -> None:
     Y = np.array([[[1.0, 0.0], [5.0, 1.0]], [[-1.0, 0.1], [0.1, -1.0]]], dtype=np.complex128)
     np.testing.assert_array_equal(llewellyn_parameter(Y), [MAX_LLEWELLYN, -1.0])
 
 
 @settings(max_examples=30, deadline=None)
 @given(seed=SEEDS)
-def test_for_two_ports_the_best_weights_decide_as_llewellyn_does(seed: int) -> None:
+def test_for_two_ports_weights_match_llewellyn(seed: int) -> None:
     Y = drawn(seed, 2)
     found = find_best_weights(Y, np.array([0, 1]))
     parameter = llewellyn_parameter(Y)
@@ -90,7 +90,9 @@ def test_for_two_ports_the_best_weights_decide_as_llewellyn_does(seed: int) -> N
 
 
 def destabilised(Y: Complex) -> NDArray[np.bool_]:
-    """Whether passive impedances at the ports make det(1 + Y diag(z)) zero: two lossless, one solved for."""
+    """True if passive impedances at the ports make det(1 + Y diag(z)) zero: two lossless, one
+    solved for.
+    """
     x = np.tan(np.linspace(-0.499 * np.pi, 0.499 * np.pi, 301))
     z1, z2 = (1j * part for part in np.meshgrid(x, x))
     found = np.zeros(len(Y), dtype=bool)
@@ -109,8 +111,10 @@ def destabilised(Y: Complex) -> NDArray[np.bool_]:
 
 @settings(max_examples=4, deadline=None)
 @given(seed=SEEDS)
-def test_for_three_ports_the_weights_fail_at_passive_hands_poles(seed: int) -> None:
-    """Necessary and sufficient: a search among passive loads finds one where and only where no weights do."""
+def test_for_three_ports_weights_are_exact(seed: int) -> None:
+    """Necessary and sufficient: a search among passive loads finds one where and only where no
+    weights do.
+    """
     Y = drawn(seed, 3)
     margin = find_best_weights(Y, np.array([0, 1, 2])).margin
     clear = np.abs(margin) > 0.05
@@ -148,8 +152,8 @@ def test_one_site_needs_no_weights() -> None:
 
 
 @given(seed=SEEDS)
-def test_what_remains_of_ports_is_part_of_a_matrix(seed: int) -> None:
-    """Hands off: rows and columns of Y fall away. Clamped: those of Z."""
+def test_remaining_ports_are_part_of_matrices(seed: int) -> None:
+    """Free: rows and columns of Y fall away. Clamped: those of Z."""
     Y = drawn(seed, 3)
     np.testing.assert_array_equal(clamp_ports(Y, [0, 2], []), Y[:, [0, 2]][:, :, [0, 2]])
     Z = np.linalg.inv(Y)

@@ -26,7 +26,7 @@ DELAYS = st.sampled_from([0.0, 0.05, 0.2, 1.0])
 
 
 @given(m=POSITIVE)
-def test_a_mass_alone_answers_with_one_over_j_w_m(m: float) -> None:
+def test_a_mass_answers_with_its_admittance(m: float) -> None:
     Y = build_admittance(Network((m,), (0.0,), (0.0,)).loop)(W)
     np.testing.assert_allclose(Y[:, 0, 0], 1.0 / (1j * W * m), rtol=1e-12)
 
@@ -48,7 +48,7 @@ def test_a_mass_alone_answers_with_one_over_j_w_m(m: float) -> None:
         max_size=4,
     ),
 )
-def test_the_answer_is_the_inverse_of_the_impedance_on_paper(
+def test_answers_invert_the_impedance_on_paper(
     m: tuple[float, ...], d: tuple[float, ...], k: tuple[float, ...], wires: list[Wire]
 ) -> None:
     """Springs, dampers, delays and reflected torque of any size."""
@@ -60,9 +60,7 @@ def test_the_answer_is_the_inverse_of_the_impedance_on_paper(
 
 
 @given(K=POSITIVE, B=POSITIVE)
-def test_springs_and_dampers_between_sites_are_reciprocal_without_delay_only(
-    K: float, B: float
-) -> None:
+def test_undelayed_springs_and_dampers_are_reciprocal(K: float, B: float) -> None:
     at_once = build_admittance(pair((K, K), B=B, T=(0.0, 0.0)).loop)(W)
     np.testing.assert_allclose(at_once[:, 0, 1], at_once[:, 1, 0], rtol=1e-9)
     late = build_admittance(pair((K, K), B=B, T=(0.1, 0.3)).loop)(W)
@@ -70,8 +68,8 @@ def test_springs_and_dampers_between_sites_are_reciprocal_without_delay_only(
     np.testing.assert_allclose(ratio, np.exp(1j * W * 0.2), rtol=1e-9)
 
 
-def test_what_is_read_may_be_past() -> None:
-    """Velocity minus what it was 0.3 s before."""
+def test_outputs_may_be_delayed() -> None:
+    """Velocity minus the velocity 0.3 s before."""
     loop = Network((2.0,), (1.0,), (0.0,)).loop
     Y = evaluate_transfer(loop, to_imaginary_axis(W), LoopOutput(loop.C, ((0.3, -loop.C),)))
     np.testing.assert_allclose(
@@ -83,7 +81,7 @@ def test_no_frequencies_no_answers() -> None:
     assert build_admittance(pair().loop)(np.zeros(0)).shape == (0, 2, 2)
 
 
-def test_a_floating_network_has_a_passive_pole_at_zero() -> None:
+def test_floating_networks_have_passive_poles_at_zero() -> None:
     floating = Network((1.0, 3.0), (0.0, 0.0), (0.0, 0.0), (Wire(0, 1, 7.0), Wire(1, 0, 7.0)))
     found = find_pole_at_zero(floating.loop)
     assert found.order == 1
@@ -96,7 +94,7 @@ def test_a_floating_network_has_a_passive_pole_at_zero() -> None:
         assert not none.residue.any()
 
 
-def test_floating_masses_that_push_unevenly_have_an_active_pole() -> None:
+def test_uneven_floating_masses_have_an_active_pole() -> None:
     """7 N m/rad one way and 3 the other: the residue is no longer symmetric."""
     found = find_pole_at_zero(
         Network((1.0, 3.0), (0.0, 0.0), (0.0, 0.0), (Wire(0, 1, 7.0), Wire(1, 0, 3.0))).loop
@@ -108,7 +106,7 @@ def test_floating_masses_that_push_unevenly_have_an_active_pole() -> None:
     assert not found.passive
 
 
-def test_following_a_floating_angle_gives_a_third_order_pole() -> None:
+def test_following_floating_angles_gives_third_order_poles() -> None:
     """qdd_a = u_a + 5 q_b and qdd_b = u_b: Y_ab = 5 / s^3."""
     loop = Network((1.0, 1.0), (0.0, 0.0), (0.0, 0.0)).loop
     A = loop.A.copy()
@@ -141,10 +139,13 @@ def test_ports_need_a_velocity_for_each_torque() -> None:
     d=st.tuples(POSITIVE, POSITIVE),
     T=st.tuples(st.floats(0.0, 0.5), st.floats(0.0, 0.5)),
 )
-def test_what_is_felt_of_p_d_is_as_on_paper(
+def test_felt_p_d_impedance_is_as_on_paper(
     K: float, d: tuple[float, float], T: tuple[float, float]
 ) -> None:
-    """Clamped: m s + d + K / s. Free: that less K^2 e^{-s (T1 + T2)} / s^2 over the other's own impedance."""
+    """Clamped: m s + d + K / s.
+
+    Free: that less K^2 e^{-s (T1 + T2)} / s^2 over the other's own impedance.
+    """
     network = pair((K, K), d, T)
     (found,) = measure_transparency(network.loop, "a", "b")
     S = 1j * found.w_rad_s
@@ -158,7 +159,7 @@ def test_what_is_felt_of_p_d_is_as_on_paper(
     assert sizes.min() * (1.0 - 1e-6) <= found.difference_nm_s_rad <= sizes.max() * (1.0 + 1e-6)
 
 
-def test_who_holds_the_third_site_counts() -> None:
+def test_the_third_sites_holder_counts() -> None:
     wires = tuple(Wire(i, j, 5.0, 0.0, 0.1) for i in range(3) for j in range(3) if i != j)
     loop = Network((1.0,) * 3, (1.0,) * 3, (0.0,) * 3, wires).loop
     (alone,) = measure_transparency(loop, "a", "c")
@@ -171,7 +172,7 @@ def test_who_holds_the_third_site_counts() -> None:
 @given(
     free=POSITIVE, clamped=POSITIVE, band=st.tuples(st.floats(0.02, 1.0), st.floats(2.0, 50.0))
 )
-def test_the_width_is_the_ratio_in_db_whatever_the_band(
+def test_the_width_is_a_ratio_in_db(
     free: float, clamped: float, band: tuple[float, float]
 ) -> None:
     w = 2.0 * np.pi * np.union1d(np.geomspace(0.01, 100.0, 401), band)
@@ -187,7 +188,7 @@ def test_the_width_is_the_ratio_in_db_whatever_the_band(
     )
 
 
-def test_the_width_grows_with_the_stiffness_of_the_coupling() -> None:
+def test_the_width_grows_with_coupling_stiffness() -> None:
     widths = [
         measure_transparency(pair((K, K), (0.5, 0.5), (0.0, 0.0)).loop, "a", "b")[0].ratio_db
         for K in (1.0, 10.0, 100.0)
@@ -209,6 +210,6 @@ def test_two_sites_that_do_not_couple_feel_nothing() -> None:
         ("a", "a", "the operator's own site"),
     ],
 )
-def test_what_cannot_be_felt_is_refused(at: str, of: str, said: str) -> None:
+def test_unfelt_pairs_are_refused(at: str, of: str, said: str) -> None:
     with pytest.raises(UsageError, match=said):
         measure_transparency(pair().loop, at, of)

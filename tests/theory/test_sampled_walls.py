@@ -26,7 +26,7 @@ WALL = {
 
 
 def windup(K: float, B: float = 0.0, b: float = 0.0) -> Scenario:
-    """`windup` at a sampled wall, whose arm has a damper in every joint."""
+    """Returns `windup` at a sampled wall, whose arm has a damper in every joint."""
     wall = {**WALL, "stiffness_n_m": K, "damping_n_s_m": B}
     damper = {"kind": "viscous", "damping_nm_s_rad": b}
     return load_scenario("windup", {ENVIRONMENT: [wall, damper]})
@@ -68,18 +68,18 @@ def test_the_bound_of_passivity_is_never_above_it(B: float, b: float) -> None:
 
 
 def say(K: float) -> CellClass:
-    """The class of a sweep's cell: it counts growth in contact, by the same map."""
+    """Returns the class of a sweep's cell, which counts growth in contact by the same map."""
     return classify_cell(windup(K).text, 480.0).verdict
 
 
 def end_alone(K: float) -> Stability:
-    """What the motion of the run shows by itself."""
+    """Returns the class by the motion of the run alone."""
     return run_whole(windup(K)).end.stability
 
 
 @pytest.mark.long
 def test_runs_have_the_edge_of_the_map() -> None:
-    """Stable 5 % below it, and not 5 % above, which shows without the map too."""
+    """Stable 5 % below the edge, and not 5 % above, which shows without the map too."""
     found = edge()
     assert found is not None
     assert say(0.95 * found.value) is CellClass.CONVERGED
@@ -108,7 +108,7 @@ NORMAL /= np.linalg.norm(NORMAL)
 
 
 def press(state: ChainState, K: float) -> Scenario:
-    """Two arms of six joints: the hand of s leans it against a sampled wall of any direction."""
+    """Returns two arms of six joints: the hand of s presses it against a sampled wall of any direction."""
     q = state.q.tolist()
     to = state.q - state.jacobian[:3].T @ NORMAL * (FORCE_N / HAND_NM_RAD)
     wall = {"kind": "wall", "sampled": True, "normal": NORMAL.tolist(), "stiffness_n_m": K}
@@ -146,9 +146,11 @@ def press(state: ChainState, K: float) -> Scenario:
 
 
 def wall_stiffness(state: ChainState, K: float) -> Array:
-    """How the torque of the wall falls with the angles: J'n K n'J, and the turning of J under its force.
+    """Returns the fall of the wall's torque with the angles: J'n K n'J, and the turning of J
+    under its force.
 
-    The column of J of joint i turns with joint j: by w_j x J_i where j comes first, else by w_i x J_j.
+    The column of J of joint i turns with joint j: by w_j x J_i where j comes first, else by w_i
+    x J_j.
     """
     linear, angular = state.jacobian[:3], state.jacobian[3:]
     turning = np.empty((6, 6))
@@ -161,8 +163,10 @@ def wall_stiffness(state: ChainState, K: float) -> Array:
 
 
 def growth_of_ticks(state: ChainState, K: float) -> float:
-    """The rate of the largest eigenvalue of a tick's map, of Pinocchio's M and J: its hand acts at any time,
-    both laws and the wall are held, each arm sees the other as it was `DELAY_TICKS` ago."""
+    """Returns the rate of the largest eigenvalue of a tick's map, of Pinocchio's M and J: its
+    hand acts at any time, both laws and the wall are held, and each arm uses the other's pose
+    of `DELAY_TICKS` ago.
+    """
     none, one = np.zeros((6, 6)), np.eye(6)
     inverse = np.linalg.inv(state.inertia + np.diag(DRIVES))
     step: dict[str, tuple[Array, Array]] = {}
@@ -189,7 +193,9 @@ def growth_of_ticks(state: ChainState, K: float) -> float:
 
 @pytest.mark.parametrize("n", range(3))
 def test_six_joints_in_contact_grow_like_pinocchios_arm(n: int) -> None:
-    """At walls in space, soft and hard; of several states the deepest counts, and without contact nothing."""
+    """At walls in space, soft and hard; of several states the deepest counts, and without
+    contact nothing does.
+    """
     state = chain_references()["arm6"].states[n]
     signs = set()
     for K in (1e4, 1e6):

@@ -47,16 +47,14 @@ SETTLED_S = {
         for n, one in enumerate(SETTLED_S.items())
     ],
 )
-def test_settling_of_free_motion_is_no_monotone_function_of_delay(
-    delay_ms: float, settled_s: float
-) -> None:
+def test_settling_is_no_monotone_function_of_delay(delay_ms: float, settled_s: float) -> None:
     made = FusedRun(load_scenario("free", {"link.delay_ms": delay_ms}))
     made.advance_to(30.0)
     assert made.settled_s == printed(settled_s, 0.1)
 
 
 @pytest.mark.long
-def test_the_error_of_free_motion_grows_with_every_delay() -> None:
+def test_free_motions_error_grows_with_delay() -> None:
     times_s = np.arange(0.02, 20.01, 0.02)
     runs = [
         sampled(load_scenario("free", {"link.delay_ms": delay_ms}), times_s)
@@ -84,9 +82,7 @@ def test_about_one_rest_some_delay_damps_common_motion(
 @pytest.mark.parametrize(
     ("name", "error", "speed"), [("paper", 6.0e-5, 3.0e-4), ("free", 1.3e-3, 1.1e-2)]
 )
-def test_errors_and_speeds_decay_as_the_theorem_says(
-    name: str, error: float, speed: float
-) -> None:
+def test_errors_and_speeds_decay_by_the_theorem(name: str, error: float, speed: float) -> None:
     last = sampled(load_scenario(name), (20.0,))[:, -1]
     assert np.abs(last[:, :2] - last[:, 4:6]).max() == pytest.approx(error, rel=0.15)
     assert np.abs(last[:, 2:4]).max() == pytest.approx(speed, rel=0.15)
@@ -130,7 +126,7 @@ HEALED = (6.0, 15.0, "s")
 
 
 @pytest.mark.long
-def test_a_link_that_heals_kicks_a_slave_that_went_on() -> None:
+def test_healing_links_kick_slaves_that_continued() -> None:
     made = measured("outage", {}, HEALED)
     assert value(made, "speed_peak_rad_s") == printed(0.41, 0.01)
     assert value(made, "torque_peak_nm") == printed(35.0, 1.0)
@@ -140,7 +136,7 @@ def test_a_link_that_heals_kicks_a_slave_that_went_on() -> None:
 
 
 @pytest.mark.long
-def test_a_ramped_return_needs_no_more_than_uncut_links() -> None:
+def test_ramped_returns_need_no_further_torque() -> None:
     held = measured("outage", {"on_stale.action": "hold"}, HEALED)
     uncut = measured("outage", {"link.outages_s": []}, (3.0, 15.0, "s"))
     assert value(held, "torque_peak_nm") <= value(uncut, "torque_peak_nm")
@@ -186,7 +182,7 @@ def test_free_motion_is_calm_at_200_ms() -> None:
     ],
     ids=str,
 )
-def test_laws_that_exchange_positions_pass_the_same_wall(law: dict[str, object]) -> None:
+def test_position_laws_pass_the_same_wall(law: dict[str, object]) -> None:
     """Both sites under one law of positions, in place of force reflection: the contact comes to rest."""
     made = measured(
         "contact",
@@ -236,7 +232,7 @@ A wall's force at a time is its mean over 0.2 or 0.4 s about it; with a force th
 
 
 @pytest.mark.parametrize(("name", "key", "window", "figure", "digit"), FIGURES)
-def test_limits_of_window_are_figure_within_its_bar(
+def test_window_limits_are_figures_within_bars(
     name: str, key: str, window: tuple[float, float], figure: float, digit: float
 ) -> None:
     asked = {(w.from_s, w.to_s): dict(w.limits) for w in load_scenario(name).expect.windows}
@@ -248,13 +244,13 @@ def test_limits_of_window_are_figure_within_its_bar(
 
 
 @pytest.mark.parametrize(("name", "settled_s"), [("free", 11.9), ("outage", 12.4)])
-def test_so_are_the_times_at_which_they_settle(name: str, settled_s: float) -> None:
+def test_settling_times_equal_their_figures(name: str, settled_s: float) -> None:
     by_s = load_scenario(name).expect.synchronised_by_s
     assert by_s is not None
     assert settled_s <= by_s <= 1.02 * settled_s
 
 
-def test_paper_ends_where_the_anchor_is() -> None:
+def test_paper_ends_at_the_anchor() -> None:
     expect = load_scenario("paper").expect
     assert set(expect.end_pose_rad.values()) == {(-0.1729, 0.0874)}
     assert expect.end_pose_within_rad <= 0.02 * 0.0874
@@ -264,7 +260,7 @@ CONSTANT = {"link.model": "constant", "link.delay_ms": 200.0}
 
 
 @pytest.mark.parametrize(("name", "margin"), [("p_d_margin", 1.0), ("p_d_margin_two", 2.0)])
-def test_margin_is_smallest_eigenvalue_of_alpha_times_k_t(name: str, margin: float) -> None:
+def test_margins_follow_the_smallest_eigenvalue(name: str, margin: float) -> None:
     """d = abs(lambda_min(alpha)) K T."""
     scenario = load_scenario(name)
     (delay_ms,) = {link.delay_ms for link in scenario.links.values()}
@@ -289,7 +285,7 @@ def test_below_its_margin_p_d_grows(name: str, d: float) -> None:
 
 
 @pytest.mark.long
-def test_margin_with_unequal_shares_is_that_of_their_smallest_eigenvalue() -> None:
+def test_unequal_shares_have_their_own_margin() -> None:
     """-0.8, so 1.6: as `docs/tutorials/lab.md` asks."""
     row = {
         "m1": {"m2": 0.1, "s": 0.9},
@@ -318,13 +314,13 @@ def test_half_of_the_margin_grows_to_10_rad() -> None:
 
 
 @pytest.mark.long
-def test_two_and_a_half_times_the_margin_decays_to_milliradians() -> None:
+def test_two_and_half_margins_decay_to_milliradians() -> None:
     made = measured("p_d_margin", {"control.d": 2.5, "duration_s": 21.0}, (19.0, 21.0, ""))
     assert peak(made) == printed(3e-3, 1e-3)
 
 
 @pytest.mark.long
-def test_jitter_of_the_same_mean_delay_turns_the_verdict() -> None:
+def test_jitter_of_equal_mean_turns_the_verdict() -> None:
     jitter = measured("jitter", {}, (38.0, 40.0, ""))
     constant = measured("jitter", CONSTANT, (38.0, 40.0, ""))
     assert (jitter.end.error.trend, constant.end.error.trend) == (
@@ -339,7 +335,7 @@ def test_jitter_of_the_same_mean_delay_turns_the_verdict() -> None:
 
 
 @pytest.mark.long
-def test_play_out_makes_jitter_constant_and_the_run_diverge() -> None:
+def test_play_out_makes_the_jittered_run_diverge() -> None:
     limits = {"limits.tau_limit_nm": 1e6, "limits.qd_limit_rad_s": 10_000.0}
     free = measured("jitter", {"link.playout_ms": 400.0, **limits}, (38.0, 40.0, ""))
     assert peak(free) == printed(339.0, 1.0)
@@ -353,7 +349,7 @@ def test_play_out_makes_jitter_constant_and_the_run_diverge() -> None:
     [({"link.order": "in_order"}, True), ({"rate_hz": 100}, False)],
     ids=["order", "rate"],
 )
-def test_order_makes_jitter_leave_its_limits_unlike_slower_rates(
+def test_order_makes_jitter_exceed_its_limits(
     changes: dict[str, str | int], leaves: bool
 ) -> None:
     made = FusedRun(load_scenario("jitter", changes))

@@ -1,4 +1,4 @@
-"""The field against the compiled leaves, which are another person's arithmetic of the same equations."""
+"""The vector field against the compiled leaves, which compute the same equations by independent code."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,9 @@ laws = st.sampled_from(["adaptive", "known"])
 
 
 def by_leaves(one: SiteSetup, x: Array) -> dict[str, Array]:
-    """The rates as a tick computes them: errors, regressor, torque, what acts, forward dynamics."""
+    """Returns the rates as a tick computes them: errors, regressor, torque, external torques,
+    forward dynamics.
+    """
     gains = one.gains
     q, qd = x[AT.q], x[AT.qd]
     Lambda = np.broadcast_to(gains.Lambda, 2)
@@ -67,7 +69,7 @@ def by_leaves(one: SiteSetup, x: Array) -> dict[str, Array]:
 
 
 @given(seed=seeds, law=laws)
-def test_the_field_is_what_a_tick_computes(seed: int, law: str) -> None:
+def test_the_field_equals_a_tick(seed: int, law: str) -> None:
     rng = np.random.default_rng(seed)
     one = site(rng, law, actors(rng))
     x = rng.uniform(-2, 2, AT.arguments)
@@ -89,7 +91,7 @@ def test_the_field_is_what_a_tick_computes(seed: int, law: str) -> None:
 @given(seed=seeds, law=laws)
 @settings(max_examples=50)
 def test_its_jacobian_is_the_limit_of_differences(seed: int, law: str) -> None:
-    """Away from the surfaces of walls, where there is none."""
+    """Away from the surfaces of walls, where no derivative exists."""
     rng = np.random.default_rng(seed)
     one = site(rng, law, [actor for actor in actors(rng) if actor.kind is not TorqueKind.WALL])
     x = rng.uniform(-1, 1, AT.arguments)
@@ -108,7 +110,7 @@ def test_its_jacobian_is_the_limit_of_differences(seed: int, law: str) -> None:
             )
 
 
-def test_a_wall_pushes_on_one_side_only_and_never_pulls() -> None:
+def test_walls_push_on_one_side_only() -> None:
     rng = np.random.default_rng(1)
     wall = TorqueSource(
         TorqueKind.WALL, a=(0.0, 0.0), b=(1.0, 0.0), K=(100.0, 0.0), B=(10.0, 0.0)
@@ -133,7 +135,7 @@ def test_a_wall_pushes_on_one_side_only_and_never_pulls() -> None:
     ).external.any()  # faster outward than the spring would push
 
 
-def test_an_estimate_leaves_its_box_nowhere_and_returns() -> None:
+def test_estimates_never_leave_their_box_and_return() -> None:
     rng = np.random.default_rng(2)
     one = site(rng, "adaptive")
     x = rng.uniform(-1, 1, AT.arguments)
@@ -151,7 +153,7 @@ def test_an_estimate_leaves_its_box_nowhere_and_returns() -> None:
     assert (evaluate_site_rates(back, x).estimate == free).all()
 
 
-def test_what_is_exactly_on_an_edge_is_said() -> None:
+def test_states_exactly_on_edges_are_reported() -> None:
     rng = np.random.default_rng(3)
     wall = TorqueSource(TorqueKind.WALL, a=(0.0, 0.0), b=(1.0, 0.0), K=(100.0, 0.0))
     one = site(rng, "known", [wall])

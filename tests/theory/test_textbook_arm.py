@@ -24,7 +24,7 @@ def placed(q: Array) -> PlacedArm:
 
 
 @given(a=links, q=angles, qd=speeds, v=speeds, acc=speeds)
-def test_they_are_those_of_two_bodies(
+def test_matrices_are_those_of_two_bodies(
     a: ArmLinks, q: Array, qd: Array, v: Array, acc: Array
 ) -> None:
     theta = theta_from_links(a)
@@ -51,8 +51,8 @@ def test_the_acceleration_needs_the_torque(
 
 
 @given(seed=st.integers(0, 2**32 - 1))
-def test_columns_are_arms_of_their_own(seed: int) -> None:
-    """Many states in one call are as many calls."""
+def test_columns_are_separate_arms(seed: int) -> None:
+    """Many states in one call equal as many calls."""
     rng = np.random.default_rng(seed)
     theta = np.array([3.0, 1.0, 1.0, 2.0, 1.0])
     q, qd, torque = rng.normal(size=(3, 2, 4))
@@ -115,8 +115,8 @@ def test_dynamics_and_kinematics_are_those_of_pinocchio(name: str) -> None:
         assert apart(placed.position_jacobian(), state.jacobian[:3]) <= 1e-12
 
 
-def test_columns_are_chains_of_their_own() -> None:
-    """Many states in one call are as many calls, and a complex step is the limit of differences."""
+def test_columns_are_separate_chains() -> None:
+    """Many states in one call equal as many calls, and a complex step is the limit of differences."""
     first, second, _ = REFERENCES["arm7"].states
     made, theta = chain("arm7", first.gravity, **DRIVE, **STOPS), parameters("arm7")
 
@@ -139,7 +139,7 @@ def test_columns_are_chains_of_their_own() -> None:
 
 
 @pytest.mark.parametrize("name", ["random3", "arm7"])
-def test_drives_and_stops_are_those_of_the_compiled_leaves(name: str) -> None:
+def test_drives_and_stops_equal_compiled_leaves(name: str) -> None:
     for state in REFERENCES[name].states:
         made, theta = chain(name, state.gravity, **DRIVE, **STOPS), parameters(name)
         rows, qdd = build_chain(made.joints, 12), np.zeros(len(state.q))
@@ -149,7 +149,7 @@ def test_drives_and_stops_are_those_of_the_compiled_leaves(name: str) -> None:
         assert apart(found, qdd) <= 1e-11
 
 
-def test_the_planar_arm_is_a_chain_of_two_joints() -> None:
+def test_planar_arms_are_two_joint_chains() -> None:
     """Rods of different lengths, hung on z axes in the x-y plane."""
     (l1, m1), (l2, m2), g = (0.7, 1.3), (1.1, 0.8), 9.81
     outer, axis, upright = (

@@ -64,7 +64,7 @@ SITES = [
 
 
 def build(text: str, site: str, law: str, **overrides: Any) -> SiteSetup:
-    """A site whose torques have no limit, under a plain digital scheme."""
+    """Returns a site whose torques have no limit, under a plain digital scheme."""
     control = LAWS.get(law, {"law": "p_f", "K": 30.0, "d": 4.0, "k_f": 0.4})
     given_changes = {"control": control, "scheme": "digital", **overrides}
     written = planar_task() if text == "planar" else posed_arms()
@@ -73,7 +73,9 @@ def build(text: str, site: str, law: str, **overrides: Any) -> SiteSetup:
 
 
 def draw(site: SiteSetup, seed: int, apart: float) -> tuple[Array, list[Array]]:
-    """The state of a site, and of each peer its pose, velocity and torque, with poses about `apart` away."""
+    """Draws the state of a site, and of each peer its pose, velocity and torque, with poses
+    about `apart` away.
+    """
     rng, at = np.random.default_rng(seed), lay_out_arguments(site)
     state = np.zeros(at.states)
     state[at.q] = np.array(site.q0) + rng.normal(0.0, 0.1, at.joints)
@@ -113,7 +115,9 @@ def by_theory(site: SiteSetup, state: Array, peers: list[Array]) -> SiteRates:
 
 
 def by_tick(site: SiteSetup, state: Array, peers: list[Array]) -> dict[str, Array]:
-    """Torque, estimates and accelerations as one compiled tick has them, the accelerations as h goes to 0."""
+    """Returns torque, estimates and accelerations of one compiled tick, the accelerations as h
+    goes to 0.
+    """
     at, accelerations, records = lay_out_arguments(site), [], []
     for rate_hz in (10_000, 20_000):
         one = site._replace(rate_hz=rate_hz)
@@ -134,10 +138,10 @@ def by_tick(site: SiteSetup, state: Array, peers: list[Array]) -> dict[str, Arra
 
 @pytest.mark.parametrize(("text", "name", "law"), SITES)
 @pytest.mark.parametrize("apart", [0.3, 0.0])
-def test_a_site_is_that_of_a_compiled_tick(
-    text: str, name: str, law: str, apart: float
-) -> None:
-    """Its torque, what it sends, and how it moves and learns, where peers are apart and where they agree."""
+def test_a_site_equals_a_compiled_tick(text: str, name: str, law: str, apart: float) -> None:
+    """Its torque, its messages, its motion and its learning, for peers that are apart and for
+    peers that agree.
+    """
     site = build(text, name, law)
     for seed in range(3):
         state, peers = draw(site, seed, apart)
@@ -168,7 +172,9 @@ def test_its_jacobian_is_the_difference_of_compiled_ticks(
     places = [*range(2 * at.joints), *range(at.states, at.inputs.stop)]
 
     def tau(place: int, by: float) -> Array:
-        """The torque of a tick with one of its arguments off; all peers send what the first does."""
+        """Returns the torque of a tick with one of its arguments off; all peers send the sample
+        of the first.
+        """
         moved = x.copy()
         moved[place] += by
         sent = np.concatenate([moved[at.q_des], moved[at.qd_des], -moved[at.peer_torque]])

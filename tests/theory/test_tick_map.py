@@ -1,4 +1,4 @@
-"""The loop as it is computed, against runs tick by tick, and against the continuous loop in the limit."""
+"""The sampled loop against runs tick by tick, and against the continuous loop in the limit."""
 
 import itertools
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ POSE = (-0.1729, 0.0874)
 
 
 def spectra(scenario: Scenario, wanted: int = 4) -> tuple[Spectrum, Spectrum]:
-    """Continuous and as computed, about one pose."""
+    """Returns the continuous and the sampled spectrum, about one pose."""
     now, rest = derive_operating_conditions(scenario), find_equilibrium(scenario, POSE)
     continuous = compute_delay_spectrum(linearise_loop(now, rest), wanted)
     found = compute_sampled_spectrum(now, rest, wanted)
@@ -63,10 +63,12 @@ RESTS_AT_ZERO = ("sync",)
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("scheme", ["second_order", "digital"])
 @pytest.mark.parametrize("delay_ms", [0.0, 30.0])
-def test_small_deviation_goes_tick_by_tick_as_run_does(
+def test_small_deviations_follow_runs_tick_by_tick(
     law: str, scheme: str, delay_ms: float
 ) -> None:
-    """The companion matrix carries it on; the run begins there, its peers' histories at their start poses."""
+    """The companion matrix advances the deviation; the run begins there, its peers' histories
+    at their start poses.
+    """
     small = 1e-6
     pose = (0.0, 0.0) if law in RESTS_AT_ZERO else POSE
     hands = [{**hand, "from_rad": list(pose)} for hand in HANDS]
@@ -123,7 +125,7 @@ def begun(
     *,
     uses_trapezoid: bool,
 ) -> Array:
-    """The state at tick 0: the past as the start, tau_-1 = tau_0, and theta_0 = theta_hat0."""
+    """Returns the state at tick 0: the past as the start, tau_-1 = tau_0, and theta_0 = theta_hat0."""
     X = np.concatenate(
         [start, np.tile(start[late], (len(whole) - len(names)) // max(1, len(late)))]
     )
@@ -138,7 +140,7 @@ def begun(
 
 @pytest.mark.parametrize(("scheme", "order"), [("second_order", 2), ("digital", 1)])
 @pytest.mark.parametrize("delay_ms", [0.0, 100.0])
-def test_it_goes_to_continuous_loop_with_order_of_its_scheme(
+def test_sampled_loops_converge_with_their_schemes_order(
     scheme: str, order: int, delay_ms: float
 ) -> None:
     """Both with the same delay in use; the rightmost root, at rates that halve the period."""
@@ -157,7 +159,7 @@ def test_it_goes_to_continuous_loop_with_order_of_its_scheme(
     ("rate_hz", "stable"), [(80, False), (100, False), (125, True), (200, True)]
 )
 def test_a_digital_controller_without_delay_needs_its_rate(rate_hz: int, stable: bool) -> None:
-    """About Gamma g^2 h > Kp it swings by itself; the extrapolated torque does not."""
+    """About Gamma g^2 h > Kp it oscillates by itself; the extrapolated torque does not."""
     given = {"link.delay_ms": 0.0, "rate_hz": rate_hz}
     _, digital = spectra(load_scenario("paper", {"scheme": "digital", **given}))
     assert (digital.verdict == "stable") == stable
@@ -165,8 +167,8 @@ def test_a_digital_controller_without_delay_needs_its_rate(rate_hz: int, stable:
     assert second.verdict == "stable"
 
 
-def test_a_swing_that_grows_is_that_of_a_run() -> None:
-    """P+d just below its edge at 50 Hz: the run's swing grows as the sampled root says."""
+def test_a_growing_swing_matches_a_run() -> None:
+    """P+d just below its edge at 50 Hz: the run's swing grows at the sampled root."""
     scenario = load_scenario(
         "p_d_margin_two",
         {
@@ -191,7 +193,7 @@ def test_a_swing_that_grows_is_that_of_a_run() -> None:
     assert slope == pytest.approx(root.real, rel=0.03)
 
 
-def test_a_held_push_moves_a_mass_by_half_h_squared() -> None:
+def test_held_pushes_move_masses_exactly() -> None:
     Phi, Gamma = discretise_zero_order_hold(
         np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [2.0]]), 0.1
     )

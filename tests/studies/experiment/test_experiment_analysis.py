@@ -182,7 +182,7 @@ def test_nothing_to_analyse_is_said(tmp_path: Path) -> None:
         tn.analyse_experiment(begun.folder)
 
 
-def test_power_by_theory_lies_in_the_interval_of_drawn_experiments() -> None:
+def test_theoretical_power_matches_drawn_experiments() -> None:
     """G*Power 3.1: d_z = 0.8, two-sided, alpha 0.05 asks for 15 participants for a power of 0.8."""
     found = tn.compute_experiment_power(0.8, 16)
     assert found.least[0.8] == 15

@@ -104,7 +104,7 @@ def test_what_a_pair_shares_is_counted_once() -> None:
     assert users.difference == pytest.approx(pairs.difference)
 
 
-def test_participant_without_a_condition_is_left_out_of_it() -> None:
+def test_incomplete_participants_are_left_out() -> None:
     rows = draw(2, 8, [0.0, 1.0, 2.0])
     kept = [row for row in rows if row["condition"] != "c2" or row["participant"] != 3]
     empty = [{**row, "time_s": ""} if row not in kept else row for row in rows]
@@ -129,7 +129,7 @@ def test_what_numbers_cannot_tell_is_none() -> None:
     assert (none.number, none.difference) == (0, None)
 
 
-def test_rows_that_are_not_tidy_say_what_is_missing() -> None:
+def test_untidy_rows_name_what_is_missing() -> None:
     with pytest.raises(UsageError, match="a row lacks condition"):
         average_trials([{"participant": 1, "time_s": 2.0}], "time_s")
     with pytest.raises(
@@ -147,7 +147,7 @@ def test_rows_that_are_not_tidy_say_what_is_missing() -> None:
 # --- intervals -------------------------------------------------------------------------------------------
 
 
-def test_intervals_of_a_condition_are_of_student_and_bootstrap() -> None:
+def test_condition_intervals_are_student_and_bootstrap() -> None:
     first, second = summarise_conditions(tidy(SLEEP), "time_s")
     assert (first.condition, first.number, first.mean) == ("first", 10, pytest.approx(0.75))
     expected = stats.t.interval(0.95, 9, loc=0.75, scale=stats.sem(SLEEP["first"]))
@@ -160,7 +160,7 @@ def test_intervals_of_a_condition_are_of_student_and_bootstrap() -> None:
     assert alone == ("a", 1, 2.0, None, None, None, 0)
 
 
-def test_bootstrap_is_a_function_of_its_seed_and_follows_asymmetry() -> None:
+def test_bootstrap_follows_seed_and_asymmetry() -> None:
     times_s = np.exp(np.random.default_rng(5).normal(0.0, 1.0, 25)).tolist()
     low, high = bootstrap_interval(times_s, 7)
     assert (low, high) == bootstrap_interval(times_s, 7) != bootstrap_interval(times_s, 8)
@@ -169,7 +169,7 @@ def test_bootstrap_is_a_function_of_its_seed_and_follows_asymmetry() -> None:
     assert bootstrap_interval([2.0]) is None
 
 
-def test_bootstrap_holds_the_truth_about_as_often_as_it_says() -> None:
+def test_bootstrap_covers_the_truth_as_stated() -> None:
     draws = np.random.default_rng(11).normal(3.0, 1.0, (120, 20))
     intervals = [bootstrap_interval(row.tolist()) for row in draws]
     assert np.mean([low <= 3.0 <= high for low, high in intervals]) > 0.87
@@ -199,7 +199,7 @@ def test_balanced_mixed_model_is_the_paired_t_test(seed: int, of_pair: float) ->
 
 
 @pytest.mark.usefixtures("statsmodels")
-def test_mixed_model_of_three_conditions_is_the_analysis_of_variance() -> None:
+def test_mixed_model_of_three_equals_anova() -> None:
     rows = draw(4, 16, [0.0, 0.5, 1.0], of_pair=1.5)
     model = fit_mixed_model(rows, "time_s")
     table = np.array([list(each.values()) for each in average_trials(rows, "time_s").values()])
@@ -314,7 +314,7 @@ def test_correction_costs_power_and_keeps_its_order() -> None:
     assert found[0].found_holm < 0.1 < 0.5 < found[1].found_holm
 
 
-def test_without_effect_p_is_uniform_and_families_keep_alpha() -> None:
+def test_without_effect_families_keep_alpha() -> None:
     runs = [
         compare_conditions(draw(seed, 10, [0.0, 0.0, 0.0]), "time_s") for seed in range(300)
     ]
