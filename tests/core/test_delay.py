@@ -256,7 +256,7 @@ def test_looped_traces_have_moments_of_one_pass() -> None:
     stamp_ns=st.integers(0, 10**12),
     at_end=st.sampled_from(list(TraceEnd)),
 )
-def test_a_trace_gives_the_delay_of_its_last_point(
+def test_a_trace_holds_its_last_points_delay(
     gaps_us: list[int], delays: list[int], stamp_ns: int, at_end: TraceEnd
 ) -> None:
     t_us = np.cumsum([0, *gaps_us])

@@ -293,7 +293,7 @@ def test_wrong_inertias_are_refused_at_their_key(links: Any, path: str, words: s
     assert words in refused.value.problem
 
 
-def test_a_link_of_a_file_without_mass_needs_one() -> None:
+def test_links_without_mass_in_files_need_one() -> None:
     with pytest.raises(ScenarioError) as refused:
         of_arm(SHAPES, {"links": {"yaw": {"com_m": [0.0, 0.0, 0.1]}}})
     assert refused.value.path == "sites.m.arm.links.yaw.mass_kg"

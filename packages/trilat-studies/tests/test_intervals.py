@@ -87,7 +87,7 @@ def test_trial_of_distribution_names_its_repeating_command(file: Path) -> None:
     assert len(set(trial.scenario.sites["m"].control.d)) == 2
 
 
-def test_a_swept_cell_has_the_means_of_its_seeds(file: Path) -> None:
+def test_swept_cells_have_the_means_of_seeds(file: Path) -> None:
     plan = plan_sweep(file, over=["link.delay_ms=20,50"], seeds=list(SEEDS), longest_s=2.0)
     results = run_sweep(prepare_sweep_folder(plan, file.parent / "o"), 1).results
     point = collect_grid_points(results)[1]

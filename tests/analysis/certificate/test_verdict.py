@@ -240,7 +240,7 @@ def test_a_broken_balance_is_never_accepted() -> None:
     assert not found.accepts(("bounded", "open"))
 
 
-def test_an_unstable_rest_refutes_or_leaves_a_run_open() -> None:
+def test_an_unstable_rest_never_passes_a_run() -> None:
     roots = LoopRoots("unstable", 0.012, True, "this rest: unstable, +0.012 /s")
     refuted = replace(still(), roots=roots)
     assert refuted.stability is Stability.NOT_STABLE

@@ -735,7 +735,7 @@ def list_bag(path: Path) -> dict[str, tuple[str, bool]]:
         }
 
 
-def test_a_bag_has_the_topics_of_the_live_bridge(tmp_path: Path) -> None:
+def test_bags_have_the_topics_of_live_bridges(tmp_path: Path) -> None:
     bag = list_bag(made(tmp_path)["bag"])
     sites = Sites([], "two_sites", "lab")
     sites.begin(10**18)

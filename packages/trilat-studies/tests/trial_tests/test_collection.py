@@ -68,7 +68,7 @@ def agree(one: RunMetrics, other: RunMetrics) -> None:
     ],
     ids=["plain", "random", "rates", "diverged", "never heard of"],
 )
-def test_a_run_and_its_log_have_the_same_figures(changes: dict[str, Any]) -> None:
+def test_runs_and_their_logs_have_equal_figures(changes: dict[str, Any]) -> None:
     assert scenario().ticks("m1") > BATCH_RECORDS
     chosen = scenario(**changes)
     agree(measure_virtual_run(chosen), measure_log(trilat_net.simulate(chosen)))
@@ -314,7 +314,7 @@ def test_window_quantities_follow_their_definitions(log: Log) -> None:
         assert found[key] == (site.q[inside, joint].min(), site.q[inside, joint].max())
 
 
-def test_a_run_and_its_log_have_the_same_windows(log: Log) -> None:
+def test_runs_and_their_logs_have_equal_windows(log: Log) -> None:
     (run,), (logged,) = measure_virtual_run(log.scenario).windows, measure_log(log).windows
     assert run.keys() == set(QUANTITIES)
     for key in QUANTITIES:

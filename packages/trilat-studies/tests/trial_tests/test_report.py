@@ -63,7 +63,7 @@ def test_failed_runs_are_named_first_with_commands() -> None:
     )
 
 
-def test_a_run_without_a_result_fails_and_says_why() -> None:
+def test_runs_without_result_fail_with_a_reason() -> None:
     report = TrialReport(
         [result(1, outcome(0.5)), result(2, error="its process ended with code -9")], 1.0
     )
