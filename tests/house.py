@@ -212,7 +212,7 @@ def unused_methods() -> set[str]:
                     references.add(name)
                 case ast.Constant(value=str(name)):
                     references.add(name)
-                case ast.ClassDef() if "tests" not in path.parts:
+                case ast.ClassDef() if "tests" not in path.relative_to(ROOT).parts:
                     methods |= {
                         (node.name, method.name)
                         for method in node.body
@@ -223,3 +223,12 @@ def unused_methods() -> set[str]:
         for owner, name in methods
         if name not in references and not name.startswith("__")
     }
+
+
+def list_test_names() -> Iterator[tuple[Path, str]]:
+    """Yields the name of every test of the program and its packages, with the file of the test."""
+    for folder in (ROOT / "tests", *sorted(ROOT.glob("packages/*/tests"))):
+        for path in sorted(folder.rglob("test_*.py")):
+            for node in ast.walk(tree(path)):
+                if isinstance(node, ast.FunctionDef) and node.name.startswith("test_"):
+                    yield path.relative_to(ROOT), node.name

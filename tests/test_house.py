@@ -2,7 +2,7 @@
 
 import csv
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 
 import grimp
 import pytest
@@ -33,6 +33,10 @@ LINE_LIMITS = {  # part: tokens per line, parallel assignments, unpacked tuples 
     "lerobot": (8.0, 0.1, 0, 1.0),
 }
 """A number here only falls, until each part has 8.5, 2, 0 and 4; `python -m tests.line_figures` prints them."""
+MOST_WORDS = 8
+"""The most words in the name of a test, without `test`."""
+LONG_TEST_NAMES = 5
+"""Names of tests with more words, all of them in tests/golden; this number only falls."""
 TOUR = (house.ROOT / "docs" / "develop" / "tour.md").read_text(encoding="utf-8")
 
 
@@ -114,6 +118,16 @@ def test_no_test_imports_another() -> None:
         for name in house.imported_names(path)
     ]
     assert not [name for name in found if any(part.startswith("test_") for part in name[1:])]
+
+
+@pytest.mark.push
+def test_names_of_tests_have_eight_words_at_most() -> None:
+    """A file states each law once, so that no two of its tests share a name."""
+    names = list(house.list_test_names())
+    assert len(names) > 3000
+    assert [name for name, uses in Counter(names).items() if uses > 1] == []
+    too_long = [f"{path}::{name}" for path, name in names if name.count("_") > MOST_WORDS]
+    assert len(too_long) <= LONG_TEST_NAMES, "\n".join(too_long)
 
 
 @pytest.mark.push
